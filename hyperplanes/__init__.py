@@ -1,0 +1,1 @@
+"""HyperPlanes: a hypernetwork reads a few posed images and writes a NeRF."""

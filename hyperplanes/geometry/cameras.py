@@ -1,0 +1,295 @@
+"""Build, pick, move and place batches of Kornia pinhole cameras.
+
+Conventions of the whole package: OpenCV axes (x right, y down, z forward), extrinsics are camera_from_world, pixel
+(0, 0) is centred at (0, 0), so that a centred principal point is ((W - 1) / 2, (H - 1) / 2). Every function returns a
+new `PinholeCamera` with storage (view, 4, 4); none changes its argument.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+__all__ = [
+    "camera_from_world",
+    "centres",
+    "concatenate",
+    "fibonacci_sphere",
+    "image_size",
+    "intrinsics",
+    "look_at",
+    "opencv_from_opengl",
+    "opengl_from_opencv",
+    "orbit",
+    "pinhole",
+    "projection_matrices",
+    "resized",
+    "select",
+    "symmetric_intrinsics",
+    "to",
+    "viewing_directions",
+]
+
+ROTATION_TOLERANCE = 1e-3
+
+
+def pinhole(
+    intrinsics: Float[Tensor, "*view 3 3"],
+    camera_from_world: Float[Tensor, "view 4 4"],
+    height: int,
+    width: int,
+) -> PinholeCamera:
+    """A checked batch of pinhole cameras that share one image size.
+
+    Kornia's constructor accepts nearly anything; this is where wrong numbers are stopped.
+
+    Args:
+        intrinsics: calibration in pixels with integer pixel centres, one (3, 3) matrix or one a view.
+        camera_from_world: rigid transforms in OpenCV axes.
+        height: rows of the images.
+        width: columns of the images.
+
+    Returns:
+        Cameras with storage (view, 4, 4), dtype and device of `camera_from_world`.
+
+    Raises:
+        ValueError: a shape, a value that is not finite, a focal length that is not positive, or a block that is no
+            rotation.
+
+    >>> cameras = pinhole(symmetric_intrinsics(64, 64, 0.7), torch.eye(4)[None], 64, 64)
+    >>> cameras.project(torch.tensor([[[0.0, 0.0, 2.0]]])).flatten().tolist()
+    [31.5, 31.5]
+    """
+    pose = camera_from_world
+    if pose.ndim != 3 or pose.shape[1:] != (4, 4):
+        raise ValueError(f"camera_from_world: expected shape (view, 4, 4), got {tuple(pose.shape)}")
+    if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim not in (2, 3):
+        raise ValueError(f"intrinsics: expected shape (3, 3) or (view, 3, 3), got {tuple(intrinsics.shape)}")
+    views = pose.shape[0]
+    if intrinsics.ndim == 3 and intrinsics.shape[0] not in (1, views):
+        raise ValueError(f"intrinsics: expected one matrix or {views}, one a pose, got {intrinsics.shape[0]}")
+    if height < 1 or width < 1:
+        raise ValueError(f"image size: expected at least 1 x 1, got {height} x {width}")
+    calibration = intrinsics.to(pose).expand(views, 3, 3)
+    with torch.no_grad():
+        _check_numbers(calibration, pose)
+    full = torch.eye(4, dtype=pose.dtype, device=pose.device).repeat(views, 1, 1)
+    full = torch.cat([torch.cat([calibration, full[:, :3, 3:]], dim=2), full[:, 3:]], dim=1)
+    size = torch.ones(views, dtype=pose.dtype, device=pose.device)
+    return PinholeCamera(full, pose, size * height, size * width)
+
+
+def _check_numbers(calibration: Tensor, pose: Tensor) -> None:
+    for name, values in (("intrinsics", calibration), ("camera_from_world", pose)):
+        bad = (~torch.isfinite(values)).flatten(1).any(1).nonzero().flatten().tolist()
+        if bad:
+            raise ValueError(f"{name}: expected finite numbers, got NaN or infinity in view {bad[0]}")
+    focal = torch.stack([calibration[:, 0, 0], calibration[:, 1, 1]], -1)
+    if (focal <= 0).any():
+        view = int((focal <= 0).any(-1).nonzero()[0])
+        raise ValueError(f"intrinsics: expected positive focal lengths, got {focal[view].tolist()} in view {view}")
+    rotation = pose[:, :3, :3]
+    identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
+    error = (rotation @ rotation.mT - identity).abs().flatten(1).amax(1)
+    wrong = (error > ROTATION_TOLERANCE) | (torch.linalg.det(rotation) < 0)
+    if wrong.any():
+        view = int(wrong.nonzero()[0])
+        raise ValueError(
+            f"camera_from_world: expected a rotation in the upper left 3 x 3 block, got one in view {view} with "
+            f"|R R^T - I| = {float(error[view]):.3g} and determinant {float(torch.linalg.det(rotation[view])):.3g}"
+        )
+    last = pose.new_tensor([0.0, 0.0, 0.0, 1.0])
+    if ((pose[:, 3] - last).abs() > ROTATION_TOLERANCE).any():
+        raise ValueError("camera_from_world: expected the last row 0 0 0 1")
+
+
+def symmetric_intrinsics(height: int, width: int, field_of_view: float) -> Float[Tensor, "3 3"]:
+    """Calibration of a camera that looks through its image centre.
+
+    Args:
+        height: rows.
+        width: columns.
+        field_of_view: horizontal opening angle in radians, measured from image border to image border, so that
+            f = W / (2 tan(angle / 2)).
+
+    Returns:
+        float32 matrix with square pixels and principal point ((W - 1) / 2, (H - 1) / 2).
+
+    Raises:
+        ValueError: an angle outside (0, pi).
+
+    >>> symmetric_intrinsics(4, 4, math.pi / 2)[0].tolist()
+    [2.0, 0.0, 1.5]
+    """
+    if not 0 < field_of_view < math.pi:
+        raise ValueError(f"field_of_view: expected radians in (0, pi), got {field_of_view}")
+    focal = width / (2 * math.tan(field_of_view / 2))
+    return torch.tensor([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+
+
+def intrinsics(cameras: PinholeCamera) -> Float[Tensor, "view 3 3"]:
+    """The calibration matrices in pixels, integer pixel centres."""
+    return cameras.intrinsics[:, :3, :3]
+
+
+def camera_from_world(cameras: PinholeCamera) -> Float[Tensor, "view 4 4"]:
+    """The rigid transforms, OpenCV axes."""
+    return cameras.extrinsics
+
+
+def image_size(cameras: PinholeCamera) -> tuple[int, int]:
+    """(height, width) in pixels, shared by the batch.
+
+    Raises:
+        ValueError: cameras of different image sizes, or no camera.
+    """
+    sizes = {(int(h), int(w)) for h, w in zip(cameras.height.tolist(), cameras.width.tolist(), strict=True)}
+    if len(sizes) != 1:
+        raise ValueError(f"cameras: expected one image size, got {sorted(sizes) or 'no camera'}")
+    return sizes.pop()
+
+
+def projection_matrices(cameras: PinholeCamera) -> Float[Tensor, "view 3 4"]:
+    """K [R | t]: homogeneous pixels from world."""
+    return intrinsics(cameras) @ camera_from_world(cameras)[:, :3]
+
+
+def centres(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
+    """Optical centres in the world: -R^T t."""
+    pose = camera_from_world(cameras)
+    return -(pose[:, :3, :3].mT @ pose[:, :3, 3:]).squeeze(-1)
+
+
+def viewing_directions(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
+    """Unit optical axes in the world, pointing away from the camera (HyperPlanes, d_I)."""
+    return camera_from_world(cameras)[:, 2, :3]
+
+
+def select(cameras: PinholeCamera, index: slice | list[int] | Int[Tensor, " chosen"]) -> PinholeCamera:
+    """The cameras at `index`, in that order."""
+    return PinholeCamera(
+        cameras.intrinsics[index], cameras.extrinsics[index], cameras.height[index], cameras.width[index]
+    )
+
+
+def concatenate(batches: list[PinholeCamera]) -> PinholeCamera:
+    """All cameras of several batches in one batch.
+
+    Raises:
+        ValueError: an empty list.
+    """
+    if not batches:
+        raise ValueError("batches: expected at least one batch of cameras, got none")
+    return PinholeCamera(
+        torch.cat([batch.intrinsics for batch in batches]),
+        torch.cat([batch.extrinsics for batch in batches]),
+        torch.cat([batch.height for batch in batches]),
+        torch.cat([batch.width for batch in batches]),
+    )
+
+
+def to(
+    cameras: PinholeCamera, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+) -> PinholeCamera:
+    """The cameras on another device or in another precision."""
+    values = (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
+    return PinholeCamera(*(value.to(device=device, dtype=dtype) for value in values))
+
+
+def resized(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
+    """The cameras for the same pictures scaled to another size.
+
+    The image borders, not the pixel centres, stay in place: c' = s (c + 1/2) - 1/2, which is not what
+    `PinholeCamera.scale` does.
+
+    >>> small = pinhole(symmetric_intrinsics(64, 64, 0.7), torch.eye(4)[None], 64, 64)
+    >>> intrinsics(resized(small, 128, 128))[0, :2, 2].tolist()
+    [63.5, 63.5]
+    """
+    old_height, old_width = image_size(cameras)
+    scale = cameras.intrinsics.new_tensor([width / old_width, height / old_height])
+    matrix = cameras.intrinsics.clone()
+    matrix[:, :2, :2] = matrix[:, :2, :2] * scale[:, None]
+    matrix[:, :2, 2] = scale * (matrix[:, :2, 2] + 0.5) - 0.5
+    return PinholeCamera(
+        matrix, cameras.extrinsics, torch.full_like(cameras.height, height), torch.full_like(cameras.width, width)
+    )
+
+
+def opencv_from_opengl(world_from_camera: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
+    """camera_from_world in OpenCV axes of poses stored as OpenGL camera-to-world (Blender, nerfstudio).
+
+    OpenGL cameras look along -z with y up, so y and z of the camera axes change sign.
+    """
+    return torch.linalg.inv(world_from_camera * world_from_camera.new_tensor([1.0, -1.0, -1.0, 1.0]))
+
+
+def opengl_from_opencv(camera_from_world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
+    """OpenGL camera-to-world of poses in our convention: the inverse of `opencv_from_opengl`."""
+    return torch.linalg.inv(camera_from_world) * camera_from_world.new_tensor([1.0, -1.0, -1.0, 1.0])
+
+
+def look_at(
+    eyes: Float[Tensor, "view 3"],
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0),
+) -> Float[Tensor, "view 4 4"]:
+    """camera_from_world of cameras at `eyes` that look at `target`, image top towards `up`.
+
+    Looking straight along `up` leaves the roll open; the world's next axis decides it then.
+
+    Raises:
+        ValueError: an eye at the target.
+    """
+    forward = eyes.new_tensor(target) - eyes
+    distance = forward.norm(dim=-1, keepdim=True)
+    if (distance < 1e-9).any():
+        raise ValueError(f"eyes: expected every eye away from the target {target}, got one at it")
+    forward = forward / distance
+    upward = eyes.new_tensor(up).expand_as(eyes)
+    other = upward.roll(1, dims=-1)
+    vertical = torch.linalg.cross(forward, upward).norm(dim=-1, keepdim=True) < 1e-6
+    right = torch.linalg.cross(forward, torch.where(vertical, other, upward))
+    right = right / right.norm(dim=-1, keepdim=True)
+    down = torch.linalg.cross(forward, right)
+    rotation = torch.stack([right, down, forward], dim=1)
+    translation = -(rotation @ eyes[..., None])
+    last = eyes.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(eyes), 1, 4)
+    return torch.cat([torch.cat([rotation, translation], dim=2), last], dim=1)
+
+
+def orbit(views: int, distance: float, elevation: float = math.radians(20.0)) -> Float[Tensor, "view 4 4"]:
+    """camera_from_world of `views` cameras evenly around the y axis, looking at the origin.
+
+    Args:
+        views: how many.
+        distance: from the origin, in world units.
+        elevation: above the xz plane, in radians.
+    """
+    azimuth = torch.arange(views) * (2 * math.pi / max(views, 1))
+    flat = math.cos(elevation)
+    up = torch.full_like(azimuth, math.sin(elevation))
+    return look_at(distance * torch.stack([flat * azimuth.sin(), up, flat * azimuth.cos()], -1))
+
+
+def fibonacci_sphere(views: int, distance: float, lowest: float = -1.0, highest: float = 1.0) -> Tensor:
+    """camera_from_world of cameras spread evenly over a band of the sphere, looking at the origin.
+
+    Args:
+        views: how many.
+        distance: from the origin, in world units.
+        lowest: sine of the lowest elevation.
+        highest: sine of the highest elevation.
+
+    Returns:
+        (view, 4, 4) poses in the order of a golden-angle spiral from `highest` to `lowest`.
+    """
+    fraction = (torch.arange(views) + 0.5) / max(views, 1)
+    height = highest + (lowest - highest) * fraction
+    azimuth = torch.arange(views) * (math.pi * (3 - math.sqrt(5)))
+    flat = (1 - height**2).clamp_min(0).sqrt()
+    return look_at(distance * torch.stack([flat * azimuth.sin(), height, flat * azimuth.cos()], -1))

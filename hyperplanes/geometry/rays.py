@@ -1,0 +1,116 @@
+"""Rays through pixels, and where they cross the sphere that bounds a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from hyperplanes.geometry import cameras as camera
+
+__all__ = ["Rays", "Sphere", "cast", "pixel_grid"]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """What bounds a scene: nothing outside it is seen.
+
+    Attributes:
+        centre: in world units.
+        radius: in world units.
+    """
+
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius: float = 1.0
+
+    def normalise(self, points: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point 3"]:
+        """Points with the sphere moved to the unit sphere."""
+        return (points - points.new_tensor(self.centre)) / self.radius
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Points origin + t direction with near <= t <= far; a ray with near == far sees nothing.
+
+    Attributes:
+        origins: in the world.
+        directions: unit vectors in the world.
+        near: first distance of interest.
+        far: last distance of interest.
+    """
+
+    origins: Float[Tensor, "ray 3"]
+    directions: Float[Tensor, "ray 3"]
+    near: Float[Tensor, " ray"]
+    far: Float[Tensor, " ray"]
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def __getitem__(self, index: slice | Tensor) -> Rays:
+        return Rays(self.origins[index], self.directions[index], self.near[index], self.far[index])
+
+    def at(self, t: Float[Tensor, ray * sample]) -> Float[Tensor, "ray *sample 3"]:
+        """The points at distances t."""
+        shape = (len(self),) + (1,) * (t.ndim - 1) + (3,)
+        return self.origins.reshape(shape) + t[..., None] * self.directions.reshape(shape)
+
+
+def pixel_grid(height: int, width: int, device: torch.device | str | None = None) -> Float[Tensor, "pixel 2"]:
+    """The centres (column, row) of all pixels, row by row.
+
+    >>> pixel_grid(2, 2).tolist()
+    [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
+    """
+    rows, columns = torch.meshgrid(
+        torch.arange(height, device=device), torch.arange(width, device=device), indexing="ij"
+    )
+    return torch.stack([columns, rows], -1).reshape(-1, 2).float()
+
+
+def cast(
+    cameras: PinholeCamera,
+    view: Int[Tensor, " ray"],
+    pixels: Float[Tensor, "ray 2"],
+    bounds: Sphere | None = None,
+    *,
+    span: str = "sphere",
+) -> Rays:
+    """Rays from camera centres through pixels.
+
+    Args:
+        cameras: a batch (view,).
+        view: which camera each ray starts from.
+        pixels: (column, row), integer pixel centres.
+        bounds: what near and far are taken from; the unit sphere where absent.
+        span: "sphere" clips each ray to the sphere (a miss gets near == far); "depth" gives every ray of a camera the
+            same near and far, the distance of the sphere's centre minus and plus its radius, as NeRF does.
+
+    Returns:
+        Rays with unit directions, differentiable in the cameras.
+
+    Raises:
+        ValueError: an unknown `span`.
+    """
+    bounds = bounds or Sphere()
+    pose = camera.camera_from_world(cameras)[view]
+    matrix = camera.intrinsics(cameras)[view]
+    y = (pixels[:, 1] - matrix[:, 1, 2]) / matrix[:, 1, 1]
+    x = (pixels[:, 0] - matrix[:, 0, 2] - matrix[:, 0, 1] * y) / matrix[:, 0, 0]
+    local = torch.stack([x, y, torch.ones_like(x)], -1)
+    directions = torch.nn.functional.normalize((pose[:, :3, :3].mT @ local[..., None]).squeeze(-1), dim=-1)
+    origins = camera.centres(cameras)[view]
+    to_centre = origins.new_tensor(bounds.centre) - origins
+    if span == "depth":
+        distance = to_centre.norm(dim=-1)
+        return Rays(origins, directions, (distance - bounds.radius).clamp_min(0), distance + bounds.radius)
+    if span != "sphere":
+        raise ValueError(f"span: expected 'sphere' or 'depth', got {span!r}")
+    middle = (to_centre * directions).sum(-1)
+    square = bounds.radius**2 - to_centre.square().sum(-1) + middle.square()
+    hit = square > 0
+    half = torch.where(hit, torch.where(hit, square, 1.0).sqrt(), 0.0)  # no sqrt at 0: its gradient is infinite
+    return Rays(origins, directions, (middle - half).clamp_min(0), (middle + half).clamp_min(0))

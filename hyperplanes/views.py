@@ -1,0 +1,115 @@
+"""Views: posed images of one scene; Task: the support and query views of one object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float, Int
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
+
+__all__ = ["Task", "Views"]
+
+
+@dataclass(frozen=True)
+class Views:
+    """Posed images of one scene.
+
+    Attributes:
+        images: RGB in [0, 1], composited over white.
+        cameras: one a view, OpenCV axes, integer pixel centres.
+        masks: opacity in [0, 1], or None where the images came without.
+        bounds: the sphere that holds all that is to be reconstructed.
+        names: where each view came from, for messages and file names.
+    """
+
+    images: Float[Tensor, "view 3 height width"]
+    cameras: PinholeCamera
+    masks: Float[Tensor, "view 1 height width"] | None = None
+    bounds: Sphere = field(default_factory=Sphere)
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.images.ndim != 4 or self.images.shape[1] != 3:
+            raise ValueError(f"images: expected shape (view, 3, height, width), got {tuple(self.images.shape)}")
+        if len(self.images) != self.cameras.batch_size:
+            raise ValueError(f"images: expected one a camera, {self.cameras.batch_size}, got {len(self.images)}")
+        if self.masks is not None and self.masks.shape != (len(self.images), 1, *self.images.shape[2:]):
+            raise ValueError(
+                f"masks: expected {(len(self.images), 1, *self.images.shape[2:])}, got {tuple(self.masks.shape)}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, index: slice | list[int] | Int[Tensor, " chosen"]) -> Views:
+        names = self.names
+        if names:
+            chosen = range(len(self))[index] if isinstance(index, slice) else torch.as_tensor(index).tolist()
+            names = tuple(names[i] for i in chosen)
+        return replace(
+            self,
+            images=self.images[index],
+            cameras=camera.select(self.cameras, index),
+            masks=None if self.masks is None else self.masks[index],
+            names=names,
+        )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of every image."""
+        return self.images.shape[2], self.images.shape[3]
+
+    def to(self, device: torch.device | str) -> Views:
+        """The views on another device."""
+        return replace(
+            self,
+            images=self.images.to(device),
+            cameras=camera.to(self.cameras, device),
+            masks=None if self.masks is None else self.masks.to(device),
+        )
+
+    def rays(self, view: int, *, span: str = "sphere") -> Rays:
+        """The rays through all pixels of one view, row by row."""
+        pixels = pixel_grid(*self.size, device=self.images.device)
+        index = torch.full((len(pixels),), view, dtype=torch.long, device=pixels.device)
+        return cast(self.cameras, index, pixels, self.bounds, span=span)
+
+    def sample_rays(
+        self, count: int, *, generator: torch.Generator | None = None, span: str = "sphere"
+    ) -> tuple[Rays, Float[Tensor, "ray 3"]]:
+        """Rays through pixels drawn uniformly from all views, and the colours seen there.
+
+        Args:
+            count: how many, drawn with replacement.
+            generator: where the randomness comes from; on the CPU, so that every device draws the same.
+            span: as in `geometry.cast`.
+
+        Returns:
+            The rays and their true colours.
+        """
+        height, width = self.size
+        flat = torch.randint(len(self) * height * width, (count,), generator=generator).to(self.images.device)
+        view, pixel = flat // (height * width), flat % (height * width)
+        row, column = pixel // width, pixel % width
+        rays = cast(self.cameras, view, torch.stack([column, row], -1).to(self.images), self.bounds, span=span)
+        return rays, self.images[view, :, row, column]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One object: what the method is shown, and what it is judged by (HyperPlanes, Eq. 5).
+
+    Attributes:
+        support: the views the method may use.
+        query: disjoint views of the same object.
+        name: of the object.
+    """
+
+    support: Views
+    query: Views
+    name: str = ""
