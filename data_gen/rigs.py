@@ -1,0 +1,372 @@
+"""Camera rigs: where the cameras of a generated object stand.
+
+Conventions: OpenCV camera axes (x right, y down, z forward), a world with y up, ``world_from_camera`` poses, intrinsics
+in pixels with INTEGER pixel centres, so a centred principal point is ``((W - 1) / 2, (H - 1) / 2)``. Objects are
+expected inside the sphere of radius 1 around the origin, at which every camera looks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = [
+    "DEFAULT_DISTANCE",
+    "OBJECT_RADIUS",
+    "RIG_PRESETS",
+    "Rig",
+    "fitting_field_of_view",
+    "fixed",
+    "look_at_origin",
+    "orbit",
+    "preset",
+    "random_hemisphere",
+    "random_sphere",
+]
+
+Array = npt.NDArray[np.float64]
+
+OBJECT_RADIUS = 1.0
+"""Radius of the sphere around the origin that holds every normalised object, in world units."""
+
+DEFAULT_DISTANCE = 3.0
+"""Distance of the cameras from the origin, in world units."""
+
+_MARGIN = 1.04
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Posed cameras of one size.
+
+    Attributes:
+        world_from_camera: Camera poses ``(view, 4, 4)``, OpenCV axes, in world units.
+        intrinsics: Pinhole matrices ``(view, 3, 3)`` in pixels, integer pixel centres. One ``(3, 3)`` is accepted and
+            repeated for every view.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        near: Distance along a ray before which there is no object, in world units.
+        far: Distance along a ray after which there is no object, in world units.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, a pose is not a rigid motion or near, far are out of order.
+    """
+
+    world_from_camera: Array
+    intrinsics: Array
+    width: int
+    height: int
+    near: float
+    far: float
+
+    def __post_init__(self) -> None:
+        poses = np.ascontiguousarray(self.world_from_camera, dtype=np.float64)
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
+            raise ValueError(f"world_from_camera: expected shape (view, 4, 4) with view >= 1, received {poses.shape}")
+        intrinsics = np.asarray(self.intrinsics, dtype=np.float64)
+        if intrinsics.shape not in {(3, 3), (len(poses), 3, 3)}:
+            raise ValueError(f"intrinsics: expected shape (3, 3) or ({len(poses)}, 3, 3), received {intrinsics.shape}")
+        intrinsics = np.array(np.broadcast_to(intrinsics, (len(poses), 3, 3)))
+        if not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
+            raise ValueError("world_from_camera, intrinsics: expected finite numbers, received NaN or infinity")
+        rotations = poses[:, :3, :3]
+        error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
+        if error > 1e-6 or np.linalg.det(rotations).min() < 0:
+            raise ValueError(
+                "world_from_camera: expected rotations without scale or mirroring, received "
+                f"|R R^T - 1| up to {error:.2g} and determinants from {np.linalg.det(rotations).min():.3g}"
+            )
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"width, height: expected at least 1 pixel, received {self.width} x {self.height}")
+        if not 0 < self.near < self.far:
+            raise ValueError(f"near, far: expected 0 < near < far, received {self.near} and {self.far}")
+        poses.flags.writeable = False
+        intrinsics.flags.writeable = False
+        object.__setattr__(self, "world_from_camera", poses)
+        object.__setattr__(self, "intrinsics", intrinsics)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self.world_from_camera)
+
+    @property
+    def camera_from_world(self) -> Array:
+        """Extrinsics ``(view, 4, 4)`` as Kornia's PinholeCamera takes them."""
+        return np.linalg.inv(self.world_from_camera)
+
+    @property
+    def camera_centres(self) -> Array:
+        """Camera positions ``(view, 3)`` in world units."""
+        return self.world_from_camera[:, :3, 3]
+
+    def select(self, views: Sequence[int]) -> Rig:
+        """Return the rig of some of the views, in the order given.
+
+        Args:
+            views: Indices of the views to keep.
+
+        Returns:
+            A rig of ``len(views)`` cameras with the same size, near and far.
+        """
+        index = np.asarray(views, dtype=np.int64)
+        return Rig(self.world_from_camera[index], self.intrinsics[index], self.width, self.height, self.near, self.far)
+
+
+def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:
+    """Field of view at which the unit sphere just fits, with a margin of 4 %.
+
+    Args:
+        distance: Distance of the camera from the centre of the sphere, more than 1.04.
+
+    Returns:
+        The full angle in degrees, ``2 asin(1.04 / distance)``.
+
+    Raises:
+        ValueError: If the camera is too near for any angle to do.
+
+    >>> round(fitting_field_of_view(3.0), 3)
+    40.562
+    """
+    if not distance > _MARGIN * OBJECT_RADIUS:
+        raise ValueError(f"distance: expected more than {_MARGIN} (the object's radius is 1), received {distance}")
+    return math.degrees(2.0 * math.asin(_MARGIN * OBJECT_RADIUS / distance))
+
+
+def look_at_origin(centres: npt.ArrayLike) -> Array:
+    """Poses of cameras that look at the origin with the world's y axis up in the picture.
+
+    Args:
+        centres: Camera positions ``(view, 3)``, none of them the origin.
+
+    Returns:
+        ``world_from_camera`` ``(view, 4, 4)``, OpenCV axes. Right above or below the origin, where no direction is up,
+        the world's -z axis is up in the picture.
+
+    >>> look_at_origin([[0.0, 0.0, 3.0]])[0].round().astype(int).tolist()
+    [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]]
+    """
+    positions = np.asarray(centres, dtype=np.float64)
+    forward = -positions / np.linalg.norm(positions, axis=-1, keepdims=True)
+    up = np.where(np.abs(forward[:, 1:2]) < 1.0 - 1e-9, [[0.0, 1.0, 0.0]], [[0.0, 0.0, -1.0]])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    poses = np.zeros((len(positions), 4, 4))
+    poses[:, :3, 0] = right
+    poses[:, :3, 1] = np.cross(forward, right)
+    poses[:, :3, 2] = forward
+    poses[:, :3, 3] = positions
+    poses[:, 3, 3] = 1.0
+    return poses + 0.0  # no negative zeros in what is written to disk
+
+
+def fixed(
+    views: int = 50,
+    resolution: int | tuple[int, int] = 128,
+    *,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+    lowest: float = -20.0,
+    highest: float = 80.0,
+) -> Rig:
+    """The same well spread poses for every object.
+
+    Views with an even index (support) and with an odd index (query) are each a spherical Fibonacci spread over the band
+    of elevations, and their union is well spread too: the second spread stands half a step higher and is turned to stand
+    in the gaps of the first. Within each half, views come in farthest-first order, so the first few are well spread as well.
+
+    Args:
+        views: Number of views.
+        resolution: Pixels, one number for a square image or (width, height).
+        distance: Distance of the cameras from the origin in world units.
+        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
+        lowest: Lowest elevation in degrees.
+        highest: Highest elevation in degrees.
+
+    Returns:
+        A rig of ``views`` cameras.
+
+    Raises:
+        ValueError: If the number of views, the elevations, the distance or the resolution make no sense.
+    """
+    _check_views(views)
+    if not -90.0 <= lowest < highest <= 90.0:
+        raise ValueError(f"lowest, highest: expected -90 <= lowest < highest <= 90, received {lowest} and {highest}")
+    directions = np.empty((views, 3))
+    for first in (0, 1):
+        count = len(range(first, views, 2))
+        if count:
+            spread = _fibonacci_band(count, lowest, highest, level=0.25 + 0.5 * first, turn=first * _HALF_TURN)
+            directions[first::2] = spread[_farthest_first(spread)]
+    return _rig(directions, resolution, distance, field_of_view)
+
+
+def random_sphere(
+    views: int = 50,
+    resolution: int | tuple[int, int] = 128,
+    *,
+    seed: int,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+) -> Rig:
+    """Cameras at random, uniformly over the whole sphere.
+
+    Args:
+        views: Number of views.
+        resolution: Pixels, one number for a square image or (width, height).
+        seed: Seed of the random numbers; the same seed gives the same poses.
+        distance: Distance of the cameras from the origin in world units.
+        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
+
+    Returns:
+        A rig of ``views`` cameras.
+    """
+    return _random(views, resolution, seed, distance, field_of_view, lowest=-1.0)
+
+
+def random_hemisphere(
+    views: int = 50,
+    resolution: int | tuple[int, int] = 128,
+    *,
+    seed: int,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+) -> Rig:
+    """Cameras at random, uniformly over the upper half of the sphere (y >= 0).
+
+    Args:
+        views: Number of views.
+        resolution: Pixels, one number for a square image or (width, height).
+        seed: Seed of the random numbers; the same seed gives the same poses.
+        distance: Distance of the cameras from the origin in world units.
+        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
+
+    Returns:
+        A rig of ``views`` cameras.
+    """
+    return _random(views, resolution, seed, distance, field_of_view, lowest=0.0)
+
+
+def orbit(
+    views: int = 60,
+    resolution: int | tuple[int, int] = 128,
+    *,
+    elevation: float = 20.0,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+) -> Rig:
+    """Cameras evenly around the object at one height: a turntable.
+
+    Args:
+        views: Number of views; the one after the last would be the first again.
+        resolution: Pixels, one number for a square image or (width, height).
+        elevation: Height of the cameras over the horizon in degrees.
+        distance: Distance of the cameras from the origin in world units.
+        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
+
+    Returns:
+        A rig of ``views`` cameras, the first in the direction of +z.
+
+    Raises:
+        ValueError: If the number of views, elevation, distance or resolution make no sense.
+    """
+    _check_views(views)
+    if not -90.0 <= elevation <= 90.0:
+        raise ValueError(f"elevation: expected -90 to 90 degrees, received {elevation}")
+    azimuths = 2.0 * math.pi * np.arange(views) / views
+    heights = np.full(views, math.sin(math.radians(elevation)))
+    return _rig(_directions(heights, azimuths), resolution, distance, field_of_view)
+
+
+def preset(name: str, *, seed: int = 0) -> Rig:
+    """The cameras of a named configuration.
+
+    Args:
+        name: A name in RIG_PRESETS.
+        seed: Seed of the presets that place cameras at random.
+
+    Returns:
+        The rig.
+
+    Raises:
+        ValueError: If no preset has that name.
+    """
+    if name not in RIG_PRESETS:
+        raise ValueError(f"rig preset: expected one of {', '.join(RIG_PRESETS)}, received {name!r}")
+    return RIG_PRESETS[name](seed)
+
+
+_HALF_TURN = _GOLDEN_ANGLE / 2.0
+
+RIG_PRESETS: dict[str, Callable[[int], Rig]] = {
+    "paper-128": lambda seed: random_sphere(50, 128, seed=seed),
+    "paper-200": lambda seed: fixed(50, 200),
+}
+"""Named camera configurations of the paper's two data sets, each a function of a seed."""
+
+
+def _check_views(views: int) -> None:
+    if views < 1:
+        raise ValueError(f"views: expected at least 1, received {views}")
+
+
+def _directions(heights: Array, azimuths: Array) -> Array:
+    """Unit vectors (view, 3) from y coordinates and angles about y that start at +z and turn towards +x."""
+    across = np.sqrt(np.clip(1.0 - heights**2, 0.0, None))
+    return np.stack((across * np.sin(azimuths), heights, across * np.cos(azimuths)), axis=-1)
+
+
+def _fibonacci_band(count: int, lowest: float, highest: float, *, level: float, turn: float) -> Array:
+    """Directions (count, 3) on a golden spiral, uniform in area between two elevations in degrees."""
+    bottom, top = math.sin(math.radians(lowest)), math.sin(math.radians(highest))
+    heights = bottom + (top - bottom) * (np.arange(count) + level) / count
+    return _directions(heights, turn + _GOLDEN_ANGLE * np.arange(count))
+
+
+def _farthest_first(directions: Array) -> list[int]:
+    """An order in which each direction is the one farthest from all before it; the first stays first."""
+    order = [0]
+    nearness = directions @ directions[0]
+    while len(order) < len(directions):
+        following = int(np.argmin(np.where(np.isin(np.arange(len(directions)), order), np.inf, nearness.round(9))))
+        order.append(following)
+        nearness = np.maximum(nearness, directions @ directions[following])
+    return order
+
+
+def _random(
+    views: int,
+    resolution: int | tuple[int, int],
+    seed: int,
+    distance: float,
+    field_of_view: float | None,
+    *,
+    lowest: float,
+) -> Rig:
+    _check_views(views)
+    generator = np.random.default_rng(seed)
+    heights = generator.uniform(lowest, 1.0, views)
+    azimuths = generator.uniform(0.0, 2.0 * math.pi, views)
+    return _rig(_directions(heights, azimuths), resolution, distance, field_of_view)
+
+
+def _rig(directions: Array, resolution: int | tuple[int, int], distance: float, field_of_view: float | None) -> Rig:
+    size: Any = resolution if isinstance(resolution, tuple) else (resolution, resolution)
+    width, height = int(size[0]), int(size[1])
+    if width < 1 or height < 1:
+        raise ValueError(f"resolution: expected at least 1 pixel, received {resolution}")
+    fitting = fitting_field_of_view(distance)
+    angle = fitting if field_of_view is None else field_of_view
+    if not 0.0 < angle < 180.0:
+        raise ValueError(f"field_of_view: expected more than 0 and less than 180 degrees, received {field_of_view}")
+    focal = min(width, height) / 2.0 / math.tan(math.radians(angle) / 2.0)
+    intrinsics = np.array(
+        [[focal, 0.0, (width - 1) / 2.0], [0.0, focal, (height - 1) / 2.0], [0.0, 0.0, 1.0]], dtype=np.float64
+    )
+    near, far = distance - OBJECT_RADIUS, distance + OBJECT_RADIUS
+    return Rig(look_at_origin(directions * distance), intrinsics, width, height, near, far)
