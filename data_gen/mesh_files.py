@@ -1,0 +1,295 @@
+"""The files of one model: what may be read, from where, and how much of it.
+
+A mesh file names other files: materials, textures, buffers. Every such name is resolved by ``ModelFolder``, which opens
+nothing outside the model's own folder and never the network, checks sizes before it reads and pixels before they are
+decoded, and remembers what it could not give.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import urllib.parse
+import warnings
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+import PIL.Image
+from trimesh.resolvers import Resolver
+
+__all__ = ["MAX_FILE_BYTES", "MAX_PIXELS", "MESH_SUFFIXES", "MeshError", "ModelFolder", "check_image", "read_bytes"]
+
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".dae")
+"""Endings of mesh files, lower case, best first where a folder holds the same model twice."""
+
+MAX_FILE_BYTES = 1 << 30
+"""Bytes of one file that are read at most."""
+
+MAX_PIXELS = 1 << 26
+"""Pixels of all textures of a model that are decoded at most: one of 8192 x 8192."""
+
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tif", ".tiff", ".tga", ".webp", ".ppm", ".dds")
+_MTL_OPTION = re.compile(
+    r"^\s*-(?:(?:blendu|blendv|cc|clamp|imfchan|type|texres|boost|bm)\s+\S+|(?:o|s|t)(?:\s+[-+.\deE]+){1,3}"
+    r"|mm\s+\S+\s+\S+)\s+"
+)
+
+
+class MeshError(ValueError):
+    """A mesh that is refused. The message is one line: file, expected, found, remedy."""
+
+
+def read_bytes(path: Path, *, limit: int = MAX_FILE_BYTES) -> bytes:
+    """Read a file whose size is checked first.
+
+    Args:
+        path: The file.
+        limit: Bytes at most.
+
+    Returns:
+        The content.
+
+    Raises:
+        MeshError: If the file is absent, unreadable, empty or larger than the limit.
+    """
+    try:
+        if not path.is_file():
+            raise MeshError(f"{path}: expected a mesh file, found {'a folder' if path.is_dir() else 'nothing'}")
+        size = path.stat().st_size
+        if size > limit:
+            raise MeshError(f"{path}: expected at most {limit} bytes, found {size}; reduce the mesh or its textures")
+        if size == 0:
+            raise MeshError(f"{path}: expected a mesh, found an empty file; fetch or export it again")
+        return path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"{path}: expected a readable file, found {error.strerror or error}") from error
+
+
+def check_image(data: bytes, name: str, *, limit: int = MAX_PIXELS) -> int:
+    """Decode an image, after its size was checked, to see that it is whole.
+
+    Args:
+        data: The bytes of an image file.
+        name: What it is called in a message.
+        limit: Pixels at most.
+
+    Returns:
+        Its number of pixels.
+
+    Raises:
+        MeshError: If it has more pixels than allowed.
+        ValueError: If it is no image, or cut short.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
+            with PIL.Image.open(io.BytesIO(data)) as image:
+                pixels = image.width * image.height
+                if pixels > limit:
+                    raise MeshError(
+                        f"{name}: expected textures of at most {limit} pixels together, found one of "
+                        f"{image.width} x {image.height}; make the texture smaller"
+                    )
+                image.load()
+    except MeshError:
+        raise
+    except PIL.Image.DecompressionBombError as error:
+        raise MeshError(f"{name}: expected at most {limit} pixels, found a decompression bomb: {error}") from error
+    except Exception as error:
+        raise ValueError(f"not a whole image ({_one_line(error) or type(error).__name__})") from error
+    return pixels
+
+
+class ModelFolder(Resolver):
+    """Gives a mesh loader the other files of its model, from one folder and no other place.
+
+    Names are taken as people write them: with backslashes, percent-encoded, in the wrong case, as ``model://NAME/rest``
+    (the folder stands for NAME), behind MTL options (``-s 1 1 1 wood.png``), or with the absolute path of the machine
+    they were made on, of which only the last part is looked for.
+
+    Args:
+        path: The mesh file; its name is what messages begin with.
+        root: The folder that nothing may leave; the mesh file's own by default.
+        pixels: Pixels that all textures together may have.
+
+    Attributes:
+        lost: Why each name that was asked for could not be given, by name.
+        notes: What a user should know about names that could be given.
+        refused: The first reason to refuse the whole model, if there was one: loaders swallow exceptions.
+    """
+
+    def __init__(self, path: Path, root: Path | None = None, *, pixels: int = MAX_PIXELS) -> None:
+        self.path = path
+        self.folder = path.parent.resolve()
+        self.root = (root or path.parent).resolve()
+        self.pixels_left = pixels
+        self.lost: dict[str, str] = {}
+        self.notes: list[str] = []
+        self.refused: MeshError | None = None
+        self.file_name = path.name
+        self._bytes: dict[Path, bytes] = {}
+
+    def get(self, name: str) -> bytes:
+        """Read a file of the model.
+
+        Args:
+            name: How the mesh refers to it.
+
+        Returns:
+            Its content.
+
+        Raises:
+            FileNotFoundError: If there is no such file, or it is an image that cannot be decoded; noted in ``lost``.
+            MeshError: If it lies outside the model's folder or is too large; noted in ``refused``.
+        """
+        try:
+            found = self.locate(name)
+            if found is None:
+                self.lost.setdefault(name, "not found")
+                raise FileNotFoundError(name)
+            if found not in self._bytes:
+                data = read_bytes(found)
+                if found.suffix.lower() in _IMAGE_SUFFIXES:
+                    self.spend_pixels(data, name)
+                self._bytes[found] = data
+            return self._bytes[found]
+        except MeshError as error:
+            self.refused = self.refused or error
+            raise
+
+    def spend_pixels(self, data: bytes, name: str) -> None:
+        """Check a texture and count its pixels.
+
+        Args:
+            data: The bytes of an image file.
+            name: What the mesh calls it.
+
+        Raises:
+            FileNotFoundError: If it cannot be decoded; noted in ``lost``.
+            MeshError: If the textures are too large.
+        """
+        try:
+            self.pixels_left -= check_image(data, f"{self.path}: {name}", limit=self.pixels_left)
+        except MeshError as error:
+            self.refused = self.refused or error
+            raise
+        except ValueError as error:
+            self.lost.setdefault(name, str(error))
+            raise FileNotFoundError(f"{name}: {error}") from error
+
+    def locate(self, name: str) -> Path | None:
+        """Find a file of the model without reading it.
+
+        Args:
+            name: How the mesh refers to it.
+
+        Returns:
+            The file, or None if there is none.
+
+        Raises:
+            MeshError: If the name leaves the model's folder.
+        """
+        spoken = name.strip().strip('"')
+        for spelling in _spellings(spoken):
+            found = self._inside(spelling, name)
+            if found is not None:
+                return found
+        if _is_absolute(spoken):
+            last = PurePosixPath(spoken.replace("\\", "/")).name
+            found = self._inside(last, name) if last else None
+            if found is None:
+                raise MeshError(
+                    f"{self.path}: expected references inside {self.root.name}/, found the absolute path {spoken!r}; "
+                    "put the file beside the mesh and name it without a folder"
+                )
+            self._note(f"{spoken}: absolute path not followed, {last} beside the mesh taken")
+            return found
+        return None
+
+    def _inside(self, relative: str, name: str) -> Path | None:
+        if not relative or _is_absolute(relative) or "\0" in relative:
+            return None
+        try:
+            candidate = self.folder / relative
+            path = candidate.resolve()
+            if not path.is_relative_to(self.root):
+                raise MeshError(
+                    f"{self.path}: expected references inside {self.root.name}/, found {name.strip()!r}, which leaves "
+                    "it; put the file beside the mesh"
+                )
+            if path.is_file():
+                return path
+            return self._other_case(path)
+        except (OSError, RuntimeError):
+            return None
+
+    def _other_case(self, path: Path) -> Path | None:
+        if path == self.root or not path.parent.is_dir():
+            return None
+        for entry in sorted(path.parent.iterdir()):
+            if entry.name.casefold() == path.name.casefold() and entry.is_file():
+                return entry if entry.resolve().is_relative_to(self.root) else None
+        return None
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def keys(self) -> Iterator[str]:
+        """List the files of the mesh's folder, which nothing here needs but the interface asks for.
+
+        Yields:
+            Names relative to the folder of the mesh file.
+        """
+        for entry in sorted(self.folder.iterdir()):
+            yield entry.name
+
+    def write(self, name: str, data: str | bytes) -> None:
+        """Refuse: a model is only read.
+
+        Args:
+            name: The file.
+            data: Its content.
+
+        Raises:
+            PermissionError: Always.
+        """
+        raise PermissionError(f"{name}: the folder of a model is only read")
+
+    def namespaced(self, namespace: str) -> ModelFolder:
+        """The same folder: names keep their meaning.
+
+        Args:
+            namespace: Ignored.
+
+        Returns:
+            This resolver.
+        """
+        return self
+
+
+def _spellings(name: str) -> Iterator[str]:
+    """Ways in which a name may be meant, likeliest first, all relative."""
+    uri = re.match(r"^(?:model|package|file)://(.*)$", name)
+    if uri:
+        parts = uri.group(1).split("/")
+        yield "/".join(parts[1:])
+        yield parts[-1]
+        return
+    plain = name.replace("\\", "/")
+    yield name
+    yield plain
+    yield urllib.parse.unquote(plain)
+    bare = plain
+    while (option := _MTL_OPTION.match(bare)) is not None:
+        bare = bare[option.end() :]
+    if bare != plain:
+        yield bare.strip()
+
+
+def _is_absolute(name: str) -> bool:
+    return name.startswith(("/", "\\", "~")) or re.match(r"^[A-Za-z]:[\\/]", name) is not None
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:160]
