@@ -6,105 +6,140 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
 
 from data_gen.backends import RendererError
 from data_gen.lighting import Lighting
 from data_gen.rigs import Rig
+from data_gen.surfaces import Surface
 
 __all__ = ["PyrenderBackend"]
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
+# Deleting any EGL renderer ends all others of the process, so there is one, which lives as long as the process does.
+_renderer: Any = None
+_made_in: tuple[int, int] | None = None
+
 
 class PyrenderBackend:
-    """Draws with one pyrender OffscreenRenderer, the only one of its process.
+    """Draws with the one pyrender OffscreenRenderer of this process.
 
     Args:
         platform: ``egl`` or ``osmesa``.
+
+    Raises:
+        RendererError: If OpenGL is loaded for another platform, or cannot be used in this thread or process.
     """
 
     def __init__(self, platform: str) -> None:
         self.name = f"pyrender-{platform}"
-        self._pyrender = _import_pyrender(platform)
-        self._renderer = _shared_renderer(self._pyrender)
+        self._renderer = _shared_renderer(platform)
         from OpenGL import GL
 
-        self.detail = f"{GL.glGetString(GL.GL_RENDERER).decode()}, OpenGL {GL.glGetString(GL.GL_VERSION).decode()}"
+        names = (GL.glGetString(GL.GL_RENDERER), GL.glGetString(GL.GL_VERSION))
+        self.detail = ", OpenGL ".join(name.decode() for name in names)
 
     def draw(
-        self, parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], rig: Rig, lighting: Lighting, supersample: int
-    ) -> npt.NDArray[np.uint8]:
-        """Draw all views.
+        self, surfaces: Sequence[Surface], rig: Rig, lighting: Lighting, supersample: int
+    ) -> Iterator[npt.NDArray[np.float32]]:
+        """Draw all views, one after the other.
 
         Args:
-            parts: Meshes, their poses ``world_from_mesh`` ``(4, 4)`` and whether to shade them smoothly.
+            surfaces: What to draw.
             rig: The cameras.
             lighting: The lights.
-            supersample: Samples along a side of a pixel.
+            supersample: Viewport pixels along a side of a pixel, each with four samples.
 
-        Returns:
-            Premultiplied RGBA ``(view, height x supersample, width x supersample, 4)``.
+        Yields:
+            Premultiplied sRGB with alpha ``(height, width, 4)``, from 0 to 255.
         """
-        pyrender = self._pyrender
-        scene = pyrender.Scene(bg_color=np.zeros(4), ambient_light=np.array(lighting.sky))
-        for mesh, pose, smooth in parts:
-            scene.add(pyrender.Mesh.from_trimesh(mesh, smooth=smooth), pose=np.asarray(pose, dtype=np.float64))
-        lights = []
-        for light in lighting.lights:
-            lamp = pyrender.DirectionalLight(color=np.ones(3), intensity=float(np.pi * light.colour[1]))
-            lights.append(scene.add(lamp))
-        camera = pyrender.IntrinsicsCamera(1.0, 1.0, 0.0, 0.0, znear=0.5 * rig.near, zfar=2.0 * rig.far)
-        camera_node = scene.add(camera)
-        self._renderer.viewport_width = rig.width * supersample
-        self._renderer.viewport_height = rig.height * supersample
-        flags = pyrender.RenderFlags.RGBA | pyrender.RenderFlags.SKIP_CULL_FACES
-        pictures = np.empty((len(rig), rig.height * supersample, rig.width * supersample, 4), np.uint8)
-        for view, (pose, matrix) in enumerate(zip(rig.world_from_camera, rig.intrinsics, strict=True)):
-            camera.fx, camera.fy = matrix[0, 0] * supersample, matrix[1, 1] * supersample
-            camera.cx, camera.cy = (matrix[0, 2] + 0.5) * supersample, (matrix[1, 2] + 0.5) * supersample
-            scene.set_pose(camera_node, pose @ _OPENGL_FROM_OPENCV)
-            for node, direction in zip(lights, lighting.directions(pose), strict=True):
-                scene.set_pose(node, _pose_along(direction))
-            pictures[view] = self._renderer.render(scene, flags)[0]
-        return pictures
+        _check_owner()
+        renderer = self._renderer
+        drawables = renderer.load(surfaces)
+        renderer.viewport_width = rig.width * supersample
+        renderer.viewport_height = rig.height * supersample
+        radius = max(float(np.linalg.norm(surface.positions, axis=1).max()) for surface in surfaces)
+        try:
+            for pose, intrinsics in zip(rig.world_from_camera, rig.intrinsics, strict=True):
+                clip_from_world = _projection(intrinsics, rig, pose, radius) @ np.linalg.inv(pose @ _OPENGL_FROM_OPENCV)
+                picture = renderer.draw(drawables, clip_from_world, pose[:3, 3], lighting, lighting.directions(pose))
+                yield _averaged(picture, supersample)
+        finally:
+            renderer.load([])
 
 
-_renderer: Any = None
+def _averaged(picture: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.float32]:
+    """Means of blocks of pixels, each side x side."""
+    rows = sum(picture[row::side].astype(np.uint16) for row in range(side))
+    total = sum(rows[:, column::side] for column in range(side))
+    return np.asarray(total, dtype=np.float32) / np.float32(side * side)
 
 
-def _shared_renderer(pyrender: Any) -> Any:
-    global _renderer
+def _projection(
+    intrinsics: npt.NDArray[np.float64], rig: Rig, pose: npt.NDArray[np.float64], radius: float
+) -> npt.NDArray[np.float64]:
+    """OpenGL's projection: pixel (0, 0) of the intrinsics is centred half a pixel inside OpenGL's window."""
+    import pyrender
+
+    distance = float(np.linalg.norm(pose[:3, 3]))
+    camera = pyrender.IntrinsicsCamera(
+        fx=intrinsics[0, 0],
+        fy=intrinsics[1, 1],
+        cx=intrinsics[0, 2] + 0.5,
+        cy=intrinsics[1, 2] + 0.5,
+        znear=max(distance - 1.01 * radius, 0.01 * distance),
+        zfar=distance + 1.01 * radius,
+    )
+    return camera.get_projection_matrix(rig.width, rig.height)
+
+
+def _shared_renderer(platform: str) -> Any:
+    global _renderer, _made_in
     if _renderer is None:
-        _renderer = (pyrender.OffscreenRenderer(64, 64), os.getpid(), threading.get_ident())
-    return _renderer[0]
+        _import_pyrender(platform)
+        import pyrender
+
+        from data_gen.pyrender_pass import SurfaceRenderer
+
+        # pyrender makes the context; its own renderer, which has drawn nothing yet, gives way to ours.
+        context = pyrender.OffscreenRenderer(64, 64)
+        context._renderer = SurfaceRenderer(64, 64)
+        _renderer, _made_in = context, (os.getpid(), threading.get_ident())
+    elif os.environ.get("PYOPENGL_PLATFORM") != platform:
+        loaded = os.environ.get("PYOPENGL_PLATFORM")
+        raise RendererError(
+            f"renderer: expected pyrender-{loaded}, which this process uses, received pyrender-{platform}"
+        )
+    _check_owner()
+    return _renderer._renderer
 
 
-def _import_pyrender(platform: str) -> Any:
-    loaded = sys.modules.get("OpenGL.platform")
+def _check_owner() -> None:
+    here = (os.getpid(), threading.get_ident())
+    if _made_in != here:
+        raise RendererError(
+            "renderer: expected the process and thread that made the OpenGL context "
+            f"{_made_in}, received {here}; start workers with the 'spawn' method and draw in one thread of each"
+        )
+
+
+def _import_pyrender(platform: str) -> None:
+    """Import pyrender for a platform, which OpenGL reads from the environment once."""
     current = os.environ.get("PYOPENGL_PLATFORM")
-    if loaded is not None and current != platform:
-        raise RendererError(f"PYOPENGL_PLATFORM: expected {platform!r}, but OpenGL is already loaded with {current!r}")
+    if "OpenGL.platform" in sys.modules and current != platform:
+        raise RendererError(
+            f"PYOPENGL_PLATFORM: expected {platform!r}, but OpenGL is loaded with {current!r} in this process already"
+        )
     os.environ["PYOPENGL_PLATFORM"] = platform
     with warnings.catch_warnings():
+        # What old releases of these packages say about themselves on import concerns their makers, not our users.
         warnings.simplefilter("ignore")
         import pyglet
 
-        pyglet.options["headless"] = True
-        import pyrender
-    return pyrender
-
-
-def _pose_along(direction: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """A pose whose +z axis is the direction towards the light."""
-    other = np.eye(3)[np.argmin(np.abs(direction))]
-    x = np.cross(other, direction)
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = x, np.cross(direction, x), direction
-    return pose
+        pyglet.options["headless"] = True  # or pyglet, which pyrender's window imports, looks for X11
+        import pyrender  # noqa: F401

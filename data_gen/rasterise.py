@@ -19,6 +19,7 @@ import trimesh
 from data_gen.backends import Backend, find_backend
 from data_gen.lighting import Lighting, resolve_lighting
 from data_gen.rigs import Rig
+from data_gen.surfaces import RasteriseError, surfaces_of
 
 __all__ = ["CHANNELS", "Part", "RasteriseError", "Rasteriser", "Rendering"]
 
@@ -27,10 +28,6 @@ Part = tuple[trimesh.Trimesh, npt.ArrayLike, bool]
 
 CHANNELS = ("rgba",)
 """What render can return."""
-
-
-class RasteriseError(ValueError):
-    """An object could not be drawn, or nothing of it can be seen."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +103,9 @@ class Rasteriser:
         Raises:
             RasteriseError: If nothing of the object is visible in any view.
         """
-        pictures = self._engine.draw(parts, rig, resolve_lighting(lighting, seed=seed), self.supersample)
-        rgba = np.stack([_average(picture, self.supersample) for picture in pictures])
+        surfaces = surfaces_of(parts, name)
+        pictures = self._engine.draw(surfaces, rig, resolve_lighting(lighting, seed=seed), self.supersample)
+        rgba = np.stack([_straight(picture) for picture in pictures])
         if not rgba[..., 3].any():
             raise RasteriseError(
                 f"{name}: expected some of it to be visible in {len(rig)} views, found every one blank"
@@ -121,12 +119,8 @@ def _make_engine(name: str) -> Any:
     return PyrenderBackend(name.removeprefix("pyrender-"))
 
 
-def _average(picture: npt.NDArray[np.uint8], supersample: int) -> npt.NDArray[np.uint8]:
-    """Average blocks of premultiplied RGBA into straight RGBA."""
-    height, width = picture.shape[0] // supersample, picture.shape[1] // supersample
-    blocks = picture.reshape(height, supersample, width, supersample, 4)
-    total = blocks.sum(axis=(1, 3), dtype=np.float32)
-    alpha = total[..., 3:]
-    colour = np.where(alpha > 0, total[..., :3] * 255.0 / np.maximum(alpha, 1.0), 0.0)
-    straight = np.concatenate((colour, alpha / supersample**2), axis=-1)
-    return np.clip(np.rint(straight), 0, 255).astype(np.uint8)
+def _straight(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """Straight uint8 of premultiplied RGBA, both from 0 to 255."""
+    alpha = picture[..., 3:]
+    colour = np.divide(picture[..., :3] * 255.0, alpha, out=np.zeros_like(picture[..., :3]), where=alpha > 0)
+    return np.clip(np.rint(np.concatenate((colour, alpha), axis=-1)), 0, 255).astype(np.uint8)
