@@ -1,0 +1,56 @@
+"""An endless supply of procedural, ShapeNet-like objects: `make(class_name, seed)` is always the same scene.
+
+Frame: y up, front along +z (so +x is the object's left). Units are metres and the origin lies wherever the object stands or
+balances; whoever renders them normalises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import trimesh
+
+from data_gen.shapes.car import car
+from data_gen.shapes.parts import Part, build_scene
+
+__all__ = ["CLASSES", "assemble", "make"]
+
+CLASSES: tuple[str, ...] = ("car", "chair", "plane", "lamp")
+"""Names of the classes; the position of a name is part of its objects' seed, so the order is fixed."""
+
+_MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {"car": car, "chair": car, "plane": car, "lamp": car}
+
+
+def assemble(class_name: str, seed: int) -> list[Part]:
+    """The painted solids of an object, before they are joined.
+
+    Args:
+        class_name: One of `CLASSES`.
+        seed: Any non-negative integer; the same one gives the same parts.
+
+    Returns:
+        Parts in metres, y up, front along +z.
+
+    Raises:
+        ValueError: If the class is unknown or the seed is negative.
+    """
+    if class_name not in CLASSES:
+        raise ValueError(f"class_name: expected one of {', '.join(CLASSES)}, got {class_name!r}")
+    if seed < 0:
+        raise ValueError(f"seed: expected a non-negative integer, got {seed}")
+    return _MAKERS[class_name](np.random.default_rng([CLASSES.index(class_name), seed]))
+
+
+def make(class_name: str, seed: int) -> trimesh.Scene:
+    """A procedural object.
+
+    Args:
+        class_name: One of `CLASSES`.
+        seed: Any non-negative integer; the same one gives the same vertices, faces and pixels.
+
+    Returns:
+        A scene with one textured geometry, named after the class: metres, y up, front along +z. Its `metadata["parts"]`
+        lists (part name, first face, number of faces).
+    """
+    return build_scene(class_name, assemble(class_name, seed))

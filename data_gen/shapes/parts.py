@@ -1,0 +1,169 @@
+"""Painted solids, and the scene they make together.
+
+All parts of an object end in ONE geometry with ONE texture: a draw call costs a renderer more than the faces of a wheel do.
+The texture is an atlas. A plain colour is a block of it, read at the block's centre by all corners of a face, so nothing bleeds
+in at any distance; a pattern is a tile with its border repeated outwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+
+from data_gen.shapes.materials import Material
+from data_gen.shapes.solids import Solid
+
+__all__ = ["Part", "atlas", "build_scene", "corner_normals"]
+
+_WIDTH, _BLOCK, _MARGIN = 256, 16, 8
+
+
+@dataclass(frozen=True)
+class Part:
+    """A solid with a material on each face.
+
+    Attributes:
+        name: What it is: "wheel", "left_wing".
+        solid: The geometry, in the object's frame.
+        materials: The materials used.
+        chosen: (F,) index into `materials` of each face.
+    """
+
+    name: str
+    solid: Solid
+    materials: tuple[Material, ...]
+    chosen: np.ndarray
+
+    @staticmethod
+    def of(name: str, solid: Solid, material: Material) -> Part:
+        """A solid in one material."""
+        return Part(name, solid, (material,), np.zeros(len(solid.faces), dtype=np.int64))
+
+    def painted(self, faces: np.ndarray, material: Material) -> Part:
+        """The part with another material on the faces of a boolean mask (F,)."""
+        chosen = np.where(faces, len(self.materials), self.chosen)
+        return replace(self, materials=(*self.materials, material), chosen=chosen)
+
+    def capped(self, material: Material, first: bool = True, last: bool = True) -> Part:
+        """The part with another material on its flat ends."""
+        cells = self.solid.cells
+        return self.painted((cells[:, 0] == -1) & np.where(cells[:, 1] == 0, first, last), material)
+
+    def mirrored(self) -> Part:
+        """The part reflected in the plane x = 0, "left" in its name become "right"."""
+        return replace(self, name=self.name.replace("left", "right"), solid=self.solid.mirrored())
+
+
+def atlas(materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:
+    """Pack materials into one image.
+
+    Args:
+        materials: Plain ones (one pixel) and patterned ones, each at most 240 pixels wide.
+
+    Returns:
+        The image (H, 256, 3), uint8, and for each material the affine map (2, 2) of its uv into the image's: rows (scale,
+        offset) for u and v, with v = 0 at the image's lower edge.
+    """
+    places, x, y, row = [], 0, 0, 0
+    for material in materials:
+        height, width = material.image.shape[:2]
+        size = (_BLOCK, _BLOCK) if height * width == 1 else (height + 2 * _MARGIN, width + 2 * _MARGIN)
+        if x + size[1] > _WIDTH:
+            x, y, row = 0, y + row, 0
+        places.append((y, x, *size))
+        x, row = x + size[1], max(row, size[0])
+    total = y + row
+    image = np.full((total, _WIDTH, 3), 128, dtype=np.uint8)
+    maps = np.zeros((len(materials), 2, 2))
+    for material, (y, x, height, width), mapping in zip(materials, places, maps, strict=True):
+        inside = material.image.shape[:2]
+        before = (height - inside[0]) // 2, (width - inside[1]) // 2
+        after = height - inside[0] - before[0], width - inside[1] - before[1]
+        padding = ((before[0], after[0]), (before[1], after[1]), (0, 0))
+        image[y : y + height, x : x + width] = np.pad(material.image, padding, mode="edge")
+        if inside == (1, 1):
+            mapping[:] = [(0, (x + width / 2) / _WIDTH), (0, 1 - (y + height / 2) / total)]
+        else:  # from the centre of the first pixel to that of the last
+            left, bottom = x + before[1] + 0.5, total - (y + before[0] + inside[0]) + 0.5
+            mapping[:] = [((inside[1] - 1) / _WIDTH, left / _WIDTH), ((inside[0] - 1) / total, bottom / total)]
+    return image, maps
+
+
+def corner_normals(solid: Solid) -> np.ndarray:
+    """Shading normals (F, 3, 3) of the faces' corners.
+
+    A corner takes the area-weighted mean of the faces around its vertex whose normals are within `solid.crease` degrees of
+    its own face's.
+    """
+    triangles = solid.vertices[solid.faces]
+    weighted = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    unit = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-30)
+    flat = solid.faces.reshape(-1)
+    order = np.argsort(flat, kind="stable")
+    start = np.searchsorted(flat[order], np.arange(len(solid.vertices)))
+    slot = np.arange(len(flat)) - start[flat[order]]
+    around = np.full((len(solid.vertices), int(slot.max()) + 1), -1)
+    around[flat[order], slot] = order // 3
+    near = around[flat]  # (corner, neighbour): the faces at the corner's vertex
+    own = np.repeat(np.arange(len(solid.faces)), 3)
+    alike = np.einsum("cnk,ck->cn", unit[near], unit[own]) > np.cos(np.radians(solid.crease))
+    alike |= near == own[:, None]
+    total = (weighted[near] * (alike & (near >= 0))[..., None]).sum(1)
+    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+    return total.reshape(-1, 3, 3)
+
+
+def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> trimesh.Scene:
+    """Join parts into a scene with one textured geometry.
+
+    Args:
+        name: Name of the geometry.
+        parts: The painted solids.
+        roughness: PBR roughness of all of it, in [0, 1].
+
+    Returns:
+        The scene. Vertices are rounded to a millionth of a unit and split where shading or texture is discontinuous; the
+        geometry's `metadata["parts"]` lists (part name, first face, number of faces).
+    """
+    materials: dict[bytes, Material] = {}
+    for part in parts:
+        for index in np.unique(part.chosen):
+            image = part.materials[index].image
+            materials.setdefault(repr(image.shape).encode() + image.tobytes(), part.materials[index])
+    keys = sorted(materials, key=lambda key: materials[key].image.size == 3)  # patterns first, then the palette
+    image, maps = atlas([materials[key] for key in keys])
+    positions, normals, coordinates, names, first = [], [], [], [], 0
+    for part in parts:
+        solid = part.solid
+        rows = [
+            keys.index(repr(m.image.shape).encode() + m.image.tobytes()) if i in part.chosen else 0
+            for i, m in enumerate(part.materials)
+        ]
+        mapping = maps[np.array(rows)[part.chosen]]  # (F, 2, 2)
+        coordinates.append(solid.uv * mapping[:, None, :, 0] + mapping[:, None, :, 1])
+        positions.append(solid.vertices[solid.faces])
+        normals.append(corner_normals(solid))
+        names.append((part.name, first, len(solid.faces)))
+        first += len(solid.faces)
+    corners = np.concatenate([np.concatenate(x).reshape(3 * first, -1) for x in (positions, normals, coordinates)], 1)
+    corners = np.round(corners, 6) + 0.0
+    unique, inverse = np.unique(corners, axis=0, return_inverse=True)
+    mesh = trimesh.Trimesh(
+        vertices=unique[:, :3],
+        faces=inverse.reshape(-1, 3),
+        vertex_normals=unique[:, 3:6],
+        visual=trimesh.visual.TextureVisuals(
+            uv=unique[:, 6:],
+            material=PBRMaterial(
+                name=name, baseColorTexture=Image.fromarray(image), metallicFactor=0.0, roughnessFactor=roughness
+            ),
+        ),
+        metadata={"parts": names},
+        process=False,
+    )
+    return trimesh.Scene({name: mesh})

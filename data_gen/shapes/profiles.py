@@ -1,0 +1,129 @@
+"""Closed planar outlines: the cross-sections that the solids are drawn through.
+
+Every function returns an array (n, 2) of corners in counter-clockwise order, centred on the origin unless said otherwise,
+in the unit of its arguments. Outlines that are to be lofted together need the same number of corners.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["airfoil", "ellipse", "polygon_area", "rectangle", "rounded_rectangle", "superellipse", "triangulate"]
+
+
+def rectangle(width: float, height: float) -> np.ndarray:
+    """Axis-aligned rectangle (4, 2), first corner at the lower left."""
+    x, y = width / 2, height / 2
+    return np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
+
+
+def rounded_rectangle(width: float, height: float, radius: float, steps: int = 3) -> np.ndarray:
+    """Rectangle with circular corners.
+
+    Args:
+        width: Full extent along the first axis.
+        height: Full extent along the second axis.
+        radius: Corner radius; cut down to just under half of the shorter side.
+        steps: Edges a corner.
+
+    Returns:
+        Corners (4 * (steps + 1), 2), starting at the lower right.
+    """
+    radius = min(radius, 0.499 * width, 0.499 * height)
+    centres = np.array([(1, -1), (1, 1), (-1, 1), (-1, -1)]) * (width / 2 - radius, height / 2 - radius)
+    angles = np.linspace(0, np.pi / 2, steps + 1)
+    corners = [
+        centre + radius * np.stack([np.cos(angles + start), np.sin(angles + start)], 1)
+        for centre, start in zip(centres, (-np.pi / 2, 0, np.pi / 2, np.pi), strict=True)
+    ]
+    return np.concatenate(corners)
+
+
+def ellipse(radius_x: float, radius_y: float, corners: int = 16) -> np.ndarray:
+    """Polygon (corners, 2) inscribed in an ellipse, first corner on the positive first axis."""
+    angles = np.arange(corners) * (2 * np.pi / corners)
+    return np.stack([radius_x * np.cos(angles), radius_y * np.sin(angles)], 1)
+
+
+def superellipse(width: float, height: float, exponent: float, corners: int = 16) -> np.ndarray:
+    """Polygon inscribed in |x / a|^e + |y / b|^e = 1: e = 2 is an ellipse, larger is boxier.
+
+    Args:
+        width: Full extent along the first axis, 2 a.
+        height: Full extent along the second axis, 2 b.
+        exponent: The e above, positive.
+        corners: Number of corners.
+
+    Returns:
+        Corners (corners, 2), the first on the positive first axis.
+    """
+    cosine, sine = ellipse(1.0, 1.0, corners).T
+    cosine, sine = np.where(np.abs(cosine) < 1e-12, 0, cosine), np.where(np.abs(sine) < 1e-12, 0, sine)
+    x = np.sign(cosine) * np.abs(cosine) ** (2 / exponent) * width / 2
+    y = np.sign(sine) * np.abs(sine) ** (2 / exponent) * height / 2
+    return np.stack([x, y], 1)
+
+
+def airfoil(chord: float, thickness: float, steps: int = 6) -> np.ndarray:
+    """Symmetric wing section after the NACA four-digit thickness law, with a blunt trailing edge.
+
+    Args:
+        chord: Length from the trailing edge at 0 to the leading edge at +chord, along the first axis.
+        thickness: Largest extent along the second axis.
+        steps: Edges a side.
+
+    Returns:
+        Corners (2 * steps + 1, 2): the trailing edge below, the lower side to the leading edge, the upper side back.
+    """
+    x = (1 - np.cos(np.linspace(0, np.pi, steps + 1))) / 2  # 0 at the leading edge
+    half = 5 * (0.2969 * np.sqrt(x) - 0.1260 * x - 0.3516 * x**2 + 0.2843 * x**3 - 0.1015 * x**4) * thickness
+    along = (1 - x) * chord
+    lower = np.stack([along, -half], 1)[::-1]
+    upper = np.stack([along, half], 1)[1:]
+    return np.concatenate([lower, upper])
+
+
+def polygon_area(corners: np.ndarray) -> float:
+    """Signed area by the shoelace formula: positive for counter-clockwise corners (n, 2)."""
+    x, y = corners.T
+    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)
+
+
+def _cross(o: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Twice the signed area of the triangle o, a, b."""
+    return (a[..., 0] - o[..., 0]) * (b[..., 1] - o[..., 1]) - (a[..., 1] - o[..., 1]) * (b[..., 0] - o[..., 0])
+
+
+def triangulate(corners: np.ndarray) -> np.ndarray:
+    """Cut a simple counter-clockwise polygon into triangles by clipping ears.
+
+    Args:
+        corners: Polygon (n, 2), not self-intersecting, convex or not.
+
+    Returns:
+        Indices (n - 2, 3) into `corners`, counter-clockwise, using the corners only.
+
+    Raises:
+        ValueError: If no ear is left although more than three corners remain, so the outline crosses itself.
+    """
+    left = list(range(len(corners)))
+    triangles = []
+    while len(left) > 3:
+        ring = corners[left]
+        before, after = np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0)
+        size = _cross(before, ring, after)
+        best, best_quality = -1, 0.0
+        for i in np.flatnonzero(size > 0):
+            a, b, c = before[i], ring[i], after[i]
+            others = np.delete(ring, [i, i - 1, (i + 1) % len(ring)], axis=0)
+            inside = (_cross(a, b, others) >= 0) & (_cross(b, c, others) >= 0) & (_cross(c, a, others) >= 0)
+            sides = ((b - a) ** 2).sum() + ((c - b) ** 2).sum() + ((a - c) ** 2).sum()
+            quality = size[i] / sides
+            if not inside.any() and quality > best_quality + 1e-9:
+                best, best_quality = int(i), quality
+        if best < 0:
+            raise ValueError(f"expected a simple counter-clockwise polygon, got one without an ear: {ring.tolist()}")
+        triangles.append((left[best - 1], left[best], left[(best + 1) % len(left)]))
+        del left[best]
+    triangles.append(tuple(left))
+    return np.array(triangles)

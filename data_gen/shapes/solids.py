@@ -1,0 +1,334 @@
+"""Watertight solids with a known volume: lofts, lathes and sweeps.
+
+A `Solid` carries its exact volume, computed from the numbers that define it and not from its triangles, so that a tear or a
+reversed face shows up as a difference between the two. Right-handed axes, y up. Faces are counter-clockwise seen from outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import trimesh
+
+from data_gen.shapes.profiles import polygon_area, rounded_rectangle, triangulate
+
+__all__ = ["Solid", "ball", "box", "cone", "cylinder", "lathe", "loft", "rotation", "sweep", "tapered", "torus"]
+
+_AXES = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
+"""World axis of the (first, second) coordinate of an outline and of the direction it is drawn along; cyclic, so that
+counter-clockwise stays counter-clockwise seen from the far end."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A closed triangle mesh.
+
+    Attributes:
+        vertices: Corners (V, 3).
+        faces: Indices (F, 3) into `vertices`.
+        uv: Texture coordinates of each face's corners (F, 3, 2), inside [0, 1].
+        cells: (F, 2): the step along the solid and the step around it that a face belongs to; (-1, 0) and (-1, 1) for the
+            first and the last cap.
+        volume: Exact volume of the polyhedron, in the cubed unit of the vertices.
+        crease: Edges sharper than this many degrees are shaded as edges, others smoothly.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    cells: np.ndarray
+    volume: float
+    crease: float = 35.0
+
+    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
+        """The solid shifted by (x, y, z)."""
+        return replace(self, vertices=self.vertices + np.array([x, y, z]))
+
+    def turned(self, axis: str, degrees: float) -> Solid:
+        """The solid turned about a world axis through the origin, counter-clockwise seen from the axis' tip."""
+        return replace(self, vertices=self.vertices @ rotation(axis, degrees).T)
+
+    def scaled(self, x: float, y: float, z: float) -> Solid:
+        """The solid stretched by positive factors about the origin."""
+        return replace(self, vertices=self.vertices * np.array([x, y, z]), volume=self.volume * x * y * z)
+
+    def mirrored(self) -> Solid:
+        """The solid reflected in the plane x = 0, its faces reversed to stay the right way out."""
+        return replace(
+            self,
+            vertices=self.vertices * np.array([-1.0, 1.0, 1.0]),
+            faces=self.faces[:, ::-1],
+            uv=self.uv[:, ::-1],
+        )
+
+    def creased(self, degrees: float) -> Solid:
+        """The solid shaded with another crease angle, in degrees."""
+        return replace(self, crease=degrees)
+
+    def projected(self, axis: str) -> Solid:
+        """The solid with texture coordinates projected along an axis onto its bounding rectangle.
+
+        Args:
+            axis: "x" maps (z, y) to (u, v), "y" maps (x, z), "z" maps (x, y).
+
+        Returns:
+            The same mesh; (0, 0) is the corner of smallest coordinates.
+        """
+        columns = {"x": [2, 1], "y": [0, 2], "z": [0, 1]}[axis]
+        plane = self.vertices[:, columns]
+        low, high = plane.min(axis=0), plane.max(axis=0)
+        return replace(self, uv=((plane - low) / (high - low))[self.faces])
+
+    def mesh(self) -> trimesh.Trimesh:
+        """The bare geometry as trimesh sees it, vertices as they are (no merging, no repair)."""
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+def rotation(axis: str, degrees: float) -> np.ndarray:
+    """Rotation matrix (3, 3) about a world axis, counter-clockwise seen from the axis' tip."""
+    first, second, along = _AXES[axis]
+    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    matrix = np.zeros((3, 3))
+    matrix[along, along] = 1
+    matrix[first, first] = matrix[second, second] = cosine
+    matrix[second, first], matrix[first, second] = sine, -sine
+    return matrix
+
+
+def _skin(rings: np.ndarray, wrap: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles between successive rings (k, n, 3); each quadrilateral is cut along its shorter diagonal.
+
+    Returns:
+        Faces (F, 3) into the flattened rings, uv (F, 3, 2), cells (F, 2), and which quadrilaterals (k or k - 1, n) are cut
+        from their first to their third corner.
+    """
+    count, around = rings.shape[:2]
+    spans = count if wrap else count - 1
+    i, j = np.meshgrid(np.arange(spans), np.arange(around), indexing="ij")
+    i1, j1 = (i + 1) % count, (j + 1) % around
+    rising = ((rings[i, j] - rings[i1, j1]) ** 2).sum(-1)
+    falling = ((rings[i, j1] - rings[i1, j]) ** 2).sum(-1)
+    forward = rising <= falling * (1 + 1e-9)
+    corners = np.stack([i * around + j, i * around + j1, i1 * around + j1, i1 * around + j], -1)
+    u, v = np.stack([j, j + 1, j + 1, j], -1) / around, np.stack([i, i, i + 1, i + 1], -1) / spans
+    order = np.where(forward[..., None], [0, 1, 2, 0, 2, 3], [0, 1, 3, 1, 2, 3])
+    faces = np.take_along_axis(corners, order, -1).reshape(-1, 3)
+    uv = np.stack([np.take_along_axis(u, order, -1), np.take_along_axis(v, order, -1)], -1).reshape(-1, 3, 2)
+    cells = np.repeat(np.stack([i, j], -1).reshape(-1, 2), 2, axis=0)
+    return faces, uv, cells, forward
+
+
+def _cap(outline: np.ndarray, start: int, last: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Faces, uv and cells of the planar end over an outline (n, 2) whose vertices begin at index `start`."""
+    triangles = triangulate(outline)
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    uv = ((outline - low) / (high - low))[triangles]
+    if not last:
+        triangles, uv = triangles[:, ::-1], uv[:, ::-1]
+    return triangles + start, uv, np.tile([-1, int(last)], (len(triangles), 1))
+
+
+def _closed(
+    rings: np.ndarray, first: np.ndarray, last: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Skin and both caps of an open row of rings: faces, uv, cells, and the cuts of the quadrilaterals."""
+    faces, uv, cells, forward = _skin(rings, wrap=False)
+    start = (len(rings) - 1) * rings.shape[1]
+    bottom, top = _cap(first, 0, last=False), _cap(last, start, last=True)
+    return (
+        np.concatenate([faces, bottom[0], top[0]]),
+        np.concatenate([uv, bottom[1], top[1]]),
+        np.concatenate([cells, bottom[2], top[2]]),
+        forward,
+    )
+
+
+def loft(sections: Sequence[np.ndarray] | np.ndarray, stations: Sequence[float] | np.ndarray, axis: str = "z") -> Solid:
+    """Skin drawn over parallel outlines, closed by flat caps.
+
+    The volume between two sections is the prismatoid's, h / 6 (A0 + 4 Am + A1), where the middle section runs through the
+    midpoints of the edges and of the diagonals that cut the side faces.
+
+    Args:
+        sections: Outlines (k, n, 2), counter-clockwise. Their coordinates are (x, y) for axis "z", (z, x) for "y", (y, z)
+            for "x".
+        stations: Positions (k,) of the sections along the axis, increasing.
+        axis: "x", "y" or "z".
+
+    Returns:
+        The solid; u runs around the outline, v along the axis.
+
+    Raises:
+        ValueError: If there are fewer than two sections or the stations do not increase.
+    """
+    outlines, heights = np.asarray(sections, dtype=float), np.asarray(stations, dtype=float)
+    if outlines.ndim != 3 or len(outlines) < 2 or len(outlines) != len(heights):
+        raise ValueError(f"expected k >= 2 outlines (k, n, 2) and k stations, got {outlines.shape} and {heights.shape}")
+    if not (np.diff(heights) > 0).all():
+        raise ValueError(f"expected increasing stations, got {heights.tolist()}")
+    rings = np.empty((*outlines.shape[:2], 3))
+    first, second, along = _AXES[axis]
+    rings[..., first], rings[..., second], rings[..., along] = outlines[..., 0], outlines[..., 1], heights[:, None]
+    faces, uv, cells, forward = _closed(rings, outlines[0], outlines[-1])
+    volume = 0.0
+    for k in range(len(heights) - 1):
+        here, there = outlines[k], outlines[k + 1]
+        after, beyond = np.roll(here, -1, axis=0), np.roll(there, -1, axis=0)
+        diagonals = np.where(forward[k][:, None], here + beyond, after + there) / 2
+        middle = np.stack([(here + there) / 2, diagonals], axis=1).reshape(-1, 2)
+        areas = polygon_area(here) + 4 * polygon_area(middle) + polygon_area(there)
+        volume += (heights[k + 1] - heights[k]) * areas / 6
+    return Solid(rings.reshape(-1, 3), faces, uv, cells, float(volume))
+
+
+def lathe(profile: Sequence[tuple[float, float]] | np.ndarray, segments: int = 16, ring: bool = False) -> Solid:
+    """Profile turned about the y axis in equal steps.
+
+    The volume is n sin(2 pi / n) / 2 times the integral of r^2 dy along the profile (Pappus' rule for a regular polygon
+    in place of the circle).
+
+    Args:
+        profile: Points (k, 2) of (radius, height). An open profile runs from the bottom to the top of the outer side; its
+            ends are closed by flat discs, or by a tip where the radius is 0. A ring's profile is a counter-clockwise closed
+            outline away from the axis.
+        segments: Steps of a turn.
+        ring: Whether the profile is a closed outline (a torus, a tyre, the shell of a shade).
+
+    Returns:
+        The solid; u runs around the axis, v along the profile.
+
+    Raises:
+        ValueError: If a radius inside an open profile, or any radius of a ring, is not positive.
+    """
+    points = np.asarray(profile, dtype=float)
+    inner = points[:, 0] if ring else points[1:-1, 0]
+    if (inner <= 0).any() or (points[:, 0] < 0).any():
+        raise ValueError(f"expected positive radii (zero at the ends of an open profile only), got {points.tolist()}")
+    closed_points = np.concatenate([points, points[:1]]) if ring else points
+    (r0, r1), rise = (closed_points[:-1, 0], closed_points[1:, 0]), np.diff(closed_points[:, 1])
+    volume = segments * np.sin(2 * np.pi / segments) / 2 * float(np.sum(rise * (r0**2 + r0 * r1 + r1**2)) / 3)
+    angles = np.arange(segments) * (2 * np.pi / segments)
+    circle = np.stack([np.cos(angles), np.sin(angles)], 1)  # (z, x): counter-clockwise seen from above
+    rings = np.empty((len(points), segments, 3))
+    rings[..., 2], rings[..., 0] = np.moveaxis(points[:, None, :1] * circle, -1, 0)
+    rings[..., 1] = points[:, None, 1]
+    if ring:
+        faces, uv, cells, _ = _skin(rings, wrap=True)
+        return Solid(rings.reshape(-1, 3), faces, uv, cells, volume)
+    faces, uv, cells, _ = _closed(rings, circle, circle)
+    vertices = rings.reshape(-1, 3)
+    for tip, start in ((0, 0), (-1, (len(points) - 1) * segments)):
+        if points[tip, 0] == 0:  # the end ring is one point: keep its first vertex and drop what lost its area
+            faces = np.where((faces >= start) & (faces < start + segments), start, faces)
+    keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    used, faces = np.unique(faces[keep], return_inverse=True)
+    return Solid(vertices[used], faces.reshape(-1, 3), uv[keep], cells[keep], volume)
+
+
+def sweep(path: Sequence[Sequence[float]] | np.ndarray, outline: np.ndarray, up: Sequence[float] = (0, 1, 0)) -> Solid:
+    """Outline carried along a polyline with mitred corners.
+
+    Every piece is a prism cut by two planes, so its volume is the outline's area times the length of the line through the
+    centroids; with the centroid on the path, area times path length.
+
+    Args:
+        path: Points (k, 3).
+        outline: Section (n, 2), counter-clockwise, with its centroid at the origin: (sideways, upwards).
+        up: Rough direction of the outline's second axis, not along the path.
+
+    Returns:
+        The solid; u runs around the outline, v along the path.
+
+    Raises:
+        ValueError: If the outline's centroid is not at the origin.
+    """
+    points = np.asarray(path, dtype=float)
+    shoelace = outline[:, 0] * np.roll(outline[:, 1], -1) - np.roll(outline[:, 0], -1) * outline[:, 1]
+    area = polygon_area(outline)
+    centroid = ((outline + np.roll(outline, -1, axis=0)) * shoelace[:, None]).sum(axis=0) / (6 * area)
+    if np.abs(centroid).max() > 1e-6 * np.abs(outline).max():
+        raise ValueError(f"expected an outline with its centroid at the origin, got {centroid.tolist()}")
+    steps = np.diff(points, axis=0)
+    directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+    side = np.cross(np.asarray(up, dtype=float), directions[0])
+    side /= np.linalg.norm(side)
+    ring = points[0] + outline[:, :1] * side + outline[:, 1:] * np.cross(directions[0], side)
+    rings = [ring]
+    for k, direction in enumerate(directions):
+        following = directions[k + 1] if k + 1 < len(directions) else direction
+        normal = direction + following
+        travel = (points[k + 1] - rings[-1]) @ normal / (direction @ normal)
+        rings.append(rings[-1] + travel[:, None] * direction)
+    solid = np.stack(rings)
+    faces, uv, cells, _ = _closed(solid, outline, outline)
+    length = float(np.linalg.norm(steps, axis=1).sum())
+    return Solid(solid.reshape(-1, 3), faces, uv, cells, area * length)
+
+
+def box(width: float, height: float, depth: float, radius: float = 0.0, steps: int = 1) -> Solid:
+    """Box centred on the origin with extents (width, height, depth) along (x, y, z).
+
+    Args:
+        width: Extent along x.
+        height: Extent along y.
+        depth: Extent along z.
+        radius: Radius of the upright edges and size of the bevel above and below; 0 for a plain box.
+        steps: Edges that round off each upright edge.
+
+    Returns:
+        The solid.
+    """
+    if radius <= 0:
+        return tapered((width, depth), (width, depth), height)
+    radius = min(radius, 0.45 * min(width, height, depth))
+    outer = rounded_rectangle(depth, width, radius, steps)
+    inner = rounded_rectangle(depth - radius, width - radius, radius / 2, steps)
+    half = height / 2
+    return loft([inner, outer, outer, inner], [-half, -half + radius / 2, half - radius / 2, half], "y").creased(50)
+
+
+def tapered(
+    bottom: tuple[float, float], top: tuple[float, float], height: float, shift: tuple[float, float] = (0, 0)
+) -> Solid:
+    """Frustum over two rectangles, centred on y = 0.
+
+    Args:
+        bottom: Extents (x, z) of the lower end.
+        top: Extents (x, z) of the upper end.
+        height: Extent along y.
+        shift: Offset (x, z) of the upper end's centre from the lower end's.
+
+    Returns:
+        The solid; an upright bar or a leg where it is tall, a slab where it is flat.
+    """
+    outlines = []
+    for (x, z), (dx, dz) in ((bottom, (0, 0)), (top, shift)):
+        outlines.append(np.array([(-z, -x), (z, -x), (z, x), (-z, x)]) / 2 + (dz, dx))
+    return loft(outlines, [-height / 2, height / 2], "y").creased(20)
+
+
+def cylinder(radius: float, height: float, segments: int = 16) -> Solid:
+    """Upright cylinder centred on the origin: a prism over a regular polygon inscribed in the circle."""
+    return cone(radius, radius, height, segments)
+
+
+def cone(bottom: float, top: float, height: float, segments: int = 16) -> Solid:
+    """Upright frustum centred on the origin with the radii of its lower and upper ends, either of which may be 0."""
+    return lathe([(bottom, -height / 2), (top, height / 2)], segments)
+
+
+def ball(radius_x: float, radius_y: float, radius_z: float, segments: int = 14, rings: int = 8) -> Solid:
+    """Ellipsoid centred on the origin, inscribed in the smooth one."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
+    radii = np.cos(angles)
+    radii[[0, -1]] = 0
+    return lathe(np.stack([radii, np.sin(angles)], 1), segments).scaled(radius_x, radius_y, radius_z).creased(60)
+
+
+def torus(major: float, minor: float, segments: int = 20, sides: int = 8) -> Solid:
+    """Ring about the y axis: a regular polygon of circumradius `minor` carried around a circle of radius `major`."""
+    angles = np.arange(sides) * (2 * np.pi / sides)
+    profile = np.stack([major + minor * np.cos(angles), minor * np.sin(angles)], 1)
+    return lathe(profile, segments, ring=True).creased(60)
