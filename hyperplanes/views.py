@@ -80,20 +80,28 @@ class Views:
         return cast(self.cameras, index, pixels, self.bounds, span=span)
 
     def sample_rays(
-        self, count: int, *, generator: torch.Generator | None = None, span: str = "sphere"
+        self,
+        count: int,
+        *,
+        generator: torch.Generator | None = None,
+        among: Int[Tensor, " pixel"] | None = None,
+        span: str = "sphere",
     ) -> tuple[Rays, Float[Tensor, "ray 3"]]:
         """Rays through pixels drawn uniformly from all views, and the colours seen there.
 
         Args:
             count: how many, drawn with replacement.
             generator: where the randomness comes from; on the CPU, so that every device draws the same.
+            among: flat indices (view, row, column) of the pixels to draw from; all where absent.
             span: as in `geometry.cast`.
 
         Returns:
             The rays and their true colours.
         """
         height, width = self.size
-        flat = torch.randint(len(self) * height * width, (count,), generator=generator).to(self.images.device)
+        total = len(self) * height * width if among is None else len(among)
+        flat = torch.randint(total, (count,), generator=generator).to(self.images.device)
+        flat = flat if among is None else among[flat]
         view, pixel = flat // (height * width), flat % (height * width)
         row, column = pixel // width, pixel % width
         rays = cast(self.cameras, view, torch.stack([column, row], -1).to(self.images), self.bounds, span=span)

@@ -1,0 +1,122 @@
+"""What every method is to evaluation: support views in, something that renders new views out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import Occupancy, carve, full
+from hyperplanes.geometry.rays import Rays, cast, pixel_grid
+from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.rendering.footprint import footprint
+from hyperplanes.rendering.renderer import FieldFunction, Hierarchical, Marched, render, render_in_chunks
+from hyperplanes.views import Views
+
+__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Rendered views.
+
+    Attributes:
+        images: RGB over white.
+        opacity: how much of each pixel is covered.
+        depth: distance along the ray in world units, 0 where nothing is.
+        samples: how often the field was asked, over all pixels.
+    """
+
+    images: Float[Tensor, "view 3 height width"]
+    opacity: Float[Tensor, "view 1 height width"]
+    depth: Float[Tensor, "view 1 height width"]
+    samples: int
+
+
+class Renderable(Protocol):
+    """Anything that can be looked at from new cameras."""
+
+    def render(self, cameras: PinholeCamera) -> Pictures:
+        """The pictures that the cameras see."""
+        ...
+
+
+class Adapter(Protocol):
+    """A method: support views -> a field."""
+
+    def adapt(self, support: Views) -> Renderable:
+        """What the method makes of one object."""
+        ...
+
+
+@dataclass(frozen=True)
+class AdaptedField:
+    """A field of one object with all that rendering it needs.
+
+    Attributes:
+        field: (points, directions) -> (colour, density).
+        occupancy: where it can be anything but empty.
+        sampling: the protocol to render it by.
+        proposal: the coarse field of `Hierarchical` sampling, where it is another one.
+    """
+
+    field: FieldFunction
+    occupancy: Occupancy
+    sampling: Hierarchical | Marched
+    proposal: FieldFunction | None = None
+
+    def __call__(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
+        """Colour and density, as the field gives them."""
+        return self.field(points, directions)
+
+    def trace(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
+        """What rays see by the field's own protocol, with gradients: one step of training."""
+        return render(
+            self.field, rays, self.sampling, occupancy=self.occupancy, proposal=self.proposal, generator=generator
+        )
+
+    @torch.no_grad()
+    def render(self, cameras: PinholeCamera, sampling: Hierarchical | Marched | None = None) -> Pictures:
+        """The pictures that the cameras see.
+
+        Args:
+            cameras: any number, one image size.
+            sampling: another protocol than the field's own.
+
+        Returns:
+            One picture a camera.
+        """
+        sampling = sampling or self.sampling
+        height, width = camera.image_size(cameras)
+        pixels = pixel_grid(height, width, cameras.intrinsics.device)
+        marched = isinstance(sampling, Marched)
+        live = footprint(self.occupancy, cameras).flatten(1) if marched else None
+        values = pixels.new_zeros(cameras.batch_size, height * width, 5)
+        values[..., :3] = 1.0
+        samples = 0
+        for view in range(cameras.batch_size):
+            chosen = slice(None) if live is None else live[view].nonzero()[:, 0]
+            seen = pixels[chosen]
+            if not len(seen):
+                continue
+            index = torch.full((len(seen),), view, dtype=torch.long, device=pixels.device)
+            rays = cast(cameras, index, seen, self.occupancy.bounds, span="sphere" if marched else "depth")
+            part = render_in_chunks(self.field, rays, sampling, occupancy=self.occupancy, proposal=self.proposal)
+            values[view, chosen] = torch.cat([part.colour, part.opacity[:, None], part.depth[:, None]], 1)
+            samples += part.samples
+        maps = values.reshape(cameras.batch_size, height, width, 5).permute(0, 3, 1, 2)
+        return Pictures(maps[:, :3], maps[:, 3:4], maps[:, 4:], samples)
+
+
+def hull(support: Views, side: int) -> Occupancy:
+    """The visual hull of the support masks, or a full grid where there are none."""
+    if support.masks is None:
+        return full(support.bounds, side, support.images.device)
+    return carve(support.masks, support.cameras, support.bounds, side)

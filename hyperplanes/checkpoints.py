@@ -1,0 +1,99 @@
+"""Weights as safetensors beside a JSON of the configuration; no pickle is ever read."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+__all__ = ["CheckpointError", "load_tensors", "read_json", "save_tensors", "write_json", "write_whole"]
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used; one line that says which file, what was expected, what was found."""
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file beside its name and rename it when it is whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write a JSON file, whole or not at all."""
+    write_whole(path, (json.dumps(value, indent=2, sort_keys=True) + "\n").encode())
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        CheckpointError: no such file, or no JSON object in it.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"{path}: expected a checkpoint's JSON file, found none; `hyperplanes train` writes one"
+        ) from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise CheckpointError(f"{path}: expected JSON, found something else ({error}); copy the file again") from None
+    if not isinstance(value, dict):
+        raise CheckpointError(f"{path}: expected a JSON object, found {type(value).__name__}")
+    return value
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Write named tensors as safetensors, whole or not at all."""
+    from safetensors.torch import save
+
+    write_whole(path, save({name: value.detach().cpu().contiguous() for name, value in tensors.items()}))
+
+
+def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+    """Read named tensors.
+
+    Args:
+        path: a safetensors file.
+        expected: names and shapes that must be there; anything where absent.
+
+    Returns:
+        Tensors by name.
+
+    Raises:
+        CheckpointError: no such file, a damaged one, or other names or shapes than expected.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        found = load_file(path)
+    except FileNotFoundError:
+        raise CheckpointError(f"{path}: expected weights, found no file; `hyperplanes train` writes them") from None
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(
+            f"{path}: expected whole safetensors, found a damaged file ({error}); copy it again"
+        ) from None
+    for name, value in (expected or {}).items():
+        if name not in found:
+            raise CheckpointError(
+                f"{path}: expected a tensor {name!r}, found none; the configuration is of another model"
+            )
+        if found[name].shape != value.shape:
+            raise CheckpointError(
+                f"{path}: expected {name} of shape {tuple(value.shape)}, found {tuple(found[name].shape)}; "
+                "the configuration is of another model"
+            )
+    return found

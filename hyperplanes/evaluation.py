@@ -1,0 +1,136 @@
+"""The tables: every method through the same code, on objects and views it never saw."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+from hyperplanes.adaptation.base import Adapter, Pictures
+from hyperplanes.adaptation.fine_tuning import FineTuned
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.nearest_view import NearestView
+from hyperplanes.metrics import psnr, ssim
+from hyperplanes.training import Tasks
+from hyperplanes.views import Task
+
+__all__ = ["METHODS", "ObjectScore", "Score", "evaluate", "make_method"]
+
+METHODS: dict[str, str] = {
+    "nearest_view": "the nearest support view, copied",
+    "point_multiplane": "PointMultiPlaneNeRF, one set of weights for all objects",
+    "hyperplanes": "HyperPlanes in one step",
+    "hyperplanes_10": "HyperPlanes after 10 fine-tuning steps",
+    "hyperplanes_100": "HyperPlanes after 100 fine-tuning steps",
+}
+
+
+@dataclass(frozen=True)
+class ObjectScore:
+    """One object by one method.
+
+    Attributes:
+        name: of the object.
+        psnr: dB, mean over its query views.
+        ssim: mean over its query views.
+        adapt_seconds: from support views to a field.
+        render_seconds: of one query view.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    adapt_seconds: float
+    render_seconds: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """A row of the table: means over objects, and the objects themselves."""
+
+    method: str
+    objects: tuple[ObjectScore, ...]
+
+    def mean(self, quantity: str) -> float:
+        """Mean over objects of one of `ObjectScore`'s numbers."""
+        return fmean(getattr(each, quantity) for each in self.objects)
+
+    def as_json(self) -> dict[str, object]:
+        """The row as it stands in metrics.json."""
+        names = ("psnr", "ssim", "adapt_seconds", "render_seconds")
+        return {
+            **{name: self.mean(name) for name in names},
+            "objects": {each.name: {name: getattr(each, name) for name in names} for each in self.objects},
+        }
+
+
+def make_method(name: str, checkpoints: Mapping[str, Path]) -> Adapter:
+    """The adapter behind a method's name.
+
+    Args:
+        name: one of METHODS.
+        checkpoints: folders by "hyperplanes" and "point_multiplane".
+
+    Returns:
+        An adapter.
+
+    Raises:
+        ValueError: an unknown name, or a checkpoint that the method needs and that is not given.
+    """
+    if name not in METHODS:
+        raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {name!r}")
+    if name == "nearest_view":
+        return NearestView()
+    family, _, steps = name.rpartition("_") if name[-1].isdigit() else (name, "", "")
+    if family not in checkpoints:
+        raise ValueError(f"method {name}: expected a checkpoint of {family}, got none; `hyperplanes train` makes one")
+    model = HyperPlanes.from_pretrained(checkpoints[family])
+    return FineTuned(model, int(steps)) if steps else model
+
+
+def evaluate(
+    method: str,
+    adapter: Adapter,
+    data: Tasks,
+    names: Sequence[str],
+    on_object: Callable[[ObjectScore, Task, Pictures], None] | None = None,
+) -> Score:
+    """Adapt to the support views of each object and compare all its query views.
+
+    Args:
+        method: the name of the row.
+        adapter: the method.
+        data: where the tasks are.
+        names: the objects, never trained on.
+        on_object: called after each, with its score, task and pictures.
+
+    Returns:
+        The row.
+
+    Raises:
+        ValueError: no object.
+    """
+    if not names:
+        raise ValueError("names: expected at least one object to evaluate on, got none")
+    scores = []
+    for name in names:
+        task = data.task(name)
+        start = time.perf_counter()
+        adapted = adapter.adapt(task.support)
+        adapted_at = time.perf_counter()
+        pictures = adapted.render(task.query.cameras)
+        rendered_at = time.perf_counter()
+        images = pictures.images.clamp(0, 1)
+        score = ObjectScore(
+            name,
+            float(psnr(images, task.query.images).mean()),
+            float(ssim(images, task.query.images).mean()),
+            adapted_at - start,
+            (rendered_at - adapted_at) / len(task.query),
+        )
+        scores.append(score)
+        if on_object is not None:
+            on_object(score, task, pictures)
+    return Score(method, tuple(scores))

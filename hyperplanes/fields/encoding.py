@@ -1,0 +1,36 @@
+"""The positional encoding of NeRF."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+__all__ = ["encoded_size", "encode"]
+
+
+def encoded_size(octaves: int, size: int = 3) -> int:
+    """Length of an encoded vector."""
+    return size * (1 + 2 * octaves)
+
+
+def encode(values: Float[Tensor, "*batch size"], octaves: int) -> Float[Tensor, "*batch encoded"]:
+    """(v, sin(2^0 v), ..., sin(2^(L-1) v), cos(2^0 v), ..., cos(2^(L-1) v)) (NeRF, Eq. 4, without its factor pi).
+
+    Only the first sine and cosine are computed; the others follow by doubling the angle.
+
+    Args:
+        values: coordinates within about [-1, 1].
+        octaves: L.
+
+    >>> encode(torch.tensor([0.0, 0.0, 0.0]), 1).tolist()
+    [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
+    """
+    if octaves == 0:
+        return values
+    sine, cosine = [values.sin()], [values.cos()]
+    for _ in range(octaves - 1):
+        sine_now, cosine_now = sine[-1], cosine[-1]
+        sine.append(2 * sine_now * cosine_now)
+        cosine.append(1 - 2 * sine_now.square())
+    return torch.cat([values, *sine, *cosine], -1)

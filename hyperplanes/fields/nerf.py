@@ -1,0 +1,26 @@
+"""NeRF: a field of the point and the direction alone (HyperPlanes, Eq. 1)."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
+
+from hyperplanes.fields.base import Target
+from hyperplanes.fields.encoding import encode, encoded_size
+from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["NeRF"]
+
+
+class NeRF(Target):
+    """F(x, d; theta) = (c, sigma)."""
+
+    @property
+    def input_size(self) -> int:
+        """The encoded point."""
+        return encoded_size(self.config.point_octaves)
+
+    def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:
+        """The encoded position in the unit sphere."""
+        return encode(bounds.normalise(points), self.config.point_octaves)

@@ -1,0 +1,90 @@
+"""Encoders: an image and its viewing direction become a code."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import relu
+
+__all__ = ["ENCODERS", "ConvNet", "ResNet101"]
+
+
+def _normalisation(name: str, channels: int) -> nn.Module:
+    if name == "batch":
+        return nn.BatchNorm2d(channels)
+    if name == "group":
+        return nn.GroupNorm(8, channels)
+    raise ValueError(f"normalisation: expected 'batch' or 'group', got {name!r}")
+
+
+class ConvNet(nn.Module):
+    """3x3 convolutions, each followed by normalisation and ReLU, halving the image (HyperPlanes, Appendix B)."""
+
+    def __init__(self, code: int, normalisation: str = "batch", channels: tuple[int, ...] = (32, 64, 128, 128)) -> None:
+        super().__init__()
+        sizes = (3, *channels)
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(before, after, 3, stride=2, padding=1, bias=False)
+            for before, after in zip(sizes, channels, strict=False)
+        )
+        self.normalisations = nn.ModuleList(_normalisation(normalisation, after) for after in channels)
+        self.pool = nn.AdaptiveAvgPool2d(4)
+        self.code = nn.Linear(channels[-1] * 16, code)
+
+    def forward(self, images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view code"]:
+        """One code an image; images in [0, 1] of any size."""
+        value = 1 - images  # a white background is silence
+        for convolution, normalisation in zip(self.convolutions, self.normalisations, strict=True):
+            value = relu(normalisation(convolution(value)))
+        return self.code(self.pool(value).flatten(1))
+
+
+class _Bottleneck(nn.Module):
+    """1x1, 3x3 (strided), 1x1 convolutions beside a shortcut (He et al. 2016, Fig. 5)."""
+
+    def __init__(self, before: int, narrow: int, stride: int, normalisation: str) -> None:
+        super().__init__()
+        after = 4 * narrow
+        self.path = nn.Sequential(
+            nn.Conv2d(before, narrow, 1, bias=False),
+            _normalisation(normalisation, narrow),
+            nn.ReLU(),
+            nn.Conv2d(narrow, narrow, 3, stride, 1, bias=False),
+            _normalisation(normalisation, narrow),
+            nn.ReLU(),
+            nn.Conv2d(narrow, after, 1, bias=False),
+            _normalisation(normalisation, after),
+        )
+        self.shortcut = nn.Identity()
+        if stride != 1 or before != after:
+            self.shortcut = nn.Sequential(
+                nn.Conv2d(before, after, 1, stride, bias=False), _normalisation(normalisation, after)
+            )
+
+    def forward(self, value: Tensor) -> Tensor:
+        return relu(self.path(value) + self.shortcut(value))
+
+
+class ResNet101(nn.Module):
+    """ResNet-101 with an output of chosen size (He et al. 2016; HyperPlanes, Appendix B)."""
+
+    def __init__(self, code: int, normalisation: str = "batch", blocks: tuple[int, ...] = (3, 4, 23, 3)) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(
+            nn.Conv2d(3, 64, 7, 2, 3, bias=False), _normalisation(normalisation, 64), nn.ReLU(), nn.MaxPool2d(3, 2, 1)
+        )
+        stages, before = [], 64
+        for stage, count in enumerate(blocks):
+            narrow = 64 << stage
+            for block in range(count):
+                stages.append(_Bottleneck(before, narrow, 2 if block == 0 and stage else 1, normalisation))
+                before = 4 * narrow
+        self.stages = nn.Sequential(*stages)
+        self.code = nn.Linear(before, code)
+
+    def forward(self, images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view code"]:
+        """One code an image; images in [0, 1] of any size."""
+        return self.code(self.stages(self.stem(1 - images)).mean((2, 3)))
+
+
+ENCODERS: dict[str, type[nn.Module]] = {"convnet": ConvNet, "resnet101": ResNet101}

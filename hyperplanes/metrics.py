@@ -1,0 +1,39 @@
+"""How good a picture is: PSNR and SSIM, one number an image."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+__all__ = ["psnr", "ssim"]
+
+
+def psnr(
+    predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
+) -> Float[Tensor, " view"]:
+    """Peak signal-to-noise ratio in dB of each image, both in [0, 1]: -10 log10 of the mean squared error.
+
+    Equal images give infinity.
+
+    >>> psnr(torch.full((1, 3, 4, 4), 0.6), torch.full((1, 3, 4, 4), 0.5)).round().tolist()
+    [20.0]
+    """
+    return -10 * torch.log10((predicted - truth).square().flatten(1).mean(1))
+
+
+def ssim(
+    predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
+) -> Float[Tensor, " view"]:
+    """Structural similarity of each image: Gaussian window of 11 pixels, sigma 1.5, mean over what it fully covers.
+
+    Equals scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)`.
+
+    Raises:
+        ValueError: images smaller than the window.
+    """
+    from kornia.metrics import ssim as kornia_ssim
+
+    if min(truth.shape[2:]) < 11:
+        raise ValueError(f"images: expected at least 11 x 11 pixels, got {truth.shape[2]} x {truth.shape[3]}")
+    return kornia_ssim(predicted, truth, 11, padding="valid").flatten(1).mean(1)

@@ -1,0 +1,91 @@
+"""Named configurations: what a model is made of and how it is trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from hyperplanes.adaptation.hyperplanes import ModelConfig
+from hyperplanes.fields.base import TargetConfig
+from hyperplanes.hypernetwork.hypernetwork import HyperNetworkConfig
+from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.training import TrainingConfig
+
+__all__ = ["PRESETS", "Preset", "preset"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A model and its training.
+
+    Attributes:
+        model: the architecture.
+        training: the procedure.
+        resolution: pixels a side of the images it is meant for.
+        about: one line for the list of presets.
+    """
+
+    model: ModelConfig
+    training: TrainingConfig
+    resolution: int
+    about: str
+
+    def without_hypernetwork(self) -> Preset:
+        """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
+        return replace(self, model=replace(self.model, hypernetwork=None))
+
+
+PRESETS: dict[str, Preset] = {
+    "quick": Preset(
+        ModelConfig(
+            network=TargetConfig(depth=4, width=128, point_octaves=5, direction_octaves=2),
+            hypernetwork=HyperNetworkConfig(normalisation="group"),
+            sampling=Marched(steps=64),
+            hull_side=64,
+        ),
+        TrainingConfig(
+            steps=2000, rays=768, learning_rate=1e-3, hypernetwork_learning_rate=5e-4, warmup=100, final=0.05
+        ),
+        64,
+        "64x64, minutes on two cores: what `make demo` trains",
+    ),
+    "small": Preset(
+        ModelConfig(
+            network=TargetConfig(depth=6, width=192, point_octaves=6),
+            hypernetwork=HyperNetworkConfig(normalisation="group"),
+            sampling=Marched(steps=96),
+            hull_side=96,
+        ),
+        TrainingConfig(
+            steps=30_000, rays=1024, learning_rate=1e-3, hypernetwork_learning_rate=5e-4, warmup=500, final=0.02
+        ),
+        128,
+        "128x128, hours on a few cores",
+    ),
+    "paper-128": Preset(
+        ModelConfig(hypernetwork=HyperNetworkConfig(), coarse_network=True, sampling=Hierarchical(64, 128)),
+        TrainingConfig(steps=100_000),
+        128,
+        "the paper's ShapeNet 128x128 setting (Appendix B): ConvNet, 5 HyperPlanes",
+    ),
+    "paper-200": Preset(
+        ModelConfig(
+            hypernetwork=HyperNetworkConfig(views=25, encoder="resnet101", depth=10),
+            coarse_network=True,
+            sampling=Hierarchical(64, 128),
+        ),
+        TrainingConfig(steps=100_000),
+        200,
+        "the paper's ShapeNet 200x200 setting (Appendix B): ResNet101, 25 HyperPlanes",
+    ),
+}
+
+
+def preset(name: str) -> Preset:
+    """The preset of that name.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {name!r}")
+    return PRESETS[name]

@@ -1,0 +1,92 @@
+"""From densities and colours along rays to pixels: dense, (ray, sample), and packed, one row a live sample."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+__all__ = ["Rendered", "composite", "composite_packed", "packed_weights"]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What rays see.
+
+    Attributes:
+        colour: over the background.
+        opacity: 1 - the transmittance of the whole ray.
+        depth: expected distance of what was hit, sum of w t / opacity; 0 where nothing was.
+        samples: how often the field was asked, over all rays.
+        coarse: the colour of the coarse pass, where there was one; training asks it to be right too.
+    """
+
+    colour: Float[Tensor, "ray 3"]
+    opacity: Float[Tensor, " ray"]
+    depth: Float[Tensor, " ray"]
+    samples: int
+    coarse: Float[Tensor, "ray 3"] | None = None
+
+
+def composite(
+    colour: Float[Tensor, "ray interval 3"],
+    density: Float[Tensor, "ray interval"],
+    edges: Float[Tensor, "ray edge"],
+    background: float = 1.0,
+) -> tuple[Rendered, Float[Tensor, "ray interval"]]:
+    """w_i = T_i (1 - exp(-sigma_i delta_i)), T_i = exp(-sum_{j<i} sigma_j delta_j) (NeRF, Eq. 3).
+
+    Returns:
+        The pixels, and the weights for importance sampling.
+    """
+    thickness = density * edges.diff(dim=1)
+    passed = torch.cat([torch.zeros_like(thickness[:, :1]), thickness.cumsum(1)], 1)
+    transmittance = torch.exp(-passed)
+    weights = transmittance[:, :-1] - transmittance[:, 1:]
+    opacity = 1 - transmittance[:, -1]
+    middles = (edges[:, 1:] + edges[:, :-1]) / 2
+    depth = (weights * middles).sum(1) / opacity.clamp_min(1e-10)
+    pixels = (weights[..., None] * colour).sum(1) + (1 - opacity)[:, None] * background
+    return Rendered(pixels, opacity, depth, density.numel()), weights
+
+
+def packed_weights(
+    thickness: Float[Tensor, " sample"], ray: Int[Tensor, " sample"], count: int
+) -> Float[Tensor, " sample"]:
+    """Compositing weights of packed samples.
+
+    Args:
+        thickness: sigma delta of each sample; the samples of a ray stand together, near ones first.
+        ray: which ray each sample belongs to, ascending.
+        count: number of rays.
+
+    Returns:
+        w_i as in `composite`.
+    """
+    if not len(thickness):
+        return thickness
+    # One running sum over all rays, in double precision so that a ray late in the batch loses nothing, less its value
+    # where the ray begins.
+    total = thickness.double().cumsum(0)
+    before = total - thickness
+    first = torch.searchsorted(ray, torch.arange(count, device=ray.device)).clamp_max(len(ray) - 1)
+    before = (before - before[first][ray]).to(thickness.dtype)
+    return torch.exp(-before) * -torch.expm1(-thickness)
+
+
+def composite_packed(
+    colour: Float[Tensor, "sample 3"],
+    weights: Float[Tensor, " sample"],
+    middles: Float[Tensor, " sample"],
+    ray: Int[Tensor, " sample"],
+    count: int,
+    background: float = 1.0,
+) -> Rendered:
+    """Pixels of `count` rays from weighted samples in any order."""
+    values = torch.cat([colour, middles[:, None], torch.ones_like(middles)[:, None]], 1) * weights[:, None]
+    sums = values.new_zeros(count, 5).index_add(0, ray, values)
+    opacity = sums[:, 4]
+    pixels = sums[:, :3] + (1 - opacity)[:, None] * background
+    return Rendered(pixels, opacity, sums[:, 3] / opacity.clamp_min(1e-10), len(weights))

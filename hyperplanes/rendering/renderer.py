@@ -1,0 +1,179 @@
+"""A field and rays make pixels. The field is any callable (points, directions) -> (colour, density)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.rays import Rays
+from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
+from hyperplanes.rendering.marching import Packed, march
+from hyperplanes.rendering.sampling import importance, stratified
+
+__all__ = ["FieldFunction", "Hierarchical", "Marched", "render", "render_in_chunks"]
+
+FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class Hierarchical:
+    """The paper's protocol: every ray, coarse samples first, fine ones where their weight is.
+
+    Attributes:
+        coarse: stratified samples a ray.
+        fine: importance samples a ray; the field is asked again at all of both.
+    """
+
+    coarse: int = 64
+    fine: int = 128
+
+
+@dataclass(frozen=True)
+class Marched:
+    """The default protocol: samples at equal steps, only in occupied voxels, only until the ray is opaque.
+
+    Attributes:
+        steps: samples along a diameter of the scene's sphere.
+        stop: transmittance below which a ray is finished (only where no gradient is wanted).
+    """
+
+    steps: int = 96
+    stop: float = 1e-3
+
+
+def render(
+    field: FieldFunction,
+    rays: Rays,
+    sampling: Hierarchical | Marched,
+    *,
+    occupancy: Occupancy | None = None,
+    proposal: FieldFunction | None = None,
+    generator: torch.Generator | None = None,
+    background: float = 1.0,
+) -> Rendered:
+    """The pixels that rays see.
+
+    Args:
+        field: asked for colour and density.
+        rays: any number.
+        sampling: which protocol.
+        occupancy: what may matter; needed by `Marched`, unused by `Hierarchical`.
+        proposal: the field of the coarse pass of `Hierarchical`; `field` where absent.
+        generator: jitters the samples; without one they are the same each time.
+        background: grey value behind everything.
+
+    Returns:
+        Pixels with gradients to whatever the field depends on.
+
+    Raises:
+        ValueError: `Marched` without an occupancy.
+    """
+    if isinstance(sampling, Hierarchical):
+        return _hierarchical(field, rays, sampling, proposal or field, generator, background)
+    if occupancy is None:
+        raise ValueError("occupancy: expected an Occupancy for Marched sampling, got None; geometry.full makes one")
+    samples = march(rays, occupancy, 2 * occupancy.bounds.radius / sampling.steps, generator)
+    if torch.is_grad_enabled():
+        return _all_at_once(field, rays, samples, background)
+    return _front_to_back(field, rays, samples, sampling.stop, background)
+
+
+def _ask(field: FieldFunction, rays: Rays, t: Tensor) -> tuple[Tensor, Tensor]:
+    points = rays.at(t)
+    directions = rays.directions[:, None].expand_as(points)
+    colour, density = field(points.reshape(-1, 3), directions.reshape(-1, 3))
+    return colour.reshape(*t.shape, 3), density.reshape(t.shape)
+
+
+def _hierarchical(
+    field: FieldFunction,
+    rays: Rays,
+    sampling: Hierarchical,
+    proposal: FieldFunction,
+    generator: torch.Generator | None,
+    background: float,
+) -> Rendered:
+    edges = stratified(rays, sampling.coarse, generator)
+    colour, density = _ask(proposal, rays, (edges[:, 1:] + edges[:, :-1]) / 2)
+    coarse, weights = composite(colour, density, edges, background)
+    if not sampling.fine:
+        return coarse
+    edges = torch.cat([edges, importance(edges, weights, sampling.fine, generator)], 1).sort(1).values
+    colour, density = _ask(field, rays, (edges[:, 1:] + edges[:, :-1]) / 2)
+    fine, _ = composite(colour, density, edges, background)
+    return Rendered(fine.colour, fine.opacity, fine.depth, coarse.samples + fine.samples, coarse.colour)
+
+
+def _ask_packed(field: FieldFunction, rays: Rays, samples: Packed) -> tuple[Tensor, Tensor]:
+    directions = rays.directions[samples.ray]
+    return field(rays.origins[samples.ray] + samples.middles[:, None] * directions, directions)
+
+
+def _all_at_once(field: FieldFunction, rays: Rays, samples: Packed, background: float) -> Rendered:
+    colour, density = _ask_packed(field, rays, samples)
+    weights = packed_weights(density * samples.width, samples.ray, len(rays))
+    return composite_packed(colour, weights, samples.middles, samples.ray, len(rays), background)
+
+
+def _front_to_back(field: FieldFunction, rays: Rays, samples: Packed, stop: float, background: float) -> Rendered:
+    """Rounds of a few samples a ray, dropping the rays that have become opaque."""
+    passed = torch.zeros(len(rays), dtype=samples.middles.dtype, device=samples.middles.device)
+    limit = -torch.log(torch.tensor(stop)).item()
+    colours, weights, kept, asked = [], [], [], 0
+    rank = torch.arange(len(samples), device=samples.ray.device)
+    first = torch.searchsorted(samples.ray, torch.arange(len(rays), device=samples.ray.device))
+    rank = rank - first[samples.ray]
+    start, size = 0, 4
+    remaining = torch.arange(len(samples), device=rank.device)
+    while len(remaining):
+        now = rank[remaining] < start + size
+        chosen, remaining = remaining[now], remaining[~now]
+        part = samples[chosen]
+        colour, density = _ask_packed(field, rays, part)
+        thickness = density * part.width
+        weight = packed_weights(thickness, part.ray, len(rays)) * torch.exp(-passed[part.ray])
+        passed = passed.index_add(0, part.ray, thickness)
+        colours.append(colour)
+        weights.append(weight)
+        kept.append(chosen)
+        asked += len(chosen)
+        remaining = remaining[passed[samples.ray[remaining]] < limit]
+        start, size = start + size, size * 2
+    if not kept:
+        return composite_packed(
+            rays.origins.new_zeros(0, 3), passed[:0], passed[:0], samples.ray, len(rays), background
+        )
+    part = samples[torch.cat(kept)]
+    return composite_packed(torch.cat(colours), torch.cat(weights), part.middles, part.ray, len(rays), background)
+
+
+@torch.no_grad()
+def render_in_chunks(
+    field: FieldFunction, rays: Rays, sampling: Hierarchical | Marched, *, chunk: int = 4096, **options: object
+) -> Rendered:
+    """`render` without gradients, some rays at a time, so that memory does not grow with the picture.
+
+    Args:
+        field: as in `render`.
+        rays: as in `render`.
+        sampling: as in `render`.
+        chunk: rays at once.
+        options: as in `render`.
+
+    Returns:
+        The pixels of all rays.
+    """
+    parts = [
+        render(field, rays[first : first + chunk], sampling, **options)  # pyright: ignore[reportArgumentType]
+        for first in range(0, len(rays), chunk)
+    ]
+    return Rendered(
+        torch.cat([part.colour for part in parts]),
+        torch.cat([part.opacity for part in parts]),
+        torch.cat([part.depth for part in parts]),
+        sum(part.samples for part in parts),
+    )

@@ -1,0 +1,266 @@
+"""Meta-training: theta and the hypernetwork by separate Adam steps on query rays (HyperPlanes, Algorithm 1)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
+from hyperplanes.checkpoints import CheckpointError, load_tensors, read_json, save_tensors, write_json
+from hyperplanes.metrics import psnr
+from hyperplanes.rendering.footprint import footprint
+from hyperplanes.rendering.renderer import Marched
+from hyperplanes.views import Task, Views
+
+__all__ = ["Progress", "Tasks", "Trainer", "TrainingConfig", "train"]
+
+
+class Tasks(Protocol):
+    """Where tasks come from: a data set."""
+
+    def names(self, split: str) -> Sequence[str]:
+        """The objects of a split."""
+        ...
+
+    def task(self, name: str) -> Task:
+        """One object."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a model is trained (HyperPlanes, Appendix B: one task a step, 512 rays, learning rates 1e-4, no schedule).
+
+    Attributes:
+        steps: Adam steps.
+        tasks: objects a step.
+        rays: query rays an object and step.
+        learning_rate: of theta.
+        hypernetwork_learning_rate: of the hypernetwork.
+        warmup: steps in which the learning rates rise from zero.
+        final: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
+        evaluate_every: steps between looks at held-out objects.
+        held_out: how many of them are looked at.
+        checkpoint_every: steps between checkpoints.
+        cached: objects whose planes and hulls are kept in memory.
+        seed: of the objects, rays and samples of every step.
+    """
+
+    steps: int = 2000
+    tasks: int = 1
+    rays: int = 512
+    learning_rate: float = 1e-4
+    hypernetwork_learning_rate: float = 1e-4
+    warmup: int = 0
+    final: float = 1.0
+    evaluate_every: int = 250
+    held_out: int = 4
+    checkpoint_every: int = 500
+    cached: int = 512
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training stands.
+
+    Attributes:
+        step: steps done.
+        steps: steps to do.
+        loss: mean squared error of the last step's rays.
+        rays_per_second: since the last report.
+        psnr: in dB, of some views of held-out objects, where this step looked at them.
+        seconds_left: by the speed so far.
+    """
+
+    step: int
+    steps: int
+    loss: float
+    rays_per_second: float
+    psnr: float | None
+    seconds_left: float
+
+
+@dataclass(frozen=True)
+class _Episode:
+    prepared: Prepared
+    query: Views
+    live: Tensor | None
+
+
+class Trainer:
+    """The state of one training: model, two optimisers, step count, the curve so far.
+
+    Every step draws from a generator seeded by (seed, step), so a training that is stopped and resumed ends exactly
+    where an uninterrupted one does.
+    """
+
+    def __init__(self, model: HyperPlanes, data: Tasks, config: TrainingConfig, folder: Path | None = None) -> None:
+        self.model = model
+        self.data = data
+        self.config = config
+        self.folder = folder
+        self.step = 0
+        self.curve: list[dict[str, float]] = []
+        self.names = sorted(data.names("train"))
+        if not self.names:
+            raise ValueError("data: expected at least one training object, got none")
+        self._episodes: OrderedDict[str, _Episode] = OrderedDict()
+        groups: list[tuple[Sequence[Tensor], float]] = [(list(model.networks.parameters()), config.learning_rate)]
+        if model.hypernetwork is not None:
+            groups.append((list(model.hypernetwork.parameters()), config.hypernetwork_learning_rate))
+        self.optimisers = [torch.optim.Adam(parameters, rate) for parameters, rate in groups]
+        self.rates = [rate for _, rate in groups]
+        if folder is not None and (folder / "training.json").exists():
+            self._resume(folder)
+        else:
+            model.set_rig(data.task(self.names[0]).support)
+
+    def run(self) -> Iterator[Progress]:
+        """Train until the last step, reporting every 25 steps; checkpoints are written on the way and at the end.
+
+        Yields:
+            Where the training stands.
+        """
+        started, first, reported = time.perf_counter(), self.step, (time.perf_counter(), self.step)
+        while self.step < self.config.steps:
+            loss = self.take_step()
+            step, last = self.step, self.step == self.config.steps
+            look = step % self.config.evaluate_every == 0 or last
+            if not (look or step % 25 == 0):
+                continue
+            now = time.perf_counter()
+            rays = (step - reported[1]) * self.config.rays * self.config.tasks / max(now - reported[0], 1e-9)
+            quality = self.held_out_psnr() if look else None
+            self.curve.append({"step": step, "loss": loss, **({} if quality is None else {"psnr": quality})})
+            if step % self.config.checkpoint_every == 0 or last:
+                self.save()
+            left = (time.perf_counter() - started) / (step - first) * (self.config.steps - step)
+            reported = (time.perf_counter(), step)
+            yield Progress(step, self.config.steps, loss, rays, quality, left)
+
+    def take_step(self) -> float:
+        """One step of both optimisers on freshly drawn objects and rays; returns the loss."""
+        config = self.config
+        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + self.step)
+        self.model.train()
+        total = torch.zeros(())
+        for _ in range(config.tasks):
+            name = self.names[int(torch.randint(len(self.names), (), generator=generator))]
+            episode = self._episode(name)
+            field = self.model.field(episode.prepared, self.model.theta + self.model.update(episode.prepared))
+            span = "sphere" if isinstance(field.sampling, Marched) else "depth"
+            rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
+            seen = field.trace(rays, generator)
+            total = total + (seen.colour - truth).square().mean()
+            if seen.coarse is not None:
+                total = total + (seen.coarse - truth).square().mean()
+        for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
+            optimiser.param_groups[0]["lr"] = rate * self._schedule()
+            optimiser.zero_grad(set_to_none=True)
+        (total / config.tasks).backward()
+        for optimiser in self.optimisers:
+            optimiser.step()
+        self.step += 1
+        return float(total.detach()) / config.tasks
+
+    @torch.no_grad()
+    def held_out_psnr(self) -> float | None:
+        """Mean PSNR in dB of two query views of some held-out objects, or None where there are none."""
+        names = sorted(self.data.names("test"))[: self.config.held_out]
+        values = []
+        for name in names:
+            task = self.data.task(name)
+            views = task.query[:: max(1, len(task.query) // 2)][:2]
+            values.append(psnr(self.model.adapt(task.support).render(views.cameras).images, views.images))
+        return float(torch.cat(values).mean()) if values else None
+
+    def save(self) -> None:
+        """Write model and training state to the folder, where there is one."""
+        if self.folder is None:
+            return
+        self.model.save(self.folder)
+        state: dict[str, Tensor] = {}
+        for index, optimiser in enumerate(self.optimisers):
+            for place, entries in optimiser.state_dict()["state"].items():
+                state |= {f"{index}.{place}.{name}": torch.as_tensor(value) for name, value in entries.items()}
+        save_tensors(self.folder / "optimisers.safetensors", state)
+        write_json(
+            self.folder / "training.json", {"step": self.step, "curve": self.curve, "config": asdict(self.config)}
+        )
+
+    def _resume(self, folder: Path) -> None:
+        saved = read_json(folder / "training.json")
+        known = asdict(self.config)
+        differing = [name for name in known if name != "steps" and saved["config"].get(name) != known[name]]
+        if differing:
+            raise CheckpointError(
+                f"{folder / 'training.json'}: expected the same training to resume, found other "
+                f"{', '.join(differing)}; give another --out folder or the same options"
+            )
+        self.model.load_state_dict(load_tensors(folder / "model.safetensors", self.model.state_dict()))
+        state = load_tensors(folder / "optimisers.safetensors")
+        for index, optimiser in enumerate(self.optimisers):
+            blank = optimiser.state_dict()
+            blank["state"] = {}
+            for key, value in state.items():
+                group, place, name = key.split(".")
+                if int(group) == index:
+                    blank["state"].setdefault(int(place), {})[name] = value
+            optimiser.load_state_dict(blank)
+        self.step, self.curve = int(saved["step"]), list(saved["curve"])
+
+    def _schedule(self) -> float:
+        config = self.config
+        if self.step < config.warmup:
+            return (self.step + 1) / config.warmup
+        done = (self.step - config.warmup) / max(1, config.steps - config.warmup)
+        return config.final + (1 - config.final) * (1 + math.cos(math.pi * done)) / 2
+
+    def _episode(self, name: str) -> _Episode:
+        if name in self._episodes:
+            self._episodes.move_to_end(name)
+            return self._episodes[name]
+        task = self.data.task(name)
+        prepared = self.model.prepare(task.support)
+        live = None
+        if isinstance(self.model.config.sampling, Marched):
+            live = footprint(prepared.occupancy, task.query.cameras).flatten().nonzero()[:, 0]
+        self._episodes[name] = _Episode(prepared, task.query, live)
+        while len(self._episodes) > self.config.cached:
+            self._episodes.popitem(last=False)
+        return self._episodes[name]
+
+
+def train(
+    model: HyperPlanes,
+    data: Tasks,
+    config: TrainingConfig,
+    folder: Path | None = None,
+    report: Callable[[Progress], None] | None = None,
+) -> Trainer:
+    """Run a training, resumed from `folder` where it holds one.
+
+    Args:
+        model: trained in place.
+        data: tasks with a "train" and perhaps a "test" split.
+        config: how.
+        folder: for checkpoints.
+        report: called with every progress.
+
+    Returns:
+        The finished training.
+    """
+    trainer = Trainer(model, data, config, folder)
+    for progress in trainer.run():
+        if report is not None:
+            report(progress)
+    return trainer
