@@ -57,7 +57,7 @@ class Rasteriser:
         supersample: Samples along a side of a pixel.
     """
 
-    def __init__(self, backend: Backend | str | None = None, supersample: int = 2) -> None:
+    def __init__(self, backend: Backend | str | None = None, supersample: int = 3) -> None:
         self.name = backend if isinstance(backend, str) else (backend or find_backend()).name
         self.supersample = supersample
         self._engine: Any = _make_engine(self.name)
