@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_gen.shapes.materials import Colour, Material, plain, shade, tint, wheel_face
+from data_gen.shapes.materials import Colour, Material, plain, shade, tint
 from data_gen.shapes.parts import Part
+from data_gen.shapes.patterns import wheel_face
+from data_gen.shapes.primitives import ball, box, cylinder, tapered
 from data_gen.shapes.profiles import ellipse
-from data_gen.shapes.solids import Solid, ball, box, cylinder, lathe, loft, sweep, tapered
+from data_gen.shapes.solids import Solid, lathe, loft, sweep
 
 __all__ = ["STYLES", "car"]
 

@@ -11,12 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Colour", "Material", "plain", "shade", "tint", "wheel_face"]
+__all__ = ["Colour", "Material", "plain", "shade", "tint"]
 
 Colour = tuple[int, int, int]
-
-TILE = 112
-"""Width and height in pixels of a patterned material."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,18 +46,3 @@ def tint(rng: np.random.Generator, hue: float, saturation: float, value: float, 
     rgb = colorsys.hsv_to_rgb((hue + 0.5 * dh) % 1, min(1, max(0, saturation + ds)), min(1, max(0, value + dv)))
     red, green, blue = (round(255 * channel) for channel in rgb)
     return red, green, blue
-
-
-def wheel_face(rng: np.random.Generator) -> Material:
-    """Spokes on a dark rim, round and centred: for the outer side of a wheel."""
-    spokes, width = int(rng.integers(4, 11)), rng.uniform(0.25, 0.6)
-    y, x = (np.mgrid[0:64, 0:64] - 31.5) / 31.5
-    radius, angle = np.hypot(x, y), np.arctan2(y, x)
-    level = rng.uniform(0.5, 0.85)
-    metal = np.array([level, level, level * 1.02])
-    dark = metal * rng.uniform(0.12, 0.3)
-    spoke = np.abs((angle * spokes / (2 * np.pi)) % 1 - 0.5) < width / 2
-    lit = (spoke & (radius < 0.9)) | (radius > 0.84) | (radius < rng.uniform(0.22, 0.34))
-    image = np.where(lit[..., None], metal, dark)
-    image[radius < 0.12] = metal * 0.4
-    return Material("wheel", (image * 255).clip(0, 255).round().astype(np.uint8))

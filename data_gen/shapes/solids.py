@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import trimesh
 
-from data_gen.shapes.profiles import polygon_area, rounded_rectangle, triangulate
+from data_gen.shapes.profiles import polygon_area, triangulate
 
-__all__ = ["Solid", "ball", "box", "cone", "cylinder", "lathe", "loft", "rotation", "sweep", "tapered", "torus"]
+__all__ = ["Solid", "lathe", "loft", "rotation", "sweep"]
 
 _AXES = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
 """World axis of the (first, second) coordinate of an outline and of the direction it is drawn along; cyclic, so that
@@ -265,70 +265,3 @@ def sweep(path: Sequence[Sequence[float]] | np.ndarray, outline: np.ndarray, up:
     faces, uv, cells, _ = _closed(solid, outline, outline)
     length = float(np.linalg.norm(steps, axis=1).sum())
     return Solid(solid.reshape(-1, 3), faces, uv, cells, area * length)
-
-
-def box(width: float, height: float, depth: float, radius: float = 0.0, steps: int = 1) -> Solid:
-    """Box centred on the origin with extents (width, height, depth) along (x, y, z).
-
-    Args:
-        width: Extent along x.
-        height: Extent along y.
-        depth: Extent along z.
-        radius: Radius of the upright edges and size of the bevel above and below; 0 for a plain box.
-        steps: Edges that round off each upright edge.
-
-    Returns:
-        The solid.
-    """
-    if radius <= 0:
-        return tapered((width, depth), (width, depth), height)
-    radius = min(radius, 0.45 * min(width, height, depth))
-    outer = rounded_rectangle(depth, width, radius, steps)
-    inner = rounded_rectangle(depth - radius, width - radius, radius / 2, steps)
-    half = height / 2
-    return loft([inner, outer, outer, inner], [-half, -half + radius / 2, half - radius / 2, half], "y").creased(50)
-
-
-def tapered(
-    bottom: tuple[float, float], top: tuple[float, float], height: float, shift: tuple[float, float] = (0, 0)
-) -> Solid:
-    """Frustum over two rectangles, centred on y = 0.
-
-    Args:
-        bottom: Extents (x, z) of the lower end.
-        top: Extents (x, z) of the upper end.
-        height: Extent along y.
-        shift: Offset (x, z) of the upper end's centre from the lower end's.
-
-    Returns:
-        The solid; an upright bar or a leg where it is tall, a slab where it is flat.
-    """
-    outlines = []
-    for (x, z), (dx, dz) in ((bottom, (0, 0)), (top, shift)):
-        outlines.append(np.array([(-z, -x), (z, -x), (z, x), (-z, x)]) / 2 + (dz, dx))
-    return loft(outlines, [-height / 2, height / 2], "y").creased(20)
-
-
-def cylinder(radius: float, height: float, segments: int = 16) -> Solid:
-    """Upright cylinder centred on the origin: a prism over a regular polygon inscribed in the circle."""
-    return cone(radius, radius, height, segments)
-
-
-def cone(bottom: float, top: float, height: float, segments: int = 16) -> Solid:
-    """Upright frustum centred on the origin with the radii of its lower and upper ends, either of which may be 0."""
-    return lathe([(bottom, -height / 2), (top, height / 2)], segments)
-
-
-def ball(radius_x: float, radius_y: float, radius_z: float, segments: int = 14, rings: int = 8) -> Solid:
-    """Ellipsoid centred on the origin, inscribed in the smooth one."""
-    angles = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
-    radii = np.cos(angles)
-    radii[[0, -1]] = 0
-    return lathe(np.stack([radii, np.sin(angles)], 1), segments).scaled(radius_x, radius_y, radius_z).creased(60)
-
-
-def torus(major: float, minor: float, segments: int = 20, sides: int = 8) -> Solid:
-    """Ring about the y axis: a regular polygon of circumradius `minor` carried around a circle of radius `major`."""
-    angles = np.arange(sides) * (2 * np.pi / sides)
-    profile = np.stack([major + minor * np.cos(angles), minor * np.sin(angles)], 1)
-    return lathe(profile, segments, ring=True).creased(60)
