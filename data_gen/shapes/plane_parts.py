@@ -1,0 +1,164 @@
+"""Building blocks of planes: fuselages, wings, fins, engines, propellers, undercarriages.
+
+Metres, y up, nose along +z, the fuselage's axis on x = y = 0 unless moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from data_gen.shapes.materials import Material, plain
+from data_gen.shapes.parts import Part
+from data_gen.shapes.primitives import ball, cylinder, post, rod
+from data_gen.shapes.profiles import airfoil, superellipse
+from data_gen.shapes.solids import Solid, lathe, loft
+
+__all__ = ["airscrew", "fin", "fuselage", "jet_engine", "pylon", "undercarriage", "wing"]
+
+_BLACK = plain((36, 36, 40), "black")
+
+
+def fuselage(
+    length: float,
+    width: float,
+    height: float,
+    shape: Sequence[tuple[float, float, float, float]],
+    boxiness: float = 2.0,
+    sides: int = 18,
+) -> Solid:
+    """Body of changing section.
+
+    Args:
+        length: From tail to nose; the middle lies at z = 0.
+        width: Largest extent along x.
+        height: Largest extent along y.
+        shape: Rows (share of the length from the tail, share of the width, share of the height, rise of the section's
+            middle as a share of the height).
+        boxiness: Exponent of the section's superellipse; 2 for an ellipse.
+        sides: Corners of a section.
+
+    Returns:
+        The solid, with texture coordinates projected along x.
+    """
+    outlines = [
+        superellipse(max(wide, 0.02) * width, max(high, 0.02) * height, boxiness, sides) + (0, rise * height)
+        for _, wide, high, rise in shape
+    ]
+    stations = [(share - 0.5) * length for share, *_ in shape]
+    return loft(outlines, stations).projected("x").creased(50)
+
+
+def wing(
+    root: float,
+    tip: float,
+    span: float,
+    sweep: float,
+    rise: float,
+    thickness: float = 0.11,
+    inside: float = 0.0,
+    kink: tuple[float, float] | None = None,
+) -> Solid:
+    """The left half of a wing or tailplane, its root's leading edge at z = 0.
+
+    Args:
+        root: Chord at the root.
+        tip: Chord at the tip.
+        span: Extent along x of this half, from `inside`.
+        sweep: How far the tip's leading edge lies behind the root's.
+        rise: How far the tip lies over the root.
+        thickness: Share of the chord.
+        inside: x at which it begins, inside the fuselage.
+        kink: Share of the span and chord there where the trailing edge bends; none if absent.
+
+    Returns:
+        The solid; texture v runs from root to tip, u around the section from the trailing edge.
+    """
+    stops = [(0.0, root)] + ([kink] if kink else [(0.5, (root + tip) / 2)]) + [(0.96, 0.04 * root + 0.96 * tip)]
+    if kink:
+        stops[-1] = (0.96, tip + (kink[1] - tip) * 0.04 / (1 - kink[0]))
+    outlines, stations = [], []
+    for share, chord in [*stops, (1.0, 0.72 * stops[-1][1])]:
+        section = airfoil(chord, thickness * chord * (1 if share < 1 else 0.5), 5)[::-1]
+        outlines.append(np.stack([section[:, 1] + rise * share, section[:, 0] - chord - sweep * share], 1))
+        stations.append(inside + span * share)
+    return loft(outlines, stations, "x").creased(55)
+
+
+def fin(root: float, tip: float, height: float, sweep: float, thickness: float = 0.1) -> Solid:
+    """Upright tail fin standing on y = 0, its root's leading edge at z = 0, texture coordinates projected along x."""
+    outlines, stations = [], []
+    for share, chord in ((0.0, root), (0.5, (root + tip) / 2), (0.97, 0.03 * root + 0.97 * tip), (1.0, 0.8 * tip)):
+        section = airfoil(chord, thickness * chord * (1 if share < 1 else 0.6), 5)
+        outlines.append(section - (chord + sweep * share, 0))
+        stations.append(height * share)
+    return loft(outlines, stations, "y").projected("x").creased(55)
+
+
+def jet_engine(name: str, radius: float, length: float, at: tuple[float, float, float], cowl: Material) -> list[Part]:
+    """A nacelle with an open intake and a core, its middle at a point, facing +z."""
+    r, h = radius, length / 2
+    shell = [(0.62 * r, -h), (0.9 * r, -0.2 * h), (r, 0.5 * h), (0.95 * r, h), (0.86 * r, 0.94 * h), (0.6 * r, -0.5 * h)]
+    outlet = lathe([(0.42 * r, -1.35 * h), (0.56 * r, -0.9 * h), (0.8 * r, 0.2 * h), (0.86 * r, 0.66 * h), (0.2 * r, 0.72 * h)], 14)
+    spinner = lathe([(0.24 * r, 0.6 * h), (0.14 * r, 0.82 * h), (0, 0.9 * h)], 10)
+    parts = [
+        (f"{name}_cowl", lathe(shell, 16, ring=True).creased(50), cowl),
+        (f"{name}_core", outlet.creased(50), plain((58, 60, 66), "core")),
+        (f"{name}_spinner", spinner, plain((120, 122, 128), "spinner")),
+    ]
+    return [Part.of(part, solid.turned("x", 90).moved(*at), material) for part, solid, material in parts]
+
+
+def airscrew(
+    name: str, radius: float, blades: int, at: tuple[float, float, float], turn: float, spinner: Material
+) -> list[Part]:
+    """A propeller with its spinner, facing +z.
+
+    Args:
+        name: Prefix of the parts' names.
+        radius: Of the circle that the tips describe.
+        blades: How many.
+        at: Centre of the hub.
+        turn: Degrees by which the first blade stands off the upright.
+        spinner: Material of the hub.
+
+    Returns:
+        The parts.
+    """
+    hub = lathe([(0.16 * radius, -0.12 * radius), (0.15 * radius, 0.08 * radius), (0.09 * radius, 0.24 * radius), (0, 0.32 * radius)], 12)
+    parts = [Part.of(f"{name}_spinner", hub.creased(50).turned("x", 90).moved(*at), spinner)]
+    tipped = plain((214, 168, 40), "blade_tip")
+    for k in range(blades):
+        blade = loft(
+            [np.array([(-0.02, -0.035), (0.02, -0.055), (0.02, 0.035), (-0.02, 0.055)]) * radius * s for s in (0.8, 1.2, 1.0, 0.6)],
+            [0.02 * radius, 0.5 * radius, 0.86 * radius, radius],
+            "y",
+        ).creased(40)
+        part = Part.of(f"{name}_blade_{k}", blade.turned("z", turn + 360 * k / blades).moved(*at), _BLACK)
+        parts.append(part.painted(blade.cells[:, 0] == 2, tipped).capped(tipped, first=False))
+    return parts
+
+
+def undercarriage(
+    name: str, top: tuple[float, float, float], foot: tuple[float, float, float], radius: float, spat: Material | None
+) -> list[Part]:
+    """A leg with a wheel at its foot, in a streamlined fairing if a material is given for one."""
+    x, y, z = foot
+    leg = rod(top, foot, 0.4 * radius, 0.22 * radius)
+    wheel = lathe([(0.75 * radius, -0.18 * radius), (radius, -0.1 * radius), (radius, 0.1 * radius), (0.75 * radius, 0.18 * radius)], 14)
+    disc = cylinder(0.5 * radius, 0.4 * radius, 10)
+    parts = [
+        Part.of(f"{name}_leg", leg, plain((120, 124, 130), "strut")),
+        Part.of(f"{name}_wheel", wheel.turned("z", 90).moved(x, y, z), _BLACK),
+        Part.of(f"{name}_disc", disc.turned("z", 90).moved(x, y, z), plain((150, 152, 158), "disc")),
+    ]
+    if spat is not None:
+        cover = ball(0.34 * radius, 0.75 * radius, 1.7 * radius, 10, 8).moved(x, y + 0.35 * radius, z - 0.2 * radius)
+        parts.append(Part.of(f"{name}_spat", cover, spat))
+    return parts
+
+
+def pylon(bottom: tuple[float, float, float], top: tuple[float, float, float], width: float, chord: float) -> Solid:
+    """Upright blade between an engine or a store and the wing above it, `chord` long."""
+    return post(bottom, top, 1.0, 1.0).moved(-bottom[0], 0, -bottom[2]).scaled(width, 1, chord).moved(bottom[0], 0, bottom[2])
