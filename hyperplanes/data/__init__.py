@@ -1,1 +1,22 @@
+"""Files to views: transforms.json, SRN, npz and COLMAP in, posed images and few-shot tasks out."""
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hyperplanes.data.dataset import Dataset, open_dataset, read_task, read_views
+    from hyperplanes.data.errors import DataError
+
+__all__ = ["DataError", "Dataset", "open_dataset", "read_task", "read_views"]
+
+_HOMES = {"DataError": "errors", "Dataset": "dataset", "open_dataset": "dataset"}
+_HOMES |= {"read_task": "dataset", "read_views": "dataset"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for, so that writing files needs no torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -1,0 +1,218 @@
+"""Generate a data set: objects stream through worker processes into files; interrupted, it resumes."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from data_gen.layouts import LAYOUTS
+from data_gen.manifest import Progress, build_manifest, verify
+from data_gen.objects import RIGS, make_rig
+from data_gen.rigs import OBJECT_RADIUS
+from data_gen.sources import Item, MeshFolder, Procedural, Source, list_items
+from data_gen.workers import Outcome, WorkerError, run_isolated
+from hyperplanes.data.errors import DataError
+from hyperplanes.data.files import sha256
+
+__all__ = ["ENGINES", "MeshFolder", "Procedural", "Report", "generate", "verify"]
+
+ENGINES = ("local", "ray")
+"""Where objects are rendered: worker processes of this machine, or a Ray cluster."""
+
+GENERATOR = "hyperplanes 0.1"
+TARGET = "data_gen.objects:open_renderer"
+EXTRA_CHANNELS = ("depth", "normals", "coordinates", "mesh")
+
+
+@dataclass(frozen=True)
+class Report:
+    """What came of a generation.
+
+    Attributes:
+        written: objects in the data set, those of an earlier, interrupted call included.
+        skipped: names and reasons of objects that are not in it.
+        seconds: that this call took.
+        images_per_second: that this call wrote.
+        reused: objects that an earlier call had written.
+        splits: how many objects are in each split.
+    """
+
+    written: int
+    skipped: list[tuple[str, str]]
+    seconds: float
+    images_per_second: float
+    reused: int = 0
+    splits: dict[str, int] = field(default_factory=dict)
+
+
+def generate(
+    source: Source,
+    out: str | Path,
+    *,
+    rig: str = "fixed",
+    views: int = 50,
+    resolution: int = 64,
+    lighting: str = "studio",
+    channels: Sequence[str] = ("rgba",),
+    held_out: float | int | None = None,
+    workers: int | None = None,
+    engine: str = "local",
+    layout: str = "native",
+    seed: int = 0,
+    distance: float | None = None,
+    field_of_view: float | None = None,
+    supersample: int = 2,
+    renderer: str | None = None,
+    timeout: float = 300.0,
+    recycle: int = 200,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Report:
+    """Render objects into a data set.
+
+    The same arguments give the same bytes, however often the work was interrupted, on any number of workers. An
+    object that cannot be drawn, or whose worker crashes or hangs twice, is skipped and listed; the rest goes on.
+
+    Args:
+        source: procedural objects or mesh files.
+        out: the folder; new, empty, or one in which the same generation was interrupted.
+        rig: "fixed" (the same poses for all objects), "random" (on the sphere), "hemisphere" or "orbit".
+        views: pictures an object, alternately support and query.
+        resolution: pixels along a side.
+        lighting: "studio", "headlight" or "random".
+        channels: "rgba" and any of "depth", "normals", "coordinates", "mesh"; more than rgba needs the native layout.
+        held_out: objects for the test split, a count or a fraction below 1; see `data_gen.sources.list_items`.
+        workers: processes; as many as cores when None.
+        engine: "local", or "ray" for a Ray cluster.
+        layout: a name in `data_gen.layouts.LAYOUTS`.
+        seed: of random rigs and lights; shapes have their own in the source.
+        distance: of the cameras from the object's centre in object radii; what suits the layout when None.
+        field_of_view: in degrees; the object just fits when None.
+        supersample: samples along a side of a pixel.
+        renderer: a name in `data_gen.backends.BACKENDS`; the best that works here when None.
+        timeout: seconds an object may take.
+        recycle: objects after which a worker is replaced.
+        progress: called with (objects done, objects in all, name) after each object.
+
+    Returns:
+        What was written and what was skipped.
+
+    Raises:
+        ValueError: an argument that makes no sense, a renderer that does not work, no object that could be drawn.
+        DataError: the folder holds something else, or the disk is full.
+    """
+    begun = time.monotonic()
+    out = Path(out)
+    _check(rig, channels, engine, layout, resolution)
+    items = list_items(source, held_out)
+    settings = _settings(source, locals())
+    settings["out"] = str(out.resolve())
+    with Progress(out, _configuration(source, items, settings, held_out)) as state:
+        done = state.done()
+        reused = sum(item.name in done for item in items)
+        todo = (asdict(item) for item in items if item.name not in done)
+        count, skipped, images = reused, [], 0
+        try:
+            for outcome in _outcomes(engine, settings, todo, workers, timeout, recycle):
+                count += 1
+                name = outcome.item["name"]
+                if outcome.result is None:
+                    skipped.append((name, str(outcome.reason)))
+                else:
+                    done[name] = outcome.result
+                    images += outcome.result["record"]["views"]
+                if progress is not None:
+                    progress(count, len(items), name)
+        except WorkerError as error:
+            raise DataError(str(error)) from error
+        if not any(item.name in done for item in items):
+            name, reason = skipped[0]
+            raise ValueError(f"{out}: none of {len(items)} objects could be drawn; {name}: {reason}")
+        kept = [item for item in items if item.name in done]
+        facts = _facts(settings)
+        manifest = build_manifest(state.configuration, items, done.values(), skipped, facts)
+        state.finish(manifest, LAYOUTS[layout].splits(kept))
+    seconds = time.monotonic() - begun
+    splits = {split: len(names) for split, names in manifest["splits"].items()}
+    return Report(len(kept), sorted(skipped), seconds, images / seconds, reused, splits)
+
+
+def _check(rig: str, channels: Sequence[str], engine: str, layout: str, resolution: int) -> None:
+    for name, value, known in (("rig", rig, RIGS), ("engine", engine, ENGINES), ("layout", layout, tuple(LAYOUTS))):
+        if value not in known:
+            raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
+    unknown = set(channels) - {"rgba", *EXTRA_CHANNELS}
+    if unknown or "rgba" not in channels:
+        raise ValueError(f"channels: expected rgba and any of {', '.join(EXTRA_CHANNELS)}, got {tuple(channels)}")
+    if layout != "native" and len(channels) > 1:
+        raise ValueError(f"channels: expected rgba alone in the {layout} layout, got {tuple(channels)}")
+    wanted = LAYOUTS[layout].resolution
+    if wanted is not None and resolution != wanted:
+        raise ValueError(f"resolution: the {layout} layout's loaders take {wanted} for granted, got {resolution}")
+
+
+def _settings(source: Source, arguments: dict[str, Any]) -> dict[str, Any]:
+    """What a worker needs to know, JSON-able."""
+    from data_gen.backends import find_backend
+
+    layout = LAYOUTS[arguments["layout"]]
+    settings = {
+        name: arguments[name]
+        for name in ("rig", "views", "resolution", "lighting", "layout", "seed", "supersample", "field_of_view")
+    }
+    settings["distance"] = layout.distance if arguments["distance"] is None else float(arguments["distance"])
+    settings["field_of_view"] = layout.field_of_view if layout.field_of_view else arguments["field_of_view"]
+    settings["channels"] = ["rgba", *sorted(set(arguments["channels"]) - {"rgba"})]
+    settings["up"] = source.up if isinstance(source, MeshFolder) else "y"
+    settings["renderer"] = find_backend(arguments["renderer"]).name
+    make_rig(settings, "")  # numbers that make no sense show here, not in every worker
+    return settings
+
+
+def _configuration(
+    source: Source, items: list[Item], settings: dict[str, Any], held_out: float | int | None
+) -> dict[str, Any]:
+    """What decides the bytes, without a path of this machine."""
+    configuration = {key: value for key, value in settings.items() if key != "out"}
+    if isinstance(source, Procedural):
+        described = asdict(source)
+    else:
+        names = [[item.name, item.split] for item in items]
+        described = {
+            "folder": Path(source.path).resolve().name,
+            "meshes": len(items),
+            "names": sha256(repr(names).encode()),
+        }
+    return configuration | {"generator": GENERATOR, "source": described, "held_out": held_out}
+
+
+def _facts(settings: dict[str, Any]) -> dict[str, Any]:
+    """What readers of the data set want to know of all its objects."""
+    layout = LAYOUTS[settings["layout"]]
+    rig = make_rig(settings, "")
+    return {
+        "layout": settings["layout"],
+        "renderer": settings["renderer"],
+        "scene_sphere": {"centre": [0.0, 0.0, 0.0], "radius": OBJECT_RADIUS * layout.scale},
+        "near": rig.near * layout.scale,
+        "far": rig.far * layout.scale,
+    }
+
+
+def _outcomes(
+    engine: str,
+    settings: dict[str, Any],
+    items: Iterator[dict[str, Any]],
+    workers: int | None,
+    timeout: float,
+    recycle: int,
+) -> Iterator[Outcome]:
+    if engine == "ray":
+        from data_gen.cluster import run_on_ray
+
+        return run_on_ray(TARGET, settings, items, workers=workers, timeout=timeout, recycle=recycle)
+    count = workers if workers is not None else len(os.sched_getaffinity(0))
+    return run_isolated(TARGET, settings, items, workers=count, timeout=timeout, recycle=recycle)

@@ -1,0 +1,94 @@
+"""The sphere around what posed pictures show, when the files do not say."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, UInt8
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import carve
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["estimate_bounds", "nearest_point"]
+
+HULL_SIDE = 48
+HULL_MARGIN = 1.05
+FEWEST_MASKS = 3
+LARGEST_MASK = 256
+
+
+def estimate_bounds(cameras: PinholeCamera, alpha: UInt8[Tensor, "view 1 height width"] | None = None) -> Sphere:
+    """A sphere that holds what the cameras look at.
+
+    From the cameras alone: the centre is the point nearest to all optical axes; the radius is what the narrowest
+    camera still sees whole at that distance, r = d sin(half the opening angle), taken over the cameras' median and
+    never reaching a camera. With masks of three views or more, the visual hull is carved inside that sphere (twice,
+    the second time inside the sphere around the first hull) and the result is the sphere around its voxels, 5 % larger.
+
+    Args:
+        cameras: of one scene.
+        alpha: their masks, or None where the pictures have none.
+    """
+    outer = _from_cameras(cameras)
+    if alpha is None or len(alpha) < FEWEST_MASKS or not alpha.any():
+        return outer
+    masks, small = _reduced(alpha, cameras)
+    sphere = outer
+    for _ in range(2):
+        points = carve(masks, small, sphere, HULL_SIDE).centres()
+        points = points[sphere.normalise(points).norm(dim=-1) <= 1]
+        if not len(points):
+            return sphere
+        voxel = 2 * sphere.radius / HULL_SIDE
+        centre = (points.amin(0) + points.amax(0)) / 2
+        radius = float((points - centre).norm(dim=-1).max() + voxel * 3**0.5 / 2)
+        if radius * HULL_MARGIN >= sphere.radius:
+            return sphere
+        sphere = Sphere(tuple(centre.tolist()), radius * HULL_MARGIN)
+    return sphere
+
+
+def nearest_point(centres: Float[Tensor, "view 3"], directions: Float[Tensor, "view 3"]) -> Float[Tensor, " 3"]:
+    """The point with the least squared distance to all lines; of parallel lines, the one nearest to their centres.
+
+    >>> eyes = torch.tensor([[0.0, 0.0, 3.0], [2.0, 0.0, 0.0]])
+    >>> nearest_point(eyes, torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])).round().abs().tolist()
+    [0.0, 0.0, 0.0]
+    """
+    across = torch.eye(3, dtype=torch.float64) - directions.double()[:, :, None] * directions.double()[:, None, :]
+    middle = centres.double().mean(0)
+    right = (across @ (centres.double() - middle)[:, :, None]).sum(0)
+    return (middle + (torch.linalg.pinv(across.sum(0), rtol=1e-6, hermitian=True) @ right).squeeze(-1)).to(centres)
+
+
+def _from_cameras(cameras: PinholeCamera) -> Sphere:
+    eyes, axes = camera.centres(cameras), camera.viewing_directions(cameras)
+    centre = nearest_point(eyes, axes)
+    distance = (eyes - centre).norm(dim=-1)
+    height, width = camera.image_size(cameras)
+    focal = camera.intrinsics(cameras)[:, [0, 1], [0, 1]]
+    half = torch.atan(focal.new_tensor([width / 2, height / 2]) / focal).amin(-1)
+    radius = float((distance * half.sin()).median())
+    nearest = float(distance.min())
+    if nearest < 1e-6 or radius < 1e-6:  # all cameras in one place: look a unit ahead
+        return Sphere(tuple((eyes + axes).mean(0).tolist()), 1.0)
+    return Sphere(tuple(centre.tolist()), min(radius, 0.95 * nearest))
+
+
+def _reduced(alpha: Tensor, cameras: PinholeCamera) -> tuple[Tensor, PinholeCamera]:
+    """Masks small enough to carve quickly: a coarse pixel is set where any of its fine ones is."""
+    height, width = alpha.shape[2:]
+    factor = -(-max(height, width) // LARGEST_MASK)
+    if factor == 1:
+        return alpha.float(), cameras
+    size = -(-height // factor), -(-width // factor)
+    padded = torch.nn.functional.pad(alpha, (0, size[1] * factor - width, 0, size[0] * factor - height))
+    masks = torch.nn.functional.max_pool2d(padded.float(), factor)
+    return masks, camera.resized(_cropped(cameras, size[0] * factor, size[1] * factor), *size)
+
+
+def _cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
+    """The cameras with the right and lower borders moved."""
+    return camera.pinhole(camera.intrinsics(cameras), camera.camera_from_world(cameras), height, width)

@@ -1,0 +1,196 @@
+"""COLMAP's sparse models, text or binary, to posed pictures; distorted pictures are undistorted."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.data.errors import DataError
+from hyperplanes.data.files import inside
+from hyperplanes.data.images import image_size, read_image
+from hyperplanes.data.posed import Posed, check_pose, posed
+from hyperplanes.data.undistort import undistort
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["find_model", "read_colmap"]
+
+# COLMAP's number, name and parameters of the camera models that are read
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
+    1: ("PINHOLE", ("fx", "fy", "cx", "cy")),
+    2: ("SIMPLE_RADIAL", ("f", "cx", "cy", "k1")),
+    3: ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
+    4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    6: ("FULL_OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+}
+_PARAMETERS = dict(_MODELS.values())
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_REMEDY = "export the model again with COLMAP"
+
+
+@dataclass(frozen=True)
+class _Camera:
+    size: tuple[int, int]
+    matrix: npt.NDArray[np.float64]
+    coefficients: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Image:
+    name: str
+    camera: int
+    camera_from_world: npt.NDArray[np.float64]
+
+
+def find_model(folder: str | Path) -> Path | None:
+    """The folder with cameras and images files: the folder itself, its sparse/0, sparse or colmap/sparse/0.
+
+    >>> find_model("no such folder") is None
+    True
+    """
+    for place in (".", "sparse/0", "sparse", "colmap/sparse/0"):
+        for suffix in (".bin", ".txt"):
+            if all((Path(folder) / place / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+                return Path(folder) / place
+    return None
+
+
+def read_colmap(folder: str | Path, *, bounds: Sphere | None = None) -> Posed:
+    """The posed pictures of a COLMAP reconstruction.
+
+    COLMAP's world and its OpenCV axes are kept; its principal point counts from the pictures' borders. Pictures lie in
+    images/ beside sparse/, or beside the model. Cameras with distortion (SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV)
+    keep their calibration, their pictures are resampled.
+
+    Args:
+        folder: the project, or the model itself.
+        bounds: of the scene; estimated when None.
+
+    Returns:
+        The pictures, sorted by name.
+
+    Raises:
+        DataError: no model, a camera model that is not read (fisheye), a truncated file, or pictures of several sizes.
+    """
+    folder = Path(folder)
+    model = find_model(folder)
+    if model is None:
+        raise DataError(folder, "cameras and images, .bin or .txt", "neither", "check the path")
+    binary = (model / "images.bin").is_file() and (model / "cameras.bin").is_file()
+    suffix = ".bin" if binary else ".txt"
+    paths = model / f"cameras{suffix}", model / f"images{suffix}"
+    try:
+        if binary:
+            cameras, images = _cameras_binary(paths[0]), _images_binary(paths[1])
+        else:
+            cameras, images = _cameras_text(paths[0]), _images_text(paths[1])
+    except DataError:
+        raise
+    except (struct.error, IndexError, UnicodeDecodeError, ValueError) as error:
+        raise DataError(model, "a whole COLMAP model", f"a broken one ({error})", _REMEDY) from error
+    if not images:
+        raise DataError(paths[1], "registered images", "none", "reconstruct again")
+    images = sorted(images, key=lambda image: image.name)
+    absent = [image.name for image in images if image.camera not in cameras]
+    if absent:
+        raise DataError(paths[0], f"the camera of {absent[0]}", "none", _REMEDY)
+    home = next((home for home in (folder / "images", model / "images", model) if home.is_dir()), folder)
+    home = next((parent / "images" for parent in (model, *model.parents[:3]) if (parent / "images").is_dir()), home)
+    size = image_size(inside(home, images[0].name, paths[1]))
+    pictures, alphas = [], []
+    for image in images:
+        seen = cameras[image.camera]
+        picture, alpha = read_image(inside(home, image.name, paths[1]), size)
+        if seen.size != size:
+            found = f"{size[1]} x {size[0]}"
+            raise DataError(home / image.name, f"{seen.size[1]} x {seen.size[0]} pixels", found, "use COLMAP's images")
+        if any(seen.coefficients):
+            picture = undistort(picture, seen.matrix, seen.coefficients, opaque=not alpha)
+        pictures.append(picture)
+        alphas.append(alpha)
+    return posed(
+        pictures,
+        np.stack([check_pose(image.camera_from_world, paths[1], image.name) for image in images]),
+        np.stack([cameras[image.camera].matrix for image in images]),
+        has_alpha=any(alphas),
+        bounds=bounds,
+        names=tuple(image.name for image in images),
+        source=model,
+    )
+
+
+def _camera(model: str, width: int, height: int, values: list[float], path: Path) -> _Camera:
+    if model not in _PARAMETERS:
+        known = ", ".join(_PARAMETERS)
+        raise DataError(path, f"one of the camera models {known}", model, "run COLMAP's image_undistorter")
+    named = dict(zip(_PARAMETERS[model], values, strict=True))
+    focal = named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
+    matrix = np.array([[focal[0], 0.0, named["cx"] - 0.5], [0.0, focal[1], named["cy"] - 0.5], [0.0, 0.0, 1.0]])
+    return _Camera((height, width), matrix, tuple(named.get(name, 0.0) for name in _COEFFICIENTS))
+
+
+def _pose(quaternion: npt.NDArray[np.float64], translation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = translation
+    return pose
+
+
+def _lines(path: Path) -> Iterator[list[str]]:
+    for line in path.read_text().splitlines():
+        if not line.startswith("#"):
+            yield line.split()
+
+
+def _cameras_text(path: Path) -> dict[int, _Camera]:
+    return {
+        int(words[0]): _camera(words[1], int(words[2]), int(words[3]), [float(word) for word in words[4:]], path)
+        for words in _lines(path)
+        if words
+    }
+
+
+def _images_text(path: Path) -> list[_Image]:
+    images = []
+    lines = _lines(path)
+    for words in lines:
+        if not words:
+            continue
+        numbers = np.array(words[1:8], dtype=np.float64)
+        images.append(_Image(" ".join(words[9:]), int(words[8]), _pose(numbers[:4], numbers[4:])))
+        next(lines, None)  # the points of this image, possibly none
+    return images
+
+
+def _cameras_binary(path: Path) -> dict[int, _Camera]:
+    data, at = path.read_bytes(), 8
+    cameras = {}
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        number, model, width, height = struct.unpack_from("<iiQQ", data, at)
+        name, parameters = _MODELS.get(model, (f"number {model}", ()))
+        values = struct.unpack_from(f"<{len(parameters)}d", data, at + 24)
+        cameras[number] = _camera(name, width, height, list(values), path)
+        at += 24 + 8 * len(parameters)
+    return cameras
+
+
+def _images_binary(path: Path) -> list[_Image]:
+    data, at = path.read_bytes(), 8
+    images = []
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        values = struct.unpack_from("<i7di", data, at)
+        end = data.index(b"\0", at + 64)
+        pose = _pose(np.array(values[1:5]), np.array(values[5:8]))
+        images.append(_Image(data[at + 64 : end].decode(), values[8], pose))
+        at = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
+    return images

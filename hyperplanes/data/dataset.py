@@ -1,0 +1,184 @@
+"""A data set of few-shot tasks, and the two functions that read a single scene."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hyperplanes.data.catalogue import SPLITS, find_catalogue, posed_folder, read_posed_task
+from hyperplanes.data.errors import DataError
+from hyperplanes.data.posed import PosedTask
+from hyperplanes.data.transforms_json import find_transforms, read_transforms
+from hyperplanes.views import Task, Views
+
+__all__ = ["Dataset", "open_dataset", "read_task", "read_views"]
+
+DEFAULT_BUDGET = 2 * 2**30
+
+
+class Dataset:
+    """The objects of a folder, read when asked for and kept as 8-bit pictures while there is room.
+
+    Args:
+        folder: a data set in the native layout, SRN's, learnit's or the HyperPlanes authors', or one posed scene.
+        budget: bytes of decoded pictures to keep in memory; the least recently used go first.
+
+    Raises:
+        DataError: nothing that is known lies there.
+    """
+
+    def __init__(self, folder: str | Path, budget: int = DEFAULT_BUDGET) -> None:
+        self.folder = Path(folder)
+        self._catalogue = find_catalogue(self.folder)
+        self._budget = budget
+        self._kept: OrderedDict[str, PosedTask] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """What manifest.json says; empty where the layout has none."""
+        return self._catalogue.manifest
+
+    @property
+    def layout(self) -> str:
+        """The name of the layout."""
+        return self._catalogue.layout
+
+    def names(self, split: str = "all") -> list[str]:
+        """The names of the objects of a split.
+
+        Args:
+            split: "train", "val", "test" or "all".
+
+        Returns:
+            The names in the order of the data set.
+
+        Raises:
+            ValueError: another split.
+        """
+        if split == "all":
+            return [name for part in SPLITS for name in self._catalogue.splits[part]]
+        if split not in SPLITS:
+            raise ValueError(f"split: expected one of {', '.join(SPLITS)}, all, got {split!r}")
+        return list(self._catalogue.splits[split])
+
+    def task(self, name: str) -> Task:
+        """The support and query views of one object, as float images over white.
+
+        Args:
+            name: one of `names()`.
+
+        Returns:
+            New tensors at every call; only the 8-bit pictures are kept. As `posed`, it raises DataError.
+        """
+        return self.posed(name).task()
+
+    def posed(self, name: str) -> PosedTask:
+        """The support and query pictures of one object, 8 bits, shared between calls: not to be changed.
+
+        Args:
+            name: one of `names()`.
+
+        Returns:
+            The pictures with their cameras.
+
+        Raises:
+            DataError: no such object, or anything wrong with its files.
+        """
+        with self._lock:
+            if name in self._kept:
+                self._kept.move_to_end(name)
+                return self._kept[name]
+        if not any(name in names for names in self._catalogue.splits.values()):
+            known = self.names()
+            some = ", ".join(known[:3]) + (", ..." if len(known) > 3 else "")
+            raise DataError(self.folder, f"one of its {len(known)} objects ({some})", repr(name), "check the name")
+        task = self._catalogue.read(name)
+        with self._lock:
+            if name not in self._kept and task.nbytes <= self._budget:
+                self._kept[name] = task
+                self._bytes += task.nbytes
+                while self._bytes > self._budget:
+                    self._bytes -= self._kept.popitem(last=False)[1].nbytes
+        return task
+
+    def __len__(self) -> int:
+        """The number of objects in all splits."""
+        return sum(map(len, self._catalogue.splits.values()))
+
+    def __iter__(self) -> Iterator[Task]:
+        """The tasks of all splits, one after the other."""
+        return (self.task(name) for name in self.names())
+
+
+def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET) -> Dataset:
+    """A data set in any layout, or a single posed scene presented as one with one test task.
+
+    Args:
+        path: a folder, or a transforms file.
+        budget: as in `Dataset`.
+
+    Returns:
+        The data set; objects are read when asked for.
+    """
+    return Dataset(path, budget)
+
+
+def read_views(path: str | Path) -> Views:
+    """All posed images of one scene, over white.
+
+    Args:
+        path: a transforms*.json, or a folder that holds some, an SRN object's folder, a COLMAP model, or the .npz of
+            one object. Of a folder with transforms_train, _val and _test files, all are read.
+
+    Returns:
+        The views in the order of the files; masks where the files have alpha.
+
+    Raises:
+        DataError: anything wrong with a file.
+    """
+    from hyperplanes.data import colmap, npz, srn
+
+    path = Path(path)
+    if path.is_file():
+        return (npz.read_npz(path) if path.suffix == ".npz" else read_transforms(path)).views()
+    if not path.is_dir():
+        raise DataError(path, "a transforms*.json or a folder that holds one", "nothing", "check the path")
+    if files := find_transforms(path):
+        return read_transforms(files).views()
+    if srn.is_srn(path):
+        return srn.read_srn(path).views()
+    if colmap.find_model(path) is not None:
+        return colmap.read_colmap(path).views()
+    found = ", ".join(sorted(child.name for child in path.iterdir())[:5]) or "an empty folder"
+    raise DataError(path, "transforms.json or another layout of one scene", found, "give one object's folder")
+
+
+def read_task(path: str | Path) -> Task:
+    """The support and query views of one scene.
+
+    Args:
+        path: a folder with transforms_train.json and transforms_test.json, or one transforms.json (whose
+            train_filenames and test_filenames decide, else views alternate), or another layout of one scene.
+
+    Returns:
+        The task; its name is the folder's.
+
+    Raises:
+        DataError: anything wrong with a file.
+    """
+    from hyperplanes.data import npz, srn
+
+    path = Path(path)
+    if path.is_file() and path.suffix == ".npz":
+        return PosedTask.alternating(npz.read_npz(path), path.stem).task()
+    if path.is_dir() and srn.is_srn(path):
+        return PosedTask.alternating(srn.read_srn(path), path.name).task()
+    folder = path.parent if path.is_file() else path
+    if not folder.is_dir():
+        raise DataError(path, "a folder with posed images", "nothing", "check the path")
+    return read_posed_task(folder, posed_folder(folder).splits["test"][0]).task()

@@ -1,0 +1,146 @@
+"""Reading and writing files whole: checked JSON, safe paths, atomic writes, deterministic PNG."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from hyperplanes.data.errors import DataError
+
+__all__ = ["encode_json", "encode_npz", "encode_png", "inside", "read_json", "sha256", "write_whole"]
+
+LARGEST_JSON = 256 * 2**20
+"""Bytes above which a JSON file is refused unread."""
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Raises:
+        DataError: no such file, too large, not JSON, not an object.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_JSON:
+            raise DataError(path, f"at most {LARGEST_JSON} bytes", f"{size}", "is it really a JSON file?")
+        value = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise DataError(path, "a JSON file", "nothing", "check the path") from error
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DataError(path, "valid JSON", str(error), "write or download the file again") from error
+    except OSError as error:
+        raise DataError(path, "a readable file", error.strerror or str(error), "check its permissions") from error
+    if not isinstance(value, dict):
+        raise DataError(path, "a JSON object", f"a {type(value).__name__}", "check that it is the right file")
+    return value
+
+
+def inside(folder: str | Path, relative: str, source: str | Path) -> Path:
+    """The path of a file named in another file, which may not leave the folder.
+
+    Args:
+        folder: what must hold the file, symbolic links followed.
+        relative: the name as it was written.
+        source: the file that names it, for the message.
+
+    Returns:
+        The path; whether there is such a file is not looked at.
+
+    Raises:
+        DataError: an absolute path, or one that leaves the folder.
+    """
+    root = Path(folder).resolve()
+    text = relative.replace("\\", "/") if isinstance(relative, str) else ""
+    if not text or "\0" in text or not (root / text).resolve().is_relative_to(root) or Path(text).is_absolute():
+        raise DataError(source, f"file names inside {folder}", repr(relative), "move the file into the folder")
+    return Path(folder) / text
+
+
+def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None) -> None:
+    """Write a file so that nobody ever sees half of it: beside its name first, then renamed.
+
+    Args:
+        path: the file; its folder is made when absent.
+        data: all of it.
+        scratch: where the unfinished file lies instead, a folder of the same file system.
+
+    Raises:
+        DataError: no space, no permission, or another trouble of the operating system.
+    """
+    path = Path(path)
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=scratch or path.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+            found, remedy = "a full disk", "free some and run the same command again"
+        else:
+            found, remedy = error.strerror or str(error), "check the folder and its permissions"
+        raise DataError(path, f"room to write {len(data)} bytes", found, remedy) from error
+    finally:
+        if temporary is not None and os.path.exists(temporary):
+            os.unlink(temporary)
+
+
+def encode_json(value: Any) -> bytes:
+    r"""JSON with sorted keys, two spaces a level and a final newline: the same value gives the same bytes.
+
+    >>> encode_json({"b": 1, "a": [1.5]})
+    b'{\n  "a": [\n    1.5\n  ],\n  "b": 1\n}\n'
+    """
+    return (json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n").encode()
+
+
+def encode_png(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> bytes:
+    """PNG bytes of (height, width), (height, width, 3) or (height, width, 4) pixels; the same pixels, the same bytes.
+
+    >>> encode_png(np.zeros((2, 2, 4), np.uint8))[1:4]
+    b'PNG'
+    """
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG", compress_level=6)
+    return buffer.getvalue()
+
+
+def encode_npz(arrays: dict[str, npt.NDArray[Any]]) -> bytes:
+    """Compressed .npz bytes of named arrays, without pickles and without a date.
+
+    >>> encode_npz({"a": np.zeros(3)}) == encode_npz({"a": np.zeros(3)})
+    True
+    """
+    import zipfile
+
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+        for name, array in arrays.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, member.getvalue())
+    return buffer.getvalue()
+
+
+def sha256(data: bytes) -> str:
+    """The checksum of some bytes, in hexadecimal.
+
+    >>> sha256(b"")[:8]
+    'e3b0c442'
+    """
+    return hashlib.sha256(data).hexdigest()

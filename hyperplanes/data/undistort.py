@@ -1,0 +1,91 @@
+"""Take the lens out of a picture: OpenCV's radial and tangential distortion, undone by resampling."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch.nn.functional import grid_sample
+
+from hyperplanes.data.errors import DataError
+
+__all__ = ["COEFFICIENTS", "distort", "distortion", "undistort"]
+
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""OpenCV's names, in OpenCV's order."""
+
+Array = npt.NDArray[np.float64]
+
+
+def distortion(fields: dict[str, Any], source: object) -> tuple[float, ...]:
+    """OpenCV's eight coefficients from a file's fields, zero where absent.
+
+    Args:
+        fields: what may hold k1, k2, p1, p2, k3, k4, k5, k6.
+        source: the file, for the message.
+
+    Returns:
+        The coefficients in the order of COEFFICIENTS.
+
+    Raises:
+        DataError: a coefficient that is not a finite number.
+    """
+    values = []
+    for name in COEFFICIENTS:
+        value = fields.get(name, 0.0)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise DataError(str(source), f"a finite number as {name}", repr(value), "correct the file")
+        values.append(float(value))
+    return tuple(values)
+
+
+def distort(points: Array, coefficients: tuple[float, ...]) -> Array:
+    """Where the lens moves points (point, 2) of the image plane z = 1 (OpenCV, calib3d, rational model).
+
+    >>> distort(np.array([[1.0, 0.0]]), (0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)).tolist()
+    [[1.1, 0.0]]
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    x, y = points[:, 0], points[:, 1]
+    square = x * x + y * y
+    radial = (1 + square * (k1 + square * (k2 + square * k3))) / (1 + square * (k4 + square * (k5 + square * k6)))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+            y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        -1,
+    )
+
+
+def undistort(
+    picture: npt.NDArray[np.uint8], matrix: Array, coefficients: tuple[float, ...], *, opaque: bool = False
+) -> npt.NDArray[np.uint8]:
+    """The picture that a pinhole with the same calibration would have taken.
+
+    Args:
+        picture: (height, width, 4), straight alpha.
+        matrix: (3, 3) calibration, integer pixel centres.
+        coefficients: of COEFFICIENTS.
+        opaque: the picture has no alpha: repeat its border where the lens did not see, instead of leaving a hole.
+
+    Returns:
+        (height, width, 4); bilinear, premultiplied while it is interpolated.
+    """
+    height, width = picture.shape[:2]
+    rows, columns = np.mgrid[:height, :width].astype(np.float64)
+    focal, centre = matrix[[0, 1], [0, 1]], matrix[:2, 2]
+    ideal = (np.stack([columns, rows], -1).reshape(-1, 2) - centre) / focal
+    pixels = distort(ideal, coefficients) * focal + centre
+    grid = pixels / [max(width - 1, 1) / 2, max(height - 1, 1) / 2] - 1
+    straight = torch.from_numpy(picture.astype(np.float32)).permute(2, 0, 1)[None]
+    premultiplied = torch.cat([straight[:, :3] * straight[:, 3:] / 255, straight[:, 3:]], 1)
+    target = torch.from_numpy(grid.astype(np.float32)).reshape(1, height, width, 2)
+    padding = "border" if opaque else "zeros"
+    sampled = grid_sample(premultiplied, target, mode="bilinear", padding_mode=padding, align_corners=True)[0]
+    colour = torch.where(sampled[3:] > 0, sampled[:3] * 255 / sampled[3:].clamp_min(1e-3), torch.zeros(()))
+    result = torch.cat([colour, sampled[3:]]).clamp(0, 255).round().permute(1, 2, 0)
+    return result.to(torch.uint8).numpy()
