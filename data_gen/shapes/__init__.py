@@ -13,6 +13,7 @@ import trimesh
 
 from data_gen.shapes.car import car
 from data_gen.shapes.chair import chair
+from data_gen.shapes.lamp import lamp
 from data_gen.shapes.parts import Part, build_scene
 from data_gen.shapes.plane import plane
 
@@ -21,7 +22,7 @@ __all__ = ["CLASSES", "assemble", "make"]
 CLASSES: tuple[str, ...] = ("car", "chair", "plane", "lamp")
 """Names of the classes; the position of a name is part of its objects' seed, so the order is fixed."""
 
-_MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {"car": car, "chair": chair, "plane": plane, "lamp": car}
+_MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {"car": car, "chair": chair, "plane": plane, "lamp": lamp}
 
 
 def assemble(class_name: str, seed: int) -> list[Part]:

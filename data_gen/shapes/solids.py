@@ -81,6 +81,27 @@ class Solid:
         low, high = plane.min(axis=0), plane.max(axis=0)
         return replace(self, uv=((plane - low) / (high - low))[self.faces])
 
+    def repeated(self, times: int) -> Solid:
+        """The solid with its texture repeated around it.
+
+        Args:
+            times: How often; a divisor of the number of steps around.
+
+        Returns:
+            The same mesh; the caps keep their texture coordinates.
+
+        Raises:
+            ValueError: If the steps around cannot be divided evenly.
+        """
+        side = self.cells[:, 0] >= 0
+        around = int(self.cells[side, 1].max()) + 1
+        if around % times:
+            raise ValueError(f"times: expected a divisor of the {around} steps around, got {times}")
+        tile = self.cells[:, 1] * times // around
+        uv = self.uv.copy()
+        uv[side, :, 0] = np.clip(uv[side, :, 0] * times - tile[side, None], 0, 1)
+        return replace(self, uv=uv)
+
     def mesh(self) -> trimesh.Trimesh:
         """The bare geometry as trimesh sees it, vertices as they are (no merging, no repair)."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
