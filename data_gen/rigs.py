@@ -55,7 +55,8 @@ class Rig:
         far: Distance along a ray after which there is no object, in world units.
 
     Raises:
-        ValueError: If a shape is wrong, a number is not finite, a pose is not a rigid motion or near, far are out of order.
+        ValueError: If a shape is wrong, a number is not finite, a pose is not a rigid motion, or near and far are out
+            of order.
     """
 
     world_from_camera: Array
@@ -177,8 +178,9 @@ def fixed(
     """The same well spread poses for every object.
 
     Views with an even index (support) and with an odd index (query) are each a spherical Fibonacci spread over the band
-    of elevations, and their union is well spread too: the second spread stands half a step higher and is turned to stand
-    in the gaps of the first. Within each half, views come in farthest-first order, so the first few are well spread as well.
+    of elevations, and their union is well spread too: the second spread stands half a step higher and is turned into
+    the gaps of the first. Within each half, views come in farthest-first order, so the first few are well spread as
+    well. Of 50 views, no two are nearer than 15.6 degrees, and no two of a half nearer than 29 degrees.
 
     Args:
         views: Number of views.

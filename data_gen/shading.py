@@ -1,9 +1,9 @@
 """The shading formula, in numpy: what the OpenGL shader computes a pixel, for arrays of points.
 
-Light is added in linear units: ambient light that fades from sky to ground with the normal's height, and for each lamp
-a Lambertian term and a GGX highlight (Walter et al. 2007, with Smith's shadowing in Schlick's form). Normals are turned
-towards the camera, so that a sheet is lit on both its sides and a face wound the wrong way looks like any other. What is
-brighter than SHOULDER is rolled off below white, and the result is encoded as sRGB.
+Light is added in linear units: ambient light that fades from sky to ground with the normal's height, and for each lamp a
+Lambertian term and a GGX highlight (Walter et al. 2007, with Smith's shadowing in Schlick's form). Normals are turned
+towards the camera, so that a sheet is lit on both its sides and a face wound the wrong way looks like any other. What
+is brighter than SHOULDER is rolled off below white, and the result is encoded as sRGB.
 """
 
 from __future__ import annotations
@@ -93,4 +93,6 @@ def shade(
 
 
 def _dot(one: Floats, other: Floats) -> Floats:
-    return np.sum(one * other, axis=-1, keepdims=True)
+    if other.ndim == 1:
+        return one @ other[:, None]
+    return np.einsum("...i,...i->...", one, other)[..., None]
