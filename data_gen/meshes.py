@@ -7,8 +7,11 @@ what cannot be drawn as the file says is named in ``Mesh.warnings``, what cannot
 
 from __future__ import annotations
 
+import contextlib
 import io
 import logging
+import warnings as python_warnings
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,9 +20,14 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from data_gen.gltf_checks import check_gltf, generator_of
+from data_gen.mesh_checks import check_stl, declared_up, read_dae, read_off, read_ply
+from data_gen.mesh_cleaning import clean, decimate, shades_smoothly
 from data_gen.mesh_files import MESH_SUFFIXES, MeshError, ModelFolder, read_bytes
 from data_gen.mesh_folders import MeshFile, find_meshes, safe_name
-from data_gen.mesh_surfaces import canonical_visual
+from data_gen.mesh_surfaces import ColourSpace, canonical_visual
+from data_gen.obj_files import read_obj
+from data_gen.shapenet import model_root
 
 __all__ = [
     "MAX_FACES",
@@ -33,8 +41,10 @@ __all__ = [
 ]
 
 MAX_FACES = 2_000_000
-"""Triangles of a mesh at most, unless said otherwise."""
+"""Triangles of a mesh at most, unless said otherwise. More are decimated where the looks survive it, else refused."""
 
+_DECIMATED_FROM = 8
+_OUTLIER = 30.0
 _Y_FROM_Z = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -68,8 +78,9 @@ def load_mesh(
     """Read a mesh file.
 
     Args:
-        path: A GLB, glTF, OBJ, PLY, STL, OFF or DAE file.
-        up: The axis that points up in the file.
+        path: A GLB, glTF, OBJ, PLY, STL, OFF or DAE file. What it refers to is read from its own folder and those
+            inside; for ``SYNSET/ID/models/model_normalized.obj`` of ShapeNet v2 from the folder of the ID.
+        up: The axis that points up in the file. A COLLADA file that declares its own is turned as it says.
         name: What to call it; the file's name by default.
         max_faces: Triangles at most.
         fit: What is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
@@ -84,30 +95,37 @@ def load_mesh(
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise MeshError(
-            f"{path}: expected a file that ends in {', '.join(MESH_SUFFIXES)}, found {suffix or 'no ending'!r}"
+            f"{path}: expected a file that ends in {', '.join(MESH_SUFFIXES)}, found {suffix!r}; convert it"
         )
     data = read_bytes(path)
-    folder = ModelFolder(path)
-    logging.getLogger("trimesh").setLevel(logging.CRITICAL)
+    folder = ModelFolder(path, model_root(path))
     try:
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
-    except Exception as error:
+        with _strict():
+            scene, colours, lines = _read(data, suffix, folder)
+    except MeshError as error:
+        raise folder.refused or error from error
+    except (Exception, MemoryError) as error:
         if folder.refused is not None:
             raise folder.refused from error
+        found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise MeshError(
-            f"{path}: expected a {suffix[1:].upper()} mesh, found {type(error).__name__}: {error}"
+            f"{path}: expected a {suffix[1:].upper()} mesh, found {found}; the file is damaged or was cut"
         ) from error
     if folder.refused is not None:
         raise folder.refused
-    lost = [f"{reference}: {reason}" for reference, reason in folder.lost.items()]
+    told = "; ".join(lines)
+    lost = [f"{reference}: {reason}" for reference, reason in folder.lost.items() if reference not in told]
+    axis = declared_up(data) if suffix == ".dae" else None
+    if axis == "x":
+        lines.append("declares x up; taken as y up")
     return prepare_scene(
         scene,
         name or safe_name(path.stem),
-        up=up,
+        up="z" if axis == "z" else up,
         max_faces=max_faces,
         fit=fit,
-        srgb=suffix not in (".glb", ".gltf"),
-        warnings=(*lost, *folder.notes),
+        colours=colours,
+        warnings=(*lost, *lines, *folder.notes),
         source=str(path),
     )
 
@@ -119,7 +137,7 @@ def prepare_scene(
     up: Literal["y", "z"] = "y",
     max_faces: int = MAX_FACES,
     fit: Literal["sphere", "cube"] = "sphere",
-    srgb: bool = False,
+    colours: ColourSpace = "scene",
     warnings: tuple[str, ...] = (),
     source: str | None = None,
 ) -> Mesh:
@@ -131,7 +149,8 @@ def prepare_scene(
         up: The axis that points up in the scene.
         max_faces: Triangles at most.
         fit: What is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
-        srgb: Whether plain colours are sRGB (most files) or linear (glTF, and pyrender's own convention).
+        colours: ``scene``: vertex and face colours are sRGB, factors of materials linear; ``gltf``: all are linear;
+            ``srgb``: all are sRGB. Textures are always sRGB.
         warnings: What is already known to be lost.
         source: What messages begin with; the name by default.
 
@@ -148,33 +167,35 @@ def prepare_scene(
         raise ValueError(f"fit: expected 'sphere' or 'cube', received {fit!r}")
     source = source or name
     found = list(warnings)
-    parts: list[trimesh.Trimesh] = []
-    for node in scene.graph.nodes_geometry:
-        transform, key = scene.graph[node]
-        geometry = scene.geometry[key]
-        if not isinstance(geometry, trimesh.Trimesh):
-            found.append(f"{key}: {type(geometry).__name__} left out, only triangles are drawn")
-            continue
-        baked = _bake(geometry, np.asarray(transform, dtype=np.float64))
-        visual, lines, visible = canonical_visual(baked, key, srgb=srgb)
-        found += lines
-        if not visible:
-            found.append(f"{key}: fully transparent, left out")
-            continue
-        baked.visual = visual
-        if len(baked.faces):
-            parts.append(baked)
+    _refuse_too_many(scene, max_faces, source)
+    parts = _parts(scene, colours, found, source)
     if not parts:
-        raise MeshError(f"{source}: expected triangles, found none; " + ("; ".join(found) or "export the mesh again"))
+        raise MeshError(f"{source}: expected triangles to draw, found none; {'; '.join(found) or 'export it again'}")
     faces = sum(len(part.faces) for part in parts)
     if faces > max_faces:
-        raise MeshError(f"{source}: expected at most {max_faces} triangles, found {faces}; simplify the mesh")
-    world_from_file = _normalising(parts, up, fit, source)
+        smaller = decimate(parts, max_faces)
+        if smaller is None:
+            raise MeshError(
+                f"{source}: expected at most {max_faces} triangles, found {faces}, whose texture or face colours would "
+                "not survive decimation; simplify the mesh or raise the limit"
+            )
+        parts = smaller
+        found.append(f"decimated from {faces} to {sum(len(part.faces) for part in parts)} triangles")
+    world_from_file = _normalising(parts, up, fit, source, found)
     ready = trimesh.Scene()
-    for part in parts:
-        moved = _bake(part, world_from_file)
-        ready.add_geometry(moved, geom_name=f"part{len(ready.geometry)}")
-    return Mesh(name, ready, world_from_file, tuple(dict.fromkeys(found)), faces)
+    for number, part in enumerate(parts):
+        key = f"part_{number:04d}"
+        smooth = shades_smoothly(part)
+        moved = _moved(part, world_from_file)
+        moved.metadata = {"smooth": smooth}
+        ready.add_geometry(moved, geom_name=key, node_name=key)
+    return Mesh(
+        name=name,
+        scene=ready,
+        world_from_file=world_from_file,
+        warnings=tuple(dict.fromkeys(found)),
+        face_count=sum(len(part.faces) for part in parts),
+    )
 
 
 def render_ready(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]]:
@@ -190,34 +211,120 @@ def render_ready(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float
     for node in sorted(mesh.scene.graph.nodes_geometry):
         pose, key = mesh.scene.graph[node]
         geometry = mesh.scene.geometry[key]
-        ready.append((geometry, np.asarray(pose), geometry.visual.kind != "face"))
+        ready.append((geometry, np.asarray(pose), bool(geometry.metadata.get("smooth", True))))
     return ready
 
 
-def _bake(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64]) -> trimesh.Trimesh:
+def _read(data: bytes, suffix: str, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
+    """A scene in the file's coordinates, what its plain colours are, and warnings."""
+    if suffix == ".obj":
+        scene, lines = read_obj(data, folder)
+        return scene, "scene", lines
+    if suffix == ".off":
+        scene, lines = read_off(data, folder)
+        return scene, "scene", lines
+    if suffix == ".ply":
+        scene, lines = read_ply(data, folder)
+        return scene, "scene", lines
+    if suffix == ".dae":
+        scene, lines = read_dae(data, folder)
+        return scene, "srgb", lines
+    lines = check_stl(data, folder) if suffix == ".stl" else check_gltf(data, folder)
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
+    painted_as_seen = suffix == ".stl" or "trimesh" in generator_of(data)
+    return scene, "scene" if painted_as_seen else "gltf", lines
+
+
+@contextlib.contextmanager
+def _strict() -> Generator[None, None, None]:
+    """Keep the loaders' log quiet, and turn numpy's remark that a text was not read to its end into an error."""
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        with python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore")
+            python_warnings.filterwarnings("error", message="string or file could not be read to its end")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:
+    """Count the triangles of all instances before any is copied."""
+    faces = 0
+    for node in scene.graph.nodes_geometry:
+        faces += len(getattr(scene.geometry[scene.graph[node][1]], "faces", ()))
+    if faces > _DECIMATED_FROM * max_faces:
+        raise MeshError(
+            f"{source}: expected at most {_DECIMATED_FROM * max_faces} triangles before decimation, found {faces}; "
+            "simplify the mesh"
+        )
+
+
+def _parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], source: str) -> list[trimesh.Trimesh]:
+    """Clean meshes in the file's axes, one a node that can be seen."""
+    parts = []
+    images: dict[Any, Any] = {}
+    for node in scene.graph.nodes_geometry:
+        transform, key = scene.graph[node]
+        geometry = scene.geometry[key]
+        if not isinstance(geometry, trimesh.Trimesh):
+            found.append(f"{key}: {type(geometry).__name__} left out, only triangles are drawn")
+            continue
+        if not len(geometry.faces):
+            continue
+        transform = np.asarray(transform, dtype=np.float64)
+        if not np.isfinite(transform).all():
+            found.append(f"{key}: left out, its transform is not finite")
+            continue
+        visual, lines, visible = canonical_visual(geometry, key, colours=colours, images=images)
+        found += lines
+        if not visible:
+            found.append(f"{key}: fully transparent, left out")
+            continue
+        try:
+            part, lines = clean(_moved(geometry, transform, visual), key)
+        except ValueError as error:
+            raise MeshError(f"{source}: {error}; the file is damaged") from error
+        found += lines
+        if part is not None:
+            parts.append(part)
+    return parts
+
+
+def _moved(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visual: Any = None) -> trimesh.Trimesh:
     """A copy in the coordinates that the transform leads to; a mirroring one also turns the faces around."""
     linear = transform[:3, :3]
-    vertices = mesh.vertices @ linear.T + transform[:3, 3]
-    mirrored = np.linalg.det(linear) < 0
-    faces = np.asarray(mesh.faces)[:, ::-1] if mirrored else np.asarray(mesh.faces)
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) @ linear.T + transform[:3, 3]
+    faces = np.asarray(mesh.faces)[:, ::-1] if np.linalg.det(linear) < 0 else np.asarray(mesh.faces)
     keywords: dict[str, Any] = {}
     if "vertex_normals" in mesh._cache.cache:
-        normals = np.asarray(mesh.vertex_normals) @ np.linalg.pinv(linear)
+        normals = np.asarray(mesh.vertex_normals, dtype=np.float64) @ np.linalg.pinv(linear)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         keywords["vertex_normals"] = normals / np.where(length > 0, length, 1.0)
-    return trimesh.Trimesh(vertices, faces, visual=mesh.visual.copy(), process=False, **keywords)
+    result = trimesh.Trimesh(vertices, faces, visual=visual or mesh.visual, process=False, **keywords)
+    result.metadata.update({key: mesh.metadata[key] for key in ("smooth",) if key in mesh.metadata})
+    return result
 
 
-def _normalising(parts: list[trimesh.Trimesh], up: str, fit: str, source: str) -> npt.NDArray[np.float64]:
+def _normalising(
+    parts: list[trimesh.Trimesh], up: str, fit: str, source: str, found: list[str]
+) -> npt.NDArray[np.float64]:
     turn = _Y_FROM_Z if up == "z" else np.eye(4)
-    points = np.concatenate([part.vertices[np.unique(part.faces)] for part in parts]) @ turn[:3, :3].T
-    if not np.isfinite(points).all() or np.abs(points).max() > 1e30:
-        raise MeshError(f"{source}: expected finite coordinates below 1e30, found others; export the mesh again")
+    points = np.concatenate([part.vertices for part in parts]) @ turn[:3, :3].T
+    largest = float(np.abs(points).max())
+    if largest > 1e30:
+        raise MeshError(f"{source}: expected coordinates below 1e30, found {largest:.3g}; export the mesh again")
     low, high = points.min(axis=0), points.max(axis=0)
     centre = (low + high) / 2
-    radius = np.linalg.norm(points - centre, axis=1).max() if fit == "sphere" else (high - low).max() / 2
-    if not radius > 1e-12:
-        raise MeshError(f"{source}: expected a mesh with an extent, found all vertices in one point")
+    distance = np.linalg.norm(points - centre, axis=1)
+    radius = float(distance.max() if fit == "sphere" else (high - low).max() / 2)
+    if not radius > 1e-12 * max(largest, 1e-12):
+        raise MeshError(f"{source}: expected a mesh with an extent, found all vertices in one point; export it again")
+    near = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    if near.max() > _OUTLIER * np.quantile(near, 0.9) > 0:
+        found.append("a few vertices lie far from all others, so the object is small in its views")
     world_from_file = turn / radius
     world_from_file[:3, 3] = -centre / radius
     world_from_file[3, 3] = 1.0
