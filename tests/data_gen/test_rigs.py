@@ -1,0 +1,137 @@
+"""Camera rigs: against Kornia's projection, by their spread, and in what they refuse."""
+
+import numpy as np
+import pytest
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+from data_gen import rigs
+
+
+def _nearest(directions):
+    cosines = directions @ directions.T
+    np.fill_diagonal(cosines, -1.0)
+    return np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))
+
+
+def _kornia_project(rig, points):
+    views = len(rig)
+    intrinsics = np.tile(np.eye(4), (views, 1, 1))
+    intrinsics[:, :3, :3] = rig.intrinsics
+    camera = PinholeCamera(
+        torch.from_numpy(intrinsics),
+        torch.from_numpy(rig.camera_from_world),
+        torch.full((views,), float(rig.height), dtype=torch.float64),
+        torch.full((views,), float(rig.width), dtype=torch.float64),
+    )
+    return camera.project(torch.from_numpy(np.tile(points, (views, 1, 1)))).numpy()
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [
+        rigs.fixed(7, 64),
+        rigs.random_sphere(7, 64, seed=1),
+        rigs.random_hemisphere(7, 64, seed=1),
+        rigs.orbit(7, 64),
+        rigs.orbit(3, 64, elevation=90.0),
+        rigs.orbit(3, 64, elevation=-90.0),
+    ],
+)
+def test_convention_origin_at_principal_point_and_up_is_up(rig):
+    pixels = _kornia_project(rig, np.array([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]]))
+    np.testing.assert_allclose(pixels[:, 0], 31.5, atol=1e-9)
+    assert (pixels[:, 1, 1] <= pixels[:, 0, 1] + 1e-9).all()
+    np.testing.assert_allclose(np.linalg.norm(rig.camera_centres, axis=1), 3.0)
+    assert (rig.near, rig.far) == (2.0, 4.0)
+
+
+@pytest.mark.parametrize("distance", [1.5, 3.0, 8.0])
+def test_unit_sphere_fits_with_a_margin(distance):
+    # The silhouette of the unit sphere is the cone of half angle asin(1 / distance) around the axis.
+    rig = rigs.fixed(1, (60, 40), distance=distance)
+    radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(1.0 / distance))
+    assert 0.90 * 20 < radius < 0.97 * 20
+
+
+def test_fixed_is_the_same_every_time_and_spread():
+    rig, again = rigs.fixed(50, 32), rigs.fixed(50, 32)
+    assert np.array_equal(rig.world_from_camera, again.world_from_camera)
+    directions = rig.camera_centres / 3.0
+    # Caps of 15 degrees around 50 points, and of 29 around 25, cover about the same share of the band.
+    assert _nearest(directions).min() > 15.0
+    assert _nearest(directions[0::2]).min() > 29.0
+    assert _nearest(directions[1::2]).min() > 29.0
+    elevations = np.degrees(np.arcsin(directions[:, 1]))
+    assert -20.0 < elevations.min() < -15.0
+    assert 70.0 < elevations.max() < 80.0
+
+
+def test_fixed_first_views_of_each_half_are_far_apart():
+    directions = rigs.fixed(50, 32).camera_centres / 3.0
+    assert _nearest(directions[0:10:2]).min() > 60.0
+    assert _nearest(directions[1:11:2]).min() > 60.0
+
+
+@pytest.mark.parametrize("views", [1, 2, 3, 50, 51])
+def test_fixed_any_number_of_views(views):
+    centres = rigs.fixed(views, 16).camera_centres
+    assert len(np.unique(centres.round(6), axis=0)) == views
+
+
+def test_random_rigs_follow_their_seed_and_cover_their_part_of_the_sphere():
+    one = rigs.random_sphere(400, 8, seed=3).camera_centres
+    assert np.array_equal(one, rigs.random_sphere(400, 8, seed=3).camera_centres)
+    assert not np.array_equal(one, rigs.random_sphere(400, 8, seed=4).camera_centres)
+    # Uniform on the sphere: the mean of 400 unit vectors is within 3 / sqrt(3 * 400) = 0.087 in each axis, nearly always.
+    assert np.abs((one / 3.0).mean(axis=0)).max() < 0.12
+    upper = rigs.random_hemisphere(400, 8, seed=3).camera_centres / 3.0
+    assert upper[:, 1].min() >= 0.0
+    assert abs(upper[:, 1].mean() - 0.5) < 0.05
+
+
+def test_presets():
+    assert set(rigs.RIG_PRESETS) == {"paper-128", "paper-200"}
+    small, large = rigs.preset("paper-128", seed=5), rigs.preset("paper-200", seed=5)
+    assert (small.width, len(small)) == (128, 50)
+    assert (large.width, len(large)) == (200, 50)
+    assert not np.array_equal(small.world_from_camera, rigs.preset("paper-128", seed=6).world_from_camera)
+    assert np.array_equal(large.world_from_camera, rigs.preset("paper-200", seed=6).world_from_camera)
+    with pytest.raises(ValueError, match="paper-128, paper-200, received 'paper-64'"):
+        rigs.preset("paper-64")
+
+
+def test_select_keeps_views_and_bounds():
+    rig = rigs.fixed(6, (20, 10))
+    part = rig.select([4, 0])
+    assert np.array_equal(part.world_from_camera, rig.world_from_camera[[4, 0]])
+    assert (part.width, part.height, part.near, part.far) == (20, 10, 2.0, 4.0)
+
+
+def test_one_intrinsic_matrix_serves_all_views():
+    rig = rigs.fixed(4, 16)
+    same = rigs.Rig(rig.world_from_camera, rig.intrinsics[0], 16, 16, 2.0, 4.0)
+    assert np.array_equal(same.intrinsics, rig.intrinsics)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: rigs.fixed(0, 16), "at least 1, received 0"),
+        (lambda: rigs.fixed(4, 0), "at least 1 pixel, received 0"),
+        (lambda: rigs.fixed(4, 16, distance=1.0), "more than 1.04 .* received 1.0"),
+        (lambda: rigs.fixed(4, 16, lowest=50.0, highest=20.0), "received 50.0 and 20.0"),
+        (lambda: rigs.fixed(4, 16, field_of_view=180.0), "received 180.0"),
+        (lambda: rigs.orbit(4, 16, elevation=91.0), "received 91.0"),
+        (lambda: rigs.Rig(np.eye(4), np.eye(3), 4, 4, 1, 2), r"received \(4, 4\)"),
+        (lambda: rigs.Rig(np.eye(4)[None], np.eye(4), 4, 4, 1, 2), r"received \(4, 4\)"),
+        (lambda: rigs.Rig(2 * np.eye(4)[None], np.eye(3), 4, 4, 1, 2), "without scale or mirroring"),
+        (lambda: rigs.Rig(np.diag([1.0, 1, -1, 1])[None], np.eye(3), 4, 4, 1, 2), "determinants from -1"),
+        (lambda: rigs.Rig(np.eye(4)[None] * np.nan, np.eye(3), 4, 4, 1, 2), "NaN"),
+        (lambda: rigs.Rig(np.eye(4)[None], np.eye(3), 4, 0, 1, 2), "received 4 x 0"),
+        (lambda: rigs.Rig(np.eye(4)[None], np.eye(3), 4, 4, 2, 2), "received 2 and 2"),
+    ],
+)
+def test_wrong_input_says_what_was_received(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
