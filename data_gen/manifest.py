@@ -141,18 +141,14 @@ class Progress:
             )
             raise DataError(self.out, f"the data set it holds ({was})", f"a request for {now}", "name another folder")
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = open(self.folder / "lock", "w")
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(self.scratch, ignore_errors=True)
-            self.scratch.mkdir()
-            (self.folder / "done").mkdir(exist_ok=True)
+            self._claim()
         except BlockingIOError as error:
-            raise DataError(
-                self.out, "a folder that nobody writes into", "another generation", "wait for it"
-            ) from error
+            self.__exit__()
+            raise DataError(self.out, "a folder of its own", "another generation at work", "wait for it") from error
         except OSError as error:
-            raise DataError(self.out, "a folder to write into", error.strerror or str(error), "name another") from error
+            self.__exit__()
+            found = error.strerror or str(error)
+            raise DataError(self.out, "a folder to write into", found, "name another one") from error
         write_whole(self.folder / "configuration.json", encode_json(self.configuration), self.scratch)
         return self
 
@@ -189,6 +185,14 @@ class Progress:
         write_whole(self.out / MANIFEST, encode_json(manifest), self.scratch)
         with suppress(OSError):
             shutil.rmtree(self.folder)
+
+    def _claim(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock = open(self.folder / "lock", "w")
+        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        shutil.rmtree(self.scratch, ignore_errors=True)
+        self.scratch.mkdir()
+        (self.folder / "done").mkdir(exist_ok=True)
 
     def _existing(self) -> dict[str, Any] | None:
         if (self.folder / "configuration.json").is_file():

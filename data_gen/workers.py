@@ -199,7 +199,10 @@ class _Worker:
         return Outcome(self.item, None, f"failed {self.attempt} times: {reason}"), False
 
     def _end(self) -> str:
-        code = self.process.wait()
+        try:
+            code = self.process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            return "closed its output"
         if code < 0:
             return f"was ended by {signal.Signals(-code).name}"
         self.log.seek(0)
