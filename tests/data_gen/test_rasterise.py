@@ -1,0 +1,424 @@
+"""Pictures of known shapes against closed forms, for every renderer that works here, and the renderers against each other.
+
+Only one OpenGL platform can be used in a process, so the second one (OSMesa where EGL is the first) draws in a subprocess.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from kornia.geometry.camera import PinholeCamera
+from PIL import Image
+
+from data_gen import rigs
+from data_gen.backends import BACKENDS, RendererError, probe
+from data_gen.lighting import Lighting
+from data_gen.rasterise import CHANNELS, RasteriseError, Rasteriser
+from data_gen.surfaces import surfaces_of
+
+DARK = Lighting((), sky=(0.0,) * 3, ground=(0.0,) * 3)
+EYE = np.eye(4)
+HERE = [name for name in BACKENDS if name != "pyrender-osmesa"]
+
+
+def _skip_unless_working(name):
+    outcome = probe(name)
+    if not outcome.works:
+        pytest.skip(f"{name} does not work here: {outcome.message}")
+
+
+@pytest.fixture(params=HERE)
+def backend(request):
+    _skip_unless_working(request.param)
+    return request.param
+
+
+def _emissive(mesh, colour=(255, 255, 255)):
+    """The mesh as a lamp: its picture is flat, so that only coverage matters."""
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=[0, 0, 0, 255], emissiveFactor=[c / 255 for c in colour], metallicFactor=0.0
+    )
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(mesh.vertices), 2)), material=material)
+    return mesh
+
+
+def _sheet(size=1.0, *, uv=True):
+    """A square in the plane z = 0 that faces +z."""
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * size
+    mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    if uv:
+        mesh.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]])
+    return mesh
+
+
+def _front_rig(resolution, distance=3.0):
+    return rigs.orbit(1, resolution, elevation=0.0, distance=distance)
+
+
+def _kornia_pixels(rig, points):
+    """Where Kornia's camera sees points: (view, point, 2)."""
+    intrinsics = np.tile(np.eye(4), (len(rig), 1, 1))
+    intrinsics[:, :3, :3] = rig.intrinsics
+    size = [torch.full((len(rig),), float(side), dtype=torch.float64) for side in (rig.height, rig.width)]
+    camera = PinholeCamera(torch.from_numpy(intrinsics), torch.from_numpy(rig.camera_from_world), *size)
+    return camera.project(torch.from_numpy(np.tile(points, (len(rig), 1, 1)))).numpy()
+
+
+def _over_white(rgba):
+    alpha = rgba[..., 3:] / 255.0
+    return rgba[..., :3] * alpha + 255.0 * (1.0 - alpha)
+
+
+@pytest.mark.parametrize("resolution", [64, (200, 120)])
+def test_convention_spheres_are_where_kornia_projects_them(backend, resolution):
+    # The image of a small sphere is an ellipse whose centroid differs from the centre's projection by O(radius^2).
+    rig = rigs.fixed(5, resolution)
+    centres = np.array([[0.0, 0.0, 0.0], [0.5, 0.3, -0.2], [-0.4, -0.5, 0.4], [0.1, 0.6, 0.5]])
+    expected = _kornia_pixels(rig, centres)
+    with Rasteriser(backend, supersample=8) as rasteriser:
+        for number, centre in enumerate(centres):
+            ball = _emissive(trimesh.creation.icosphere(3, radius=0.08))
+            alpha = rasteriser.render([(ball, trimesh.transformations.translation_matrix(centre), True)], rig).rgba[..., 3]
+            weights = alpha / alpha.sum(axis=(1, 2), keepdims=True, dtype=float)
+            x = (weights * np.arange(rig.width)).sum(axis=(1, 2))
+            y = (weights * np.arange(rig.height)[:, None]).sum(axis=(1, 2))
+            np.testing.assert_allclose(np.stack((x, y), axis=-1), expected[:, number], atol=0.05)
+
+
+def test_alpha_is_the_covered_area_of_the_pixel(backend):
+    # A square whose image reaches from u0 to u1 covers of pixel i the overlap of [u0, u1] and [i - 1/2, i + 1/2].
+    rig = _front_rig(48)
+    size = 0.613
+    (u0, v1), (u1, v0) = _kornia_pixels(rig, np.array([[-size, -size, 0.0], [size, size, 0.0]]))[0]
+    pixel = np.arange(48)
+    across = np.clip(np.minimum(u1, pixel + 0.5) - np.maximum(u0, pixel - 0.5), 0.0, 1.0)
+    down = np.clip(np.minimum(v1, pixel + 0.5) - np.maximum(v0, pixel - 0.5), 0.0, 1.0)
+    for supersample in (1, 3, 8):
+        with Rasteriser(backend, supersample=supersample) as rasteriser:
+            alpha = rasteriser.render([(_sheet(size), EYE, False)], rig).rgba[0, ..., 3] / 255.0
+        # Samples stand 1 / supersample apart, so an edge is off by at most half of that.
+        np.testing.assert_allclose(alpha, down[:, None] * across, atol=1.01 / supersample / 2 + 0.004)
+
+
+def test_sphere_silhouette_has_the_area_of_its_cone(backend):
+    rig = _front_rig(100)
+    ball = trimesh.creation.icosphere(5, radius=0.8)
+    with Rasteriser(backend, supersample=4) as rasteriser:
+        alpha = rasteriser.render([(ball, EYE, True)], rig).rgba[0, ..., 3] / 255.0
+    radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(0.8 / 3.0))
+    # 0.05 pixels of the radius: icospheres are inscribed.
+    assert abs(np.sqrt(alpha.sum() / np.pi) - radius) < 0.05
+    values = np.unique(np.rint(alpha * 16) / 16)
+    assert len(values) == 17
+
+
+def test_no_dark_fringe_over_white(backend):
+    # An emissive off-white sphere over white: every pixel, edge or not, lies between the two colours.
+    ball = _emissive(trimesh.creation.icosphere(4, radius=0.8), (240, 240, 240))
+    with Rasteriser(backend) as rasteriser:
+        rgba = rasteriser.render([(ball, EYE, True)], rigs.fixed(2, 64), lighting=DARK).rgba
+    inside = rgba[rgba[..., 3] == 255]
+    flat = inside[0, 0]
+    assert (inside[:, :3] == flat).all()
+    partial = rgba[(rgba[..., 3] > 0) & (rgba[..., 3] < 255)]
+    assert len(partial) > 100
+    np.testing.assert_allclose(partial[:, :3], flat, atol=1)
+    assert _over_white(rgba).min() >= flat - 1
+    assert not rgba[rgba[..., 3] == 0].any()
+
+
+def _tricky_parts():
+    """Parts with a texture, vertex colours, face colours, reversed faces, a mirroring pose, a cutoff and glass."""
+    generator = np.random.default_rng(0)
+    texels = generator.integers(0, 255, (16, 16, 3), dtype=np.uint8).repeat(16, axis=0).repeat(16, axis=1)
+    textured = trimesh.creation.box((0.6, 0.6, 0.6))
+    uv = generator.uniform(0.0, 1.0, (len(textured.vertices), 2))
+    textured.visual = trimesh.visual.TextureVisuals(uv=uv, image=Image.fromarray(texels))
+    ball = trimesh.creation.icosphere(3, radius=0.3)
+    ball.visual.vertex_colors = np.clip(ball.vertices * 400 + 128, 0, 255).astype(np.uint8)
+    ball.invert()
+    block = trimesh.creation.box((0.4, 0.3, 0.2))
+    block.visual.face_colors = generator.integers(30, 255, (len(block.faces), 4), dtype=np.uint8) | [0, 0, 0, 255]
+    glass = _sheet(0.8)
+    glass.visual.material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=[20, 60, 200, 100], alphaMode="BLEND", metallicFactor=1.0, roughnessFactor=0.2
+    )
+    fence = _sheet(0.5)
+    bars = np.zeros((8, 8, 4), np.uint8)
+    bars[:, ::2] = (200, 120, 40, 255)
+    fence.visual.material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(bars).resize((128, 128), Image.Resampling.NEAREST), alphaMode="MASK"
+    )
+    place = trimesh.transformations.translation_matrix
+    mirrored = place([0.2, 0.5, 0.2]) @ np.diag([-1.0, 1.5, 1.0, 1.0])
+    return [
+        (textured, place([-0.4, -0.3, 0.0]), False),
+        (ball, place([0.4, 0.0, -0.2]), True),
+        (block, mirrored, True),
+        (glass, place([0.0, 0.0, 0.55]), False),
+        (fence, place([-0.2, 0.3, -0.6]) @ trimesh.transformations.rotation_matrix(0.4, [0, 1, 0]), False),
+    ]
+
+
+def _assert_agree(one, other):
+    """Silhouettes to half a pixel and colours to 2 of 255 on average, 99 of 100 pixels to 12."""
+    a, b = one.astype(float), other.astype(float)
+    # An edge that is half a pixel off changes alpha by a half.
+    assert np.abs(a[..., 3] - b[..., 3]).max() < 128
+    # And the area by far less.
+    np.testing.assert_allclose(a[..., 3].sum(axis=(1, 2)), b[..., 3].sum(axis=(1, 2)), rtol=2e-3)
+    difference = np.abs(_over_white(a) - _over_white(b)).max(axis=-1)[a[..., 3] > 0]
+    assert difference.mean() < 2.0
+    assert np.quantile(difference, 0.99) < 12.0
+
+
+@pytest.fixture(scope="module")
+def tricky_by_embree():
+    with Rasteriser("embree") as rasteriser:
+        return rasteriser.render(_tricky_parts(), rigs.fixed(6, 96)).rgba
+
+
+def test_egl_and_embree_agree(tricky_by_embree):
+    _skip_unless_working("pyrender-egl")
+    with Rasteriser("pyrender-egl") as rasteriser:
+        _assert_agree(rasteriser.render(_tricky_parts(), rigs.fixed(6, 96)).rgba, tricky_by_embree)
+
+
+def _drawn_elsewhere(name, path):
+    """The tricky parts drawn in another process."""
+    code = (
+        "import sys, numpy as np; from tests.data_gen import test_rasterise as t;"
+        "r = t.Rasteriser(sys.argv[1]); np.save(sys.argv[2], r.render(t._tricky_parts(), t.rigs.fixed(6, 96)).rgba)"
+    )
+    if not os.path.exists("tests/__init__.py"):
+        code = code.replace("from tests.data_gen import test_rasterise as t", "import test_rasterise as t")
+    paths = os.pathsep.join([os.path.dirname(os.path.abspath(__file__)), *filter(None, sys.path)])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    subprocess.run([sys.executable, "-c", code, name, str(path)], check=True, env=environment)
+    return np.load(path)
+
+
+def test_osmesa_and_embree_agree(tricky_by_embree, tmp_path):
+    _skip_unless_working("pyrender-osmesa")
+    _assert_agree(_drawn_elsewhere("pyrender-osmesa", tmp_path / "osmesa.npy"), tricky_by_embree)
+
+
+def test_same_bytes_in_every_run_and_process(backend, tmp_path):
+    with Rasteriser(backend) as rasteriser:
+        first = rasteriser.render(_tricky_parts(), rigs.fixed(6, 96)).rgba
+        rasteriser.render([(_sheet(), EYE, False)], _front_rig((31, 17)))
+        again = rasteriser.render(_tricky_parts(), rigs.fixed(6, 96)).rgba
+    assert np.array_equal(first, again)
+    assert np.array_equal(first, _drawn_elsewhere(backend, tmp_path / "again.npy"))
+
+
+def test_reversed_faces_look_like_any_others(backend):
+    ball = trimesh.creation.icosphere(3, radius=0.7)
+    inside_out = ball.copy()
+    inside_out.invert()
+    with Rasteriser(backend) as rasteriser:
+        right = rasteriser.render([(ball, EYE, True)], rigs.fixed(2, 48)).rgba
+        wrong = rasteriser.render([(inside_out, EYE, True)], rigs.fixed(2, 48)).rgba
+    assert np.abs(right.astype(int) - wrong).max() <= 2
+
+
+def test_a_sheet_is_seen_from_both_sides(backend):
+    rig = rigs.orbit(2, 32, elevation=0.0)
+    with Rasteriser(backend) as rasteriser:
+        rgba = rasteriser.render([(_sheet(), EYE, False)], rig).rgba
+    assert (rgba[:, 16, 16, 3] == 255).all()
+    assert rgba[:, 16, 16, :3].min() > 80
+
+
+def test_glass_over_black_and_white_closed_form(backend):
+    # Emissive glass of alpha 0.4 before an emissive wall: out = 0.4 glass + 0.6 wall, alpha 1; alone, alpha 0.4.
+    glass, wall = _emissive(_sheet(0.9), (255, 0, 0)), _emissive(_sheet(0.5), (0, 0, 255))
+    glass.visual.material.baseColorFactor = [0, 0, 0, 102]
+    glass.visual.material.alphaMode = "BLEND"
+    behind = trimesh.transformations.translation_matrix([0, 0, -0.5])
+    with Rasteriser(backend) as rasteriser:
+        rgba = rasteriser.render([(glass, EYE, False), (wall, behind, False)], _front_rig(33), lighting=DARK).rgba[0]
+    np.testing.assert_allclose(rgba[16, 16], [102, 0, 153, 255], atol=2)
+    np.testing.assert_allclose(rgba[16, 5], [255, 0, 0, 102], atol=2)
+
+
+def test_transparent_texels_do_not_bleed(backend):
+    # Green leaves on transparent black: wherever anything is seen, it is as green as the leaf.
+    texels = np.zeros((64, 64, 4), np.uint8)
+    texels[::8, :, :] = texels[1::8] = texels[2::8] = (40, 220, 40, 255)
+    sheet = _sheet(0.9)
+    sheet.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(texels))
+    flat = Lighting((), sky=(0.7,) * 3, ground=(0.7,) * 3)
+    with Rasteriser(backend) as rasteriser:
+        rgba = rasteriser.render([(sheet, EYE, False)], _front_rig(40), lighting=flat).rgba[0]
+    seen = rgba[rgba[..., 3] > 40].astype(int)
+    assert len(seen) > 100
+    assert (seen[:, 1] > seen[:, 1].max() - 12).all()
+
+
+def test_texture_is_the_right_way_up(backend):
+    quarters = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
+    sheet = _sheet(0.9)
+    sheet.visual.material = trimesh.visual.material.SimpleMaterial(
+        image=Image.fromarray(quarters).resize((64, 64), Image.Resampling.NEAREST)
+    )
+    with Rasteriser(backend) as rasteriser:
+        rgb = rasteriser.render([(sheet, EYE, False)], _front_rig(40)).rgba[0, ..., :3]
+    bright = rgb > 100
+    assert bright[12, 12].tolist() == [True, False, False]
+    assert bright[12, 28].tolist() == [False, True, False]
+    assert bright[28, 12].tolist() == [False, False, True]
+    assert bright[28, 28].tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("kind", ["vertex", "face", "texture", "kd"])
+def test_srgb_colours_come_out_alike_however_they_are_given(backend, kind):
+    colour = (180, 90, 60)
+    sheet = _sheet(0.9)
+    if kind == "texture":
+        sheet.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), colour))
+    elif kind == "kd":
+        sheet.visual.material = trimesh.visual.material.SimpleMaterial(diffuse=[*colour, 255])
+    else:
+        colours = np.tile([*colour, 255], (4 if kind == "vertex" else 2, 1)).astype(np.uint8)
+        sheet.visual = trimesh.visual.ColorVisuals(sheet, **{f"{kind}_colors": colours})
+    # Ambient light of 0.8 on a diffuse surface: linear(colour) x 0.8.
+    flat = Lighting((), sky=(0.8,) * 3, ground=(0.8,) * 3)
+    expected = 255 * (0.8 * ((np.array(colour) / 255 + 0.055) / 1.055) ** 2.4)
+    expected = 255 * (1.055 * (expected / 255) ** (1 / 2.4) - 0.055)
+    with Rasteriser(backend) as rasteriser:
+        rgba = rasteriser.render([(sheet, EYE, False)], _front_rig(16), lighting=flat).rgba[0, 8, 8]
+    np.testing.assert_allclose(rgba, [*expected, 255], atol=1.5)
+
+
+def test_geometry_lies_on_the_mesh_to_a_hundredth_of_a_pixel():
+    mesh = trimesh.creation.icosphere(2, radius=0.6)
+    pose = trimesh.transformations.translation_matrix([0.1, -0.2, 0.3]) @ np.diag([1.0, 1.3, 0.7, 1.0])
+    rig = rigs.fixed(3, (50, 40))
+    with Rasteriser("embree", supersample=1) as rasteriser:
+        out = rasteriser.render([(mesh, pose, False)], rig, channels=CHANNELS)
+    placed = mesh.copy().apply_transform(pose)
+    x, y = np.meshgrid(np.arange(50), np.arange(40))
+    rays = np.stack((x, y, np.ones_like(x)), axis=-1) @ np.linalg.inv(rig.intrinsics[0]).T
+    for view, world_from_camera in enumerate(rig.world_from_camera):
+        mask, depth = out.mask[view], out.depth[view]
+        assert np.array_equal(mask, depth > 0)
+        points = (rays * depth[..., None])[mask] @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+        footprint = depth[mask].max() / rig.intrinsics[0, 0, 0]
+        _, distance, face = trimesh.proximity.closest_point(placed, points)
+        assert distance.max() < 0.01 * footprint
+        np.testing.assert_allclose(out.coordinates[view][mask], points, atol=1e-5)
+        normals = out.normals[view][mask]
+        aligned = np.abs(np.einsum("pi,pi->p", normals, placed.face_normals[face]))
+        assert np.quantile(aligned, 0.02) > 0.999
+        towards = world_from_camera[:3, 3] - points
+        assert (np.einsum("pi,pi->p", normals, towards) > 0).all()
+        assert not depth[~mask].any()
+        assert not out.coordinates[view][~mask].any()
+        # With one sample a pixel, colour and geometry see the same.
+        assert np.array_equal(mask, out.rgba[view, ..., 3] > 0)
+
+
+def test_geometry_looks_through_what_is_mostly_clear():
+    glass = _emissive(_sheet(0.9))
+    glass.visual.material.alphaMode = "BLEND"
+    wall, behind = _sheet(0.9), trimesh.transformations.translation_matrix([0, 0, -0.5])
+    with Rasteriser("embree") as rasteriser:
+        for alpha, depth in ((100, 3.5), (200, 3.0)):
+            glass.visual.material.baseColorFactor = [0, 0, 0, alpha]
+            out = rasteriser.render([(glass, EYE, False), (wall, behind, False)], _front_rig(9), channels=("depth",))
+            assert out.rgba is None
+            np.testing.assert_allclose(out.depth[0, 4, 4], depth, atol=1e-6)
+
+
+def test_blank_and_impossible_objects_are_named(backend):
+    away = trimesh.transformations.translation_matrix([50.0, 0, 0])
+    empty = trimesh.Trimesh()
+    broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], process=False)
+    untextured = _sheet(uv=False)
+    untextured.visual = trimesh.visual.TextureVisuals(image=Image.new("RGB", (2, 2)))
+    rig = _front_rig(8)
+    with Rasteriser(backend) as rasteriser:
+        for parts, message in (
+            ([(_sheet(), away, False)], "teapot: expected some of it to be visible in 1 views"),
+            ([], "teapot: expected at least one face, received 0 parts"),
+            ([(empty, EYE, False)], "teapot: expected at least one face, received 1 parts"),
+            ([(broken, EYE, False)], "teapot, part 0: expected finite vertices, received 1 faces"),
+            ([(_sheet(), EYE, False), ("cube", EYE, False)], "teapot, part 1: expected a trimesh.Trimesh, received str"),
+            ([(_sheet(), np.eye(3), False)], "teapot, part 0: expected a finite affine pose"),
+            ([(untextured, EYE, False)], "texture coordinates for its 4 textured vertices, received none"),
+        ):
+            with pytest.raises(RasteriseError, match=message):
+                rasteriser.render(parts, rig, name="teapot")
+        assert rasteriser.render([(_sheet(), EYE, False)], rig).rgba.any()
+
+
+def test_wrong_arguments_say_what_was_received():
+    with pytest.raises(ValueError, match="expected 1 to 8, received 9"):
+        Rasteriser("embree", supersample=9)
+    with pytest.raises(ValueError, match="received 'vulkan'"):
+        Rasteriser("vulkan")
+    rasteriser = Rasteriser("embree")
+    with pytest.raises(ValueError, match="rgba, depth, normals, coordinates, mask, received rgb"):
+        rasteriser.render([(_sheet(), EYE, False)], _front_rig(8), channels=("rgb",))
+    rasteriser.close()
+    with pytest.raises(ValueError, match="received one that was closed"):
+        rasteriser.render([(_sheet(), EYE, False)], _front_rig(8))
+
+
+def test_rasterisers_share_the_context_and_other_threads_are_refused():
+    _skip_unless_working("pyrender-egl")
+    parts, rig = [(_sheet(), EYE, False)], _front_rig(8)
+    caught = []
+
+    def elsewhere():
+        try:
+            Rasteriser("pyrender-egl")
+        except RendererError as error:
+            caught.append(str(error))
+
+    with Rasteriser("pyrender-egl") as outer:
+        with Rasteriser("pyrender-egl") as inner:
+            assert inner.render(parts, rig).rgba.any()
+        thread = threading.Thread(target=elsewhere)
+        thread.start()
+        thread.join()
+        assert outer.render(parts, rig).rgba.any()
+    assert "spawn" in caught[0]
+    with pytest.raises(RendererError, match="pyrender-egl, which this process uses, received pyrender-osmesa"):
+        Rasteriser("pyrender-osmesa")
+
+
+def test_unreferenced_bad_vertices_and_vanished_normals_do_no_harm():
+    corners = [[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [np.nan, 0, 0]]
+    mesh = trimesh.Trimesh(corners, [[0, 1, 2]], vertex_normals=np.zeros((4, 3)), process=False, validate=False)
+    with Rasteriser("embree") as rasteriser:
+        out = rasteriser.render([(mesh, EYE, True)], _front_rig(9), channels=("rgba", "normals"))
+    assert out.rgba[0, 4, 4, :3].min() > 80
+    np.testing.assert_allclose(out.normals[0, 4, 4], [0, 0, 1], atol=1e-6)
+
+
+def test_metal_is_not_black_and_unset_metal_is_no_metal():
+    def shade(**material):
+        sheet = _sheet(0.9)
+        sheet.visual.material = trimesh.visual.material.PBRMaterial(baseColorFactor=[128, 128, 128, 255], **material)
+        with Rasteriser("embree") as rasteriser:
+            return int(rasteriser.render([(sheet, EYE, False)], _front_rig(8)).rgba[0, 4, 4, 0])
+
+    assert shade() == shade(metallicFactor=0.0)
+    assert shade(metallicFactor=1.0) > 0.8 * shade()
+
+
+def test_equal_textures_of_parts_share_their_texels():
+    def part():
+        sheet = _sheet()
+        sheet.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), (9, 8, 7)))
+        return sheet, EYE, False
+
+    one, other = surfaces_of([part(), part()])
+    assert one.texture is other.texture
