@@ -312,9 +312,9 @@ RIG_PRESETS: dict[str, Callable[[int], Rig]] = {
 }
 """Named camera configurations of the paper's two data sets, each a function of a seed.
 
-`paper-128` follows the ShapeNet renders of "Learned Initializations" (Tancik et al. 2021), the paper's first data set: at
-random all over the sphere, at distance 4 (its loaders sample rays from 2 to 6), with Blender's field of view; the object
-fills about three quarters of the picture. `paper-200` is the paper's second: the same 50 poses for every object.
+`paper-128` follows the ShapeNet renders of "Learned Initializations" (Tancik et al. 2021), the paper's first data set:
+at random all over the sphere, at distance 4 (its loaders sample rays from 2 to 6), with Blender's field of view; the
+unit sphere spans 72 % of the picture. `paper-200` is the paper's second: the same 50 poses for every object.
 """
 
 

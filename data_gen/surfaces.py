@@ -147,8 +147,9 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
         faces = np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
         edges = positions[1::3] - positions[0::3], positions[2::3] - positions[0::3]
         normals = np.repeat(_unit(np.cross(*edges)), 3, axis=0)
-    if colours is not None and (colours[:, 3] < 1.0).any():
-        material["opaque"] = False
+    if colours is not None:
+        material["base_colour"] = np.ones(4)
+        material["opaque"] = bool((colours[:, 3] >= 1.0).all())
     return Surface(positions=positions, faces=faces, normals=normals, uv=uv, colours=colours, **material)
 
 

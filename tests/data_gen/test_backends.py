@@ -1,4 +1,4 @@
-"""Finding a renderer: what is tried, remembered and said. Fakes stand for the subprocess where its outcome is the input."""
+"""Finding a renderer: what is tried, remembered and said. Fakes stand for the subprocess where needed."""
 
 import json
 import subprocess

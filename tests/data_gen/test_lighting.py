@@ -27,7 +27,7 @@ def test_srgb_round_trip():
 
 
 def test_lambert_closed_form():
-    # One light of colour 0.5 at 60 degrees on a rough black-specular surface: ambient 0.1 + 0.5 cos 60 = 0.35, times 0.6.
+    # One light of colour 0.5 at 60 degrees on a rough surface: (0.1 + 0.5 cos 60) x 0.6 = 0.21.
     lighting = Lighting((Light((0.0, 0.5, 3**0.5 / 2), (0.5, 0.5, 0.5)),), sky=(0.1,) * 3, ground=(0.1,) * 3)
     normal = np.array([[0.0, 1.0, 0.0]])
     one, none = np.ones((1, 1)), np.zeros((1, 1))
@@ -51,7 +51,9 @@ def test_what_is_too_bright_is_rolled_off_below_white():
     assert shades[-1] < 1.0
 
 
-@pytest.mark.parametrize("lighting", [resolve_lighting("studio"), *(resolve_lighting("random", seed=s) for s in range(8))])
+@pytest.mark.parametrize(
+    "lighting", [resolve_lighting("studio"), *(resolve_lighting("random", seed=s) for s in range(8))]
+)
 def test_no_black_sides_and_no_burnt_whites(lighting):
     white, grey = _sphere_shades(lighting, 0.9), _sphere_shades(lighting, 0.5)
     assert white.max() < 1.0

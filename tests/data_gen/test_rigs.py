@@ -83,7 +83,7 @@ def test_random_rigs_follow_their_seed_and_cover_their_part_of_the_sphere():
     one = rigs.random_sphere(400, 8, seed=3).camera_centres
     assert np.array_equal(one, rigs.random_sphere(400, 8, seed=3).camera_centres)
     assert not np.array_equal(one, rigs.random_sphere(400, 8, seed=4).camera_centres)
-    # Uniform on the sphere: the mean of 400 unit vectors is within 3 / sqrt(3 * 400) = 0.087 in each axis, nearly always.
+    # Uniform on the sphere: each coordinate of the mean of 400 has standard deviation sqrt(1 / 3 / 400) = 0.029.
     assert np.abs((one / 3.0).mean(axis=0)).max() < 0.12
     upper = rigs.random_hemisphere(400, 8, seed=3).camera_centres / 3.0
     assert upper[:, 1].min() >= 0.0
