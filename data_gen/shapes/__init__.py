@@ -1,7 +1,7 @@
 """An endless supply of procedural, ShapeNet-like objects: `make(class_name, seed)` is always the same scene.
 
-Frame: y up, front along +z (so +x is the object's left). Units are metres and the origin lies wherever the object stands or
-balances; whoever renders them normalises.
+Frame: y up, front along +z (so +x is the object's left). Units are metres and the origin lies wherever the object
+stands or balances; whoever renders them normalises.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ __all__ = ["CLASSES", "assemble", "make"]
 CLASSES: tuple[str, ...] = ("car", "chair", "plane", "lamp")
 """Names of the classes; the position of a name is part of its objects' seed, so the order is fixed."""
 
-_MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {"car": car, "chair": chair, "plane": plane, "lamp": lamp}
+_MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
+    "car": car,
+    "chair": chair,
+    "plane": plane,
+    "lamp": lamp,
+}
 
 
 def assemble(class_name: str, seed: int) -> list[Part]:

@@ -82,7 +82,9 @@ def _framed(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Pa
     parts.append(_rail(frame, palette, 0.2, 0.04, 0.0, "low_rail"))
     choice, x = rng.random(), frame.width / 2 - size
     if choice < 0.35:
-        parts.append(Part.of("brace_0", rod(frame.at_back(x, 0.2), frame.at_back(-x, 0.94), 0.03, 0.016), palette.frame))
+        parts.append(
+            Part.of("brace_0", rod(frame.at_back(x, 0.2), frame.at_back(-x, 0.94), 0.03, 0.016), palette.frame)
+        )
         second = rod(frame.at_back(-x, 0.2, 0.004), frame.at_back(x, 0.94, 0.004), 0.03, 0.016)
         parts.append(Part.of("brace_1", second, palette.frame))
     elif choice < 0.65:
@@ -102,7 +104,11 @@ def _padded(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Pa
     thick = rng.uniform(0.08, 0.13) * (1.25 if frame.kind == "lounge" else 0.8)
     wide = frame.width * rng.uniform(0.9, 1.0)
     pad = cushion(wide, thick, frame.back + 0.05, rng.uniform(0.2, 0.8)).turned("x", 90).projected("z")
-    pad = pad.moved(0, frame.back / 2).turned("x", -frame.lean).moved(0, frame.seat - 0.025, -frame.depth / 2 + thick * 0.5)
+    pad = (
+        pad.moved(0, frame.back / 2)
+        .turned("x", -frame.lean)
+        .moved(0, frame.seat - 0.025, -frame.depth / 2 + thick * 0.5)
+    )
     return [Part.of("back", pad, palette.seat)]
 
 
@@ -110,7 +116,9 @@ def _office(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Pa
     """A pad on a bracket, with a headrest on some."""
     gap = rng.uniform(0.05, 0.12)
     wide = frame.width * rng.uniform(0.85, 0.98)
-    pad = panel(wide * 0.9, wide, frame.back - gap, 0.05, 0.05, 0.5 * (frame.back - gap) * 0.3, rng.choice([0.2, 0.4, 0.6]))
+    pad = panel(
+        wide * 0.9, wide, frame.back - gap, 0.05, 0.05, 0.5 * (frame.back - gap) * 0.3, rng.choice([0.2, 0.4, 0.6])
+    )
     z = -frame.depth / 2 + 0.02
     spine = [(0, frame.under + 0.015, -0.1), (0, frame.under + 0.015, z - 0.06), (0, frame.seat + gap + 0.18, z - 0.06)]
     parts = [
@@ -177,6 +185,14 @@ def arms(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]
         )
         foot, head = (x - 0.03, frame.seat - 0.02, front - 0.03), (x - 0.014, high, front - 0.01)
         stand = Part.of("left_arm_post", post(foot, head, 0.032, 0.028, 4 if palette.wooden else 8), palette.frame)
+        prop = post(
+            (x - 0.03, frame.seat - 0.02, rear + 0.03),
+            (x - 0.016, high, rear),
+            0.026,
+            0.024,
+            4 if palette.wooden else 8,
+        )
+        rear_stand = Part.of("left_arm_rear_post", prop, palette.frame)
         left = Part.of("left_arm", rest, palette.frame)
-        return [stand, stand.mirrored(), left, left.mirrored()]
+        return [stand, stand.mirrored(), rear_stand, rear_stand.mirrored(), left, left.mirrored()]
     return [left, left.mirrored()]

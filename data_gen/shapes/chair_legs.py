@@ -41,7 +41,9 @@ def _stretchers(rng: np.random.Generator, frame: Frame, palette: Palette, feet: 
         start, end = along(f"rear_{side}", low), along(f"front_{side}", low)
         parts.append(Part.of(f"{side}_stretcher", rod(start, end, thick), palette.frame))
     if rng.random() < 0.6:
-        middle = [(np.array(along(f"rear_{s}", low)) + np.array(along(f"front_{s}", low))) / 2 for s in ("left", "right")]
+        middle = [
+            (np.array(along(f"rear_{s}", low)) + np.array(along(f"front_{s}", low))) / 2 for s in ("left", "right")
+        ]
         parts.append(Part.of("cross_stretcher", rod(*middle, thick), palette.frame))
     else:
         for end in ("rear", "front"):
@@ -69,7 +71,10 @@ def _four(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part
             ("left", 0.018, frame.depth - 0.074, frame.width / 2 - 0.045, 0.0),
             ("right", 0.018, frame.depth - 0.074, -frame.width / 2 + 0.045, 0.0),
         ):
-            apron = tapered((wide, deep), (wide, deep), height).moved(x, frame.under - height / 2 + 0.004, z)
+            tall = height if x == 0 else height - 0.006
+            apron = tapered((wide, deep), (wide, deep), tall).moved(
+                x, frame.under - tall / 2 + 0.004 + 0.002 * (x == 0), z
+            )
             parts.append(Part.of(f"{name}_apron", apron, palette.frame))
     if frame.kind == "bar" or (frame.kind != "lounge" and rng.random() < 0.5):
         parts += _stretchers(rng, frame, palette, feet, heads)
@@ -170,11 +175,15 @@ def _star(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part
         x, z = float(np.sin(angle)), float(np.cos(angle))
         arm = rod((0.02 * x, 0.11, 0.02 * z), (reach * x, 0.075, reach * z), 0.042, 0.03, sides=4)
         wheel = ball(0.028, 0.028, 0.028, 8, 6).moved(0.96 * reach * x, 0.028, 0.96 * reach * z)
-        fork = post((0.96 * reach * x, 0.03, 0.96 * reach * z), (0.96 * reach * x, 0.075, 0.96 * reach * z), 0.018, 0.018)
+        fork = post(
+            (0.96 * reach * x, 0.03, 0.96 * reach * z), (0.96 * reach * x, 0.075, 0.96 * reach * z), 0.018, 0.018
+        )
         for name, solid, material in (("arm", arm, arms), ("caster", wheel, black), ("fork", fork, black)):
             parts.append(Part.of(f"star_{name}_{k}", solid, material))
     low, high = 0.12, frame.under
-    parts.append(Part.of("sleeve", cylinder(0.034, 0.55 * (high - low), 10).moved(0, low + 0.275 * (high - low)), black))
+    parts.append(
+        Part.of("sleeve", cylinder(0.034, 0.55 * (high - low), 10).moved(0, low + 0.275 * (high - low)), black)
+    )
     parts.append(Part.of("spring", cylinder(0.02, high - low, 8).moved(0, (high + low) / 2 + 0.01), palette.metal))
     mount = tapered((0.12, 0.16), (0.24, 0.28), 0.04).moved(0, high - 0.012)
     return [*parts, Part.of("mount", mount, black)]

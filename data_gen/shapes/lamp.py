@@ -38,7 +38,7 @@ def _on_top(style: Shade, height: float, metal: Material) -> list[Part]:
     """A shade carried by a stem that ends at `height`: the neck, the shade, a finial."""
     rim = height + 0.02 - 0.12 * style.height
     top = rim + 0.86 * style.height
-    neck = cylinder(0.011, top - height + 0.05, 8).moved(0, (top + height) / 2 - 0.025)
+    neck = cylinder(0.011, top - height + 0.055, 8).moved(0, (top + height) / 2 - 0.0225)
     finial = ball(0.017, 0.024, 0.017, 10, 6).moved(0, top + 0.012)
     return [
         Part.of("neck", neck, metal),
@@ -57,7 +57,11 @@ def _table(rng: np.random.Generator) -> list[Part]:
         size = rng.uniform(0.11, 0.15)
         globe = ball(size, size, size, 20, 12).moved(0, 0.05 + 0.93 * size)
         collar = cylinder(0.5 * size, 0.07, 16).moved(0, 0.05)
-        return [*foot(rng, 0.75 * size, metal), Part.of("collar", collar, metal), Part.of("globe", globe, draw_cloth(rng))]
+        return [
+            *foot(rng, 0.75 * size, metal),
+            Part.of("collar", collar, metal),
+            Part.of("globe", globe, draw_cloth(rng)),
+        ]
     return [*table_body(rng, height, radius, metal), *_on_top(style, height, metal)]
 
 
@@ -90,7 +94,9 @@ def _desk(rng: np.random.Generator) -> list[Part]:
     """Two jointed arms and a turnable metal head."""
     colour = plain(tint(rng, rng.random(), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)), "paint")
     metal = colour if rng.random() < 0.5 else draw_metal(rng)
-    style = draw_shade(rng, rng.uniform(0.085, 0.115), rng.uniform(0.12, 0.16), ("dome", "coolie", "bell", "empire", "tulip"))
+    style = draw_shade(
+        rng, rng.uniform(0.085, 0.115), rng.uniform(0.12, 0.16), ("dome", "coolie", "bell", "empire", "tulip")
+    )
     style = replace(style, cloth=colour, trim=None, segments=24)
     lower, upper = rng.uniform(0.22, 0.3), rng.uniform(0.2, 0.28)
     lean, forward = np.radians(rng.uniform(8, 32)), np.radians(rng.uniform(25, 60))
@@ -137,8 +143,10 @@ def _pendant(rng: np.random.Generator) -> list[Part]:
         if style.shape in ("dome", "coolie"):
             cover = lathe([(style.radius_at(1.0) - 0.004, 0.985 * style.height), (0.02, 1.12 * style.height)], 24)
             parts.append(Part.of("cover", cover, metal))
-            parts.append(Part.of("collar", cylinder(0.019, 0.3 * style.height, 10).moved(0, 0.95 * style.height), metal))
-    cord = cylinder(0.009, drop + 0.12, 8).moved(0, top + drop / 2 - 0.04)
+            parts.append(
+                Part.of("collar", cylinder(0.019, 0.3 * style.height, 10).moved(0, 0.95 * style.height), metal)
+            )
+    cord = cylinder(0.009, drop + 0.1, 8).moved(0, top + drop / 2 - 0.05)
     return [*parts, Part.of("cord", cord, plain((46, 44, 44), "cord")), *_ceiling(top + drop, metal)]
 
 
@@ -173,7 +181,7 @@ def _chandelier(rng: np.random.Generator) -> list[Part]:
     for k in range(count):
         turned = _turned(arm, "y", 360 * k / count)
         parts += [replace(part, name=f"{part.name}_{k}") for part in turned]
-    cord = cylinder(0.011, drop + 0.04, 8).moved(0, 0.19 + drop / 2)
+    cord = cylinder(0.011, drop + 0.03, 8).moved(0, 0.18 + drop / 2)
     return [*parts, Part.of("cord", cord, metal), *_ceiling(0.19 + drop, metal)]
 
 

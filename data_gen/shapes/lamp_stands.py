@@ -14,7 +14,14 @@ from data_gen.shapes.solids import lathe
 
 __all__ = ["draw_body_material", "draw_metal", "floor_stand", "foot", "table_body"]
 
-_METALS: tuple[Colour, ...] = ((168, 128, 62), (58, 56, 58), (140, 144, 150), (142, 88, 58), (44, 46, 52), (112, 96, 72))
+_METALS: tuple[Colour, ...] = (
+    (168, 128, 62),
+    (58, 56, 58),
+    (140, 144, 150),
+    (142, 88, 58),
+    (44, 46, 52),
+    (112, 96, 72),
+)
 _WOODS: tuple[Colour, ...] = ((176, 122, 72), (130, 82, 48), (92, 58, 40), (200, 154, 100))
 
 
@@ -44,7 +51,14 @@ def foot(rng: np.random.Generator, radius: float, metal: Material) -> list[Part]
         profile = np.stack([radius * np.cos(angles), 0.01 + 0.45 * radius * np.sin(angles)], 1)
         solid = lathe([(radius, 0), *profile, (0.1 * radius, 0.01 + 0.45 * radius)], 24)
     elif choice == 2:
-        steps = [(radius, 0), (radius, 0.02), (0.72 * radius, 0.024), (0.72 * radius, 0.046), (0.42 * radius, 0.05), (0.4 * radius, 0.075)]
+        steps = [
+            (radius, 0),
+            (radius, 0.02),
+            (0.72 * radius, 0.024),
+            (0.72 * radius, 0.046),
+            (0.42 * radius, 0.05),
+            (0.4 * radius, 0.075),
+        ]
         solid = lathe(steps, 24)
     else:
         solid = box(1.7 * radius, 0.04, 1.7 * radius, 0.02, 2).moved(0, 0.02)
@@ -80,7 +94,10 @@ def table_body(rng: np.random.Generator, height: float, radius: float, metal: Ma
         body = lathe(_vase(rng, height, radius), 20).repeated(2).creased(50)
         parts = [Part.of("body", body, material)]
         if rng.random() < 0.5:
-            parts = [Part.of("plinth", cylinder(0.8 * radius, 0.03, 20).moved(0, 0.013), metal), Part.of("body", body.moved(0, 0.02), material)]
+            parts = [
+                Part.of("plinth", cylinder(0.8 * radius, 0.03, 20).moved(0, 0.013), metal),
+                Part.of("body", body.moved(0, 0.02), material),
+            ]
         return parts
     if choice < 0.55:  # balls on one another
         count = int(rng.integers(2, 5))
@@ -113,7 +130,9 @@ def _tripod(rng: np.random.Generator, height: float, radius: float, material: Ma
         if height > 0.8:
             share = 0.45
             tip = radius * (1 - share) + 0.02 * share
-            parts.append(Part.of(f"brace_{k}", rod((0, share * height, 0), (tip * x, share * height, tip * z), 0.012), metal))
+            parts.append(
+                Part.of(f"brace_{k}", rod((0, share * height, 0), (tip * x, share * height, tip * z), 0.012), metal)
+            )
     return [*parts, Part.of("hub", cylinder(0.022 + 0.7 * thick, 0.07, 12).moved(0, height - 0.01), metal)]
 
 

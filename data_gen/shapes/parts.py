@@ -1,8 +1,8 @@
 """Painted solids, and the scene they make together.
 
-All parts of an object end in ONE geometry with ONE texture: a draw call costs a renderer more than the faces of a wheel do.
-The texture is an atlas. A plain colour is a block of it, read at the block's centre by all corners of a face, so nothing bleeds
-in at any distance; a pattern is a tile with its border repeated outwards.
+All parts of an object end in ONE geometry with ONE texture: a draw call costs a renderer more than the faces of a
+wheel do. The texture is an atlas. A plain colour is a block of it, read at the block's centre by all corners of a
+face, so nothing bleeds in at any distance; a pattern is a tile with its border repeated outwards.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def atlas(materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:
         materials: Plain ones (one pixel) and patterned ones, each at most 240 pixels wide.
 
     Returns:
-        The image (H, 256, 3), uint8, and for each material the affine map (2, 2) of its uv into the image's: rows (scale,
-        offset) for u and v, with v = 0 at the image's lower edge.
+        The image (H, 256, 3), uint8, and for each material the affine map (2, 2) of its uv into the image's: rows
+        (scale, offset) for u and v, with v = 0 at the image's lower edge.
     """
     places, x, y, row = [], 0, 0, 0
     for material in materials:
@@ -97,8 +97,8 @@ def atlas(materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:
 def corner_normals(solid: Solid) -> np.ndarray:
     """Shading normals (F, 3, 3) of the faces' corners.
 
-    A corner takes the area-weighted mean of the faces around its vertex whose normals are within `solid.crease` degrees of
-    its own face's.
+    A corner takes the area-weighted mean of the faces around its vertex whose normals are within `solid.crease`
+    degrees of its own face's.
     """
     triangles = solid.vertices[solid.faces]
     weighted = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -127,8 +127,8 @@ def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> tr
         roughness: PBR roughness of all of it, in [0, 1].
 
     Returns:
-        The scene. Vertices are rounded to a millionth of a unit and split where shading or texture is discontinuous; the
-        geometry's `metadata["parts"]` lists (part name, first face, number of faces).
+        The scene. Vertices are rounded to a millionth of a unit and split where shading or texture is discontinuous;
+        the geometry's `metadata["parts"]` lists (part name, first face, number of faces).
     """
     materials: dict[bytes, Material] = {}
     for part in parts:

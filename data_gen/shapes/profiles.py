@@ -1,7 +1,7 @@
 """Closed planar outlines: the cross-sections that the solids are drawn through.
 
-Every function returns an array (n, 2) of corners in counter-clockwise order, centred on the origin unless said otherwise,
-in the unit of its arguments. Outlines that are to be lofted together need the same number of corners.
+Every function returns an array (n, 2) of corners in counter-clockwise order, centred on the origin unless said
+otherwise, in the unit of its arguments. Outlines that are to be lofted together need the same number of corners.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Watertight solids with a known volume: lofts, lathes and sweeps.
 
-A `Solid` carries its exact volume, computed from the numbers that define it and not from its triangles, so that a tear or a
-reversed face shows up as a difference between the two. Right-handed axes, y up. Faces are counter-clockwise seen from outside.
+A `Solid` carries its exact volume, computed from the numbers that define it and not from its triangles, so that a
+tear or a reversed face shows up as a difference between the two. Right-handed axes, y up. Faces are counter-clockwise
+seen from outside.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ class Solid:
         vertices: Corners (V, 3).
         faces: Indices (F, 3) into `vertices`.
         uv: Texture coordinates of each face's corners (F, 3, 2), inside [0, 1].
-        cells: (F, 2): the step along the solid and the step around it that a face belongs to; (-1, 0) and (-1, 1) for the
-            first and the last cap.
+        cells: (F, 2): the step along the solid and the step around it that a face belongs to; (-1, 0) and (-1, 1) for
+            the first and the last cap.
         volume: Exact volume of the polyhedron, in the cubed unit of the vertices.
         crease: Edges sharper than this many degrees are shaded as edges, others smoothly.
     """
@@ -122,8 +123,8 @@ def _skin(rings: np.ndarray, wrap: bool) -> tuple[np.ndarray, np.ndarray, np.nda
     """Triangles between successive rings (k, n, 3); each quadrilateral is cut along its shorter diagonal.
 
     Returns:
-        Faces (F, 3) into the flattened rings, uv (F, 3, 2), cells (F, 2), and which quadrilaterals (k or k - 1, n) are cut
-        from their first to their third corner.
+        Faces (F, 3) into the flattened rings, uv (F, 3, 2), cells (F, 2), and which quadrilaterals (k or k - 1, n)
+        are cut from their first to their third corner.
     """
     count, around = rings.shape[:2]
     spans = count if wrap else count - 1
@@ -169,12 +170,12 @@ def _closed(
 def loft(sections: Sequence[np.ndarray] | np.ndarray, stations: Sequence[float] | np.ndarray, axis: str = "z") -> Solid:
     """Skin drawn over parallel outlines, closed by flat caps.
 
-    The volume between two sections is the prismatoid's, h / 6 (A0 + 4 Am + A1), where the middle section runs through the
-    midpoints of the edges and of the diagonals that cut the side faces.
+    The volume between two sections is the prismatoid's, h / 6 (A0 + 4 Am + A1), where the middle section runs through
+    the midpoints of the edges and of the diagonals that cut the side faces.
 
     Args:
-        sections: Outlines (k, n, 2), counter-clockwise. Their coordinates are (x, y) for axis "z", (z, x) for "y", (y, z)
-            for "x".
+        sections: Outlines (k, n, 2), counter-clockwise. Their coordinates are (x, y) for axis "z", (z, x) for "y",
+            (y, z) for "x".
         stations: Positions (k,) of the sections along the axis, increasing.
         axis: "x", "y" or "z".
 
@@ -211,9 +212,9 @@ def lathe(profile: Sequence[tuple[float, float]] | np.ndarray, segments: int = 1
     in place of the circle).
 
     Args:
-        profile: Points (k, 2) of (radius, height). An open profile runs from the bottom to the top of the outer side; its
-            ends are closed by flat discs, or by a tip where the radius is 0. A ring's profile is a counter-clockwise closed
-            outline away from the axis.
+        profile: Points (k, 2) of (radius, height). An open profile runs from the bottom to the top of the outer side;
+            its ends are closed by flat discs, or by a tip where the radius is 0. A ring's profile is a
+            counter-clockwise closed outline away from the axis.
         segments: Steps of a turn.
         ring: Whether the profile is a closed outline (a torus, a tyre, the shell of a shade).
 
@@ -251,8 +252,8 @@ def lathe(profile: Sequence[tuple[float, float]] | np.ndarray, segments: int = 1
 def sweep(path: Sequence[Sequence[float]] | np.ndarray, outline: np.ndarray, up: Sequence[float] = (0, 1, 0)) -> Solid:
     """Outline carried along a polyline with mitred corners.
 
-    Every piece is a prism cut by two planes, so its volume is the outline's area times the length of the line through the
-    centroids; with the centroid on the path, area times path length.
+    Every piece is a prism cut by two planes, so its volume is the outline's area times the length of the line through
+    the centroids; with the centroid on the path, area times path length.
 
     Args:
         path: Points (k, 3).

@@ -1,0 +1,132 @@
+"""What every object promises. Sources of truth: trimesh's topology and volume, brute-force geometry (solid_checks),
+hashes."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_gen.shapes import CLASSES, assemble, make
+
+sys.path.insert(0, str(Path(__file__).parent))
+from solid_checks import fighting, islands, touch
+
+SEEDS = range(5)
+
+
+def digest(class_name: str, seed: int) -> str:
+    mesh = make(class_name, seed).geometry[class_name]
+    texture = np.asarray(mesh.visual.material.baseColorTexture)
+    arrays = (mesh.vertices, mesh.faces, mesh.vertex_normals, mesh.visual.uv, texture)
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
+
+@pytest.mark.parametrize("class_name", CLASSES)
+def test_every_part_is_watertight_right_way_out_and_has_its_volume(class_name):
+    for seed in range(15):
+        parts = assemble(class_name, seed)
+        assert len({part.name for part in parts}) == len(parts)
+        for part in parts:
+            mesh = part.solid.mesh()
+            assert mesh.is_watertight, (seed, part.name)
+            assert mesh.is_winding_consistent, (seed, part.name)
+            assert mesh.volume == pytest.approx(part.solid.volume, rel=1e-6), (seed, part.name)
+            assert part.solid.volume > 0, (seed, part.name)
+
+
+@pytest.mark.parametrize("class_name", CLASSES)
+def test_nothing_floats_and_nothing_flickers(class_name):
+    """Brute force: the crossing surfaces connect all parts; no two lie within 1/5000 of the size in different
+    colours."""
+    for seed in SEEDS:
+        parts = assemble(class_name, seed)
+        groups = islands(parts)
+        assert len(groups) == 1, (seed, groups[1:])
+        size = np.ptp(np.concatenate([part.solid.vertices for part in parts]), axis=0).max()
+        assert not fighting(parts, 2e-4 * size), seed
+
+
+def test_the_brute_force_sees_gaps_nesting_and_flicker():
+    """By hand: boxes side by side with a gap, one inside the other, and a plate flush with a face."""
+    from data_gen.shapes.materials import plain
+    from data_gen.shapes.parts import Part
+    from data_gen.shapes.primitives import box
+
+    red, blue = plain((255, 0, 0)), plain((0, 0, 255))
+    cube = Part.of("cube", box(1, 1, 1), red)
+    apart, inside = Part.of("apart", box(1, 1, 1).moved(1.01), blue), Part.of("inside", box(0.2, 0.2, 0.2), blue)
+    assert not touch(cube, apart)
+    assert touch(cube, inside)
+    assert islands([cube, apart, inside]) == [["cube", "inside"], ["apart"]]
+    flush = Part.of("flush", box(0.5, 0.2, 0.5).moved(0, 0.4), blue)
+    assert {tuple(sorted(pair)) for pair in fighting([cube, flush], 1e-4)} == {("cube", "flush")}
+    assert not fighting([cube, Part.of("proud", box(0.5, 0.2, 0.5).moved(0, 0.41), blue)], 1e-4)
+
+
+@pytest.mark.parametrize("class_name", CLASSES)
+def test_scene_is_one_textured_mesh_of_modest_size(class_name):
+    for seed in SEEDS:
+        scene = make(class_name, seed)
+        assert list(scene.geometry) == [class_name]
+        mesh = scene.geometry[class_name]
+        assert 150 < len(mesh.faces) < 3500
+        assert np.isfinite(mesh.vertices).all()
+        assert mesh.visual.uv.shape == (len(mesh.vertices), 2)
+        assert mesh.visual.material.baseColorTexture.mode == "RGB"
+        assert max(mesh.visual.material.baseColorTexture.size) <= 1024
+        np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-5)
+        assert ((mesh.vertex_normals[mesh.faces] * mesh.face_normals[:, None]).sum(-1) > 0).mean() > 0.97
+        assert sum(count for _, _, count in mesh.metadata["parts"]) == len(mesh.faces)
+        assert mesh.volume == pytest.approx(sum(p.solid.volume for p in assemble(class_name, seed)), rel=1e-3)
+
+
+def test_no_two_are_alike():
+    """Hashes of vertices, faces, normals, texture coordinates and pixels."""
+    digests = [digest(class_name, seed) for class_name in CLASSES for seed in range(12)]
+    assert len(set(digests)) == len(digests)
+
+
+def test_two_processes_make_the_same_bytes():
+    names = [(class_name, seed) for class_name in CLASSES for seed in (3, 17)]
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from test_objects import digest\n"
+        f"sys.stdout.write(' '.join(digest(c, s) for c, s in {names!r}))"
+    )
+    root = Path(__file__).parents[3]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
+    assert done.stdout.split() == [digest(class_name, seed) for class_name, seed in names]
+
+
+def test_frame_is_y_up_and_front_along_z():
+    """By name of the parts: lamps of cars, backs and seats of chairs, fins of planes; feet and tyres on y = 0."""
+    for seed in SEEDS:
+        car = {part.name: part.solid.vertices for part in assemble("car", seed)}
+        assert car["left_headlamp"][:, 2].mean() > 1 > -1 > car["left_tail_lamp"][:, 2].mean()
+        assert car["left_headlamp"][:, 0].mean() > 0 > car["right_headlamp"][:, 0].mean()
+        assert min(vertices[:, 1].min() for vertices in car.values()) == pytest.approx(0, abs=0.01)
+        chair = assemble("chair", seed)
+        assert min(part.solid.vertices[:, 1].min() for part in chair) == pytest.approx(0, abs=0.025)
+        for part in chair:
+            if part.name.startswith(("back", "slat", "spindle")):
+                assert part.solid.vertices[:, 2].mean() < -0.1
+        plane = {part.name: part.solid.vertices for part in assemble("plane", seed)}
+        fin = plane["fin"] if "fin" in plane else plane["left_fin"]
+        assert fin[:, 2].mean() < plane["fuselage"][:, 2].mean()
+        assert fin[:, 1].max() > plane["fuselage"][:, 1].max()
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(ValueError, match="class_name: expected one of car, chair, plane, lamp, got 'boat'"):
+        make("boat", 0)
+    with pytest.raises(ValueError, match="seed: expected a non-negative integer, got -1"):
+        make("car", -1)
+
+
+def test_importing_the_package_stays_light():
+    code = "import sys, data_gen; sys.exit('trimesh' in sys.modules or 'PIL' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[3]).returncode == 0
