@@ -17,13 +17,13 @@ __all__ = ["body"]
 
 
 def _sections(frame: Frame, stations: np.ndarray) -> np.ndarray:
-    """Outlines (k, 20, 2) of the body at the stations: up the left side (+x) from the floor, over, and down the
-    right."""
+    """Outlines (k, 20, 2) of the body at the stations: up the left side (+x) from the floor, over, down the right."""
     half = frame.half_width(stations)
     top = frame.top(stations)
     end = np.abs(stations) / (frame.length / 2)
-    floor = frame.floor + 0.12 * np.clip((end - 0.9) / 0.1, 0, 1) arch =
-    np.maximum(frame.arch(stations), floor) belt = np.minimum(frame.belt, top - 0.05)
+    floor = frame.floor + 0.12 * np.clip((end - 0.9) / 0.1, 0, 1)
+    arch = np.maximum(frame.arch(stations), floor)
+    belt = np.minimum(frame.belt, top - 0.05)
     rise = top - belt
     cabin = np.clip((rise - 0.05) / (frame.height - frame.belt - 0.05), 0, 1)
     lower = np.maximum(floor + 0.42 * (belt - floor), arch + 0.025)

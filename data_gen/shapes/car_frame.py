@@ -94,7 +94,7 @@ class Frame:
         at = np.array([0, 0.015, 0.06, 0.16, 0.84, 0.94, 0.985, 1]) - 0.5
         blunt = 0.96 if self.style in ("van", "suv", "pickup") else 0.9
         share = np.array([blunt - 0.05, blunt, 0.97, 1, 1, 0.965, blunt - 0.02, blunt - 0.1])
-        return np.interp(z, at * self.length, share * self.width / 2)
+        return np.asarray(np.interp(z, at * self.length, share * self.width / 2))
 
     def top(self, z: float | np.ndarray) -> np.ndarray:
         """Height of the silhouette at z, seen from the side."""
@@ -105,7 +105,7 @@ class Frame:
         lid = self.deck
         highs = [lid - 0.1, lid - 0.01, lid, self.height - 0.03, self.height, self.height - 0.04, self.cowl]
         highs += [self.cowl * 0.7 + self.nose * 0.3 + 0.02, self.nose, self.nose - 0.12]
-        return np.interp(z, np.maximum.accumulate(np.array(at)), highs)
+        return np.asarray(np.interp(z, np.maximum.accumulate(np.array(at)), highs))
 
     def arch(self, z: np.ndarray) -> np.ndarray:
         """Height of the wheel arches over the ground at z; 0 away from them."""

@@ -44,7 +44,7 @@ def _stretchers(rng: np.random.Generator, frame: Frame, palette: Palette, feet: 
         middle = [
             (np.array(along(f"rear_{s}", low)) + np.array(along(f"front_{s}", low))) / 2 for s in ("left", "right")
         ]
-        parts.append(Part.of("cross_stretcher", rod(*middle, thick), palette.frame))
+        parts.append(Part.of("cross_stretcher", rod(middle[0], middle[1], thick), palette.frame))
     else:
         for end in ("rear", "front"):
             bar = rod(along(f"{end}_left", low * 1.25), along(f"{end}_right", low * 1.25), thick)

@@ -11,7 +11,7 @@ from data_gen.shapes.solids import Solid, lathe, loft, sweep
 
 __all__ = ["ball", "box", "cone", "cushion", "cylinder", "panel", "post", "rod", "tapered", "torus", "tube"]
 
-Point = Sequence[float]
+Point = Sequence[float] | np.ndarray
 
 
 def box(width: float, height: float, depth: float, radius: float = 0.0, steps: int = 1) -> Solid:

@@ -1,5 +1,4 @@
-"""What every object promises. Sources of truth: trimesh's topology and volume, brute-force geometry (solid_checks),
-hashes."""
+"""What every object promises. Sources of truth: trimesh's topology and volume, solid_checks' brute force, hashes."""
 
 from __future__ import annotations
 
@@ -41,8 +40,7 @@ def test_every_part_is_watertight_right_way_out_and_has_its_volume(class_name):
 
 @pytest.mark.parametrize("class_name", CLASSES)
 def test_nothing_floats_and_nothing_flickers(class_name):
-    """Brute force: the crossing surfaces connect all parts; no two lie within 1/5000 of the size in different
-    colours."""
+    """Brute force: the crossing surfaces connect all parts; no two of different colours are within 1/5000 of the size."""
     for seed in SEEDS:
         parts = assemble(class_name, seed)
         groups = islands(parts)
