@@ -56,7 +56,10 @@ def read_npz(path: str | Path, *, legacy: bool = False, bounds: Sphere | None = 
     rgba, alpha = _rgba(images, path)
     checked = np.stack([check_pose(pose, path, str(index)) for index, pose in enumerate(poses)])
     height, width = images.shape[1:3]
-    focal = float(arrays["focal"]) if arrays.get("focal", np.zeros(2)).size == 1 else AUTHORS_FOCAL * width / 200
+    stated = arrays.get("focal", np.array([AUTHORS_FOCAL * width / 200]))
+    if stated.size != 1 or not np.issubdtype(stated.dtype, np.number):
+        raise DataError(path, "focal, one number of pixels", f"{stated.dtype} {stated.shape}", "check the file")
+    focal = float(stated.reshape(-1)[0])
     shift = 0.0 if legacy else 0.5
     matrix = np.array([[focal, 0.0, width / 2 - shift], [0.0, focal, height / 2 - shift], [0.0, 0.0, 1.0]])
     return posed(

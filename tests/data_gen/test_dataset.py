@@ -56,9 +56,7 @@ def test_a_data_set_is_what_was_asked_for(whole):
     assert torch.allclose(
         camera.camera_from_world(task.support.cameras), torch.tensor(rig.camera_from_world[::2]).float(), atol=1e-6
     )
-    assert torch.allclose(
-        camera.intrinsics(task.query.cameras), torch.tensor(rig.intrinsics[1::2]).float(), atol=1e-5
-    )
+    assert torch.allclose(camera.intrinsics(task.query.cameras), torch.tensor(rig.intrinsics[1::2]).float(), atol=1e-5)
     assert (task.support.bounds.centre, task.support.bounds.radius) == ((0.0, 0.0, 0.0), 1.0)
     assert 0.02 < float(task.support.masks.mean()) < 0.8
     assert not (out / ".progress").exists()

@@ -1,0 +1,67 @@
+"""What a native data set holds beside the pictures: depth, normals, surface coordinates, and the mesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyperplanes.data.errors import DataError
+from hyperplanes.data.npz import read_arrays
+
+__all__ = ["CHANNELS", "mesh_path", "read_channel"]
+
+CHANNELS = {"depth": 3, "normals": 4, "coordinates": 4}
+"""The channels, and the number of dimensions of each."""
+
+_REMEDY = "generate the data set with this channel"
+
+
+def read_channel(folder: str | Path, channel: str) -> Tensor:
+    """One channel of all views of an object, in the order of its frames (not split into support and query).
+
+    depth: distance along the camera's z axis in world units, 0 where nothing is seen, float32 (view, height, width).
+    normals: unit vectors towards the camera in world axes; coordinates: surface points in world units; both float32
+    (view, height, width, 3), 0 where nothing is seen.
+
+    Args:
+        folder: of the object.
+        channel: a key of CHANNELS.
+
+    Returns:
+        The values, exactly as they were rendered.
+
+    Raises:
+        ValueError: an unknown channel.
+        DataError: the object was generated without it, or the file is broken.
+    """
+    if channel not in CHANNELS:
+        raise ValueError(f"channel: expected one of {', '.join(CHANNELS)}, got {channel!r}")
+    path = Path(folder) / f"{channel}.npz"
+    if not path.is_file():
+        raise DataError(path, f"the {channel} of the object", "nothing", _REMEDY)
+    values = read_arrays(path, {channel}).get(channel)
+    if values is None or values.ndim != CHANNELS[channel] or values.dtype != np.float32:
+        found = "another array" if values is None else f"{values.dtype} {values.shape}"
+        raise DataError(path, f"a float32 array {channel} of {CHANNELS[channel]} dimensions", found, _REMEDY)
+    return torch.from_numpy(values)
+
+
+def mesh_path(folder: str | Path) -> Path:
+    """The GLB file of an object's mesh, in the world that the cameras stand in.
+
+    Args:
+        folder: of the object.
+
+    Returns:
+        The path of a file that exists.
+
+    Raises:
+        DataError: the object was generated without its mesh.
+    """
+    path = Path(folder) / "mesh.glb"
+    if not path.is_file():
+        raise DataError(path, "the mesh of the object", "nothing", _REMEDY)
+    return path

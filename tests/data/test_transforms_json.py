@@ -1,0 +1,130 @@
+"""Source of truth: a ball whose pictures are computed in closed form (conftest), and numbers worked out by hand."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hyperplanes.data import read_task, read_views
+from hyperplanes.data.transforms_document import transforms_document
+from hyperplanes.data.transforms_json import read_transforms
+from hyperplanes.geometry import cameras as camera
+
+CHAIR = Path(__file__).parents[3] / "shared/posed/chair"
+
+
+def test_blender_pictures_poses_and_calibration(scene, tmp_path):
+    views = read_views(scene.write(tmp_path))
+    assert torch.allclose(views.images, scene.over_white(), atol=1e-6)
+    assert torch.equal(views.masks[:, 0] > 0, torch.from_numpy(np.stack(scene.pictures)[..., 3] > 0))
+    pose = torch.from_numpy(scene.camera_from_world).float()
+    assert torch.allclose(camera.camera_from_world(views.cameras), pose, atol=1e-6)
+    expected = torch.from_numpy(scene.matrix).float().expand(len(views), 3, 3)
+    assert torch.allclose(camera.intrinsics(views.cameras), expected, atol=1e-5)
+    assert views.names == tuple(scene.names)
+
+
+def test_the_balls_centre_projects_onto_the_middle_of_its_silhouettes(scene, tmp_path):
+    """Property: the convention is right when geometry and pictures agree to a third of a pixel."""
+    views = read_views(scene.write(tmp_path))
+    points = torch.tensor(scene.centre).float().expand(len(views), 1, 3)
+    pixels = views.cameras.project(points)[:, 0]
+    for mask, pixel in zip(views.masks[:, 0], pixels, strict=True):
+        rows, columns = torch.nonzero(mask > 0, as_tuple=True)
+        middle = torch.stack([columns.float().mean(), rows.float().mean()])
+        assert (middle - pixel).abs().max() < 0.35
+
+
+def test_legacy_reading_moves_the_principal_point_by_half_a_pixel(scene, tmp_path):
+    scene.write(tmp_path)
+    legacy = read_transforms(tmp_path / "transforms.json", legacy=True)
+    assert camera.intrinsics(legacy.cameras)[0, :2, 2].tolist() == [16.0, 12.0]
+    assert camera.intrinsics(read_views(tmp_path).cameras)[0, :2, 2].tolist() == [15.5, 11.5]
+
+
+def test_nerfstudio_fields_are_scaled_to_the_size_of_the_pictures(scene, tmp_path):
+    """By hand: the file describes 64 x 48 pictures, the pictures have half of that."""
+    document = scene.document(fl_x=100.0, fl_y=90.0, cx=30.0, cy=25.0, w=64, h=48, camera_model="OPENCV")
+    matrix = camera.intrinsics(read_views(scene.write(tmp_path, document)).cameras)[0]
+    assert matrix.tolist() == [[50.0, 0.0, 14.5], [0.0, 45.0, 12.0], [0.0, 0.0, 1.0]]
+
+
+def test_a_frames_own_calibration_wins(scene, tmp_path):
+    document = scene.document(fl_x=100.0)
+    document["frames"][1]["fl_x"] = 50.0
+    focal = camera.intrinsics(read_views(scene.write(tmp_path, document)).cameras)[:3, 0, 0]
+    assert focal.tolist() == [100.0, 50.0, 100.0]
+
+
+def test_what_is_written_is_read_again(scene, tmp_path):
+    document = transforms_document(
+        np.linalg.inv(scene.camera_from_world),
+        np.tile(scene.matrix, (8, 1, 1)),
+        scene.size,
+        scene.names,
+        near_far=(2.0, 4.0),
+        sphere=((0.1, 0.2, 0.0), 0.5),
+    )
+    task = read_task(scene.write(tmp_path, document))
+    assert task.support.names == tuple(scene.names[::2])
+    assert task.query.names == tuple(scene.names[1::2])
+    assert (task.support.bounds.centre, task.support.bounds.radius) == ((0.1, 0.2, 0.0), 0.5)
+    written = torch.from_numpy(scene.camera_from_world[1::2]).float()
+    assert torch.allclose(camera.camera_from_world(task.query.cameras), written, atol=1e-6)
+    rays = task.query.rays(0)
+    other = read_views(scene.write(tmp_path / "blender")).rays(1)
+    assert torch.allclose(rays.directions, other.directions, atol=1e-6)
+
+
+def test_train_and_test_files_are_support_and_query(scene, tmp_path):
+    scene.write(tmp_path)
+    document = scene.document()
+    for name, part in (("train", slice(0, 5)), ("test", slice(5, 8))):
+        (tmp_path / f"transforms_{name}.json").write_text(json.dumps(document | {"frames": document["frames"][part]}))
+    (tmp_path / "transforms.json").unlink()
+    task = read_task(tmp_path)
+    assert (len(task.support), len(task.query)) == (5, 3)
+    assert task.support.bounds == task.query.bounds
+    assert len(read_views(tmp_path)) == 8
+    assert len(read_views(tmp_path / "transforms_test.json")) == 3
+    assert read_task(tmp_path / "transforms_train.json").name == tmp_path.name
+
+
+def test_views_alternate_without_a_split(scene, tmp_path):
+    task = read_task(scene.write(tmp_path))
+    assert task.support.names == tuple(scene.names[::2])
+    assert task.query.names == tuple(scene.names[1::2])
+
+
+def test_the_sphere_is_estimated_around_the_hull_of_the_masks(scene, tmp_path):
+    """The ball has radius 0.5; voxels, coarse pictures and the margin make its sphere larger, by less than a half."""
+    bounds = read_views(scene.write(tmp_path)).bounds
+    assert np.linalg.norm(np.array(bounds.centre) - scene.centre) < 0.1
+    assert 0.5 < bounds.radius < 0.75
+    photographs = read_views(scene.write(tmp_path / "rgb", mode="RGB"))
+    assert photographs.masks is None
+    assert np.linalg.norm(photographs.bounds.centre) < 1e-3
+    assert abs(photographs.bounds.radius - 3 * np.sin(np.arctan(np.tan(0.4) * 24 / 32))) < 1e-3
+
+
+def test_masks_beside_photographs(scene, tmp_path):
+    from PIL import Image
+
+    document = scene.document()
+    for index, frame in enumerate(document["frames"]):
+        frame["mask_path"] = f"mask{index}.png"
+        Image.fromarray(scene.pictures[index][..., 3]).save(tmp_path / frame["mask_path"])
+    views = read_views(scene.write(tmp_path, document, mode="RGB"))
+    assert torch.allclose(views.images, scene.over_white(), atol=1e-6)
+
+
+@pytest.mark.skipif(not CHAIR.is_dir(), reason="the posed chair is not beside this checkout")
+def test_the_chair_of_blenders_format():
+    task = read_task(CHAIR)
+    assert task.name == "chair"
+    assert task.support.images.shape == (50, 3, 200, 200)
+    assert task.query.images.shape == (25, 3, 200, 200)
+    assert abs(float(camera.intrinsics(task.support.cameras)[0, 0, 0]) - 277.7777) < 1e-3
+    assert 1.0 < task.support.bounds.radius < 1.5
