@@ -1,0 +1,116 @@
+"""Slow, obvious rendering, one ray and one sample at a time; and toy scenes: coloured balls seen by posed cameras."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from hyperplanes.geometry.cameras import fibonacci_sphere, look_at, pinhole, symmetric_intrinsics
+from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
+from hyperplanes.views import Task, Views
+
+
+def composite_ray(colours, densities, edges, background=1.0):
+    """(colour, opacity, depth, weights) of one ray by the textbook recursion, in Python numbers."""
+    left, colour, moment, weights = 1.0, [0.0, 0.0, 0.0], 0.0, []
+    for (red, green, blue), density, near, far in zip(colours, densities, edges, edges[1:], strict=False):
+        alpha = 1 - math.exp(-density * (far - near))
+        weight = left * alpha
+        colour = [c + weight * s for c, s in zip(colour, (red, green, blue), strict=True)]
+        moment += weight * (near + far) / 2
+        weights.append(weight)
+        left *= 1 - alpha
+    opacity = 1 - left
+    return [c + left * background for c in colour], opacity, moment / opacity if opacity else 0.0, weights
+
+
+def voxel_is_occupied(occupied, centre, radius, point):
+    """Whether a point lies in an occupied voxel of the cube around a sphere."""
+    side = len(occupied)
+    cell = [math.floor((p - c + radius) / (2 * radius) * side) for p, c in zip(point, centre, strict=True)]
+    return all(0 <= i < side for i in cell) and bool(occupied[cell[0]][cell[1]][cell[2]])
+
+
+def march_ray(origin, direction, near, far, step, offset, occupied, centre, radius):
+    """The distances of the samples of one ray: every step from near, in occupied voxels, before far."""
+    found, index = [], 0
+    while (t := near + (offset + index) * step) < far:
+        point = [o + t * d for o, d in zip(origin, direction, strict=True)]
+        if voxel_is_occupied(occupied, centre, radius, point):
+            found.append(t)
+        index += 1
+    return found
+
+
+def ball_hit(origin, direction, centre, radius):
+    """The length of a ray within a ball."""
+    to_centre = [c - o for c, o in zip(centre, origin, strict=True)]
+    middle = sum(a * b for a, b in zip(to_centre, direction, strict=True))
+    square = radius**2 - sum(a * a for a in to_centre) + middle**2
+    return 2 * math.sqrt(square) if square > 0 else 0.0
+
+
+def soft_ball(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """A smooth field: a ball of radius about a half that fades out, coloured by place and direction."""
+    colour = 0.5 + 0.25 * torch.sin(3 * points) + 0.2 * directions
+    return colour.clamp(0, 1), 12 * torch.sigmoid((0.5 - points.norm(dim=-1)) * 12)
+
+
+def some_rays(count: int, *, seed: int = 0, dtype: torch.dtype = torch.float64) -> Rays:
+    """Rays from a sphere of radius 3 towards points of the unit ball."""
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.randn(count, 3, generator=generator, dtype=dtype)
+    origins = 3 * origins / origins.norm(dim=-1, keepdim=True)
+    aims = torch.rand(count, 3, generator=generator, dtype=dtype) - 0.5
+    directions = (aims - origins) / (aims - origins).norm(dim=-1, keepdim=True)
+    return Rays(origins, directions, torch.full((count,), 2.0, dtype=dtype), torch.full((count,), 4.0, dtype=dtype))
+
+
+def ring(count: int, size: tuple[int, int] = (16, 16), *, distance: float = 3.0, angle: float = 0.7, shift: int = 0):
+    """Cameras around the origin; `shift` turns the spiral so that two rings do not coincide."""
+    poses = fibonacci_sphere(count + shift, distance)[shift:]
+    return pinhole(symmetric_intrinsics(*size, angle), poses, *size)
+
+
+def camera_at(eye, size=(16, 16), *, target=(0.0, 0.0, 0.0), angle=0.7):
+    """One camera that looks from `eye` at `target`."""
+    return pinhole(symmetric_intrinsics(*size, angle), look_at(torch.tensor([eye]), target), *size)
+
+
+def ball_views(cameras, *, colour=(0.8, 0.2, 0.1), radius=0.5, masks=True, bounds: Sphere | None = None) -> Views:
+    """Pictures of a ball about the origin, of one hue and brighter towards +y, over white."""
+    height, width = int(cameras.height[0]), int(cameras.width[0])
+    pixels = pixel_grid(height, width).repeat(cameras.batch_size, 1)
+    view = torch.arange(cameras.batch_size).repeat_interleave(height * width)
+    rays = cast(cameras, view, pixels, Sphere(radius=radius))
+    hit = rays.far > rays.near
+    normal = rays.at(rays.near) / radius
+    shade = 0.7 + 0.3 * normal[:, 1:2]
+    seen = torch.where(hit[:, None], (shade * torch.tensor(colour)).clamp(0, 1), torch.ones(()))
+    images = seen.reshape(-1, height, width, 3).permute(0, 3, 1, 2).contiguous()
+    alpha = hit.float().reshape(-1, 1, height, width) if masks else None
+    return Views(images, cameras, alpha, bounds or Sphere())
+
+
+class Balls:
+    """A data set in memory: one ball an object, of its own colour and size."""
+
+    def __init__(self, train: int = 3, test: int = 1, *, views: int = 4, size: tuple[int, int] = (16, 16)) -> None:
+        self.views, self.size = views, size
+        self.splits = {
+            "train": [f"train{i}" for i in range(train)],
+            "test": [f"test{i}" for i in range(test)],
+        }
+
+    def names(self, split: str) -> list[str]:
+        return self.splits[split]
+
+    def task(self, name: str) -> Task:
+        number = int(name[-1]) + (5 if name.startswith("test") else 0)
+        colour = (0.15 + 0.1 * number, 0.9 - 0.1 * number, 0.3)
+        radius = 0.4 + 0.04 * number
+        support = ball_views(ring(self.views, self.size), colour=colour, radius=radius)
+        query = ball_views(ring(self.views, self.size, shift=1), colour=colour, radius=radius)
+        return Task(support, query, name)
