@@ -1,0 +1,103 @@
+import pytest
+import torch
+
+from hyperplanes.geometry.rays import Rays
+from hyperplanes.rendering import importance, stratified
+
+
+def rays_between(near, far, count):
+    zeros = torch.zeros(count, 3)
+    return Rays(zeros, zeros, torch.full((count,), near), torch.full((count,), far))
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def resampled(rays, count, generator):
+    return importance(stratified(rays, 4), torch.ones(len(rays), 4), count, generator)
+
+
+def distance_to_uniform(values):
+    """The Kolmogorov-Smirnov statistic of values against U(0, 1)."""
+    ordered = values.flatten().sort().values
+    ranks = (torch.arange(len(ordered)) + 0.5) / len(ordered)
+    return (ordered - ranks).abs().max().item()
+
+
+def test_intervals_are_equal_without_a_generator():
+    assert stratified(rays_between(2.0, 6.0, 2), 4).tolist() == [[2.0, 3.0, 4.0, 5.0, 6.0]] * 2
+
+
+def test_edges_begin_near_end_far_and_ascend():
+    edges = stratified(rays_between(2.0, 6.0, 500), 16, generator())
+    assert edges.shape == (500, 17)
+    assert (edges[:, 0] == 2).all()
+    assert (edges[:, -1] == 6).all()
+    assert (edges.diff(dim=1) >= 0).all()
+
+
+def test_inner_edges_are_uniform_and_one_a_stratum():
+    count = 8
+    edges = stratified(rays_between(0.0, 1.0, 4000), count, generator())[:, 1:-1]
+    place = edges * count - torch.arange(1, count) + 0.5  # within its stratum, [0, 1]
+    assert place.min() >= -1e-5
+    assert place.max() <= 1 + 1e-5
+    # the 1e-6 quantile of the statistic is 2.7 / sqrt(n)
+    assert distance_to_uniform(place) < 2.7 / place.numel() ** 0.5
+    assert abs(torch.corrcoef(place.T)[0, 1]) < 0.1  # each its own
+
+
+def test_a_ray_that_misses_has_intervals_of_no_length():
+    edges = stratified(rays_between(3.0, 3.0, 2), 5, generator())
+    assert (edges == 3).all()
+    again = importance(edges, torch.zeros(2, 5), 4, generator())
+    assert (again == 3).all()
+
+
+@pytest.mark.parametrize("draw", [stratified, resampled])
+def test_the_same_generator_draws_the_same(draw):
+    rays = rays_between(1.0, 2.0, 3)
+    assert torch.equal(draw(rays, 6, generator(1)), draw(rays, 6, generator(1)))
+    assert not torch.equal(draw(rays, 6, generator(1)), draw(rays, 6, generator(2)))
+
+
+def test_importance_reproduces_its_histogram():
+    edges = torch.tensor([[0.0, 0.5, 2.0, 2.1, 4.0]]).expand(2000, -1)
+    weights = torch.tensor([[0.1, 0.4, 0.2, 0.3]]).expand(2000, -1)
+    drawn = importance(edges, weights, 10, generator())
+    assert drawn.shape == (2000, 10)
+    counts = torch.histogram(drawn, edges[0].contiguous()).hist / drawn.numel()
+    # 20,000 draws: one standard deviation is at most 0.0035, less because they are stratified
+    torch.testing.assert_close(counts, weights[0], atol=0.01, rtol=0)
+    for low, high in zip(edges[0], edges[0, 1:], strict=False):
+        inside = drawn[(drawn >= low) & (drawn < high)]
+        assert distance_to_uniform((inside - low) / (high - low)) < 2.7 / len(inside) ** 0.5
+
+
+def test_importance_without_a_generator_takes_even_quantiles():
+    # cumulative 0.25 at t = 1, 1 at t = 2; quantiles 1/8, 3/8, 5/8, 7/8 -> 1/2, 1 + 1/6, 1 + 3/6, 1 + 5/6
+    drawn = importance(torch.tensor([[0.0, 1.0, 2.0]]), torch.tensor([[1.0, 3.0]]), 4)
+    torch.testing.assert_close(drawn, torch.tensor([[1 / 2, 7 / 6, 9 / 6, 11 / 6]]), atol=1e-4, rtol=0)
+
+
+def test_importance_ascends_within_its_edges():
+    edges = torch.rand(50, 9, generator=generator()).sort(1).values
+    weights = torch.rand(50, 8, generator=generator(1)) ** 8
+    drawn = importance(edges, weights, 33, generator(2))
+    assert (drawn.diff(dim=1) >= 0).all()
+    assert ((drawn >= edges[:, :1]) & (drawn <= edges[:, -1:])).all()
+
+
+def test_importance_of_no_weight_at_all_is_uniform():
+    drawn = importance(torch.linspace(0, 1, 9).expand(400, -1), torch.zeros(400, 8), 16, generator())
+    assert distance_to_uniform(drawn) < 2.7 / drawn.numel() ** 0.5
+
+
+def test_importance_passes_no_gradient_to_the_weights_but_to_the_edges():
+    edges = torch.linspace(0, 1, 5, dtype=torch.float64)[None].requires_grad_()
+    weights = torch.rand(1, 4, dtype=torch.float64, generator=generator(), requires_grad=True)
+    importance(edges, weights, 3).sum().backward()
+    assert weights.grad is None
+    # with quantiles fixed, a shift of all edges shifts every distance by the same: the gradient sums to 3
+    assert edges.grad.sum().item() == pytest.approx(3)
