@@ -136,8 +136,8 @@ def _random(seed: int) -> Lighting:
     return Lighting(tuple(lights), sky=_grey(ambient), ground=_grey(ambient * generator.uniform(0.6, 0.9)))
 
 
-# Key, fill and rim. An upright wall reflects 0.69 of its colour when it faces +z, 0.58 at +x, 0.50 at -x and 0.44 at -z,
-# a floor 0.91 and a ceiling 0.27: every side is told from its neighbour, none is black.
+# Key, fill and rim. An upright wall reflects 0.69 of its colour when it faces +z, 0.58 at +x, 0.50 at -x, 0.44 at -z; a
+# floor 0.91 and a ceiling 0.27: every side is told from its neighbour, none is black.
 _STUDIO = Lighting(
     lights=(
         Light(_towards(35.0, 45.0), _grey(0.54)),

@@ -133,7 +133,8 @@ def _import_pyrender(platform: str) -> None:
     current = os.environ.get("PYOPENGL_PLATFORM")
     if "OpenGL.platform" in sys.modules and current != platform:
         raise RendererError(
-            f"PYOPENGL_PLATFORM: expected {platform!r}, but OpenGL is loaded with {current!r} in this process already"
+            f"PYOPENGL_PLATFORM: expected {platform!r} when this process first imported OpenGL, found {current!r}; "
+            f"set PYOPENGL_PLATFORM={platform} before Python starts, or make the Rasteriser before importing pyrender"
         )
     os.environ["PYOPENGL_PLATFORM"] = platform
     with warnings.catch_warnings():

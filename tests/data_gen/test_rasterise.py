@@ -193,20 +193,20 @@ def _assert_agree(one, other):
 @pytest.fixture(scope="module")
 def tricky_by_embree():
     with Rasteriser("embree") as rasteriser:
-        return rasteriser.render(_tricky_parts(), rigs.fixed(6, 96)).rgba
+        return rasteriser.render(_tricky_parts(), rigs.fixed(4, 72)).rgba
 
 
 def test_egl_and_embree_agree(tricky_by_embree):
     _skip_unless_working("pyrender-egl")
     with Rasteriser("pyrender-egl") as rasteriser:
-        _assert_agree(rasteriser.render(_tricky_parts(), rigs.fixed(6, 96)).rgba, tricky_by_embree)
+        _assert_agree(rasteriser.render(_tricky_parts(), rigs.fixed(4, 72)).rgba, tricky_by_embree)
 
 
 def _drawn_elsewhere(name, path):
     """The tricky parts drawn in another process."""
     code = (
         "import sys, numpy as np, test_rasterise as t;"
-        "r = t.Rasteriser(sys.argv[1]); np.save(sys.argv[2], r.render(t._tricky_parts(), t.rigs.fixed(6, 96)).rgba)"
+        "r = t.Rasteriser(sys.argv[1]); np.save(sys.argv[2], r.render(t._tricky_parts(), t.rigs.fixed(4, 72)).rgba)"
     )
     paths = os.pathsep.join([os.path.dirname(os.path.abspath(__file__)), *filter(None, sys.path)])
     environment = {**os.environ, "PYTHONPATH": paths}
@@ -221,9 +221,9 @@ def test_osmesa_and_embree_agree(tricky_by_embree, tmp_path):
 
 def test_same_bytes_in_every_run_and_process(backend, tmp_path):
     with Rasteriser(backend) as rasteriser:
-        first = rasteriser.render(_tricky_parts(), rigs.fixed(6, 96)).rgba
+        first = rasteriser.render(_tricky_parts(), rigs.fixed(4, 72)).rgba
         rasteriser.render([(_sheet(), EYE, False)], _front_rig((31, 17)))
-        again = rasteriser.render(_tricky_parts(), rigs.fixed(6, 96)).rgba
+        again = rasteriser.render(_tricky_parts(), rigs.fixed(4, 72)).rgba
     assert np.array_equal(first, again)
     assert np.array_equal(first, _drawn_elsewhere(backend, tmp_path / "again.npy"))
 
@@ -243,7 +243,7 @@ def test_a_sheet_is_seen_from_both_sides(backend):
     with Rasteriser(backend) as rasteriser:
         rgba = rasteriser.render([(_sheet(), EYE, False)], rig).rgba
     assert (rgba[:, 16, 16, 3] == 255).all()
-    assert rgba[:, 16, 16, :3].min() > 70
+    assert rgba[:, 16, 16, :3].min() > 60
 
 
 def test_glass_over_black_and_white_closed_form(backend):
