@@ -8,10 +8,12 @@ import subprocess
 import sys
 import threading
 
+import drawn_parts
 import numpy as np
 import pytest
 import torch
 import trimesh
+from drawn_parts import draw_tricky, sheet
 from kornia.geometry.camera import PinholeCamera
 from PIL import Image
 
@@ -54,15 +56,6 @@ def _emissive(mesh, colour=(255, 255, 255)):
         baseColorFactor=[0, 0, 0, 255], emissiveFactor=[c / 255 for c in colour], metallicFactor=0.0
     )
     mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(mesh.vertices), 2)), material=material)
-    return mesh
-
-
-def _sheet(size=1.0, *, uv=True):
-    """A square in the plane z = 0 that faces +z."""
-    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * size
-    mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
-    if uv:
-        mesh.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]])
     return mesh
 
 
@@ -112,7 +105,7 @@ def test_alpha_is_the_covered_area_of_the_pixel(backend):
     down = np.clip(np.minimum(v1, pixel + 0.5) - np.maximum(v0, pixel - 0.5), 0.0, 1.0)
     for supersample in (1, 3, 8):
         with Rasteriser(backend, supersample=supersample) as rasteriser:
-            alpha = rasteriser.render([(_sheet(size), EYE, False)], rig).rgba[0, ..., 3] / 255.0
+            alpha = rasteriser.render([(sheet(size), EYE, False)], rig).rgba[0, ..., 3] / 255.0
         # Samples stand 1 / supersample apart, so an edge is off by at most half of that.
         np.testing.assert_allclose(alpha, down[:, None] * across, atol=1.01 / supersample / 2 + 0.004)
 
@@ -145,39 +138,6 @@ def test_no_dark_fringe_over_white(backend):
     assert not rgba[rgba[..., 3] == 0].any()
 
 
-def _tricky_parts():
-    """Parts with a texture, vertex colours, face colours, reversed faces, a mirroring pose, a cutoff and glass."""
-    generator = np.random.default_rng(0)
-    texels = generator.integers(0, 255, (16, 16, 3), dtype=np.uint8).repeat(16, axis=0).repeat(16, axis=1)
-    textured = trimesh.creation.box((0.6, 0.6, 0.6))
-    uv = generator.uniform(0.0, 1.0, (len(textured.vertices), 2))
-    textured.visual = trimesh.visual.TextureVisuals(uv=uv, image=Image.fromarray(texels))
-    ball = trimesh.creation.icosphere(3, radius=0.3)
-    ball.visual.vertex_colors = np.clip(ball.vertices * 400 + 128, 0, 255).astype(np.uint8)
-    ball.invert()
-    block = trimesh.creation.box((0.4, 0.3, 0.2))
-    block.visual.face_colors = generator.integers(30, 255, (len(block.faces), 4), dtype=np.uint8) | [0, 0, 0, 255]
-    glass = _sheet(0.8)
-    glass.visual.material = trimesh.visual.material.PBRMaterial(
-        baseColorFactor=[20, 60, 200, 100], alphaMode="BLEND", metallicFactor=1.0, roughnessFactor=0.2
-    )
-    fence = _sheet(0.5)
-    bars = np.zeros((8, 8, 4), np.uint8)
-    bars[:, ::2] = (200, 120, 40, 255)
-    fence.visual.material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(bars).resize((128, 128), Image.Resampling.NEAREST), alphaMode="MASK"
-    )
-    place = trimesh.transformations.translation_matrix
-    mirrored = place([0.2, 0.5, 0.2]) @ np.diag([-1.0, 1.5, 1.0, 1.0])
-    return [
-        (textured, place([-0.4, -0.3, 0.0]), False),
-        (ball, place([0.4, 0.0, -0.2]), True),
-        (block, mirrored, True),
-        (glass, place([0.0, 0.0, 0.55]), False),
-        (fence, place([-0.2, 0.3, -0.6]) @ trimesh.transformations.rotation_matrix(0.4, [0, 1, 0]), False),
-    ]
-
-
 def _assert_agree(one, other):
     """Silhouettes to half a pixel and colours to 2 of 255 on average, 99 of 100 pixels to 12."""
     a, b = one.astype(float), other.astype(float)
@@ -192,25 +152,18 @@ def _assert_agree(one, other):
 
 @pytest.fixture(scope="module")
 def tricky_by_embree():
-    with Rasteriser("embree") as rasteriser:
-        return rasteriser.render(_tricky_parts(), rigs.fixed(4, 72)).rgba
+    return draw_tricky("embree")
 
 
 def test_egl_and_embree_agree(tricky_by_embree):
     _skip_unless_working("pyrender-egl")
-    with Rasteriser("pyrender-egl") as rasteriser:
-        _assert_agree(rasteriser.render(_tricky_parts(), rigs.fixed(4, 72)).rgba, tricky_by_embree)
+    _assert_agree(draw_tricky("pyrender-egl"), tricky_by_embree)
 
 
 def _drawn_elsewhere(name, path):
     """The tricky parts drawn in another process."""
-    code = (
-        "import sys, numpy as np, test_rasterise as t;"
-        "r = t.Rasteriser(sys.argv[1]); np.save(sys.argv[2], r.render(t._tricky_parts(), t.rigs.fixed(4, 72)).rgba)"
-    )
-    paths = os.pathsep.join([os.path.dirname(os.path.abspath(__file__)), *filter(None, sys.path)])
-    environment = {**os.environ, "PYTHONPATH": paths}
-    subprocess.run([sys.executable, "-c", code, name, str(path)], check=True, env=environment)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    subprocess.run([sys.executable, drawn_parts.__file__, name, str(path)], check=True, env=environment)
     return np.load(path)
 
 
@@ -220,11 +173,10 @@ def test_osmesa_and_embree_agree(tricky_by_embree, tmp_path):
 
 
 def test_same_bytes_in_every_run_and_process(backend, tmp_path):
+    first = draw_tricky(backend)
     with Rasteriser(backend) as rasteriser:
-        first = rasteriser.render(_tricky_parts(), rigs.fixed(4, 72)).rgba
-        rasteriser.render([(_sheet(), EYE, False)], _front_rig((31, 17)))
-        again = rasteriser.render(_tricky_parts(), rigs.fixed(4, 72)).rgba
-    assert np.array_equal(first, again)
+        rasteriser.render([(sheet(), EYE, False)], _front_rig((31, 17)))
+    assert np.array_equal(first, draw_tricky(backend))
     assert np.array_equal(first, _drawn_elsewhere(backend, tmp_path / "again.npy"))
 
 
@@ -241,14 +193,14 @@ def test_reversed_faces_look_like_any_others(backend):
 def test_a_sheet_is_seen_from_both_sides(backend):
     rig = rigs.orbit(2, 32, elevation=0.0)
     with Rasteriser(backend) as rasteriser:
-        rgba = rasteriser.render([(_sheet(), EYE, False)], rig).rgba
+        rgba = rasteriser.render([(sheet(), EYE, False)], rig).rgba
     assert (rgba[:, 16, 16, 3] == 255).all()
     assert rgba[:, 16, 16, :3].min() > 60
 
 
 def test_glass_over_black_and_white_closed_form(backend):
     # Emissive glass of alpha 0.4 before an emissive wall: out = 0.4 glass + 0.6 wall, alpha 1; alone, alpha 0.4.
-    glass, wall = _emissive(_sheet(0.9), (255, 0, 0)), _emissive(_sheet(0.5), (0, 0, 255))
+    glass, wall = _emissive(sheet(0.9), (255, 0, 0)), _emissive(sheet(0.5), (0, 0, 255))
     glass.visual.material.baseColorFactor = [0, 0, 0, 102]
     glass.visual.material.alphaMode = "BLEND"
     behind = trimesh.transformations.translation_matrix([0, 0, -0.5])
@@ -262,11 +214,11 @@ def test_transparent_texels_do_not_bleed(backend):
     # Green leaves on transparent black: wherever anything is seen, it is as green as the leaf.
     texels = np.zeros((64, 64, 4), np.uint8)
     texels[::8, :, :] = texels[1::8] = texels[2::8] = (40, 220, 40, 255)
-    sheet = _sheet(0.9)
-    sheet.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(texels))
+    square = sheet(0.9)
+    square.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(texels))
     flat = Lighting((), sky=(0.7,) * 3, ground=(0.7,) * 3)
     with Rasteriser(backend) as rasteriser:
-        rgba = rasteriser.render([(sheet, EYE, False)], _front_rig(40), lighting=flat).rgba[0]
+        rgba = rasteriser.render([(square, EYE, False)], _front_rig(40), lighting=flat).rgba[0]
     seen = rgba[rgba[..., 3] > 40].astype(int)
     assert len(seen) > 100
     assert (seen[:, 1] > seen[:, 1].max() - 12).all()
@@ -274,12 +226,12 @@ def test_transparent_texels_do_not_bleed(backend):
 
 def test_texture_is_the_right_way_up(backend):
     quarters = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
-    sheet = _sheet(0.9)
-    sheet.visual.material = trimesh.visual.material.SimpleMaterial(
+    square = sheet(0.9)
+    square.visual.material = trimesh.visual.material.SimpleMaterial(
         image=Image.fromarray(quarters).resize((64, 64), Image.Resampling.NEAREST)
     )
     with Rasteriser(backend) as rasteriser:
-        rgb = rasteriser.render([(sheet, EYE, False)], _front_rig(40)).rgba[0, ..., :3]
+        rgb = rasteriser.render([(square, EYE, False)], _front_rig(40)).rgba[0, ..., :3]
     bright = rgb > 100
     assert bright[12, 12].tolist() == [True, False, False]
     assert bright[12, 28].tolist() == [False, True, False]
@@ -290,20 +242,20 @@ def test_texture_is_the_right_way_up(backend):
 @pytest.mark.parametrize("kind", ["vertex", "face", "texture", "kd"])
 def test_srgb_colours_come_out_alike_however_they_are_given(backend, kind):
     colour = (180, 90, 60)
-    sheet = _sheet(0.9)
+    square = sheet(0.9)
     if kind == "texture":
-        sheet.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), colour))
+        square.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), colour))
     elif kind == "kd":
-        sheet.visual.material = trimesh.visual.material.SimpleMaterial(diffuse=[*colour, 255])
+        square.visual.material = trimesh.visual.material.SimpleMaterial(diffuse=[*colour, 255])
     else:
         colours = np.tile([*colour, 255], (4 if kind == "vertex" else 2, 1)).astype(np.uint8)
-        sheet.visual = trimesh.visual.ColorVisuals(sheet, **{f"{kind}_colors": colours})
+        square.visual = trimesh.visual.ColorVisuals(square, **{f"{kind}_colors": colours})
     # Ambient light of 0.8 on a diffuse surface: linear(colour) x 0.8.
     flat = Lighting((), sky=(0.8,) * 3, ground=(0.8,) * 3)
     expected = 255 * (0.8 * ((np.array(colour) / 255 + 0.055) / 1.055) ** 2.4)
     expected = 255 * (1.055 * (expected / 255) ** (1 / 2.4) - 0.055)
     with Rasteriser(backend) as rasteriser:
-        rgba = rasteriser.render([(sheet, EYE, False)], _front_rig(16), lighting=flat).rgba[0, 8, 8]
+        rgba = rasteriser.render([(square, EYE, False)], _front_rig(16), lighting=flat).rgba[0, 8, 8]
     np.testing.assert_allclose(rgba, [*expected, 255], atol=1.5)
 
 
@@ -336,9 +288,9 @@ def test_geometry_lies_on_the_mesh_to_a_hundredth_of_a_pixel():
 
 
 def test_geometry_looks_through_what_is_mostly_clear():
-    glass = _emissive(_sheet(0.9))
+    glass = _emissive(sheet(0.9))
     glass.visual.material.alphaMode = "BLEND"
-    wall, behind = _sheet(0.9), trimesh.transformations.translation_matrix([0, 0, -0.5])
+    wall, behind = sheet(0.9), trimesh.transformations.translation_matrix([0, 0, -0.5])
     with Rasteriser("embree") as rasteriser:
         for alpha, depth in ((100, 3.5), (200, 3.0)):
             glass.visual.material.baseColorFactor = [0, 0, 0, alpha]
@@ -351,25 +303,25 @@ def test_blank_and_impossible_objects_are_named(backend):
     away = trimesh.transformations.translation_matrix([50.0, 0, 0])
     empty = trimesh.Trimesh()
     broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], process=False)
-    untextured = _sheet(uv=False)
+    untextured = sheet(uv=False)
     untextured.visual = trimesh.visual.TextureVisuals(image=Image.new("RGB", (2, 2)))
     rig = _front_rig(8)
     with Rasteriser(backend) as rasteriser:
         for parts, message in (
-            ([(_sheet(), away, False)], "teapot: expected some of it to be visible in 1 views"),
+            ([(sheet(), away, False)], "teapot: expected some of it to be visible in 1 views"),
             ([], "teapot: expected at least one face, received 0 parts"),
             ([(empty, EYE, False)], "teapot: expected at least one face, received 1 parts"),
             ([(broken, EYE, False)], "teapot, part 0: expected finite vertices, received 1 faces"),
             (
-                [(_sheet(), EYE, False), ("cube", EYE, False)],
+                [(sheet(), EYE, False), ("cube", EYE, False)],
                 "teapot, part 1: expected a trimesh.Trimesh, received str",
             ),
-            ([(_sheet(), np.eye(3), False)], "teapot, part 0: expected a finite affine pose"),
+            ([(sheet(), np.eye(3), False)], "teapot, part 0: expected a finite affine pose"),
             ([(untextured, EYE, False)], "texture coordinates for its 4 textured vertices, received none"),
         ):
             with pytest.raises(RasteriseError, match=message):
                 rasteriser.render(parts, rig, name="teapot")
-        assert rasteriser.render([(_sheet(), EYE, False)], rig).rgba.any()
+        assert rasteriser.render([(sheet(), EYE, False)], rig).rgba.any()
 
 
 def test_wrong_arguments_say_what_was_received():
@@ -379,15 +331,15 @@ def test_wrong_arguments_say_what_was_received():
         Rasteriser("vulkan")
     rasteriser = Rasteriser("embree")
     with pytest.raises(ValueError, match="rgba, depth, normals, coordinates, mask, received rgb"):
-        rasteriser.render([(_sheet(), EYE, False)], _front_rig(8), channels=("rgb",))
+        rasteriser.render([(sheet(), EYE, False)], _front_rig(8), channels=("rgb",))
     rasteriser.close()
     with pytest.raises(ValueError, match="received one that was closed"):
-        rasteriser.render([(_sheet(), EYE, False)], _front_rig(8))
+        rasteriser.render([(sheet(), EYE, False)], _front_rig(8))
 
 
 def test_rasterisers_share_the_context_and_other_threads_are_refused():
     _skip_unless_working("pyrender-egl")
-    parts, rig = [(_sheet(), EYE, False)], _front_rig(8)
+    parts, rig = [(sheet(), EYE, False)], _front_rig(8)
     caught = []
 
     def elsewhere():
@@ -419,10 +371,10 @@ def test_unreferenced_bad_vertices_and_vanished_normals_do_no_harm():
 
 def test_metal_is_not_black_and_unset_metal_is_no_metal():
     def shade(**material):
-        sheet = _sheet(0.9)
-        sheet.visual.material = trimesh.visual.material.PBRMaterial(baseColorFactor=[128, 128, 128, 255], **material)
+        square = sheet(0.9)
+        square.visual.material = trimesh.visual.material.PBRMaterial(baseColorFactor=[128, 128, 128, 255], **material)
         with Rasteriser("embree") as rasteriser:
-            return int(rasteriser.render([(sheet, EYE, False)], _front_rig(8)).rgba[0, 4, 4, 0])
+            return int(rasteriser.render([(square, EYE, False)], _front_rig(8)).rgba[0, 4, 4, 0])
 
     assert shade() == shade(metallicFactor=0.0)
     assert shade(metallicFactor=1.0) > 0.8 * shade()
@@ -430,9 +382,9 @@ def test_metal_is_not_black_and_unset_metal_is_no_metal():
 
 def test_equal_textures_of_parts_share_their_texels():
     def part():
-        sheet = _sheet()
-        sheet.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), (9, 8, 7)))
-        return sheet, EYE, False
+        square = sheet()
+        square.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), (9, 8, 7)))
+        return square, EYE, False
 
     one, other = surfaces_of([part(), part()])
     assert one.texture is other.texture
