@@ -40,7 +40,7 @@ _FINE_EXTENSIONS = {
 _MODES = {0: "points", 1: "lines", 2: "lines", 3: "lines", 6: "triangle fans"}
 
 
-def check_gltf(data: bytes, folder: ModelFolder) -> list[str]:
+def check_gltf(data: bytes, folder: ModelFolder) -> tuple[list[str], set[str | None]]:
     """Check a file, its buffers and its textures.
 
     Args:
@@ -48,7 +48,8 @@ def check_gltf(data: bytes, folder: ModelFolder) -> list[str]:
         folder: Gives the other files of the model.
 
     Returns:
-        Warnings that name what will not be drawn as the file says.
+        Warnings that name what will not be drawn as the file says, and the names of materials whose base colour
+        texture is lost.
 
     Raises:
         MeshError: If the file was cut, is malformed, or needs what is not supported.
@@ -101,7 +102,7 @@ def _glb(data: bytes, folder: ModelFolder) -> tuple[Any, bytes | None]:
     return header, data[start + 8 : start + 8 + size]
 
 
-def _check(header: dict[str, Any], chunk: bytes | None, folder: ModelFolder) -> list[str]:
+def _check(header: dict[str, Any], chunk: bytes | None, folder: ModelFolder) -> tuple[list[str], set[str | None]]:
     warnings: list[str] = []
     used, required = set(header.get("extensionsUsed", [])), set(header.get("extensionsRequired", []))
     for name in sorted(used | required):
@@ -115,9 +116,9 @@ def _check(header: dict[str, Any], chunk: bytes | None, folder: ModelFolder) -> 
             warnings.append(f"{name}: drawn without it")
     buffers = _buffers(header, chunk, folder)
     _check_accessors(header, buffers, folder)
-    _check_textures(header, buffers, folder, warnings)
+    bare = _check_textures(header, buffers, folder, warnings)
     _check_primitives(header, warnings, folder)
-    return warnings
+    return warnings, bare
 
 
 def _buffers(header: dict[str, Any], chunk: bytes | None, folder: ModelFolder) -> list[bytes]:
@@ -135,7 +136,7 @@ def _buffers(header: dict[str, Any], chunk: bytes | None, folder: ModelFolder) -
     return found
 
 
-def _uri(uri: str, folder: ModelFolder, where: str) -> bytes | None:
+def _uri(uri: str, folder: ModelFolder, where: str, *, image: bool = False) -> bytes | None:
     if uri.startswith("data:"):
         _, _, text = uri.partition("base64,")
         try:
@@ -146,7 +147,7 @@ def _uri(uri: str, folder: ModelFolder, where: str) -> bytes | None:
     if scheme in ("http", "https", "ftp"):
         raise MeshError(f"{where}: expected a file beside the mesh, found {uri}; nothing is fetched from the network")
     try:
-        return folder.get(uri)
+        return folder.get_image(uri) if image else folder.read(uri)
     except FileNotFoundError:
         return None
 
@@ -177,7 +178,11 @@ def _check_accessors(header: dict[str, Any], buffers: list[bytes], folder: Model
             )
 
 
-def _check_textures(header: dict[str, Any], buffers: list[bytes], folder: ModelFolder, warnings: list[str]) -> None:
+def _check_textures(
+    header: dict[str, Any], buffers: list[bytes], folder: ModelFolder, warnings: list[str]
+) -> set[str | None]:
+    """Names of materials whose base colour texture is lost."""
+    bare: set[str | None] = set()
     lost: dict[int, str] = {}
     for index, image in enumerate(header.get("images", [])):
         name = image.get("uri") or image.get("name") or f"image {index}"
@@ -190,7 +195,7 @@ def _check_textures(header: dict[str, Any], buffers: list[bytes], folder: ModelF
             start = view.get("byteOffset", 0)
             data: bytes | None = buffers[view["buffer"]][start : start + view["byteLength"]]
         else:
-            data = _uri(image.get("uri", ""), folder, f"{folder.path}: {name}") if image.get("uri") else None
+            data = _uri(image["uri"], folder, f"{folder.path}: {name}", image=True) if image.get("uri") else None
         if data is None:
             lost[index] = f"{name} ({folder.lost.get(image.get('uri', ''), 'not found')})"
             continue
@@ -209,7 +214,10 @@ def _check_textures(header: dict[str, Any], buffers: list[bytes], folder: ModelF
             texture = textures[reference["index"]]
             source = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source", texture.get("source"))
             if source is None or source in lost:
-                warnings.append(f"{label}: drawn without its {slot} {lost.get(source, 'which has no image')}")
+                reason = "which has no image" if source is None else lost[source]
+                warnings.append(f"{label}: drawn without its {slot} {reason}")
+                if slot == "baseColorTexture":
+                    bare.add(material.get("name"))
             if slot == "baseColorTexture" and reference.get("texCoord", 0) != 0:
                 warnings.append(
                     f"{label}: its texture uses the coordinates TEXCOORD_{reference['texCoord']}; TEXCOORD_0 taken"
@@ -220,6 +228,8 @@ def _check_textures(header: dict[str, Any], buffers: list[bytes], folder: ModelF
                 for key, plain in (("offset", [0, 0]), ("rotation", 0), ("scale", [1, 1]))
             ):
                 warnings.append(f"{label}: KHR_texture_transform of its {slot} is not applied")
+
+    return bare
 
 
 def _slots(material: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:

@@ -210,10 +210,14 @@ def read_dae(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
         Its geometries, factors of materials as in the file (sRGB), and warnings.
 
     Raises:
-        MeshError: If it declares a document type, which COLLADA needs for nothing.
+        MeshError: If it declares a document type, which COLLADA needs for nothing, or a number is NaN.
     """
     if re.search(rb"<!\s*(DOCTYPE|ENTITY)", data, re.IGNORECASE):
         raise MeshError(f"{folder.path}: expected plain COLLADA, found a document type or entity; export it again")
+    arrays = re.findall(rb"<(?:\w+:)?float_array[^>]*>([^<]*)<", data)
+    unknown = sum(len(re.findall(rb"nan", array, re.IGNORECASE)) for array in arrays)
+    if unknown:  # pycollada would read them as 0
+        raise MeshError(f"{folder.path}: expected numbers, found {unknown} times NaN; repair or export it again")
     from trimesh.exchange.dae import load_collada
 
     loaded = load_collada(io.BytesIO(data), resolver=folder)

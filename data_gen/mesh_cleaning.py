@@ -38,7 +38,7 @@ def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, li
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) and not (0 <= faces.min() and faces.max() < len(vertices)):
         raise ValueError(f"{label}: expected faces on its {len(vertices)} vertices, found one on vertex {faces.max()}")
-    finite = np.isfinite(vertices).all(axis=1)[faces].all(axis=1)
+    finite = np.isfinite(vertices[faces]).all(axis=(1, 2))
     if not finite.all():
         warnings.append(
             f"{label}: {int((~finite).sum())} of {len(faces)} faces left out, on vertices that are not finite"
@@ -50,12 +50,13 @@ def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, li
     kept = kept[~flat]
     if not len(kept):
         return None, warnings
-    used, corners = np.unique(faces[kept], return_inverse=True)
-    result = _part(mesh, used, kept, corners.reshape(-1, 3), _normals(mesh, label, faces[kept], used, warnings))
-    if _inside_out(result):
+    kept_faces = faces[kept]
+    if _inside_out(vertices, kept_faces):
         warnings.append(f"{label}: wound inside out, its faces are turned")
-        result = _turned(result)
-    return result, warnings
+        kept_faces = kept_faces[:, ::-1]
+    used, corners = np.unique(kept_faces, return_inverse=True)
+    normals = _normals(mesh, label, kept_faces, used, warnings)
+    return _part(mesh, used, kept, corners.reshape(-1, 3), normals), warnings
 
 
 def shades_smoothly(mesh: trimesh.Trimesh) -> bool:
@@ -85,7 +86,7 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
         The parts with at most that many triangles, or None where textures or face colours forbid it.
     """
     import fast_simplification
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     simple = [_is_simple(part) for part in parts]
     fixed = sum(len(part.faces) for part, free in zip(parts, simple, strict=True) if not free)
@@ -105,7 +106,7 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
         )
         visual = part.visual.copy()
         if part.visual.kind == "vertex":
-            nearest = cKDTree(np.asarray(part.vertices)).query(points)[1]
+            nearest = KDTree(np.asarray(part.vertices)).query(points)[1]
             visual = ColorVisuals(vertex_colors=np.asarray(part.visual.vertex_colors)[nearest])
         small = trimesh.Trimesh(points, faces, visual=visual, process=False)
         small.metadata["smooth"] = shades_smoothly(part)
@@ -183,18 +184,12 @@ def _part(
     return result
 
 
-def _inside_out(mesh: trimesh.Trimesh) -> bool:
-    if len(mesh.faces) > _MOST_FACES_TO_CLOSE:
+def _inside_out(vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> bool:
+    """Whether the faces enclose a volume and are all wound inwards."""
+    if len(faces) > _MOST_FACES_TO_CLOSE:
         return False
-    corners = np.asarray(mesh.triangles) - mesh.vertices[0]
+    corners = vertices[faces] - vertices[faces[0, 0]]
     if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) >= 0:
         return False
-    closed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    closed = trimesh.Trimesh(vertices, faces, process=True)
     return bool(closed.is_watertight and closed.is_winding_consistent)
-
-
-def _turned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    keywords = {"vertex_normals": -mesh.vertex_normals} if "vertex_normals" in mesh._cache.cache else {}
-    turned = trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], visual=mesh.visual, process=False, **keywords)
-    turned.metadata.update(mesh.metadata)
-    return turned

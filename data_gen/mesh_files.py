@@ -17,7 +17,16 @@ from pathlib import Path, PurePosixPath
 import PIL.Image
 from trimesh.resolvers import Resolver
 
-__all__ = ["MAX_FILE_BYTES", "MAX_PIXELS", "MESH_SUFFIXES", "MeshError", "ModelFolder", "check_image", "read_bytes"]
+__all__ = [
+    "IMAGE_FORMATS",
+    "MAX_FILE_BYTES",
+    "MAX_PIXELS",
+    "MESH_SUFFIXES",
+    "MeshError",
+    "ModelFolder",
+    "check_image",
+    "read_bytes",
+]
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".dae")
 """Endings of mesh files, lower case, best first where a folder holds the same model twice."""
@@ -28,7 +37,9 @@ MAX_FILE_BYTES = 1 << 30
 MAX_PIXELS = 1 << 26
 """Pixels of all textures of a model that are decoded at most: one of 8192 x 8192."""
 
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tif", ".tiff", ".tga", ".webp", ".ppm", ".dds")
+IMAGE_FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "TGA", "WEBP", "PPM", "DDS", "JPEG2000")
+"""Formats of textures that are decoded, as pillow names them; none of them runs a program."""
+
 _MTL_OPTION = re.compile(
     r"^\s*-(?:(?:blendu|blendv|cc|clamp|imfchan|type|texres|boost|bm)\s+\S+|(?:o|s|t)(?:\s+[-+.\deE]+){1,3}"
     r"|mm\s+\S+\s+\S+)\s+"
@@ -83,7 +94,7 @@ def check_image(data: bytes, name: str, *, limit: int = MAX_PIXELS) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
-            with PIL.Image.open(io.BytesIO(data)) as image:
+            with PIL.Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
                 pixels = image.width * image.height
                 if pixels > limit:
                     raise MeshError(
@@ -95,6 +106,8 @@ def check_image(data: bytes, name: str, *, limit: int = MAX_PIXELS) -> int:
         raise
     except PIL.Image.DecompressionBombError as error:
         raise MeshError(f"{name}: expected at most {limit} pixels, found a decompression bomb: {error}") from error
+    except PIL.UnidentifiedImageError as error:
+        raise ValueError("not a whole image of a known format") from error
     except Exception as error:
         raise ValueError(f"not a whole image ({_one_line(error) or type(error).__name__})") from error
     return pixels
@@ -112,6 +125,8 @@ class ModelFolder(Resolver):
         root: The folder that nothing may leave; the mesh file's own by default.
         pixels: Pixels that all textures together may have.
 
+    A file that is not there, and a texture that cannot be decoded, is a FileNotFoundError and noted in ``lost``.
+
     Attributes:
         lost: Why each name that was asked for could not be given, by name.
         notes: What a user should know about names that could be given.
@@ -128,9 +143,22 @@ class ModelFolder(Resolver):
         self.refused: MeshError | None = None
         self.file_name = path.name
         self._bytes: dict[Path, bytes] = {}
+        self._images: set[Path] = set()
 
     def get(self, name: str) -> bytes:
-        """Read a file of the model.
+        """Give a file to a loader: one that was read before, or a texture.
+
+        Args:
+            name: How the mesh refers to it.
+
+        Returns:
+            Its content.
+        """
+        found = self._find(name)
+        return self._bytes[found] if found in self._bytes else self.get_image(name)
+
+    def read(self, name: str) -> bytes:
+        """Read a file of the model that is no texture.
 
         Args:
             name: How the mesh refers to it.
@@ -139,23 +167,46 @@ class ModelFolder(Resolver):
             Its content.
 
         Raises:
-            FileNotFoundError: If there is no such file, or it is an image that cannot be decoded; noted in ``lost``.
+            FileNotFoundError: If there is no such file, or it is empty; noted in ``lost``.
             MeshError: If it lies outside the model's folder or is too large; noted in ``refused``.
         """
+        found = self._find(name)
         try:
-            found = self.locate(name)
-            if found is None:
-                self.lost.setdefault(name, "not found")
-                raise FileNotFoundError(name)
             if found not in self._bytes:
-                data = read_bytes(found)
-                if found.suffix.lower() in _IMAGE_SUFFIXES:
-                    self.spend_pixels(data, name)
-                self._bytes[found] = data
-            return self._bytes[found]
+                if found.stat().st_size == 0:
+                    self.lost.setdefault(name, "an empty file")
+                    raise FileNotFoundError(name)
+                self._bytes[found] = read_bytes(found)
         except MeshError as error:
             self.refused = self.refused or error
             raise
+        return self._bytes[found]
+
+    def get_image(self, name: str) -> bytes:
+        """Read a texture of the model, which is decoded once to see that it is whole.
+
+        Args:
+            name: How the mesh refers to it.
+
+        Returns:
+            Its content.
+        """
+        found = self._find(name)
+        if found not in self._images:
+            self.spend_pixels(self.read(name), name)
+            self._images.add(found)
+        return self._bytes[found]
+
+    def _find(self, name: str) -> Path:
+        try:
+            found = self.locate(name)
+        except MeshError as error:
+            self.refused = self.refused or error
+            raise
+        if found is None:
+            self.lost.setdefault(name, "not found")
+            raise FileNotFoundError(name)
+        return found
 
     def spend_pixels(self, data: bytes, name: str) -> None:
         """Check a texture and count its pixels.

@@ -15,6 +15,8 @@ import trimesh
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 
+from data_gen.mesh_files import IMAGE_FORMATS
+
 __all__ = ["DEFAULT_COLOUR", "ColourSpace", "canonical_visual", "linear_from_srgb", "srgb_from_linear"]
 
 ColourSpace = Literal["scene", "gltf", "srgb"]
@@ -212,11 +214,18 @@ def _shared(image: PIL.Image.Image | None, mode: str, images: dict[Any, Any]) ->
         return None
     key = (id(image), mode)
     if key not in images:
-        images[key] = (_plain(image, mode), image)
+        images[key] = (_plain(image, mode), image)  # the source too: its id must not be given to another
     return images[key][0]
 
 
-def _plain(image: PIL.Image.Image, mode: str) -> PIL.Image.Image:
+def _plain(image: PIL.Image.Image, mode: str) -> PIL.Image.Image | None:
+    """The image converted; None for one that cannot be decoded, of which the reader of the file has warned."""
+    if image.format not in (None, *IMAGE_FORMATS):
+        return None
+    try:
+        image.load()
+    except (OSError, SyntaxError, ValueError):
+        return None
     if image.mode.startswith(("I", "F")):
         top = 65535.0 if image.mode.startswith("I") else 1.0
         image = PIL.Image.fromarray(np.clip(np.asarray(image) / top * 255.0, 0, 255).astype(np.uint8))

@@ -25,7 +25,7 @@ from data_gen.mesh_checks import check_stl, declared_up, read_dae, read_off, rea
 from data_gen.mesh_cleaning import clean, decimate, shades_smoothly
 from data_gen.mesh_files import MESH_SUFFIXES, MeshError, ModelFolder, read_bytes
 from data_gen.mesh_folders import MeshFile, find_meshes, safe_name
-from data_gen.mesh_surfaces import ColourSpace, canonical_visual
+from data_gen.mesh_surfaces import DEFAULT_COLOUR, ColourSpace, canonical_visual
 from data_gen.obj_files import read_obj
 from data_gen.shapenet import model_root
 
@@ -168,7 +168,8 @@ def prepare_scene(
     source = source or name
     found = list(warnings)
     _refuse_too_many(scene, max_faces, source)
-    parts = _parts(scene, colours, found, source)
+    with np.errstate(all="ignore"):
+        parts = _parts(scene, colours, found, source)
     if not parts:
         raise MeshError(f"{source}: expected triangles to draw, found none; {'; '.join(found) or 'export it again'}")
     faces = sum(len(part.faces) for part in parts)
@@ -229,10 +230,22 @@ def _read(data: bytes, suffix: str, folder: ModelFolder) -> tuple[trimesh.Scene,
     if suffix == ".dae":
         scene, lines = read_dae(data, folder)
         return scene, "srgb", lines
-    lines = check_stl(data, folder) if suffix == ".stl" else check_gltf(data, folder)
+    lines, bare = (check_stl(data, folder), set()) if suffix == ".stl" else check_gltf(data, folder)
     scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
+    _grey_out(scene, bare)
     painted_as_seen = suffix == ".stl" or "trimesh" in generator_of(data)
     return scene, "scene" if painted_as_seen else "gltf", lines
+
+
+def _grey_out(scene: trimesh.Scene, names: set[str | None]) -> None:
+    """Give white materials that lost their texture the default colour: white on white would be lost to the eye too."""
+    for geometry in scene.geometry.values():
+        material = getattr(getattr(geometry, "visual", None), "material", None)
+        if material is None or material.name not in names or getattr(material, "baseColorTexture", None) is not None:
+            continue
+        factor = material.baseColorFactor
+        if factor is None or (np.asarray(factor)[:3] == 255).all():
+            material.baseColorFactor = DEFAULT_COLOUR
 
 
 @contextlib.contextmanager

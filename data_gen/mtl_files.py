@@ -46,7 +46,7 @@ def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str
         names = [line] if whole or len(line.split()) < 2 else line.split()
         for name in names:
             try:
-                text = decoded(folder.get(name))
+                text = decoded(folder.read(name))
             except FileNotFoundError:
                 continue
             for values in _statements(text, name, warnings):
@@ -115,7 +115,7 @@ def _texture(values: dict[str, Any], label: str, folder: ModelFolder, warnings: 
     if not name:
         return None
     try:
-        image = PIL.Image.open(io.BytesIO(folder.get(name)))
+        image = PIL.Image.open(io.BytesIO(folder.get_image(name)))
         image.load()
     except FileNotFoundError:
         warnings.append(f"{label}: drawn without its texture {name} ({folder.lost.get(name, 'not found')})")
