@@ -55,7 +55,7 @@ def ball_hit(origin, direction, centre, radius):
 def soft_ball(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """A smooth field: a ball of radius about a half that fades out, coloured by place and direction."""
     colour = 0.5 + 0.25 * torch.sin(3 * points) + 0.2 * directions
-    return colour.clamp(0, 1), 12 * torch.sigmoid((0.5 - points.norm(dim=-1)) * 12)
+    return colour.clamp(0, 1), 12 * torch.sigmoid((0.5 - points.norm(dim=-1)) * 20)
 
 
 def some_rays(count: int, *, seed: int = 0, dtype: torch.dtype = torch.float64) -> Rays:

@@ -1,0 +1,268 @@
+import math
+
+import pytest
+import torch
+
+from hyperplanes.geometry.cameras import pinhole, symmetric_intrinsics
+from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
+from hyperplanes.rendering import Hierarchical, Marched, march, render, render_in_chunks
+from tests.reference_rendering import ball_hit, composite_ray, ring, soft_ball, some_rays
+
+DOUBLE = torch.float64
+GRID = full(Sphere(), 8)
+PROTOCOLS = [Hierarchical(16, 0), Hierarchical(16, 32), Marched(64)]
+
+
+def fog(sigma):
+    """A field of one density and colour (0.2, 0.4, 0.6) everywhere."""
+
+    def field(points, directions):
+        return points.new_tensor([0.2, 0.4, 0.6]).expand(len(points), 3), points.new_full((len(points),), sigma)
+
+    return field
+
+
+def clipped(cameras, bounds=None):
+    height, width = int(cameras.height[0]), int(cameras.width[0])
+    views = cameras.batch_size
+    view = torch.arange(views).repeat_interleave(height * width)
+    return cast(cameras, view, pixel_grid(height, width).repeat(views, 1), bounds)
+
+
+@pytest.mark.parametrize("sampling", PROTOCOLS)
+@torch.no_grad()
+def test_fog_in_a_sphere_in_closed_form(sampling):
+    sigma, bounds = 0.7, Sphere((0.2, -0.1, 0.3), 0.8)
+    rays = clipped(ring(2, (9, 7)), bounds)
+    seen = render(fog(sigma), rays, sampling, occupancy=full(bounds, 8))
+    # Marched counts whole steps: the length is off by at most half a step of 2 r / 64
+    slack = sigma * bounds.radius / 64 if isinstance(sampling, Marched) else 0
+    assert (rays.far > rays.near).any()
+    assert (rays.far == rays.near).any()
+    for ray in range(len(rays)):
+        length = ball_hit(rays.origins[ray].tolist(), rays.directions[ray].tolist(), bounds.centre, bounds.radius)
+        opacity = 1 - math.exp(-sigma * length)
+        assert seen.opacity[ray].item() == pytest.approx(opacity, abs=2e-5 + slack)
+        expected = [opacity * c + 1 - opacity for c in (0.2, 0.4, 0.6)]
+        assert seen.colour[ray].tolist() == pytest.approx(expected, abs=2e-5 + slack)
+
+
+@torch.no_grad()
+def test_marched_equals_the_loop_over_its_samples():
+    grid = Occupancy(torch.rand(6, 6, 6, generator=torch.Generator().manual_seed(0)) < 0.4, Sphere())
+    rays = some_rays(30)
+    seen = render(soft_ball, rays, Marched(50, 1e-12), occupancy=grid, background=0.2)
+    samples = march(rays, grid, 2 / 50)
+    for index in range(len(rays)):
+        t = samples.middles[samples.ray == index]
+        direction = rays.directions[index].expand(len(t), 3)
+        colour, density = soft_ball(rays.origins[index] + t[:, None] * direction, direction)
+        thickness = [0.0, *(density * 2 / 50).cumsum(0).tolist()]  # the gaps between live voxels let everything pass
+        expected = composite_ray(colour.tolist(), [1.0] * len(t), thickness, 0.2)
+        assert seen.colour[index].tolist() == pytest.approx(expected[0], abs=1e-9)
+        assert seen.opacity[index].item() == pytest.approx(expected[1], abs=1e-9)
+
+
+@torch.no_grad()
+def test_marched_converges_to_hierarchical():
+    rays = some_rays(60)
+    truth = render(soft_ball, rays, Hierarchical(400, 0))
+    errors = []
+    for steps in (24, 96, 384):
+        seen = render(soft_ball, rays, Marched(steps, 1e-9), occupancy=GRID)
+        errors.append((seen.colour - truth.colour).abs().max().item())
+    # the midpoint rule: four times the steps, at least four times nearer
+    assert errors[1] < errors[0] / 4
+    assert errors[2] < 1e-4
+    seen = render(soft_ball, rays, Marched(384, 1e-9), occupancy=GRID)
+    thick = truth.opacity > 0.05
+    assert (seen.depth - truth.depth)[thick].abs().max() < 1e-3
+
+
+@torch.no_grad()
+def test_fine_samples_bring_the_coarse_picture_nearer():
+    rays = some_rays(60)
+    truth = render(soft_ball, rays, Hierarchical(400, 0)).colour
+    seen = render(soft_ball, rays, Hierarchical(12, 40))
+    assert (seen.colour - truth).abs().mean() < 0.3 * (seen.coarse - truth).abs().mean()
+
+
+@pytest.mark.parametrize("stop", [0.2, 1e-2, 1e-3])
+@torch.no_grad()
+def test_stopping_changes_a_colour_by_less_than_the_threshold(stop):
+    rays = some_rays(100)
+    whole = render(soft_ball, rays, Marched(64, 1e-12), occupancy=GRID)
+    stopped = render(soft_ball, rays, Marched(64, stop), occupancy=GRID)
+    assert (stopped.colour - whole.colour).abs().max() < stop
+    assert (stopped.opacity - whole.opacity).abs().max() < stop
+    assert stopped.samples < whole.samples
+
+
+def test_the_picture_is_the_same_with_and_without_gradients():
+    rays = some_rays(50)
+    with_gradients = render(soft_ball, rays, Marched(64, 1e-9), occupancy=GRID)
+    with torch.no_grad():
+        without = render(soft_ball, rays, Marched(64, 1e-9), occupancy=GRID)
+    torch.testing.assert_close(with_gradients.colour, without.colour, atol=1e-8, rtol=0)
+    torch.testing.assert_close(with_gradients.depth, without.depth, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("sampling", PROTOCOLS)
+def test_chunks_make_the_same_picture(sampling):
+    rays = some_rays(37, dtype=torch.float32)
+    whole = render_in_chunks(soft_ball, rays, sampling, chunk=1000, occupancy=GRID)
+    for chunk in (1, 10, 37):
+        parts = render_in_chunks(soft_ball, rays, sampling, chunk=chunk, occupancy=GRID)
+        torch.testing.assert_close(parts.colour, whole.colour, atol=1e-6, rtol=0)
+        torch.testing.assert_close(parts.opacity, whole.opacity, atol=1e-6, rtol=0)
+        torch.testing.assert_close(parts.depth, whole.depth, atol=1e-4, rtol=0)
+        assert parts.samples == whole.samples
+    assert not whole.colour.requires_grad
+
+
+@pytest.mark.parametrize("sampling", PROTOCOLS)
+@torch.no_grad()
+def test_a_ray_sees_the_same_in_any_company(sampling):
+    rays = some_rays(20)
+    together = render(soft_ball, rays, sampling, occupancy=GRID).colour
+    order = torch.randperm(20, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(render(soft_ball, rays[order], sampling, occupancy=GRID).colour, together[order])
+
+
+@pytest.mark.parametrize("sampling", PROTOCOLS)
+def test_randomness_comes_from_the_generator_alone(sampling):
+    rays = some_rays(8)
+
+    def pixels(seed):
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        return render(soft_ball, rays, sampling, occupancy=GRID, generator=generator).colour
+
+    before = torch.random.get_rng_state()
+    assert torch.equal(pixels(1), pixels(1))
+    assert torch.equal(pixels(None), pixels(None))
+    assert not torch.equal(pixels(1), pixels(2))
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_the_paper_asks_the_field_at_64_and_192_samples_a_ray():
+    asked = []
+
+    def counting(points, directions):
+        asked.append(len(points))
+        return soft_ball(points, directions)
+
+    seen = render(counting, some_rays(5), Hierarchical())
+    assert sum(asked) == seen.samples == 5 * (64 + 64 + 128)
+
+
+def test_fields_are_asked_with_unit_directions_and_points_on_their_rays():
+    rays = some_rays(6)
+
+    def field(points, directions):
+        torch.testing.assert_close(directions.norm(dim=-1), torch.ones(len(directions), dtype=DOUBLE))
+        ray = torch.cdist(directions, rays.directions).argmin(1)
+        offset = points - rays.origins[ray]
+        assert torch.linalg.cross(offset, directions).norm(dim=-1).max() < 1e-9
+        return soft_ball(points, directions)
+
+    for sampling in PROTOCOLS:
+        render(field, rays, sampling, occupancy=GRID)
+
+
+def test_the_proposal_draws_the_coarse_picture_and_learns_from_it():
+    coarse = torch.tensor(0.3, dtype=DOUBLE, requires_grad=True)
+    fine = torch.tensor(0.6, dtype=DOUBLE, requires_grad=True)
+
+    def of(level):
+        return lambda points, directions: (level.expand(len(points), 3), soft_ball(points, directions)[1])
+
+    seen = render(of(fine), some_rays(9), Hierarchical(8, 16), proposal=of(coarse))
+    own, _ = torch.autograd.grad(seen.colour.sum(), (fine, coarse), allow_unused=True, retain_graph=True)
+    assert own > 0
+    assert torch.autograd.grad(seen.colour.sum(), coarse, allow_unused=True, retain_graph=True)[0] is None
+    assert torch.autograd.grad(seen.coarse.sum(), coarse)[0] > 0
+
+
+@pytest.mark.parametrize("background", [0.0, 0.4, 1.0])
+def test_rays_that_meet_nothing_are_background(background):
+    empty = Occupancy(torch.zeros(4, 4, 4, dtype=torch.bool), Sphere())
+    for context in (torch.no_grad, torch.enable_grad):
+        with context():
+            seen = render(soft_ball, some_rays(3), Marched(), occupancy=empty, background=background)
+            assert (seen.colour == background).all()
+            assert (seen.opacity == 0).all()
+            assert (seen.depth == 0).all()
+            assert seen.samples == 0
+    seen = render(fog(0.0), some_rays(3), Hierarchical(8, 8), background=background)
+    torch.testing.assert_close(seen.colour, torch.full((3, 3), background, dtype=DOUBLE))
+
+
+def test_no_rays_make_no_pixels():
+    for sampling in PROTOCOLS:
+        assert render(soft_ball, some_rays(4)[:0], sampling, occupancy=GRID).colour.shape == (0, 3)
+
+
+def test_marched_needs_an_occupancy():
+    with pytest.raises(ValueError, match="occupancy: expected an Occupancy .* got None"):
+        render(soft_ball, some_rays(2), Marched())
+
+
+def parametric(weight, bias):
+    """A small smooth network as a field of its parameters."""
+
+    def field(points, directions):
+        hidden = torch.tanh(torch.cat([points, directions], 1) @ weight + bias)
+        density = torch.nn.functional.softplus(3 * torch.tanh(points @ weight[:3] + bias)[:, 0])
+        return torch.sigmoid(hidden[:, :3]), density
+
+    return field
+
+
+@pytest.mark.parametrize("sampling", [Hierarchical(5, 0), Hierarchical(4, 3), Marched(6)])
+def test_gradients_of_parameters(sampling):
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.randn(6, 4, generator=generator, dtype=DOUBLE, requires_grad=True)
+    bias = torch.randn(4, generator=generator, dtype=DOUBLE, requires_grad=True)
+
+    def pixels(weight, bias):
+        # a proposal of its own: where the fine samples lie is no function of these parameters
+        seen = render(parametric(weight, bias), some_rays(3), sampling, occupancy=GRID, proposal=soft_ball)
+        return seen.colour, seen.opacity, seen.depth
+
+    assert torch.autograd.gradcheck(pixels, (weight, bias))
+
+
+@pytest.mark.parametrize("sampling", [Hierarchical(5, 0), Marched(6)])
+def test_gradients_of_rays(sampling):
+    rays = some_rays(3)
+    generator = torch.Generator().manual_seed(1)
+    field = parametric(*(torch.randn(s, generator=generator, dtype=DOUBLE) for s in ((6, 4), (4,))))
+
+    def pixels(origins, directions):
+        seen = render(field, Rays(origins, directions, rays.near, rays.far), sampling, occupancy=GRID)
+        return seen.colour, seen.opacity, seen.depth
+
+    inputs = (rays.origins.clone().requires_grad_(), rays.directions.clone().requires_grad_())
+    assert torch.autograd.gradcheck(pixels, inputs)
+
+
+def test_gradients_of_cameras():
+    generator = torch.Generator().manual_seed(2)
+    field = parametric(*(torch.randn(s, generator=generator, dtype=DOUBLE) for s in ((6, 4), (4,))))
+    matrix = symmetric_intrinsics(2, 3, 0.7).double()
+    straight = torch.eye(4, dtype=DOUBLE)
+    straight[2, 3] = 3.0
+
+    def pixels(turn, shift, focal):
+        cross = torch.linalg.cross(turn.expand(3, 3), torch.eye(3, dtype=DOUBLE)).T
+        pose = torch.eye(4, dtype=DOUBLE)
+        pose = torch.cat([torch.cat([torch.matrix_exp(cross), shift[:, None]], 1), pose[3:]])
+        scale = torch.stack([focal, focal, torch.ones_like(focal)])
+        cameras = pinhole(matrix * scale[:, None], (pose @ straight)[None], 2, 3)
+        rays = cast(cameras, torch.zeros(6, dtype=torch.long), pixel_grid(2, 3), span="depth")
+        return render(field, rays, Hierarchical(5, 0)).colour
+
+    turn, shift = torch.full((3,), 0.1, dtype=DOUBLE), torch.full((3,), 0.05, dtype=DOUBLE)
+    inputs = (turn, shift, torch.tensor(1.1, dtype=DOUBLE))
+    assert torch.autograd.gradcheck(pixels, tuple(value.requires_grad_() for value in inputs))
