@@ -98,7 +98,7 @@ class HyperNetwork(nn.Module):
         seen = directions if self.config.see_directions else torch.zeros_like(directions)
         weights = torch.cat([theta[name].flatten() for name in self.shapes])
         weights = self.weights_code(weights if self.config.see_weights else torch.zeros_like(weights))
-        value = relu(torch.cat([codes.flatten(), seen.flatten(), weights]))[None]
+        value = torch.cat([relu(codes).flatten(), seen.flatten(), relu(weights)])[None]
         for layer in self.head:
             value = relu(layer(value))
         return Parameters(
