@@ -1,0 +1,123 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.hypernetwork import HyperNetwork, HyperNetworkConfig
+
+CONFIG = HyperNetworkConfig(views=3, normalisation="group", code=8, depth=2, width=16)
+SHAPES = {
+    "fine.layers.0.weight": torch.Size([6, 4]),
+    "fine.layers.0.bias": torch.Size([6]),
+    "fine.density.weight": torch.Size([1, 6]),
+    "fine.density.bias": torch.Size([1]),
+    "fine.colour.weight": torch.Size([3, 5]),
+    "fine.colour.bias": torch.Size([3]),
+}
+
+
+def make(config=CONFIG, *, awake=True):
+    torch.manual_seed(0)
+    network = HyperNetwork(config, SHAPES)
+    if awake:  # the outputs start at zero; here they are to say something
+        for output in network.outputs:
+            torch.nn.init.normal_(output.weight)
+    return network.eval()
+
+
+def inputs(seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    images = torch.rand(3, 3, 16, 16, generator=generator)
+    directions = torch.randn(3, 3, generator=generator)
+    theta = {name: torch.randn(shape, generator=generator) for name, shape in SHAPES.items()}
+    return images, directions / directions.norm(dim=1, keepdim=True), theta
+
+
+def differs(one, other):
+    return any((one[name] - other[name]).abs().max() > 1e-6 for name in one)
+
+
+def test_an_untrained_hypernetwork_changes_nothing():
+    update = make(awake=False)(*inputs())
+    assert all((change == 0).all() for change in update.values())
+
+
+def test_the_update_has_the_names_and_shapes_of_the_chosen_layers():
+    update = make()(*inputs())
+    assert {name: value.shape for name, value in update.items()} == {
+        name: shape for name, shape in SHAPES.items() if "layers" not in name
+    }
+    other = make(replace(CONFIG, layers=("0",)))(*inputs())
+    assert set(other) == {"fine.layers.0.weight", "fine.layers.0.bias"}
+
+
+@torch.no_grad()
+def test_every_input_is_seen():
+    network, (images, directions, theta) = make(), inputs()
+    update = network(images, directions, theta)
+    for view in range(3):
+        changed = images.clone()
+        changed[view] *= 0.5
+        assert differs(update, network(changed, directions, theta))
+    for name in update:
+        assert differs(update, network(images, directions, {**theta, name: theta[name] + 1}))
+    assert differs(update, network(images.flip(0), directions, theta))
+
+
+@pytest.mark.parametrize("view", range(3))
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@torch.no_grad()
+def test_viewing_directions_are_seen_on_both_sides_of_zero(view, axis, sign):
+    network, (images, directions, theta) = make(), inputs()
+    directions[view, axis] = 0.3 * sign
+    changed = directions.clone()
+    changed[view, axis] = 0.6 * sign
+    assert differs(network(images, directions, theta), network(images, changed, theta))
+
+
+@torch.no_grad()
+def test_directions_and_weights_can_be_left_out():
+    images, directions, theta = inputs()
+    other = {name: value + 1 for name, value in theta.items()}
+    blind = make(replace(CONFIG, see_directions=False))
+    assert not differs(blind(images, directions, theta), blind(images, -directions, theta))
+    assert differs(blind(images, directions, theta), blind(images, directions, other))
+    unweighted = make(replace(CONFIG, see_weights=False))
+    assert not differs(unweighted(images, directions, theta), unweighted(images, directions, other))
+
+
+@torch.no_grad()
+def test_gain_multiplies_the_update():
+    one, three = make()(*inputs()), make(replace(CONFIG, gain=3.0))(*inputs())
+    for name in one:
+        torch.testing.assert_close(three[name], 3 * one[name])
+
+
+@pytest.mark.parametrize("depth", [1, 3, 10])
+def test_the_head_has_the_depth_and_width_of_its_configuration(depth):
+    head = make(replace(CONFIG, depth=depth, width=20)).head
+    assert [layer.out_features for layer in head] == [20] * depth
+    # three images of code 8 with a direction each, and the code of theta
+    assert head[0].in_features == 3 * (8 + 3) + 8
+
+
+def test_gradients_reach_the_hypernetwork_the_images_and_theta():
+    network, (images, directions, theta) = make().train(), inputs()
+    theta = {name: value.requires_grad_() for name, value in theta.items()}
+    update = network(images.requires_grad_(), directions.requires_grad_(), theta)
+    sum(change.square().sum() for change in update.values()).backward()
+    assert all(value.grad.abs().sum() > 0 for value in network.parameters())
+    assert images.grad.abs().sum() > 0
+    assert directions.grad.abs().sum() > 0
+    assert all((theta[name].grad is not None) == (name in update) for name in theta)
+
+
+def test_wrong_shapes_of_the_network_are_refused():
+    with pytest.raises(ValueError, match=r"layers: expected some of \['0', 'colour', 'density'\], got \['sigma'\]"):
+        make(replace(CONFIG, layers=("sigma",)))
+    with pytest.raises(ValueError, match=r"encoder: expected one of \['convnet', 'resnet101'\], got 'vgg'"):
+        make(replace(CONFIG, encoder="vgg"))
+    images, directions, theta = inputs()
+    with pytest.raises(ValueError, match="HyperPlanes: expected 3 images and directions, got 2 and 2"):
+        make()(images[:2], directions[:2], theta)
