@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from data_gen.shapes.car_frame import Frame
-from data_gen.shapes.materials import Colour, plain, tint
+from data_gen.shapes.materials import Colour, Material, plain, shade, tint
 from data_gen.shapes.parts import Part
-from data_gen.shapes.solids import loft
+from data_gen.shapes.solids import Solid, loft
 
 __all__ = ["body"]
 
@@ -79,21 +79,52 @@ def _pillars(frame: Frame) -> list[float]:
     return [0.62 * front + 0.38 * rear, 0.22 * front + 0.78 * rear]
 
 
+def _flank(rng: np.random.Generator, frame: Frame, paint: Colour, pillars: list[float], solid: Solid) -> Material:
+    """The painted sides, seen along x over the body's bounds: door gaps, a dark sill, a moulding, some with a decal."""
+    (_, low, back), (_, high, front) = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+    row, column = np.mgrid[0:80, 0:224]
+    z, y = back + (column + 0.5) / 224 * (front - back), high - (row + 0.5) / 80 * (high - low)
+    image = np.tile(np.array(paint, dtype=np.uint8), (80, 224, 1))
+    sill, dark = frame.floor + 0.07, shade(paint, 0.45)
+    image[y < sill + 0.05] = shade(paint, 0.7)
+    contrast: Colour = (226, 222, 208) if sum(paint) < 400 else (40, 42, 50)
+    choice = rng.random()
+    middle = (sill + frame.belt) / 2
+    _, rear, roof_front, cowl = frame.glass
+    if choice < 0.16:
+        image[np.abs(y - middle - 0.05 * (z / frame.length)) < 0.045] = contrast
+    elif choice < 0.28 and frame.style in ("sports", "coupe", "hatchback"):
+        centre = 0.5 * (pillars[0] + cowl)
+        image[np.hypot(z - centre, y - middle) < 0.2] = contrast
+        image[np.hypot(z - centre, y - middle) < 0.13] = shade(contrast, 0.45)
+    elif choice < 0.5 and frame.style == "van":
+        image[(np.abs(z - 0.5 * (rear + pillars[0])) < 0.9) & (np.abs(y - middle) < 0.17)] = contrast
+    elif choice < 0.6:
+        image[np.abs(y - middle) < 0.022] = (150, 152, 158)
+    seams = [0.8 * cowl + 0.2 * roof_front, pillars[0]]
+    if frame.style not in ("coupe", "sports", "pickup"):
+        seams.append(max(pillars[-1], frame.axles[0] + 1.2 * frame.wheel) if len(pillars) > 1 else rear)
+    for seam in seams:
+        image[(np.abs(z - seam) < 0.014) & (y > sill)] = dark
+    image[(np.abs(y - sill - 0.05) < 0.012) & (z > min(seams)) & (z < max(seams))] = dark
+    return Material("flank", image)
+
+
 def body(rng: np.random.Generator, frame: Frame, paint: Colour) -> Part:
     """The shell with its glass, trim and wheel wells."""
     pillars = _pillars(frame)
     stations = _stations(frame, pillars)
-    solid = loft(_sections(frame, stations), stations).creased(28)
+    solid = loft(_sections(frame, stations), stations).projected("x").creased(28)
     middle = (stations[1:] + stations[:-1]) / 2
     along, around = solid.cells.T
     z = np.where(along >= 0, middle[along], -9.0)
-    strip = np.where(
-        around <= 9, around, 18 - around
-    )  # 0, 1 wheel well; 2, 3 flank; 4, 5 shoulder; 6 glass; 7 rail; 8, 9 top
+    # strips of either side: 0, 1 wheel well; 2, 3 flank; 4, 5 shoulder; 6 glass; 7 rail; 8, 9 top
+    strip = np.where(around <= 9, around, 18 - around)
     side = along >= 0
     part = Part.of("body", solid, plain(paint, "paint"))
     dark = plain((38, 38, 42), "underbody")
     part = part.painted(side & (strip <= 1), dark)
+    part = part.painted(side & (strip >= 2) & (strip <= 5), _flank(rng, frame, paint, pillars, solid))
     tail, rear, front, cowl = frame.glass
     post = np.min([np.abs(z - p) for p in pillars], axis=0) < 0.04
     cargo = frame.style == "van" and rng.random() < 0.5

@@ -37,6 +37,7 @@ def _frame(rng: np.random.Generator) -> Frame:
         round_seat = bool(back_height == 0 and rng.random() < 0.7)
     elif kind == "dining" and rng.random() < 0.06:
         back_height, round_seat = 0.0, True
+        width = depth = rng.uniform(0.31, 0.37)
     return Frame(kind, width, depth, seat, thick, float(back_height), lean, round_seat)
 
 

@@ -53,7 +53,7 @@ def _table(rng: np.random.Generator) -> list[Part]:
     height = rng.uniform(0.2, 0.36)
     radius = rng.uniform(0.07, 0.13)
     style = draw_shade(rng, rng.uniform(0.14, 0.2), rng.uniform(0.16, 0.25), _CLOTH)
-    if rng.random() < 0.12:  # a globe straight on a foot
+    if rng.random() < 0.08:  # a globe straight on a foot
         size = rng.uniform(0.11, 0.15)
         globe = ball(size, size, size, 20, 12).moved(0, 0.05 + 0.93 * size)
         collar = cylinder(0.5 * size, 0.07, 16).moved(0, 0.05)

@@ -84,7 +84,7 @@ def fighter(rng: np.random.Generator) -> list[Part]:
     body = fuselage(length, width, height, shape, 2.6, 16)
     radome = plain((70, 72, 78), "radome")
     parts = [Part.of("fuselage", body, main).painted(body.cells[:, 0] >= 6, radome)]
-    canopy = ball(0.23 * width, 0.42 * height, 0.105 * length, 12, 8).moved(0, 0.36 * height, 0.24 * length)
+    canopy = ball(0.22 * width, 0.36 * height, 0.105 * length, 12, 8).moved(0, 0.33 * height, 0.24 * length)
     parts.append(Part.of("canopy", canopy, plain((56, 60, 64) if rng.random() < 0.6 else (132, 104, 52), "glass")))
     intake = fuselage(
         0.36 * length, 0.34 * width, 0.62 * height, ((0, 0.4, 0.5, 0), (0.25, 0.9, 0.9, 0), (1, 1, 1, 0)), 5, 12

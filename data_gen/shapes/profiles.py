@@ -94,8 +94,16 @@ def _cross(o: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (a[..., 0] - o[..., 0]) * (b[..., 1] - o[..., 1]) - (a[..., 1] - o[..., 1]) * (b[..., 0] - o[..., 0])
 
 
+def _strip(count: int) -> np.ndarray:
+    """Zigzag triangles (count - 2, 3) across a convex polygon."""
+    steps = np.arange(count - 2)
+    low, high = (steps + 1) // 2, count - 1 - steps // 2
+    third = np.where(steps % 2 == 0, low + 1, high - 1)
+    return np.stack([low, third, high], 1)
+
+
 def triangulate(corners: np.ndarray) -> np.ndarray:
-    """Cut a simple counter-clockwise polygon into triangles by clipping ears.
+    """Cut a simple counter-clockwise polygon into triangles: a zigzag if it is convex, by clipping ears otherwise.
 
     Args:
         corners: Polygon (n, 2), not self-intersecting, convex or not.
@@ -106,6 +114,11 @@ def triangulate(corners: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: If no ear is left although more than three corners remain, so the outline crosses itself.
     """
+    turns = _cross(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0))
+    edges = np.roll(corners, -1, axis=0) - corners
+    turned = np.arctan2(turns, (edges * np.roll(edges, 1, axis=0)).sum(axis=1)).sum()
+    if (turns > 1e-9 * np.abs(turns).max()).all() and turned < 3 * np.pi:
+        return _strip(len(corners))
     left = list(range(len(corners)))
     triangles = []
     while len(left) > 3:

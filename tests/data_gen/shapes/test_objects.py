@@ -40,7 +40,7 @@ def test_every_part_is_watertight_right_way_out_and_has_its_volume(class_name):
 
 @pytest.mark.parametrize("class_name", CLASSES)
 def test_nothing_floats_and_nothing_flickers(class_name):
-    """Brute force: the crossing surfaces connect all parts; no two of different colours are within 1/5000 of the size."""
+    """Brute force: crossing surfaces connect all parts; different colours keep 1/5000 of the size apart."""
     for seed in SEEDS:
         parts = assemble(class_name, seed)
         groups = islands(parts)
