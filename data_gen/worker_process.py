@@ -10,11 +10,13 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Callable
 from importlib import import_module
+from typing import Any
 
 from hyperplanes.data.errors import DataError
 
-__all__ = ["main"]
+__all__ = ["answer", "main"]
 
 
 def main() -> int:
@@ -27,7 +29,7 @@ def main() -> int:
         with getattr(import_module(module), function)(settings) as process:
             answers.write(json.dumps({"ready": True}) + "\n")
             for line in iter(sys.stdin.readline, ""):
-                answers.write(json.dumps(_answer(process, json.loads(line))) + "\n")
+                answers.write(json.dumps(answer(process, json.loads(line))) + "\n")
     except BrokenPipeError:
         return 1
     except Exception as error:  # the renderer cannot be made: no item can be done
@@ -36,7 +38,16 @@ def main() -> int:
     return 0
 
 
-def _answer(process, item: object) -> dict[str, object]:
+def answer(process: Callable[[Any], dict[str, Any]], item: Any) -> dict[str, Any]:
+    """Do one item, and say how it went.
+
+    Args:
+        process: what does it.
+        item: the item.
+
+    Returns:
+        {"ok": result}, {"skip": reason} or {"fatal": reason}; nothing is raised.
+    """
     try:
         return {"ok": process(item)}
     except DataError as error:
