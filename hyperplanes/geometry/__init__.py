@@ -1,6 +1,7 @@
 """Differentiable geometry on Kornia's pinhole cameras: projection, lookup, rays, the visual hull."""
 
-from hyperplanes.geometry.image_planes import ImagePlanes, Lookup
+from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.lookup import Lookup
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Rays, Sphere, cast
 

@@ -2,42 +2,49 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.lookup import Lookup, lookup
+from hyperplanes.geometry.lookup_torch import NEAREST_DEPTH
+from hyperplanes.geometry.storage import Packed, pack
 
-__all__ = ["ImagePlanes", "Lookup"]
-
-NEAREST_DEPTH = 1e-4
-
-
-@dataclass(frozen=True)
-class Lookup:
-    """What all planes say about each point.
-
-    Attributes:
-        colours: bilinear colours; the background where `valid` is false.
-        coordinates: where the point falls on the plane, (column, row) in [-1, 1] from the first pixel's centre to the
-            last one's. Clamped to that range where the point falls outside the image, zero where it is behind.
-        valid: the point is in front of the camera and inside its image.
-    """
-
-    colours: Float[Tensor, "point view channel"]
-    coordinates: Float[Tensor, "point view 2"]
-    valid: Bool[Tensor, "point view"]
+__all__ = ["NEAREST_DEPTH", "ImagePlanes", "Lookup"]
 
 
 class ImagePlanes:
-    """Images with their cameras, seen as one function of points in the world."""
+    """Images with their cameras, seen as one function of points in the world.
+
+    Several objects go into one batch as one set of planes: `views` then names the planes of each point's object.
+    """
 
     def __init__(
-        self, images: Float[Tensor, "view channel height width"], cameras: PinholeCamera, background: float = 1.0
+        self,
+        images: Float[Tensor, "view channel height width"],
+        cameras: PinholeCamera,
+        background: float = 1.0,
+        *,
+        backend: str | None = None,
+        exact: bool = False,
     ) -> None:
+        """Checks that images and cameras belong together.
+
+        Args:
+            images: any number of channels. Pictures in [0, 1] that need no gradient may be read from a copy of 32 bits
+                a pixel, exact for 8-bit pictures and within 1/2046 for others.
+            cameras: one an image, of the images' size.
+            background: colour where a point is not seen.
+            backend: of the lookup; the fastest available where absent.
+            exact: always read the images themselves.
+
+        Raises:
+            ValueError: images of another number or size than the cameras, or of another number of dimensions.
+        """
         if images.ndim != 4:
             raise ValueError(f"images: expected shape (view, channel, height, width), got {tuple(images.shape)}")
         if len(images) != cameras.batch_size:
@@ -49,33 +56,53 @@ class ImagePlanes:
         self.images = images
         self.cameras = cameras
         self.background = background
+        self.backend = backend
+        self.exact = exact
+        self._packed: tuple[int, Packed | None] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
 
-    def lookup(self, points: Float[Tensor, "point 3"], views: Int[Tensor, "point chosen"] | None = None) -> Lookup:
-        """Project every point onto every plane and interpolate the colours there."""
-        height, width = self.images.shape[2:]
-        projection = camera.projection_matrices(self.cameras).to(points)
-        homogeneous = torch.einsum("vij,pj->vpi", projection[..., :3], points) + projection[:, None, :, 3]
-        depth = homogeneous[..., 2]
-        front = depth > NEAREST_DEPTH
-        pixels = homogeneous[..., :2] / torch.where(front, depth, 1.0)[..., None]
-        scale = pixels.new_tensor([2 / max(width - 1, 1), 2 / max(height - 1, 1)])
-        coordinates = pixels * scale - 1
-        valid = front & (coordinates.abs() <= 1).all(-1)
-        coordinates = torch.where(front[..., None], coordinates, 0.0).clamp(-1, 1)
-        sampled = torch.nn.functional.grid_sample(
-            self.images.to(points.dtype), coordinates[:, :, None], align_corners=True, padding_mode="border"
-        )[..., 0]
-        colours = torch.where(valid[:, None], sampled, self.background)
-        result = Lookup(colours.permute(2, 0, 1), coordinates.transpose(0, 1), valid.T)
-        return result if views is None else _pick(result, views)
+    def lookup(
+        self,
+        points: Float[Tensor, "point 3"],
+        views: Int[Tensor, "point chosen"] | None = None,
+        *,
+        bearings: bool = False,
+    ) -> Lookup:
+        """Projects every point onto the planes and interpolates the colours there.
 
+        Args:
+            points: in the world.
+            views: planes chosen for each point; all where absent.
+            bearings: also return the direction and distance from each camera.
 
-def _pick(result: Lookup, views: Tensor) -> Lookup:
-    return Lookup(
-        torch.take_along_dim(result.colours, views[..., None], 1),
-        torch.take_along_dim(result.coordinates, views[..., None], 1),
-        torch.take_along_dim(result.valid, views, 1),
-    )
+        Returns:
+            One row a point, one column a plane. Differentiable in points, images and cameras.
+        """
+        matrices = camera.projection_matrices(self.cameras)
+        found = lookup(
+            points,
+            matrices,
+            self.images,
+            views,
+            background=self.background,
+            packed=self._words(points),
+            backend=self.backend,
+        )
+        if not bearings:
+            return found
+        centres = camera.centres(self.cameras).to(points)
+        offsets = points[:, None] - (centres if views is None else centres[views])
+        distances = offsets.norm(dim=-1)
+        directions = offsets / distances.clamp_min(torch.finfo(points.dtype).tiny)[..., None]
+        return replace(found, directions=directions, distances=distances)
+
+    def _words(self, points: Tensor) -> Packed | None:
+        """The packed images, made at the first lookup that can use them and again after the images were changed."""
+        if self.exact or self.images.requires_grad or self.images.device.type != "cpu" or points.dtype != torch.float32:
+            return None
+        version = 0 if self.images.is_inference() else self.images._version
+        if self._packed is None or self._packed[0] != version:
+            self._packed = version, pack(self.images)
+        return self._packed[1]

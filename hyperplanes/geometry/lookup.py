@@ -1,0 +1,135 @@
+"""One lookup, several backends: project points onto posed images and interpolate the colours there."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from hyperplanes.geometry import lookup_torch
+from hyperplanes.geometry.storage import Packed
+
+__all__ = ["Backend", "Lookup", "backends", "choose", "lookup"]
+
+
+@dataclass(frozen=True)
+class Lookup:
+    """What planes say about each point.
+
+    Attributes:
+        colours: bilinear colours; the background where `valid` is false.
+        coordinates: where the point falls on the plane, (column, row) in [-1, 1] from the first pixel's centre to the
+            last one's. Clamped to that range where the point falls outside the image, zero where it is behind.
+        valid: the point is in front of the camera and inside its image, borders included.
+        directions: unit vectors from each camera's centre to the point, in the world; only on request.
+        distances: from each camera's centre to the point, in world units; only on request.
+    """
+
+    colours: Float[Tensor, "point view channel"]
+    coordinates: Float[Tensor, "point view 2"]
+    valid: Bool[Tensor, "point view"]
+    directions: Float[Tensor, "point view 3"] | None = None
+    distances: Float[Tensor, "point view"] | None = None
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A way to do lookups, and whether it can be used here.
+
+    Attributes:
+        name: what `backend=` takes.
+        available: whether it can run.
+        reason: why, or what would make it run.
+    """
+
+    name: str
+    available: bool
+    reason: str
+
+
+def backends() -> list[Backend]:
+    """Every way to do lookups, the plain reference first."""
+    found = [Backend("torch", True, "plain PyTorch, any device; the reference")]
+    if importlib.util.find_spec("numba") is None:
+        found.append(Backend("cpu", False, "needs numba: pip install numba"))
+    else:
+        found.append(Backend("cpu", True, f"numba kernels, {torch.get_num_threads()} threads; the default on the CPU"))
+    if importlib.util.find_spec("triton") is None:
+        found.append(Backend("triton", False, "needs triton, which comes with PyTorch for CUDA"))
+    elif not torch.cuda.is_available():
+        found.append(Backend("triton", False, "needs a CUDA device that PyTorch can see"))
+    else:
+        name = torch.cuda.get_device_name()
+        found.append(Backend("triton", True, f"fused kernels on {name}; the default on CUDA"))
+    return found
+
+
+def choose(points: Tensor, images: Tensor) -> str:
+    """The fastest backend for these tensors: by device, and plain PyTorch for all that the kernels do not take."""
+    height, width = images.shape[2:]
+    known = points.dtype in (torch.float32, torch.float64) and height * width < 2**31
+    wanted = {"cpu": "cpu", "cuda": "triton"}.get(points.device.type)
+    usable = known and any(backend.available and backend.name == wanted for backend in backends())
+    return wanted if wanted is not None and usable else "torch"
+
+
+def lookup(
+    points: Float[Tensor, "point 3"],
+    matrices: Float[Tensor, "view 3 4"],
+    images: Float[Tensor, "view channel height width"],
+    views: Int[Tensor, "point chosen"] | None = None,
+    *,
+    background: float = 1.0,
+    packed: Packed | None = None,
+    backend: str | None = None,
+) -> Lookup:
+    """Projects every point onto planes and interpolates the colours there.
+
+    Differentiable in points, matrices and images; with the torch backend twice. With u = M (x, 1), the pixel is
+    (u_0 / u_2, u_1 / u_2) in integer pixel centres.
+
+    Args:
+        points: in the world; float32 or float64 for the fast backends. All computations happen in their dtype.
+        matrices: K [R | t] of each plane.
+        images: the planes, any number of channels, none included.
+        views: planes chosen for each point, which alone are then looked at and paid for; all planes where absent.
+        background: colour where a point is not seen.
+        packed: the same images in 32 bits a pixel, which the CPU backend reads instead for float32 points when no
+            gradient with respect to the images is wanted.
+        backend: "torch", "cpu" or "triton"; the fastest that takes these tensors where absent.
+
+    Returns:
+        Contiguous tensors (point, view, ...), where view counts the chosen ones if `views` is given.
+
+    Raises:
+        ValueError: an unknown backend, one that is not available, or an index in `views` of no plane.
+
+    >>> ramp = torch.arange(4.0).expand(1, 1, 4, 4)
+    >>> matrix = torch.tensor([[[2.0, 0.0, 1.5, 0.0], [0.0, 2.0, 1.5, 0.0], [0.0, 0.0, 1.0, 0.0]]])
+    >>> found = lookup(torch.tensor([[0.5, 0.0, 2.0]]), matrix, ramp)
+    >>> found.colours.item(), found.valid.item()
+    (2.0, True)
+    """
+    name = backend or choose(points, images)
+    matrices, images = matrices.to(points), images.to(points)
+    if views is not None:
+        views = views.long()
+        if views.device.type == "cpu" and views.numel() and not 0 <= views.min() <= views.max() < len(images):
+            raise ValueError(
+                f"views: expected indices of {len(images)} planes, got {int(views.min())} to {int(views.max())}"
+            )
+    if name == "torch":
+        return Lookup(*lookup_torch.lookup(points, matrices, images, views, background))
+    known = {each.name: each for each in backends()}
+    if name not in known:
+        raise ValueError(f"backend: expected one of {', '.join(known)}, got {name!r}")
+    if not known[name].available:
+        raise ValueError(f"backend: {name} {known[name].reason}")
+    from hyperplanes.geometry import lookup_op
+
+    fits = packed is not None and points.dtype == torch.float32 and not images.requires_grad
+    words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
+    return Lookup(*lookup_op.lookup(points, matrices, images, words, bits, views, background))

@@ -1,0 +1,162 @@
+"""The fused lookup as a PyTorch operator, `hyperplanes::lookup`, and its gradient, `hyperplanes::lookup_backward`.
+
+Registered with `torch.library`, so that autograd, `torch.compile` and fake tensors know them. Each device type brings
+its own kernel; this file holds what they share (shapes and the gradient's wiring) and the CPU ones. Second derivatives
+need the plain torch backend.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyperplanes.geometry.lookup_torch import NEAREST_DEPTH
+from hyperplanes.geometry.threads import share
+
+__all__ = ["lookup", "lookup_backward"]
+
+_CHUNK = 4096  # lookups' points a call of a kernel
+
+
+@torch.library.custom_op("hyperplanes::lookup", mutates_args=(), device_types="cpu")
+def lookup(
+    points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
+    background: float,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Colours (point, view, channel), coordinates (point, view, 2) and validity (point, view)."""
+    colours, coordinates, valid = _empty(points, images, views)
+    if valid.numel():
+        kernel = _kernel("forward", points.dtype, views is not None)
+        number = _array(points).dtype.type
+        fixed = (*_geometry(points, matrices, views), *_store(images, packed, bits), number(background))
+        fixed += (number(NEAREST_DEPTH), colours.numpy().reshape(-1), coordinates.numpy().reshape(-1))
+        fixed += (valid.view(torch.uint8).numpy().reshape(-1),)
+        share(lambda start, stop: kernel(*fixed, start, stop), len(points), _CHUNK)
+    return colours, coordinates, valid
+
+
+@torch.library.custom_op("hyperplanes::lookup_backward", mutates_args=(), device_types="cpu")
+def lookup_backward(
+    points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
+    grad_colours: Tensor | None, grad_coordinates: Tensor | None, geometry: bool, pixels: bool,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Gradients with respect to points, matrices and images; empty where not asked for."""
+    rows = (len(points), images.shape[0] if views is None else views.shape[1])
+    zero = points.new_zeros(())
+    colour = zero.expand(*rows, images.shape[1]) if grad_colours is None else grad_colours
+    coordinate = zero.expand(*rows, 2) if grad_coordinates is None else grad_coordinates
+    grad_points, grad_matrices, grad_images = (points.new_empty(0) for _ in range(3))
+    if geometry:
+        grad_points, grad_matrices = _geometry_gradient(
+            points, matrices, images, packed, bits, views, colour, coordinate
+        )
+    if pixels:
+        grad_images = _image_gradient(points, matrices, images, views, colour)
+    return grad_points, grad_matrices, grad_images
+
+
+def _empty(points: Tensor, images: Tensor, views: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    rows = (points.shape[0], images.shape[0] if views is None else views.shape[1])
+    valid = points.new_empty(rows, dtype=torch.bool)
+    return points.new_empty(*rows, images.shape[1]), points.new_empty(*rows, 2), valid
+
+
+def _kernel(name: str, dtype: torch.dtype, chosen: bool) -> Any:
+    from hyperplanes.geometry.kernels_cpu import compiled
+
+    return compiled(name, str(dtype).removeprefix("torch."), chosen)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+def _geometry(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[np.ndarray, ...]:
+    return (_array(points), *(() if views is None else (_array(views),)), _array(matrices))
+
+
+def _store(images: Tensor, packed: Tensor | None, bits: int) -> tuple[Any, ...]:
+    words = np.zeros(0, np.uint32) if packed is None else _array(packed).reshape(-1).view(np.uint32)
+    return _array(images), words, bits if packed is not None else 0, images.shape[2], images.shape[3]
+
+
+def _geometry_gradient(
+    points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
+    grad_colours: Tensor, grad_coordinates: Tensor,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    grad_points = torch.zeros(points.shape, dtype=points.dtype)
+    if not grad_coordinates.numel():
+        return grad_points, torch.zeros_like(matrices)
+    kernel = _kernel("backward", points.dtype, views is not None)
+    number = _array(points).dtype.type
+    fixed = (*_geometry(points, matrices, views), *_store(images, packed, bits), number(NEAREST_DEPTH))
+    fixed += (grad_colours.detach().numpy(), grad_coordinates.detach().numpy(), grad_points.numpy())
+
+    def work(start: int, stop: int) -> np.ndarray:
+        sums = np.zeros((len(matrices), 12))
+        kernel(*fixed, sums, start, stop)
+        return sums
+
+    total = np.sum(share(work, len(points), _CHUNK), axis=0)
+    return grad_points, torch.from_numpy(total).to(matrices).reshape(matrices.shape)
+
+
+def _image_gradient(
+    points: Tensor, matrices: Tensor, images: Tensor, views: Tensor | None, grad_colours: Tensor
+) -> Tensor:
+    count, channels, height, width = images.shape
+    gradient = torch.zeros(count, height * width, channels, dtype=images.dtype)
+    if grad_colours.numel():
+        kernel = _kernel("image_backward", points.dtype, views is not None)
+        fixed = (*_geometry(points, matrices, views), height, width, _array(points).dtype.type(NEAREST_DEPTH))
+        fixed += (grad_colours.detach().numpy(), gradient.numpy())
+        step = 1 if views is None else -(-count // torch.get_num_threads())  # each call reads all the chosen views
+        share(lambda start, stop: kernel(*fixed, start, stop), count, step)
+    return gradient.reshape(count, height, width, channels).permute(0, 3, 1, 2)
+
+
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    points, matrices, images, packed, bits, views, _ = inputs
+    ctx.set_materialize_grads(False)
+    ctx.mark_non_differentiable(output[-1])
+    ctx.save_for_backward(points, matrices, images, packed, views)
+    ctx.bits = bits
+
+
+def _gradients(
+    ctx: Any, grad_colours: Tensor | None, grad_coordinates: Tensor | None, _: None
+) -> tuple[Tensor | None, ...]:
+    points, matrices, images, packed, views = ctx.saved_tensors
+    geometry, pixels = ctx.needs_input_grad[0] or ctx.needs_input_grad[1], ctx.needs_input_grad[2]
+    if grad_colours is None and grad_coordinates is None:
+        return (None,) * 7
+    grad_points, grad_matrices, grad_images = lookup_backward(
+        points, matrices, images, packed, ctx.bits, views, grad_colours, grad_coordinates, geometry, pixels
+    )
+    return (
+        grad_points if ctx.needs_input_grad[0] else None,
+        grad_matrices if ctx.needs_input_grad[1] else None,
+        grad_images if pixels else None,
+        *(None,) * 4,
+    )
+
+
+@lookup.register_fake
+def _(points, matrices, images, packed, bits, views, background):
+    return _empty(points, images, views)
+
+
+@lookup_backward.register_fake
+def _(points, matrices, images, packed, bits, views, grad_colours, grad_coordinates, geometry, pixels):
+    count, channels, height, width = images.shape
+    return (
+        points.new_empty(points.shape if geometry else 0),
+        points.new_empty(matrices.shape if geometry else 0),
+        points.new_empty(count, height, width, channels).permute(0, 3, 1, 2) if pixels else points.new_empty(0),
+    )
+
+
+lookup.register_autograd(_gradients, setup_context=_setup)

@@ -1,0 +1,73 @@
+"""Images packed into 32 bits a pixel, so that one memory access fetches a pixel's three channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+
+__all__ = ["Packed", "pack", "unpack"]
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Three-channel images, one 32-bit word a pixel, the first channel in the lowest bits.
+
+    Attributes:
+        words: the pixels.
+        bits: 8 for eight bits a channel; 11 for eleven, eleven and ten.
+    """
+
+    words: Int32[Tensor, "view height width"]
+    bits: int
+
+    @property
+    def widths(self) -> tuple[int, int, int]:
+        """Bits of each channel."""
+        return (self.bits, self.bits, self.bits if self.bits == 8 else self.bits - 1)
+
+
+@torch.no_grad()
+def pack(images: Float[Tensor, "view 3 height width"]) -> Packed | None:
+    """The images in the better of the two formats, or None where they cannot be packed.
+
+    Images that were 8-bit files come out exact. All others are off by at most 1/2046, a quarter of the 1/512 that the
+    lookup promises.
+
+    Args:
+        images: any float dtype.
+
+    Returns:
+        None for values outside [0, 1] or not finite, and for anything but three channels.
+    """
+    if images.shape[1] != 3 or not images.numel():
+        return None
+    least, most = torch.aminmax(images)
+    if not (least >= 0 and most <= 1):
+        return None
+    scaled = images.float() * 255
+    eight = scaled.round()
+    if (scaled - eight).abs().max() < 1e-2:
+        return Packed(_words(eight, 8), 8)
+    steps = images.new_tensor([2047.0, 2047.0, 1023.0], dtype=torch.float32)[:, None, None]
+    return Packed(_words((images.float() * steps).round(), 11), 11)
+
+
+def _words(channels: Tensor, bits: int) -> Tensor:
+    whole = channels.to(torch.int32)
+    return whole[:, 0] | (whole[:, 1] << bits) | (whole[:, 2] << 2 * bits)
+
+
+def unpack(packed: Packed) -> Float[Tensor, "view 3 height width"]:
+    """The images as float32 in [0, 1].
+
+    >>> unpack(pack(torch.tensor([1.0, 0.2, 0.0]).reshape(1, 3, 1, 1))).flatten().tolist()
+    [1.0, 0.20000000298023224, 0.0]
+    """
+    planes = []
+    for channel, width in enumerate(packed.widths):
+        top = (1 << width) - 1
+        planes.append(((packed.words >> channel * packed.bits) & top).float() / top)
+    return torch.stack(planes, 1)
