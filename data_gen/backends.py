@@ -23,9 +23,10 @@ __all__ = [
     "find_backend",
     "probe",
     "probe_all",
+    "remedy",
 ]
 
-BACKENDS = ("pyrender-egl", "pyrender-osmesa", "embree")
+BACKENDS: tuple[str, ...] = ("pyrender-egl", "pyrender-osmesa", "embree")
 """Names of the renderers, best first."""
 
 CHOICE_VARIABLE = "HYPERPLANES_RENDERER"
@@ -159,6 +160,18 @@ def find_backend(prefer: str | None = None) -> Backend:
     )
 
 
+def remedy(name: str) -> str:
+    """The command that should make a renderer work on Debian and Ubuntu.
+
+    Args:
+        name: One of BACKENDS.
+
+    Returns:
+        A line for a shell.
+    """
+    return _REMEDIES[name]
+
+
 def _unknown(name: str) -> str:
     return f"renderer: expected one of {', '.join(BACKENDS)}, received {name!r}"
 
@@ -224,7 +237,8 @@ def _draw_test_picture(name: str) -> str:
     intrinsics = np.array([[16.0, 0.0, 7.5], [0.0, 16.0, 7.5], [0.0, 0.0, 1.0]])
     rig = Rig(look_at_origin([[0.0, 0.0, 2.0]]), intrinsics, 16, 16, 1.0, 3.0)
     with Rasteriser(name) as rasteriser:
-        picture = rasteriser.render([(sheet, np.eye(4), False)], rig).rgba[0].astype(int)
+        drawn = rasteriser.render([(sheet, np.eye(4), False)], rig)
+        picture = np.asarray(drawn.rgba)[0].astype(int)
         detail = rasteriser.detail
     left, right = picture[:, :8], picture[:, 8:]
     red = (left[..., 3] == 255) & (left[..., 0] > 40) & (left[..., 0] > 2 * left[..., 1])

@@ -95,7 +95,7 @@ def cast_geometry(surfaces: Sequence[Surface], rig: Rig) -> Iterator[Geometry]:
     """
     scene = _Scene(surfaces)
     for pose, intrinsics in zip(rig.world_from_camera, rig.intrinsics, strict=True):
-        rays = pixel_rays(pose, intrinsics, np.arange(rig.width), np.arange(rig.height))
+        rays = pixel_rays(pose, intrinsics, np.arange(0.0, rig.width), np.arange(0.0, rig.height))
         depth, normals, coordinates = np.zeros(len(rays)), np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
         waiting, after = np.arange(len(rays)), None
         for _ in range(_MOST_LAYERS):

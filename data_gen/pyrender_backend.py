@@ -75,9 +75,13 @@ class PyrenderBackend:
 
 def _averaged(picture: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.float32]:
     """Means of blocks of pixels, each side x side."""
-    rows = sum(picture[row::side].astype(np.uint16) for row in range(side))
-    total = sum(rows[:, column::side] for column in range(side))
-    return np.asarray(total, dtype=np.float32) / np.float32(side * side)
+    rows = picture[::side].astype(np.uint16)
+    for row in range(1, side):
+        rows += picture[row::side]
+    total = rows[:, ::side].copy()
+    for column in range(1, side):
+        total += rows[:, column::side]
+    return total.astype(np.float32) / np.float32(side * side)
 
 
 def _projection(

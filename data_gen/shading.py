@@ -1,7 +1,7 @@
 """The shading formula, in numpy: what the OpenGL shader computes a pixel, for arrays of points.
 
-Light is added in linear units: ambient light that fades from sky to ground with the normal's height, and for each lamp a
-Lambertian term and a GGX highlight (Walter et al. 2007, with Smith's shadowing in Schlick's form). Normals are turned
+Light is added in linear units: ambient light that fades from sky to ground with the normal's height, and for each lamp
+a Lambertian term and a GGX highlight (Walter et al. 2007, with Smith's shadowing in Schlick's form). Normals are turned
 towards the camera, so that a sheet is lit on both its sides and a face wound the wrong way looks like any other. What
 is brighter than SHOULDER is rolled off below white, and the result is encoded as sRGB.
 """

@@ -103,7 +103,7 @@ def surfaces_of(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: str = 
 
     Raises:
         RasteriseError: If a part is no Trimesh, a pose is no finite affine map, a face's vertex is not finite, a
-            texture has no coordinates, or no part has a face.
+            texture has no coordinates, a material is of an unknown kind, or no part has a face.
     """
     images: dict[Any, npt.NDArray[np.uint8]] = {}
     surfaces = []
@@ -124,7 +124,7 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
         raise RasteriseError(f"{where}: expected a finite affine pose (4, 4), received {matrix.tolist()}")
     faces = np.asarray(mesh.faces, dtype=np.int64)
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    finite = np.isfinite(vertices).all(axis=1)
+    finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(vertices).all(axis=1))
     if not finite[faces].all():
         bad = int((~finite[faces]).any(axis=1).sum())
         raise RasteriseError(f"{where}: expected finite vertices, received {bad} faces on NaN or infinity")
@@ -132,7 +132,7 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
     kind = mesh.visual.kind if mesh.visual.defined else None
-    material = _material(mesh.visual.material if kind == "texture" else None, images)
+    material = _material(mesh.visual.material if kind == "texture" else None, images, where)
     uv = _texture_coordinates(mesh, material, where)
     colours = _linear_colours(mesh.visual.vertex_colors) if kind == "vertex" else None
     if smooth and kind != "face":
@@ -177,7 +177,7 @@ def _texture_coordinates(mesh: trimesh.Trimesh, material: dict[str, Any], where:
     return np.where(np.isfinite(uv), uv, 0.0)
 
 
-def _material(material: Any, images: dict[Any, Any]) -> dict[str, Any]:
+def _material(material: Any, images: dict[Any, Any], where: str) -> dict[str, Any]:
     """The fields of a Surface that come from a trimesh material."""
     fields: dict[str, Any] = {
         "base_colour": np.array([_PLAIN, _PLAIN, _PLAIN, 1.0]) if material is None else np.ones(4),
@@ -193,6 +193,8 @@ def _material(material: Any, images: dict[Any, Any]) -> dict[str, Any]:
         _fill_from_gltf(fields, material, images)
     elif isinstance(material, trimesh.visual.material.SimpleMaterial):
         _fill_from_mtl(fields, material, images)
+    elif material is not None:
+        raise RasteriseError(f"{where}: expected a PBRMaterial or a SimpleMaterial, received {type(material).__name__}")
     return fields
 
 

@@ -305,6 +305,8 @@ def test_blank_and_impossible_objects_are_named(backend):
     broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], process=False)
     untextured = sheet(uv=False)
     untextured.visual = trimesh.visual.TextureVisuals(image=Image.new("RGB", (2, 2)))
+    several = sheet()
+    several.visual.material = trimesh.visual.material.MultiMaterial()
     rig = _front_rig(8)
     with Rasteriser(backend) as rasteriser:
         for parts, message in (
@@ -317,6 +319,7 @@ def test_blank_and_impossible_objects_are_named(backend):
                 "teapot, part 1: expected a trimesh.Trimesh, received str",
             ),
             ([(sheet(), np.eye(3), False)], "teapot, part 0: expected a finite affine pose"),
+            ([(several, EYE, False)], "part 0: expected a PBRMaterial or a SimpleMaterial, received MultiMaterial"),
             ([(untextured, EYE, False)], "texture coordinates for its 4 textured vertices, received none"),
         ):
             with pytest.raises(RasteriseError, match=message):
@@ -358,6 +361,12 @@ def test_rasterisers_share_the_context_and_other_threads_are_refused():
     assert "spawn" in caught[0]
     with pytest.raises(RendererError, match="pyrender-egl, which this process uses, received pyrender-osmesa"):
         Rasteriser("pyrender-osmesa")
+
+
+def test_renderer_that_cannot_start_says_what_to_do(monkeypatch):
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    with pytest.raises(RendererError, match="'embree': expected it to start, found .*Remedy: pip install embreex"):
+        Rasteriser("embree")
 
 
 def test_unreferenced_bad_vertices_and_vanished_normals_do_no_harm():
