@@ -21,6 +21,7 @@ __all__ = [
     "IMAGE_FORMATS",
     "MAX_FILE_BYTES",
     "MAX_PIXELS",
+    "MAX_TEXT_BYTES",
     "MESH_SUFFIXES",
     "MeshError",
     "ModelFolder",
@@ -33,6 +34,9 @@ MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".dae")
 
 MAX_FILE_BYTES = 1 << 30
 """Bytes of one file that are read at most."""
+
+MAX_TEXT_BYTES = 1 << 28
+"""Bytes of a file of text (OBJ, MTL, OFF, DAE) at most: it takes about twenty times as many in memory."""
 
 MAX_PIXELS = 1 << 26
 """Pixels of all textures of a model that are decoded at most: one of 8192 x 8192."""
@@ -157,11 +161,12 @@ class ModelFolder(Resolver):
         found = self._find(name)
         return self._bytes[found] if found in self._bytes else self.get_image(name)
 
-    def read(self, name: str) -> bytes:
+    def read(self, name: str, *, limit: int = MAX_FILE_BYTES) -> bytes:
         """Read a file of the model that is no texture.
 
         Args:
             name: How the mesh refers to it.
+            limit: Bytes at most.
 
         Returns:
             Its content.
@@ -176,7 +181,7 @@ class ModelFolder(Resolver):
                 if found.stat().st_size == 0:
                     self.lost.setdefault(name, "an empty file")
                     raise FileNotFoundError(name)
-                self._bytes[found] = read_bytes(found)
+                self._bytes[found] = read_bytes(found, limit=limit)
         except MeshError as error:
             self.refused = self.refused or error
             raise

@@ -23,7 +23,7 @@ import trimesh
 from data_gen.gltf_checks import check_gltf, generator_of
 from data_gen.mesh_checks import check_stl, declared_up, read_dae, read_off, read_ply
 from data_gen.mesh_cleaning import clean, decimate, shades_smoothly
-from data_gen.mesh_files import MESH_SUFFIXES, MeshError, ModelFolder, read_bytes
+from data_gen.mesh_files import MAX_FILE_BYTES, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, ModelFolder, read_bytes
 from data_gen.mesh_folders import MeshFile, find_meshes, safe_name
 from data_gen.mesh_surfaces import DEFAULT_COLOUR, ColourSpace, canonical_visual
 from data_gen.obj_files import read_obj
@@ -45,6 +45,7 @@ MAX_FACES = 2_000_000
 
 _DECIMATED_FROM = 8
 _OUTLIER = 30.0
+_TEXT = (".obj", ".off", ".dae", ".gltf")
 _Y_FROM_Z = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -97,7 +98,7 @@ def load_mesh(
         raise MeshError(
             f"{path}: expected a file that ends in {', '.join(MESH_SUFFIXES)}, found {suffix!r}; convert it"
         )
-    data = read_bytes(path)
+    data = read_bytes(path, limit=MAX_TEXT_BYTES if suffix in _TEXT else MAX_FILE_BYTES)
     folder = ModelFolder(path, model_root(path))
     try:
         with _strict():
@@ -233,6 +234,9 @@ def _read(data: bytes, suffix: str, folder: ModelFolder) -> tuple[trimesh.Scene,
     lines, bare = (check_stl(data, folder), set()) if suffix == ".stl" else check_gltf(data, folder)
     scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
     _grey_out(scene, bare)
+    if suffix == ".stl":
+        for geometry in scene.geometry.values():
+            geometry.metadata["smooth"] = False
     painted_as_seen = suffix == ".stl" or "trimesh" in generator_of(data)
     return scene, "scene" if painted_as_seen else "gltf", lines
 

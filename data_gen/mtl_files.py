@@ -13,7 +13,7 @@ import numpy as np
 import PIL.Image
 from trimesh.visual.material import PBRMaterial
 
-from data_gen.mesh_files import ModelFolder
+from data_gen.mesh_files import MAX_TEXT_BYTES, ModelFolder
 from data_gen.mesh_surfaces import linear_from_srgb
 
 __all__ = ["decoded", "read_materials"]
@@ -46,7 +46,7 @@ def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str
         names = [line] if whole or len(line.split()) < 2 else line.split()
         for name in names:
             try:
-                text = decoded(folder.read(name))
+                text = decoded(folder.read(name, limit=MAX_TEXT_BYTES))
             except FileNotFoundError:
                 continue
             for values in _statements(text, name, warnings):

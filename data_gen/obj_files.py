@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ class _Group:
     smooth: bool | None
     corners: dict[Any, int] = field(default_factory=dict)
     rows: list[tuple[int, int, int]] = field(default_factory=list)
-    triangles: list[tuple[int, int, int]] = field(default_factory=list)
+    triangles: list[int] = field(default_factory=list)
 
 
 def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
@@ -65,12 +66,12 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     for number, line in _lines(text):
         keyword, _, rest = line.partition(" ")
         if keyword in rows:
-            rows[keyword].append(rest)
+            rows[keyword].append(rest.partition("#")[0] if "#" in rest else rest)
             numbers[keyword].append(number)
         elif keyword == "f":
             if group is None:
                 group = groups.setdefault((material, smooth), _Group(smooth))
-            _add_face(rest, group, rows, f"{folder.path}: line {number}", skipped)
+            _add_face(rest, group, rows, number, folder, skipped)
         elif keyword == "usemtl":
             material, group = rest.strip() or None, None
         elif keyword == "s":
@@ -111,27 +112,40 @@ def _lines(text: str) -> Any:
             yield number, line.replace("\t", " ") if "\t" in line else line
 
 
-def _add_face(rest: str, group: _Group, rows: dict[str, list[str]], where: str, skipped: Counter[str]) -> None:
-    corners = rest.partition("#")[0].split()
+def _add_face(
+    rest: str, group: _Group, rows: dict[str, list[str]], number: int, folder: ModelFolder, skipped: Counter[str]
+) -> None:
+    corners = (rest.partition("#")[0] if "#" in rest else rest).split()
     if len(corners) < 3:
         skipped["faces with fewer than 3 corners left out"] += 1
         return
-    face = []
-    for corner in corners:
-        index = group.corners.get(corner)
-        if index is None:
-            try:
-                row = _corner(corner, rows)
-            except ValueError:
-                raise MeshError(
-                    f"{where}: expected a face corner like 1/2/3, found {corner!r}; repair the line"
-                ) from None
-            key: Any = row if "-" in corner else corner
-            index = group.corners.setdefault(key, len(group.rows))
-            if index == len(group.rows):
-                group.rows.append(row)
-        face.append(index)
-    group.triangles.extend((face[0], face[i], face[i + 1]) for i in range(1, len(face) - 1))
+    known = group.corners
+    try:
+        face = [known[corner] for corner in corners]
+    except KeyError:
+        face = [_index(corner, group, rows, number, folder) for corner in corners]
+    if len(face) == 3:
+        group.triangles += face
+        return
+    for first, second in pairwise(face[1:]):
+        group.triangles += (face[0], first, second)
+
+
+def _index(corner: str, group: _Group, rows: dict[str, list[str]], number: int, folder: ModelFolder) -> int:
+    """The number of a corner among the different ones of its group."""
+    index = group.corners.get(corner)
+    if index is None:
+        try:
+            row = _corner(corner, rows)
+        except ValueError:
+            raise MeshError(
+                f"{folder.path}: line {number}: expected a face corner like 1/2/3, found {corner!r}; repair the line"
+            ) from None
+        key: Any = row if "-" in corner else corner  # what a negative number refers to depends on the line
+        index = group.corners.setdefault(key, len(group.rows))
+        if index == len(group.rows):
+            group.rows.append(row)
+    return index
 
 
 def _corner(text: str, rows: dict[str, list[str]]) -> tuple[int, int, int]:
@@ -234,7 +248,9 @@ def _geometry(
             if material is not None
             else f"{name}: vertex colours left out, some vertices have none"
         )
-    mesh = trimesh.Trimesh(vertices[:, :3], np.array(group.triangles, dtype=np.int64), process=False, **keywords)
+    mesh = trimesh.Trimesh(
+        vertices[:, :3], np.array(group.triangles, dtype=np.int64).reshape(-1, 3), process=False, **keywords
+    )
     if group.smooth is not None:
         mesh.metadata["smooth"] = group.smooth
     return mesh

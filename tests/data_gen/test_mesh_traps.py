@@ -621,7 +621,7 @@ def test_many_textures_count_together(tmp_path, monkeypatch):
 def test_files_are_measured_before_they_are_read(tmp_path):
     path = tmp_path / "huge.obj"
     with path.open("wb") as file:
-        file.truncate(mesh_files.MAX_FILE_BYTES + 1)
+        file.truncate(mesh_files.MAX_TEXT_BYTES + 1)
     assert "expected at most" in refusal(path)
     (tmp_path / "bomb").mkdir()
     with (tmp_path / "bomb" / "wood.png").open("wb") as file:

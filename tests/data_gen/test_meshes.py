@@ -150,7 +150,7 @@ def test_obj_polygons_relative_indices_tabs_and_several_libraries(tmp_path):
     (tmp_path / "b c.mtl").write_text("newmtl blue\nKd 0 0 1\nd 0.5\n")
     body = (
         "mtllib a.mtl\nmtllib b c.mtl\n# a square and a pentagon\n"
-        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nusemtl red\nf\t-4 -3 -2 -1\n"
+        "v 0 0 0 # a corner\nv 1 0 0\nv 1 1 0\nv 0 1 0\nusemtl red\nf\t-4 -3 -2 -1\n"
         "v 0 0 1\nv 1 0 1\nv 2 1 1\nv 1 2 1\nv 0 1 1\nusemtl blue\n  f 5 6 \\\n 7 8 9\r\n"
     )
     mesh = load_mesh(write_obj(tmp_path, body=body))
@@ -193,6 +193,34 @@ def test_gltf_vertex_colours_are_linear_and_tinted_by_the_material(tmp_path):
     part = render_ready(mesh)[0][0]
     assert mesh.warnings == ()
     assert np.array_equal(part.visual.vertex_colors, [[188, 0, 255, 255]] * 4)
+
+
+def test_colours_of_ply_faces_are_kept(tmp_path):
+    head, _, _ = ply_bytes(binary=False).partition(b"end_header")
+    head += b"".join(b"property uchar " + name + b"\n" for name in (b"red", b"green", b"blue")) + b"end_header\n"
+    points = "".join(" ".join(str(float(value)) for value in point) + "\n" for point in TETRAHEDRON)
+    faces = "".join(f"3 {a} {b} {c} {10 * a} {10 * b} {10 * c}\n" for a, b, c in TETRAHEDRON_FACES)
+    (tmp_path / "a.ply").write_bytes(head + (points + faces).encode())
+    part, _, smooth = render_ready(load_mesh(tmp_path / "a.ply"))[0]
+    assert not smooth
+    assert np.array_equal(part.visual.face_colors[:, :3], 10 * TETRAHEDRON_FACES)
+
+
+def test_a_prepared_scene_survives_its_own_export(tmp_path):
+    painted = np.array([[0.50196, 0.25, 1, 1]] * 4)
+    mesh = load_mesh(
+        write_glb(tmp_path / "a.glb", colours=painted, nodes=[{"mesh": 0}, {"mesh": 0, "scale": [-2, 2, 2]}])
+    )
+    mesh.scene.export(tmp_path / "b.glb")
+    again = load_mesh(tmp_path / "b.glb")
+    assert again.warnings == ()
+    assert np.allclose(again.world_from_file, np.eye(4), atol=1e-6)
+    before, after = (
+        sorted((part for part, _, _ in render_ready(each)), key=lambda part: part.scale) for each in (mesh, again)
+    )
+    for first, second in zip(before, after, strict=True):
+        assert np.allclose(first.vertices[first.faces], second.vertices[second.faces], atol=1e-6)
+        assert np.array_equal(first.visual.vertex_colors, second.visual.vertex_colors)
 
 
 def test_face_colours_are_shaded_flat(tmp_path):
