@@ -1,1 +1,98 @@
-"""HyperPlanes: a hypernetwork reads a few posed images and writes a NeRF."""
+"""HyperPlanes: a hypernetwork reads a few posed images and writes a NeRF.
+
+What most programs need is here; a name is imported when it is first used, so `import hyperplanes` costs nothing:
+
+    import hyperplanes as hp
+
+    model = hp.HyperPlanes.from_pretrained("runs/demo/hyperplanes")
+    task = hp.read_task("runs/demo/data/car_test_00000")
+    field = model.adapt(task.support)
+    pictures = field.render(task.query.cameras)
+    hp.save_images(pictures.images, "new_views")
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hyperplanes.adaptation.fine_tuning import FineTuned
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
+    from hyperplanes.adaptation.nearest_view import NearestView
+    from hyperplanes.data import DataError, Dataset, open_dataset, read_task, read_views
+    from hyperplanes.evaluation import evaluate
+    from hyperplanes.export import extract_mesh, save_images, save_mesh, save_turntable
+    from hyperplanes.geometry.image_planes import ImagePlanes, Lookup
+    from hyperplanes.metrics import psnr, ssim
+    from hyperplanes.presets import preset
+    from hyperplanes.rendering.renderer import render
+    from hyperplanes.training import Trainer
+    from hyperplanes.views import Task, Views
+
+_HOMES = {
+    "DataError": "data",
+    "Dataset": "data",
+    "FineTuned": "adaptation.fine_tuning",
+    "HyperPlanes": "adaptation.hyperplanes",
+    "ImagePlanes": "geometry.image_planes",
+    "Lookup": "geometry.image_planes",
+    "ModelConfig": "adaptation.hyperplanes",
+    "NearestView": "adaptation.nearest_view",
+    "Task": "views",
+    "Trainer": "training",
+    "Views": "views",
+    "evaluate": "evaluation",
+    "extract_mesh": "export",
+    "open_dataset": "data",
+    "preset": "presets",
+    "psnr": "metrics",
+    "read_task": "data",
+    "read_views": "data",
+    "render": "rendering.renderer",
+    "save_images": "export",
+    "save_mesh": "export",
+    "save_turntable": "export",
+    "ssim": "metrics",
+}
+
+__all__ = [
+    "DataError",
+    "Dataset",
+    "FineTuned",
+    "HyperPlanes",
+    "ImagePlanes",
+    "Lookup",
+    "ModelConfig",
+    "NearestView",
+    "Task",
+    "Trainer",
+    "Views",
+    "evaluate",
+    "extract_mesh",
+    "open_dataset",
+    "preset",
+    "psnr",
+    "read_task",
+    "read_views",
+    "render",
+    "save_images",
+    "save_mesh",
+    "save_turntable",
+    "ssim",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported when it is first asked for; `__version__` too."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("hyperplanes")
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(set(globals()) | set(__all__))

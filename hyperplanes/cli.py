@@ -1,0 +1,107 @@
+"""The one command: `hyperplanes VERB`. It parses and prints; everything else is in the packages below.
+
+A verb's module is imported only when that verb is asked for, so `hyperplanes --help` loads neither torch nor OpenGL.
+"""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import inspect
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from hyperplanes.commands import EXAMPLES, VERBS
+
+__all__ = ["main"]
+
+TRACEBACK_VARIABLE = "HYPERPLANES_TRACEBACK"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb.
+
+    Args:
+        arguments: what stands after `hyperplanes` on the command line; that of this process where absent.
+
+    Returns:
+        The exit code: 0 done, 1 done but something is wrong, 2 wrong input, 130 interrupted.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    traceback = "--traceback" in given or os.environ.get(TRACEBACK_VARIABLE, "") not in ("", "0")
+    given = [argument for argument in given if argument != "--traceback"]
+    if not given or given[0] in ("-h", "--help", "help"):
+        print(_overview())
+        return 0 if given else 2
+    if given[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"hyperplanes {version('hyperplanes')}")
+        return 0
+    verb, *rest = given
+    if verb not in VERBS:
+        near = difflib.get_close_matches(verb, VERBS, 1)
+        known = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(VERBS)}"
+        return _complain(f"hyperplanes: no verb {verb!r}; {known}")
+    try:
+        return _run(verb, rest)
+    except KeyboardInterrupt as interrupt:
+        advice = str(interrupt) or "the same command goes on where it can"
+        _complain(f"hyperplanes {verb}: interrupted; {advice}")
+        return 130
+    except BrokenPipeError:
+        sys.stdout = None  # whoever read our output has gone; nothing is left to be flushed to
+        return 0
+    except (ValueError, OSError) as error:
+        if traceback:
+            raise
+        return _complain(f"hyperplanes {verb}: {_one_line(error)}")
+
+
+def _run(verb: str, rest: list[str]) -> int:
+    import tyro
+
+    module = import_module(f"hyperplanes.commands.{verb}")
+    parsed = tyro.cli(
+        module.Arguments,
+        prog=f"hyperplanes {verb}",
+        description=inspect.cleandoc(module.__doc__ or ""),
+        args=rest,
+        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
+    )
+    return module.run(parsed)
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}expected room to write, found a full disk; free some and run the same command again"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror or error}; check the path and its permissions"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _complain(line: str) -> int:
+    print(line, file=sys.stderr)
+    return 2
+
+
+def _overview() -> str:
+    width = max(map(len, VERBS))
+    verbs = "\n".join(f"  {verb:<{width}}  {about}" for verb, about in VERBS.items())
+    return (
+        "usage: hyperplanes VERB [OPTIONS]\n\n"
+        "A hypernetwork looks at a few posed images of an object and writes a NeRF of it in one step.\n\n"
+        f"verbs (`hyperplanes VERB --help` says more):\n{verbs}\n\n"
+        f"examples:\n{EXAMPLES}\n\n"
+        "options:\n"
+        "  --help       this text\n"
+        "  --version    which version this is\n"
+        f"  --traceback  with any verb: show where an error came from (or set {TRACEBACK_VARIABLE}=1)"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

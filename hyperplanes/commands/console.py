@@ -1,0 +1,94 @@
+"""What a person sees: plain lines, and one live line where there is a terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console as RichConsole
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Table
+
+__all__ = ["Bar", "Console"]
+
+QUIET_SECONDS = 10.0
+"""Time between progress lines where there is no terminal."""
+
+
+class Bar:
+    """Progress towards a known number: redrawn in place in a terminal, a line now and then elsewhere."""
+
+    def __init__(self, console: RichConsole, progress: Progress | None, title: str) -> None:
+        self._console, self._progress, self._title = console, progress, title
+        self._task: TaskID | None = None
+        self._printed = time.monotonic()
+
+    def show(self, done: int, total: int, text: str, *, important: bool = False) -> None:
+        """Move on.
+
+        Args:
+            done: of the total.
+            total: when it is finished.
+            text: what to say about now.
+            important: worth a line of its own where nothing is redrawn.
+        """
+        if self._progress is not None:
+            if self._task is None:
+                self._task = self._progress.add_task(self._title, total=total, text=text)
+            self._progress.update(self._task, completed=done, total=total, text=text)
+        elif important or done == total or time.monotonic() - self._printed >= QUIET_SECONDS:
+            self._printed = time.monotonic()
+            self._console.print(f"{self._title} {done}/{total}  {text}", markup=False, highlight=False, soft_wrap=True)
+
+
+class Console:
+    """Standard output for results, standard error for warnings."""
+
+    def __init__(self) -> None:
+        self._out = RichConsole(file=sys.stdout)
+        self._live = self._out.is_terminal
+
+    def say(self, line: str) -> None:
+        """A line of its own."""
+        self._out.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def warn(self, line: str) -> None:
+        """A line on standard error."""
+        RichConsole(file=sys.stderr).print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def table(self, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """A table; all columns but the first are aligned to the right."""
+        if not self._live:
+            widths = [max(len(row[i]) for row in [headings, *rows]) for i in range(len(headings))]
+            for row in [headings, *rows]:
+                first, *others = zip(row, widths, strict=True)
+                cells = [f"{first[0]:<{first[1]}}", *(f"{cell:>{width}}" for cell, width in others)]
+                self.say("  ".join(cells).rstrip())
+            return
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        for index, heading in enumerate(headings):
+            table.add_column(heading, justify="right" if index else "left", no_wrap=index > 0)
+        for row in rows:
+            table.add_row(*row)
+        self._out.print(table)
+
+    @contextmanager
+    def bar(self, title: str) -> Generator[Bar]:
+        """A progress line for as long as the context lasts.
+
+        Yields:
+            What shows it.
+        """
+        if not self._live:
+            yield Bar(self._out, None, title)
+            return
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(24),
+            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            TextColumn("{task.fields[text]}", markup=False),
+        )
+        with Progress(*columns, console=self._out) as progress:
+            yield Bar(self._out, progress, title)

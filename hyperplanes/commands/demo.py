@@ -1,0 +1,186 @@
+"""The whole method once, small: procedural cars, training, new views of cars it has never seen, and a page about it.
+
+Takes minutes on two cores. Everything goes to --out: the data set, the checkpoints, metrics.json and report.html.
+Interrupted, the same command goes on; run again, it does only what is not done yet.
+
+Example:
+    hyperplanes demo
+    hyperplanes demo --class chair --out runs/chairs
+    hyperplanes demo --quick-check --out runs/check
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.options import OptionalInt
+from hyperplanes.words import duration
+
+if TYPE_CHECKING:
+    from hyperplanes.demo import DemoSettings
+    from hyperplanes.stages import Stage, Stages
+
+__all__ = ["Arguments", "run", "settings_of"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """How large, and where to.
+
+    Attributes:
+        out: The folder for everything.
+        class_name: Which procedural objects.
+        objects: How many, the held-out ones included.
+        held_out: How many of them are kept from training.
+        resolution: Pixels along a side.
+        preset: What is trained; see `hyperplanes presets`.
+        steps: Training steps other than the preset's.
+        seed: Of everything.
+        quick_check: Only see that everything runs: a few tiny objects and networks that learn nothing.
+        device: auto, cpu or cuda.
+    """
+
+    out: Path = Path("runs/demo")
+    class_name: Annotated[Literal["car", "chair", "plane", "lamp"], tyro.conf.arg(name="class")] = "car"
+    objects: int = 70
+    held_out: int = 10
+    resolution: int = 64
+    preset: str = "quick"
+    steps: OptionalInt = None
+    seed: int = 0
+    quick_check: bool = False
+    device: str = "auto"
+
+
+def settings_of(arguments: Arguments) -> DemoSettings:
+    """The settings of the demonstration.
+
+    Raises:
+        ValueError: too few objects or pixels.
+    """
+    from hyperplanes.demo import DemoSettings
+
+    if arguments.quick_check:
+        return DemoSettings.quick_check(arguments.seed)
+    if not 0 < arguments.held_out < arguments.objects:
+        raise ValueError(
+            f"expected --held-out above 0 and below --objects, got {arguments.held_out} and {arguments.objects}"
+        )
+    if arguments.resolution < 16:
+        raise ValueError(f"resolution: expected at least 16 pixels, got {arguments.resolution}")
+    return DemoSettings(
+        arguments.class_name,
+        arguments.objects,
+        arguments.held_out,
+        arguments.resolution,
+        preset=arguments.preset,
+        steps=arguments.steps,
+        seed=arguments.seed,
+    )
+
+
+def run(arguments: Arguments) -> int:
+    """All stages, each skipped when it is done."""
+    from hyperplanes.demo import stages
+    from hyperplanes.stages import Stages
+
+    console, settings = Console(), settings_of(arguments)
+    todo, record = stages(settings), Stages(arguments.out)
+    for number, stage in enumerate(todo, 1):
+        heading = f"[{number}/{len(todo)}] {stage.name}"
+        if record.done(stage):
+            console.say(f"{heading}: done before")
+            continue
+        console.say(heading)
+        with record.work(stage):
+            _work(stage, settings, arguments, console, record)
+    _finish(arguments.out, console)
+    return 0
+
+
+def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: Console, record: Stages) -> None:
+    from hyperplanes.data import open_dataset
+    from hyperplanes.demo import MODELS, recipes
+
+    out = arguments.out
+    if stage.name == "data":
+        _generate(settings, out / "data", console)
+        return
+    data = open_dataset(out / "data")
+    if stage.name in MODELS:
+        _train(stage.name, recipes(settings)[stage.name], arguments, console)
+    elif stage.name == "report":
+        from hyperplanes.demo import write_metrics
+        from hyperplanes.demo_report import how_it_was_made, write_report
+
+        facts = how_it_was_made(settings, out, data.manifest)
+        write_report(out, data, settings, write_metrics(out), facts)
+    else:
+        from hyperplanes.demo import score_method
+
+        method, names = stage.name.removeprefix("evaluate "), data.names("test")
+        with console.bar(method) as bar:
+            done = 0
+
+            def show(score) -> None:
+                nonlocal done
+                done += 1
+                bar.show(done, len(names), f"{score.name} {score.psnr:.2f} dB")
+
+            score_method(method, data, out, show, arguments.device)
+
+
+def _generate(settings: DemoSettings, folder: Path, console: Console) -> None:
+    from data_gen.backends import find_backend
+    from data_gen.dataset import Procedural, generate
+    from hyperplanes.commands.generate import summary
+
+    backend = find_backend()
+    console.say(f"renderer: {backend.name} ({backend.detail})")
+    for line in backend.advice:
+        console.say(f"a faster one: {line}")
+    with console.bar("rendering") as bar:
+        report = generate(
+            Procedural(settings.class_name, settings.objects, settings.seed),
+            folder,
+            views=settings.views,
+            resolution=settings.resolution,
+            held_out=settings.held_out,
+            seed=settings.seed,
+            progress=lambda done, total, name: bar.show(done, total, name),
+        )
+    for name, reason in report.skipped:
+        console.warn(f"skipped {name}: {reason}")
+    console.say(summary(report, folder))
+
+
+def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:
+    from hyperplanes.commands.train import follow
+    from hyperplanes.data import open_dataset
+    from hyperplanes.models import choose_device
+    from hyperplanes.recipes import start_training
+
+    data = open_dataset(arguments.out / "data")
+    trainer = start_training(chosen, data, arguments.out / name, choose_device(arguments.device))
+    if trainer.step:
+        console.say(f"going on from step {trainer.step}")
+    with console.bar(name) as bar:
+        follow(trainer, bar)
+
+
+def _finish(out: Path, console: Console) -> None:
+    from hyperplanes.checkpoints import read_json
+    from hyperplanes.evaluation import METHODS
+
+    metrics = read_json(out / "metrics.json")
+    rows = [
+        (METHODS[name], f"{each['psnr']:.2f} dB", f"{each['ssim']:.3f}", duration(each["adapt_seconds"]))
+        for name, each in sorted(metrics.items(), key=lambda pair: pair[1]["psnr"])
+    ]
+    console.table(("held-out objects, new views", "PSNR", "SSIM", "to adapt"), rows)
+    console.say(f"the page: {(out / 'report.html').resolve().as_uri()}")

@@ -1,0 +1,21 @@
+"""Options that several verbs share, and how optional ones look in their help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+__all__ = ["OptionalFolder", "OptionalInt", "OptionalName", "OptionalNumber", "optional"]
+
+
+def optional(metavar: str, **options: Any) -> Any:
+    """What tyro is told of an option that may be left out: no {None}, no (default: None)."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="", **options)
+
+
+OptionalFolder = Annotated[Path | None, optional("FOLDER")]
+OptionalInt = Annotated[int | None, optional("INT")]
+OptionalName = Annotated[str | None, optional("NAME")]
+OptionalNumber = Annotated[int | float | None, optional("NUMBER")]

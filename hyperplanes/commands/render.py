@@ -1,0 +1,101 @@
+"""New views of one object from a few posed images: the model adapts to them in one step, or some more with --steps.
+
+The images come as a folder with transforms.json (Blender's, nerfstudio's), a COLMAP model, or an object of any data
+set. The model is shown the support half of the views and asked for the other half, so that the result can be compared
+with the truth; --orbit asks for a round about the object instead.
+
+Example:
+    hyperplanes render --checkpoint runs/demo --views photos/ --out new-views
+    hyperplanes render --checkpoint runs/demo --views photos/ --out new-views --orbit 48 --all-views
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.options import OptionalInt, optional
+from hyperplanes.words import duration
+
+if TYPE_CHECKING:
+    from hyperplanes.views import Task
+
+__all__ = ["Arguments", "read_scene", "run"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to look at, and from where.
+
+    Attributes:
+        checkpoint: What `train`, `adapt` or `demo` wrote.
+        views: The posed images of the object.
+        out: The folder for the pictures.
+        steps: Fine-tuning steps on the shown views; none is the paper's single step.
+        orbit: So many pictures evenly around the object, and a turntable, instead of the query poses.
+        size: Pixels along the longer side of an orbit's pictures; as the images when not given.
+        turntable: The format of the turntable.
+        all_views: Show the model every view, not only the support half.
+        device: auto, cpu or cuda.
+    """
+
+    checkpoint: Path
+    views: Path
+    out: Path
+    steps: int = 0
+    orbit: Annotated[int | None, optional("FRAMES")] = None
+    size: OptionalInt = None
+    turntable: Literal["webp", "gif"] = "webp"
+    all_views: bool = False
+    device: str = "auto"
+
+
+def read_scene(path: Path, all_views: bool) -> Task:
+    """The views to show and the views to ask for; the same ones where all are shown."""
+    from hyperplanes.data import read_task, read_views
+    from hyperplanes.views import Task
+
+    if not all_views:
+        return read_task(path)
+    views = read_views(path)
+    return Task(views, views, path.resolve().name)
+
+
+def run(arguments: Arguments) -> int:
+    """Adapt, render, write, and say how well it went where the truth is known."""
+    from hyperplanes.checkpoints import write_whole
+    from hyperplanes.export import encode_animation, orbit_cameras, save_images, to_pixels
+    from hyperplanes.metrics import psnr, ssim
+    from hyperplanes.models import adapt, choose_device, load_model
+
+    console, device = Console(), choose_device(arguments.device)
+    model = load_model(arguments.checkpoint).to(device)
+    task = read_scene(arguments.views, arguments.all_views)
+    shown, asked = task.support.to(device), task.query.to(device)
+    started = time.perf_counter()
+    field = adapt(model, shown, arguments.steps)
+    console.say(f"adapted to {len(shown)} views of {task.name} in {duration(time.perf_counter() - started)}")
+    cameras = asked.cameras
+    if arguments.orbit is not None:
+        cameras = orbit_cameras(shown, arguments.orbit, size=arguments.size)
+    started = time.perf_counter()
+    pictures = field.render(cameras)
+    seconds = (time.perf_counter() - started) / cameras.batch_size
+    if arguments.orbit is None:
+        paths = save_images(pictures.images, arguments.out, asked.names)
+        images = pictures.images.clamp(0, 1)
+        quality = f"{float(psnr(images, asked.images).mean()):.2f} dB PSNR"
+        if min(asked.size) >= 11:
+            quality += f", {float(ssim(images, asked.images).mean()):.3f} SSIM"
+        known = "shown to the model as well" if arguments.all_views else "never shown to the model"
+        console.say(f"against the {len(asked)} true views, {known}: {quality}")
+    else:
+        paths = save_images(pictures.images, arguments.out)
+        animation = arguments.out / f"turntable.{arguments.turntable}"
+        write_whole(animation, encode_animation(to_pixels(pictures.images), arguments.turntable))
+        console.say(f"{animation}: the turntable")
+    console.say(f"{arguments.out}: {len(paths)} pictures, {duration(seconds)} each")
+    return 0

@@ -1,0 +1,132 @@
+"""Train a model on a data set; what `generate` writes, or any other layout that `inspect` can read.
+
+The model is looked at on held-out objects now and then. Checkpoints are written to --out on the way; interrupted, the
+same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once.
+
+Example:
+    hyperplanes train --data data/cars --preset quick --out runs/cars
+    hyperplanes train --data data/cars --preset quick --method point_multiplane --out runs/cars-baseline
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from hyperplanes.commands.console import Bar, Console
+from hyperplanes.commands.options import OptionalInt
+from hyperplanes.words import duration, rate
+
+if TYPE_CHECKING:
+    from hyperplanes.training import Progress, Trainer
+
+__all__ = ["Arguments", "follow", "progress_line", "run"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to train, and on what.
+
+    Attributes:
+        data: The data set.
+        out: The folder for checkpoints; a training that was interrupted there goes on.
+        preset: One of `hyperplanes presets`: how large the model is and how long it is trained.
+        method: HyperPlanes, or its target network alone with one set of weights for all objects.
+        steps: Other than the preset's.
+        seed: Of the first weights and of every draw.
+        device: auto, cpu or cuda.
+    """
+
+    data: Path
+    out: Path
+    preset: str = "quick"
+    method: Literal["hyperplanes", "point_multiplane", "multiplane"] = "hyperplanes"
+    steps: OptionalInt = None
+    seed: int = 0
+    device: str = "auto"
+
+
+def progress_line(progress: Progress, best: float | None = None) -> str:
+    """Loss, quality on held-out objects, speed, time left.
+
+    Args:
+        progress: of this step.
+        best: the quality to show where this step did not look at it.
+    """
+    quality = progress.psnr if progress.psnr is not None else best
+    held_out = f"held-out {quality:5.2f} dB" if quality is not None else "held-out    -    "
+    return (
+        f"loss {progress.loss:.4f}  {held_out}  {rate(progress.rays_per_second):>6} rays/s  "
+        f"{duration(progress.seconds_left)} left"
+    )
+
+
+@contextmanager
+def _polite_interrupt() -> Generator[list[int]]:
+    """The first Ctrl-C is only noted, the second one is a KeyboardInterrupt."""
+    noted: list[int] = []
+
+    def note(number: int, _: object) -> None:
+        if noted:
+            raise KeyboardInterrupt
+        noted.append(number)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def follow(trainer: Trainer, bar: Bar) -> None:
+    """Train to the end and show how it goes.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C, with a checkpoint written and advice as its text.
+    """
+    quality = None
+    with _polite_interrupt() as interrupted:
+        for progress in trainer.run():
+            quality = progress.psnr if progress.psnr is not None else quality
+            line = progress_line(progress, quality)
+            bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
+            if interrupted and progress.step < progress.steps:
+                trainer.save()
+                raise KeyboardInterrupt(f"step {progress.step} is saved, the same command goes on from there")
+
+
+def run(arguments: Arguments) -> int:
+    """Train, from the start or from where it was interrupted."""
+    from hyperplanes.data import open_dataset
+    from hyperplanes.models import choose_device
+    from hyperplanes.recipes import recipe, start_training
+
+    console = Console()
+    chosen = recipe(arguments.preset, arguments.method, steps=arguments.steps, seed=arguments.seed)
+    data = open_dataset(arguments.data)
+    if not data.names("train"):
+        raise ValueError(
+            f"{arguments.data}: expected objects to train on, found none in its train split; "
+            "a single scene can only be rendered or evaluated"
+        )
+    trainer = start_training(chosen, data, arguments.out, choose_device(arguments.device))
+    held_out = len(data.names("test"))
+    console.say(
+        f"{arguments.method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "
+        f"{len(trainer.names)} objects to train on, {held_out} held out"
+    )
+    if trainer.step:
+        console.say(f"going on from step {trainer.step}")
+    with console.bar("training") as bar:
+        follow(trainer, bar)
+    console.say(f"{arguments.out}: trained for {trainer.step} steps")
+    if held_out:
+        method = arguments.method
+        console.say(
+            f"next: hyperplanes evaluate --data {arguments.data} --checkpoint {arguments.out} --method {method}"
+        )
+    return 0

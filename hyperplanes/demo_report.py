@@ -1,0 +1,179 @@
+"""From the folder of a demonstration to its page and its picture."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from hyperplanes.checkpoints import read_json, write_whole
+from hyperplanes.demo import METHODS, MODELS, DemoSettings
+from hyperplanes.evaluation import METHODS as ABOUT
+from hyperplanes.export import encode_animation, encode_png, orbit_cameras, to_pixels
+from hyperplanes.models import load_model
+from hyperplanes.report import Exhibit, Look, Report, Row, render_page
+from hyperplanes.report.content import Pixels
+from hyperplanes.stages import Stages
+from hyperplanes.training import Tasks
+from hyperplanes.words import duration
+
+__all__ = ["describe", "how_it_was_made", "overview", "write_report"]
+
+TURNTABLE_SCALE = 1.5
+GAP = 6
+
+
+def write_report(
+    folder: Path, data: Tasks, settings: DemoSettings, metrics: Mapping[str, Any], facts: Sequence[tuple[str, str]]
+) -> Path:
+    """Write report.html and overview.png.
+
+    Args:
+        folder: of the demonstration, everything before the report done.
+        data: its data set.
+        settings: of the demonstration.
+        metrics: what `write_metrics` returned.
+        facts: how it was made, label and value.
+
+    Returns:
+        The page.
+    """
+    model = load_model(folder / "hyperplanes")
+    size = round(TURNTABLE_SCALE * settings.resolution)
+    exhibits, rounds = [], []
+    for name in sorted(data.names("test"))[: settings.exhibits]:
+        task = data.task(name)
+        support = model.arrange(task.support)
+        frames = to_pixels(model.adapt(support).render(orbit_cameras(support, settings.frames, size=size)).images)
+        rounds.append(frames)
+        truth = to_pixels(task.query.images)
+        chosen = sorted({len(truth) // 4, 3 * len(truth) // 4})
+        looks = [Look(truth[i], _predictions(folder, name, task.query.names[i])) for i in chosen]
+        quality = {method: metrics[method]["objects"][name]["psnr"] for method in METHODS}
+        read = model.hyperplanes().tolist()
+        exhibits.append(
+            Exhibit(name, to_pixels(support.images), read, looks, quality, encode_animation(frames, "webp"))
+        )
+    curves = {method: read_json(folder / method / "training.json")["curve"] for method in MODELS}
+    write_whole(folder / "overview.png", encode_png(overview(exhibits[:3], rounds[:3])))
+    page = render_page(describe(settings, metrics, exhibits, curves, facts))
+    write_whole(folder / "report.html", page.encode())
+    return folder / "report.html"
+
+
+def _predictions(folder: Path, name: str, view: str) -> dict[str, Pixels]:
+    file = f"{Path(view).stem}.png"
+    return {
+        method: np.asarray(Image.open(folder / "pictures" / method / name / file).convert("RGB")) for method in METHODS
+    }
+
+
+def describe(
+    settings: DemoSettings,
+    metrics: Mapping[str, Any],
+    exhibits: Sequence[Exhibit],
+    curves: Mapping[str, Sequence[Mapping[str, float]]],
+    facts: Sequence[tuple[str, str]],
+) -> Report:
+    """The page's content in words and numbers."""
+    one_step = metrics["hyperplanes"]
+    table = [
+        Row(
+            method,
+            ABOUT[method],
+            metrics[method]["psnr"],
+            metrics[method]["ssim"],
+            duration(metrics[method]["adapt_seconds"]),
+            duration(metrics[method]["render_seconds"]),
+        )
+        for method in METHODS
+    ]
+    shown = len(exhibits[0].support)
+    return Report(
+        title="New views of objects it has never seen",
+        lead=f"A hypernetwork looks at a few of {shown} posed images of a {settings.class_name} and writes the weights "
+        "of a field that can be looked at from anywhere.",
+        figures=[
+            (f"{one_step['psnr']:.2f} dB", "PSNR on held-out objects after a single step"),
+            (f"{one_step['ssim']:.3f}", "SSIM of the same views"),
+            (duration(one_step["adapt_seconds"]), f"from {shown} images to a field"),
+            (duration(one_step["render_seconds"]), f"a view of {settings.resolution} x {settings.resolution} pixels"),
+        ],
+        method="hyperplanes",
+        exhibits=exhibits,
+        table=table,
+        curves=curves,
+        facts=facts,
+        commands=[
+            ("this page again, or what is left of it after an interruption", "hyperplanes demo"),
+            (
+                "a turntable of your own posed images (transforms.json beside them)",
+                "hyperplanes render --checkpoint runs/demo --views photos/ --out new-views --orbit 48",
+            ),
+            (
+                "a mesh with coloured vertices",
+                "hyperplanes export --checkpoint runs/demo --views photos/ --out model --what mesh --mesh-format glb",
+            ),
+        ],
+    )
+
+
+def how_it_was_made(settings: DemoSettings, folder: Path, manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Data, training, machine and time, label and value."""
+    done = Stages(folder)
+    steps = read_json(folder / "hyperplanes" / "training.json")["step"]
+    trained = settings.objects - settings.held_out
+    times = ", ".join(f"{name} {duration(done.seconds(name))}" for name in ("data", *MODELS) if done.seconds(name))
+    return [
+        ("objects", f"{trained} procedural {settings.class_name}s to train on, {settings.held_out} held out"),
+        (
+            "images",
+            f"{settings.views} an object, {settings.resolution} px, half support, half query",
+        ),
+        ("renderer of the data", str(manifest.get("renderer", "unknown"))),
+        ("training", f"{steps:,} steps of each model, preset {settings.preset}, seed {settings.seed}"),
+        ("time", times),
+        ("machine", f"{_processor()}, {len(os.sched_getaffinity(0))} cores, torch {torch.__version__}"),
+    ]
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return named[0] if named else platform.processor() or platform.machine()
+
+
+def overview(exhibits: Sequence[Exhibit], rounds: Sequence[Pixels], columns: int = 7) -> Pixels:
+    """One picture of it all: a row an object, on the left what was read, on the right new views around it.
+
+    Args:
+        exhibits: the objects.
+        rounds: the frames of their turntables.
+        columns: new views a row.
+
+    Returns:
+        Pixels (height, width, 3).
+    """
+    rows = []
+    for exhibit, frames in zip(exhibits, rounds, strict=True):
+        side = frames.shape[1]
+        read = [_resized(exhibit.support[index], side) for index in exhibit.read[:5]]
+        new = [frames[round(column * len(frames) / columns) % len(frames)] for column in range(columns)]
+        edge = np.full((side, GAP, 3), 255, np.uint8)
+        rule = np.full((side, 2, 3), 200, np.uint8)
+        tiles = [piece for tile in read for piece in (tile, edge)] + [rule] + [p for tile in new for p in (edge, tile)]
+        rows += [np.concatenate(tiles, 1), np.full((GAP, sum(t.shape[1] for t in tiles), 3), 255, np.uint8)]
+    return np.concatenate(rows[:-1], 0)
+
+
+def _resized(pixels: Pixels, side: int) -> Pixels:
+    return np.asarray(Image.fromarray(pixels).resize((side, side), Image.Resampling.LANCZOS))

@@ -1,0 +1,95 @@
+"""What a report shows, as plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["Exhibit", "Look", "Pixels", "Report", "Row"]
+
+Pixels = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Look:
+    """One view that no method was shown.
+
+    Attributes:
+        truth: (height, width, 3).
+        predictions: by method, of the same size.
+    """
+
+    truth: Pixels
+    predictions: Mapping[str, Pixels]
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """One held-out object.
+
+    Attributes:
+        name: of the object.
+        support: (view, height, width, 3), what the methods were shown.
+        read: which of them the hypernetwork reads.
+        looks: some query views.
+        psnr: dB over all query views, by method.
+        turntable: an animated WebP of the prediction, or nothing.
+    """
+
+    name: str
+    support: Pixels
+    read: Sequence[int]
+    looks: Sequence[Look]
+    psnr: Mapping[str, float]
+    turntable: bytes = b""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table.
+
+    Attributes:
+        method: its name.
+        about: what it is, in a few words.
+        psnr: dB, mean over objects.
+        ssim: mean over objects.
+        adapt: how long it took from images to a field, as text.
+        render: how long a view took, as text.
+    """
+
+    method: str
+    about: str
+    psnr: float
+    ssim: float
+    adapt: str
+    render: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that the page says.
+
+    Attributes:
+        title: its heading.
+        lead: one sentence under it.
+        figures: a few numbers worth reading first, each with what it is.
+        method: the one that is shown first.
+        exhibits: held-out objects.
+        table: one row a method.
+        curves: by method, training entries with "step", "loss" and at times "psnr".
+        facts: how it was made, label and value.
+        commands: how to make it again, and what to try next.
+    """
+
+    title: str
+    lead: str
+    figures: Sequence[tuple[str, str]]
+    method: str
+    exhibits: Sequence[Exhibit]
+    table: Sequence[Row]
+    curves: Mapping[str, Sequence[Mapping[str, float]]]
+    facts: Sequence[tuple[str, str]]
+    commands: Sequence[tuple[str, str]]

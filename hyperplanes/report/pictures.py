@@ -1,0 +1,59 @@
+"""Pictures for a page: inlined files, and errors as colours."""
+
+from __future__ import annotations
+
+import base64
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.export import encode_png
+from hyperplanes.report.content import Pixels
+
+__all__ = ["ERROR_SCALE", "colour_scale", "error_map", "gradient", "inline", "inline_png"]
+
+ERROR_SCALE = 0.25
+"""The difference that is drawn in the last colour."""
+
+_ANCHORS = ("#0b0a1e", "#3b1467", "#85216b", "#cb3f52", "#f2813a", "#fccb4d", "#fdf6c6")
+"""Dark to bright, even in lightness."""
+
+
+def colour_scale(values: npt.NDArray[np.floating]) -> Pixels:
+    """Colours (..., 3) of values in [0, 1], interpolated between anchors; what lies outside is clamped.
+
+    >>> colour_scale(np.array([0.0, 1.0])).tolist()
+    [[11, 10, 30], [253, 246, 198]]
+    """
+    anchors = np.array([[int(hue[i : i + 2], 16) for i in (1, 3, 5)] for hue in _ANCHORS], dtype=np.float64)
+    place = np.clip(values, 0, 1) * (len(anchors) - 1)
+    lower = np.minimum(place.astype(int), len(anchors) - 2)
+    part = (place - lower)[..., None]
+    return np.round(anchors[lower] * (1 - part) + anchors[lower + 1] * part).astype(np.uint8)
+
+
+def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
+    """The absolute difference, mean over the channels, on the colour scale up to ERROR_SCALE.
+
+    Raises:
+        ValueError: pictures of different sizes.
+    """
+    if prediction.shape != truth.shape:
+        raise ValueError(f"prediction: expected shape {truth.shape}, got {prediction.shape}")
+    difference = np.abs(prediction.astype(np.float64) - truth.astype(np.float64)).mean(-1) / 255
+    return colour_scale(difference / ERROR_SCALE)
+
+
+def gradient() -> str:
+    """The colour scale as a CSS gradient."""
+    return f"linear-gradient(90deg, {', '.join(_ANCHORS)})"
+
+
+def inline(content: bytes, kind: str) -> str:
+    """A file as a data URI."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def inline_png(pixels: Pixels) -> str:
+    """A picture as a data URI."""
+    return inline(encode_png(pixels), "png")

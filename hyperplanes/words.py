@@ -1,0 +1,32 @@
+"""Numbers as people say them."""
+
+from __future__ import annotations
+
+__all__ = ["duration", "rate"]
+
+
+def duration(seconds: float) -> str:
+    """A length of time for people.
+
+    >>> duration(0.034), duration(8.25), duration(75), duration(7322)
+    ('34 ms', '8.2 s', '1 min 15 s', '2 h 02 min')
+    """
+    if seconds < 1:
+        return f"{1000 * seconds:.0f} ms"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    if seconds < 3600:
+        return f"{int(seconds) // 60} min {int(seconds) % 60:02d} s"
+    return f"{int(seconds) // 3600} h {int(seconds) % 3600 // 60:02d} min"
+
+
+def rate(value: float) -> str:
+    """A large number in thousands or millions.
+
+    >>> rate(950), rate(12345), rate(2.5e6)
+    ('950', '12.3k', '2.5M')
+    """
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if value >= size:
+            return f"{value / size:.1f}{letter}"
+    return f"{value:.0f}"
