@@ -48,7 +48,7 @@ def read_json(path: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: expected a checkpoint's JSON file, found none; `hyperplanes train` writes one"
         ) from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: expected JSON, found something else ({error}); copy the file again") from None
     if not isinstance(value, dict):
         raise CheckpointError(f"{path}: expected a JSON object, found {type(value).__name__}")
@@ -67,7 +67,7 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
 
     Args:
         path: a safetensors file.
-        expected: names and shapes that must be there; anything where absent.
+        expected: the names and shapes that must be there, no more and no less; anything where absent.
 
     Returns:
         Tensors by name.
@@ -86,7 +86,9 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
         raise CheckpointError(
             f"{path}: expected whole safetensors, found a damaged file ({error}); copy it again"
         ) from None
-    for name, value in (expected or {}).items():
+    if expected is None:
+        return found
+    for name, value in expected.items():
         if name not in found:
             raise CheckpointError(
                 f"{path}: expected a tensor {name!r}, found none; the configuration is of another model"
@@ -96,4 +98,9 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
                 f"{path}: expected {name} of shape {tuple(value.shape)}, found {tuple(found[name].shape)}; "
                 "the configuration is of another model"
             )
+    if surplus := sorted(set(found) - set(expected)):
+        raise CheckpointError(
+            f"{path}: expected {len(expected)} tensors, found {len(surplus)} more, as {surplus[0]!r}; "
+            "the configuration is of another model"
+        )
     return found

@@ -1,0 +1,154 @@
+import errno
+import io
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from hyperplanes.checkpoints import (
+    CheckpointError,
+    load_tensors,
+    read_json,
+    save_tensors,
+    write_json,
+    write_whole,
+)
+
+TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "count": torch.tensor(7), "b": torch.ones(3, 2).T}
+
+
+@pytest.fixture
+def weights(tmp_path):
+    path = tmp_path / "model.safetensors"
+    save_tensors(path, TENSORS)
+    return path
+
+
+def complaint(path, call):
+    """The message of the CheckpointError: one line, about this file."""
+    with pytest.raises(CheckpointError) as caught:
+        call()
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(f"{path}: expected ")
+    assert ", found " in message
+    assert "; " in message or message.endswith("found list")
+    return message
+
+
+def test_tensors_come_back_as_they_were(weights):
+    found = load_tensors(weights, TENSORS)
+    assert set(found) == set(TENSORS)
+    for name, value in TENSORS.items():
+        assert torch.equal(found[name], value)
+        assert found[name].dtype == value.dtype
+    assert os.listdir(weights.parent) == [weights.name]
+
+
+def test_json_comes_back_as_it_was(tmp_path):
+    value = {"steps": 3, "nested": {"layers": ["colour", "density"]}, "none": None}
+    write_json(tmp_path / "deep" / "model.json", value)
+    assert read_json(tmp_path / "deep" / "model.json") == value
+
+
+def test_a_missing_file_names_the_command_that_makes_one(tmp_path):
+    for name, call in (("x.safetensors", load_tensors), ("x.json", read_json)):
+        path = tmp_path / name
+        assert "`hyperplanes train` writes" in complaint(path, lambda call=call, path=path: call(path))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.99])
+def test_a_truncated_file_is_damaged(weights, share):
+    content = weights.read_bytes()
+    weights.write_bytes(content[: int(len(content) * share)])
+    assert "copy it again" in complaint(weights, lambda: load_tensors(weights))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"c": torch.ones(1)}, "expected a tensor 'c', found none"),
+        ({"b": torch.ones(3, 3)}, r"expected b of shape (3, 3), found (2, 3)"),
+        ({"b": None}, "expected 2 tensors, found 1 more, as 'b'"),
+    ],
+)
+def test_weights_of_another_architecture(weights, change, words):
+    expected = {name: value for name, value in {**TENSORS, **change}.items() if value is not None}
+    message = complaint(weights, lambda: load_tensors(weights, expected))
+    assert words in message
+    assert "the configuration is of another model" in message
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"\xff\xfe\x00", b"[1, 2]", b"nonsense", b"[" * 100_000], ids=lambda c: repr(c[:8])
+)
+def test_garbage_instead_of_json(tmp_path, content):
+    path = tmp_path / "model.json"
+    path.write_bytes(content)
+    complaint(path, lambda: read_json(path))
+
+
+def test_folders_are_no_files(tmp_path):
+    complaint(tmp_path, lambda: read_json(tmp_path))
+    complaint(tmp_path, lambda: load_tensors(tmp_path))
+
+
+class Poison:
+    """Unpickling this leaves a file behind."""
+
+    def __init__(self, trace):
+        self.trace = trace
+
+    def __reduce__(self):
+        return Path.touch, (self.trace,)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_pickle_is_refused_and_never_run(tmp_path, legacy):
+    path, trace = tmp_path / "model.safetensors", tmp_path / "trace"
+    torch.save({"a": Poison(trace)}, path, _use_new_zipfile_serialization=not legacy)
+    complaint(path, lambda: load_tensors(path))
+    assert not trace.exists()
+    torch.load(io.BytesIO(path.read_bytes()), weights_only=False)
+    assert trace.exists()  # it would have
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    """A disk that is full when the content is to be made durable."""
+
+    def fail(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fail)
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_a_full_disk_leaves_the_old_file_or_none(tmp_path, full_disk, existing):
+    path = tmp_path / "model.json"
+    if existing:
+        path.write_text('{"old": 1}')
+    for write in (lambda: write_json(path, {"new": 1}), lambda: save_tensors(path, TENSORS)):
+        with pytest.raises(OSError, match="No space left on device"):
+            write()
+        assert os.listdir(tmp_path) == (["model.json"] if existing else [])
+    if existing:
+        assert json.loads(path.read_text()) == {"old": 1}
+
+
+def test_a_rename_that_fails_leaves_no_partial_file(tmp_path, monkeypatch):
+    def fail(self, target):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(OSError, match="Input/output error"):
+        write_whole(tmp_path / "file", b"content")
+    assert os.listdir(tmp_path) == []
+
+
+def test_what_cannot_be_written_as_json_leaves_nothing(tmp_path):
+    with pytest.raises(TypeError):
+        write_json(tmp_path / "model.json", {"tensor": torch.ones(1)})
+    assert os.listdir(tmp_path) == []
