@@ -38,6 +38,10 @@ class Views:
             raise ValueError(f"images: expected shape (view, 3, height, width), got {tuple(self.images.shape)}")
         if len(self.images) != self.cameras.batch_size:
             raise ValueError(f"images: expected one a camera, {self.cameras.batch_size}, got {len(self.images)}")
+        if len(self.images) and camera.image_size(self.cameras) != self.size:
+            raise ValueError(f"images: expected the cameras' size {camera.image_size(self.cameras)}, got {self.size}")
+        if self.names and len(self.names) != len(self.images):
+            raise ValueError(f"names: expected one a view, {len(self.images)}, got {len(self.names)}")
         if self.masks is not None and self.masks.shape != (len(self.images), 1, *self.images.shape[2:]):
             raise ValueError(
                 f"masks: expected {(len(self.images), 1, *self.images.shape[2:])}, got {tuple(self.masks.shape)}"
@@ -49,8 +53,8 @@ class Views:
     def __getitem__(self, index: slice | list[int] | Int[Tensor, " chosen"]) -> Views:
         names = self.names
         if names:
-            chosen = range(len(self))[index] if isinstance(index, slice) else torch.as_tensor(index).tolist()
-            names = tuple(names[i] for i in chosen)
+            chosen = torch.arange(len(self))[index.cpu() if isinstance(index, Tensor) else index]
+            names = tuple(names[i] for i in chosen.reshape(-1).tolist())
         return replace(
             self,
             images=self.images[index],

@@ -1,0 +1,121 @@
+import pytest
+import torch
+
+from hyperplanes.geometry.cameras import centres, select
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.views import Task, Views
+from tests.reference_rendering import ball_views, ring
+
+NAMES = ("a", "b", "c", "d")
+
+
+def views(size=(6, 9), **others):
+    images = torch.rand(4, 3, *size, generator=torch.Generator().manual_seed(0))
+    masks = (images[:, :1] > 0.5).float()
+    return Views(images, ring(4, size), masks, **{"names": NAMES, **others})
+
+
+@pytest.mark.parametrize(
+    ("index", "chosen"),
+    [
+        (slice(1, None, 2), [1, 3]),
+        ([2, 0], [2, 0]),
+        (torch.tensor([3, 3]), [3, 3]),
+        (torch.tensor([False, False, True, True]), [2, 3]),
+        (slice(0, 0), []),
+    ],
+)
+def test_chosen_views_keep_their_cameras_masks_and_names(index, chosen):
+    whole = views(bounds=Sphere((1.0, 0.0, 0.0), 2.0))
+    part = whole[index]
+    assert len(part) == len(chosen)
+    assert part.names == tuple(NAMES[i] for i in chosen)
+    assert torch.equal(part.images, whole.images[chosen])
+    assert torch.equal(part.masks, whole.masks[chosen])
+    assert torch.equal(part.cameras.extrinsics, whole.cameras.extrinsics[chosen])
+    assert part.bounds == whole.bounds
+
+
+def test_views_without_masks_or_names():
+    plain = Views(views().images, views().cameras)
+    assert plain[1:].masks is None
+    assert plain[1:].names == ()
+    assert plain.to("cpu").masks is None
+
+
+def test_size_is_height_and_width():
+    assert views((6, 9)).size == (6, 9)
+
+
+def test_rays_go_row_by_row_through_the_pixels_of_one_view():
+    whole = views()
+    rays = whole.rays(2)
+    assert len(rays) == 6 * 9
+    torch.testing.assert_close(rays.origins, centres(whole.cameras)[2].expand(54, 3))
+    # seen from its own camera, the ray of row 4, column 7 comes from pixel (7, 4)
+    point = rays.at(torch.full((54,), 2.5))[4 * 9 + 7]
+    pixel = select(whole.cameras, [2]).project(point[None, None])
+    torch.testing.assert_close(pixel.flatten(), torch.tensor([7.0, 4.0]), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("span", ["sphere", "depth"])
+def test_sampled_rays_come_with_the_colours_that_their_pixels_show(span):
+    whole = views()
+    rays, truth = whole.sample_rays(200, generator=torch.Generator().manual_seed(1), span=span)
+    for index in range(200):
+        view = int((centres(whole.cameras) - rays.origins[index]).norm(dim=1).argmin())
+        point = rays.origins[index] + 3 * rays.directions[index]
+        column, row = select(whole.cameras, [view]).project(point[None, None]).flatten().round().long().tolist()
+        assert torch.equal(truth[index], whole.images[view, :, row, column])
+
+
+def test_rays_are_drawn_uniformly_from_all_views():
+    whole = views((2, 2))
+    unique = torch.arange(16.0).reshape(4, 1, 2, 2).expand(4, 3, 2, 2) / 16
+    _, truth = Views(unique, whole.cameras).sample_rays(16_000, generator=torch.Generator().manual_seed(0))
+    counts = torch.bincount((truth[:, 0] * 16).round().long(), minlength=16)
+    # one standard deviation of a count of 1000 is 31
+    assert (counts - 1000).abs().max() < 150
+
+
+def test_rays_are_drawn_among_the_given_pixels_only():
+    whole = ball_views(ring(3))
+    among = whole.masks.flatten().nonzero()[:, 0]
+    rays, truth = whole.sample_rays(300, generator=torch.Generator().manual_seed(0), among=among)
+    assert (truth < 1).any(1).all()  # the ball, never the white behind it
+    assert len(rays) == 300
+
+
+def test_the_same_generator_draws_the_same_rays():
+    def draw(seed):
+        return views().sample_rays(50, generator=torch.Generator().manual_seed(seed))[1]
+
+    before = torch.random.get_rng_state()
+    assert torch.equal(draw(1), draw(1))
+    assert not torch.equal(draw(1), draw(2))
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": torch.rand(4, 1, 6, 9)}, r"images: expected shape \(view, 3, height, width\), got \(4, 1, 6, 9\)"),
+        ({"images": torch.rand(3, 6, 9)}, r"images: expected shape"),
+        ({"images": torch.rand(3, 3, 6, 9), "masks": None}, "images: expected one a camera, 4, got 3"),
+        (
+            {"images": torch.rand(4, 3, 9, 6), "masks": None},
+            r"images: expected the cameras' size \(6, 9\)",
+        ),
+        ({"masks": torch.ones(4, 6, 9)}, r"masks: expected \(4, 1, 6, 9\), got \(4, 6, 9\)"),
+        ({"names": ("a",)}, "names: expected one a view, 4, got 1"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(change, message):
+    whole = views()
+    parts = {"images": whole.images, "cameras": whole.cameras, "masks": whole.masks, "names": NAMES}
+    with pytest.raises(ValueError, match=message):
+        Views(**{**parts, **change})
+
+
+def test_a_task_names_its_object():
+    assert Task(views(), views(), "car").name == "car"
