@@ -1,0 +1,65 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from hyperplanes.metrics import psnr, ssim
+
+
+def pairs(size=(24, 31), noise=0.1):
+    generator = torch.Generator().manual_seed(0)
+    smooth = torch.nn.functional.interpolate(torch.rand(3, 3, 5, 5, generator=generator), size, mode="bicubic")
+    truth = smooth.clamp(0, 1)
+    truth[1, :, : size[0] // 2] = 1.0  # white background, as rendered objects have
+    scale = noise * torch.tensor([0.2, 1.0, 3.0])[:, None, None, None]
+    return (truth + scale * torch.randn(truth.shape, generator=generator)).clamp(0, 1), truth
+
+
+def as_image(image):
+    return image.permute(1, 2, 0).double().numpy()
+
+
+def test_psnr_equals_scikit_images():
+    predicted, truth = pairs()
+    expected = [
+        peak_signal_noise_ratio(as_image(t), as_image(p), data_range=1) for p, t in zip(predicted, truth, strict=True)
+    ]
+    np.testing.assert_allclose(psnr(predicted, truth).numpy(), expected, atol=1e-4)
+
+
+def test_ssim_equals_scikit_images():
+    predicted, truth = pairs()
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    expected = [
+        structural_similarity(as_image(t), as_image(p), data_range=1, channel_axis=2, **window)
+        for p, t in zip(predicted, truth, strict=True)
+    ]
+    np.testing.assert_allclose(ssim(predicted, truth).numpy(), expected, atol=1e-5)
+
+
+def test_a_constant_error_by_hand():
+    # an error of 0.1 everywhere: -10 log10(0.01) = 20; of 0.5 in one image of two: -10 log10(0.25) = 6.02
+    truth = torch.full((2, 3, 4, 4), 0.5)
+    predicted = torch.stack([truth[0] + 0.1, truth[1] - 0.5])
+    assert psnr(predicted, truth).tolist() == pytest.approx([20.0, -10 * math.log10(0.25)], abs=1e-4)
+
+
+def test_equal_images_are_perfect():
+    image = pairs()[1]
+    assert psnr(image, image).tolist() == [math.inf] * 3
+    np.testing.assert_allclose(ssim(image, image).numpy(), 1.0, atol=1e-6)
+
+
+def test_more_noise_is_worse():
+    truth = pairs()[1]
+    quality = [(psnr(pairs(noise=n)[0], truth).mean(), ssim(pairs(noise=n)[0], truth).mean()) for n in (0.02, 0.1, 0.3)]
+    assert quality[0] > quality[1] > quality[2]
+    assert quality[0][1] > quality[1][1] > quality[2][1]
+
+
+def test_ssim_refuses_images_smaller_than_its_window():
+    with pytest.raises(ValueError, match="images: expected at least 11 x 11 pixels, got 10 x 20"):
+        ssim(torch.rand(1, 3, 10, 20), torch.rand(1, 3, 10, 20))
+    assert torch.isfinite(ssim(torch.rand(1, 3, 11, 11), torch.rand(1, 3, 11, 11))).all()
