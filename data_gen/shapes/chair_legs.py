@@ -20,6 +20,8 @@ _BITE = 0.012
 
 def _corners(frame: Frame, inset: float) -> list[tuple[str, float, float]]:
     """Where legs meet the seat: name, x and z of each."""
+    if frame.kind == "lounge":
+        inset += 0.06  # the cushion's lower corners are round
     x, z = frame.width / 2 - inset, frame.depth / 2 - inset
     if frame.round_seat:
         x, z = 0.72 * x, 0.72 * z
@@ -65,11 +67,12 @@ def _four(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part
         parts.append(Part.of(f"{name}_leg", post(feet[name], heads[name], taper * size, size, sides), palette.frame))
     if sides == 4 and splay == 0 and not frame.round_seat:
         height = rng.uniform(0.04, 0.07)
+        x_edge, z_edge = _corners(frame, 0.045)[0][1:]
         for name, wide, deep, x, z in (
-            ("front", frame.width - 0.07, 0.018, 0.0, frame.depth / 2 - 0.045),
-            ("rear", frame.width - 0.07, 0.018, 0.0, -frame.depth / 2 + 0.045),
-            ("left", 0.018, frame.depth - 0.074, frame.width / 2 - 0.045, 0.0),
-            ("right", 0.018, frame.depth - 0.074, -frame.width / 2 + 0.045, 0.0),
+            ("front", 2 * x_edge + 0.02, 0.018, 0.0, z_edge),
+            ("rear", 2 * x_edge + 0.02, 0.018, 0.0, -z_edge),
+            ("left", 0.018, 2 * z_edge + 0.016, x_edge, 0.0),
+            ("right", 0.018, 2 * z_edge + 0.016, -x_edge, 0.0),
         ):
             tall = height if x == 0 else height - 0.006
             apron = tapered((wide, deep), (wide, deep), tall).moved(
