@@ -13,7 +13,8 @@ import struct
 import urllib.parse
 from typing import Any
 
-from data_gen.mesh_files import MeshError, ModelFolder
+from data_gen.mesh_files import MeshError
+from data_gen.model_folder import ModelFolder
 from data_gen.mtl_files import decoded
 
 __all__ = ["check_gltf", "generator_of"]

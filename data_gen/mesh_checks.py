@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from data_gen.mesh_files import MeshError, ModelFolder
+from data_gen.mesh_files import MeshError
+from data_gen.model_folder import ModelFolder
 from data_gen.mtl_files import decoded
 
 __all__ = ["check_ply", "check_stl", "declared_up", "read_dae", "read_off", "read_ply"]

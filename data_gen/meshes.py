@@ -7,11 +7,6 @@ what cannot be drawn as the file says is named in ``Mesh.warnings``, what cannot
 
 from __future__ import annotations
 
-import contextlib
-import io
-import logging
-import warnings as python_warnings
-from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from data_gen.gltf_checks import check_gltf, generator_of
-from data_gen.mesh_checks import check_stl, declared_up, read_dae, read_off, read_ply
+from data_gen.mesh_checks import declared_up
 from data_gen.mesh_cleaning import clean, decimate, shades_smoothly
-from data_gen.mesh_files import MAX_FILE_BYTES, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, ModelFolder, read_bytes
+from data_gen.mesh_files import MAX_FILE_BYTES, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, read_bytes
 from data_gen.mesh_folders import MeshFile, find_meshes, safe_name
-from data_gen.mesh_surfaces import DEFAULT_COLOUR, ColourSpace, canonical_visual
-from data_gen.obj_files import read_obj
+from data_gen.mesh_readers import read_scene
+from data_gen.mesh_surfaces import ColourSpace, canonical_visual
+from data_gen.model_folder import ModelFolder
 from data_gen.shapenet import model_root
 
 __all__ = [
@@ -100,20 +95,7 @@ def load_mesh(
         )
     data = read_bytes(path, limit=MAX_TEXT_BYTES if suffix in _TEXT else MAX_FILE_BYTES)
     folder = ModelFolder(path, model_root(path))
-    try:
-        with _strict():
-            scene, colours, lines = _read(data, suffix, folder)
-    except MeshError as error:
-        raise folder.refused or error from error
-    except (Exception, MemoryError) as error:
-        if folder.refused is not None:
-            raise folder.refused from error
-        found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise MeshError(
-            f"{path}: expected a {suffix[1:].upper()} mesh, found {found}; the file is damaged or was cut"
-        ) from error
-    if folder.refused is not None:
-        raise folder.refused
+    scene, colours, lines = read_scene(data, folder)
     told = "; ".join(lines)
     lost = [f"{reference}: {reason}" for reference, reason in folder.lost.items() if reference not in told]
     axis = declared_up(data) if suffix == ".dae" else None
@@ -215,56 +197,6 @@ def render_ready(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float
         geometry = mesh.scene.geometry[key]
         ready.append((geometry, np.asarray(pose), bool(geometry.metadata.get("smooth", True))))
     return ready
-
-
-def _read(data: bytes, suffix: str, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
-    """A scene in the file's coordinates, what its plain colours are, and warnings."""
-    if suffix == ".obj":
-        scene, lines = read_obj(data, folder)
-        return scene, "scene", lines
-    if suffix == ".off":
-        scene, lines = read_off(data, folder)
-        return scene, "scene", lines
-    if suffix == ".ply":
-        scene, lines = read_ply(data, folder)
-        return scene, "scene", lines
-    if suffix == ".dae":
-        scene, lines = read_dae(data, folder)
-        return scene, "srgb", lines
-    lines, bare = (check_stl(data, folder), set()) if suffix == ".stl" else check_gltf(data, folder)
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
-    _grey_out(scene, bare)
-    if suffix == ".stl":
-        for geometry in scene.geometry.values():
-            geometry.metadata["smooth"] = False
-    painted_as_seen = suffix == ".stl" or "trimesh" in generator_of(data)
-    return scene, "scene" if painted_as_seen else "gltf", lines
-
-
-def _grey_out(scene: trimesh.Scene, names: set[str | None]) -> None:
-    """Give white materials that lost their texture the default colour: white on white would be lost to the eye too."""
-    for geometry in scene.geometry.values():
-        material = getattr(getattr(geometry, "visual", None), "material", None)
-        if material is None or material.name not in names or getattr(material, "baseColorTexture", None) is not None:
-            continue
-        factor = material.baseColorFactor
-        if factor is None or (np.asarray(factor)[:3] == 255).all():
-            material.baseColorFactor = DEFAULT_COLOUR
-
-
-@contextlib.contextmanager
-def _strict() -> Generator[None, None, None]:
-    """Keep the loaders' log quiet, and turn numpy's remark that a text was not read to its end into an error."""
-    logger = logging.getLogger("trimesh")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL + 1)
-    try:
-        with python_warnings.catch_warnings():
-            python_warnings.simplefilter("ignore")
-            python_warnings.filterwarnings("error", message="string or file could not be read to its end")
-            yield
-    finally:
-        logger.setLevel(level)
 
 
 def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:

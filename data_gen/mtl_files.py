@@ -13,8 +13,9 @@ import numpy as np
 import PIL.Image
 from trimesh.visual.material import PBRMaterial
 
-from data_gen.mesh_files import MAX_TEXT_BYTES, ModelFolder
+from data_gen.mesh_files import MAX_TEXT_BYTES
 from data_gen.mesh_surfaces import linear_from_srgb
+from data_gen.model_folder import ModelFolder
 
 __all__ = ["decoded", "read_materials"]
 

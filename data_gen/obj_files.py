@@ -19,8 +19,9 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from data_gen.mesh_files import MeshError, ModelFolder
+from data_gen.mesh_files import MeshError
 from data_gen.mesh_surfaces import DEFAULT_COLOUR
+from data_gen.model_folder import ModelFolder
 from data_gen.mtl_files import decoded, read_materials
 
 __all__ = ["read_obj"]

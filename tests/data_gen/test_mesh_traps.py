@@ -32,6 +32,7 @@ from mesh_writers import (
 
 from data_gen import mesh_files
 from data_gen.meshes import MeshError, load_mesh, prepare_scene, render_ready
+from data_gen.model_folder import ModelFolder
 
 PAINT = "newmtl paint\nKd 1 0 0\n"
 WOOD = PAINT + "map_Kd wood.png\n"
@@ -614,7 +615,7 @@ def test_many_textures_count_together(tmp_path, monkeypatch):
         (tmp_path / f"{index}.png").write_bytes(picture(size=(10, 10)))
     path = write_obj(tmp_path, mtl=mtl, body=body)
     assert len(render_ready(load_mesh(path))) == 3
-    monkeypatch.setattr(mesh_files.ModelFolder.__init__, "__kwdefaults__", {"pixels": 250})
+    monkeypatch.setattr(ModelFolder.__init__, "__kwdefaults__", {"pixels": 250})
     assert "2.png: expected textures of at most 50 pixels" in refusal(path)
 
 
