@@ -65,7 +65,7 @@ def generate(
     seed: int = 0,
     distance: float | None = None,
     field_of_view: float | None = None,
-    supersample: int = 2,
+    supersample: int = 3,
     renderer: str | None = None,
     timeout: float = 300.0,
     recycle: int = 200,

@@ -193,4 +193,6 @@ def _images_binary(path: Path) -> list[_Image]:
         pose = _pose(np.array(values[1:5]), np.array(values[5:8]))
         images.append(_Image(data[at + 64 : end].decode(), values[8], pose))
         at = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
+    if at > len(data):
+        raise ValueError(f"{path.name} ends early")
     return images

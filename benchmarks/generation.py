@@ -1,0 +1,184 @@
+"""How fast data sets are generated, against the obvious loop: one process, a new pyrender renderer for every mesh.
+
+Both make the same procedural cars, draw the same 50 views of each at 128x128, and write RGBA PNGs; both times include
+the start of the processes. Ours is drawn with supersampling, the loop with what pyrender does by itself. The loop runs
+in a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+__all__ = ["main"]
+
+VIEWS, RESOLUTION = 50, 128
+THOUSAND = 1000
+
+
+def main(arguments: list[str]) -> int:
+    """Measure, print the rows, and write them as JSON where asked.
+
+    Args:
+        arguments: --quick for a rough answer in about a minute, --json FILE, or (inside) --loop COUNT OUT.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks generation", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="fewer objects")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--loop", nargs=2, metavar=("COUNT", "OUT"), help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.loop:
+        print(json.dumps(obvious_loop(int(options.loop[0]), Path(options.loop[1]))))
+        return 0
+    objects = 8 if options.quick else 40
+    with tempfile.TemporaryDirectory() as folder:
+        rows = [compare(objects, Path(folder))]
+        rows += [extrapolate(rows[0]), memory(24 if options.quick else THOUSAND, Path(folder))]
+    for row in rows:
+        print(
+            "  ".join(
+                f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
+            )
+        )
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps({"benchmark": "generation", "rows": rows}, indent=2) + "\n")
+    return 0
+
+
+def compare(objects: int, folder: Path) -> dict[str, Any]:
+    """Images a second of `data_gen.dataset.generate` and of the obvious loop.
+
+    Args:
+        objects: how many each makes.
+        folder: where they write.
+
+    Returns:
+        The row; `speedup` is ours over theirs.
+    """
+    from data_gen.backends import find_backend
+    from data_gen.dataset import Procedural, generate
+
+    renderer = find_backend().name
+    workers = len(os.sched_getaffinity(0))
+    source = Procedural("car", objects)
+    begun = time.perf_counter()
+    generate(source, folder / "ours", views=VIEWS, resolution=RESOLUTION, held_out=0, workers=workers)
+    ours = objects * VIEWS / (time.perf_counter() - begun)
+    row = {"name": "generate", "objects": objects, "views": VIEWS, "resolution": RESOLUTION}
+    row |= {"renderer": renderer, "workers": workers, "images_per_second": ours}
+    if not renderer.startswith("pyrender"):
+        return row | {"note": "the obvious loop needs OpenGL, which is not here"}
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks",
+        "generation",
+        "--loop",
+        str(max(4, objects // 4)),
+        str(folder / "loop"),
+    ]
+    environment = os.environ | {"PYOPENGL_PLATFORM": renderer.removeprefix("pyrender-")}
+    loop = json.loads(subprocess.run(command, check=True, capture_output=True, env=environment).stdout.splitlines()[-1])
+    reference = loop["images"] / loop["seconds"]
+    return row | {"reference_images_per_second": reference, "speedup": ours / reference}
+
+
+def extrapolate(row: dict[str, Any]) -> dict[str, Any]:
+    """The time that 1,000 objects of 50 views would take at a measured rate; extrapolated, not measured."""
+    seconds = THOUSAND * VIEWS / row["images_per_second"]
+    return {"name": "1,000 objects x 50 views at 128x128", "seconds_extrapolated": seconds}
+
+
+def memory(objects: int, folder: Path) -> dict[str, Any]:
+    """The memory of parent and workers while many small objects stream through, workers not recycled.
+
+    Args:
+        objects: how many, with 2 views of 32x32 each.
+        folder: where they are written.
+
+    Returns:
+        Medians of the resident memory in MB over the second and the last tenth of the objects, and the growth.
+    """
+    from data_gen.dataset import Procedural, generate
+
+    sizes: list[float] = []
+    generate(
+        Procedural("car", objects),
+        folder / "stream",
+        views=2,
+        resolution=32,
+        held_out=0,
+        recycle=objects,
+        progress=lambda *_: sizes.append(resident_megabytes()),
+    )
+    tenth = max(1, len(sizes) // 10)
+    early, late = statistics.median(sizes[tenth : 2 * tenth]), statistics.median(sizes[-tenth:])
+    return {
+        "name": f"memory over {objects} objects",
+        "early_megabytes": early,
+        "late_megabytes": late,
+        "growth_megabytes_an_object": (late - early) / objects,
+    }
+
+
+def resident_megabytes() -> float:
+    """Resident memory of this process and its children."""
+    processes = [os.getpid()]
+    for task in Path("/proc/self/task").iterdir():
+        processes += map(int, (task / "children").read_text().split())
+    total = 0
+    for process in processes:
+        try:
+            total += int(Path(f"/proc/{process}/statm").read_text().split()[1])
+        except FileNotFoundError:
+            continue  # it has ended meanwhile
+    return total * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def obvious_loop(objects: int, out: Path) -> dict[str, float]:
+    """What one would write first with pyrender.
+
+    Args:
+        objects: how many cars.
+        out: where the pictures go.
+
+    Returns:
+        The number of images and the seconds they took.
+    """
+    begun = time.perf_counter()
+    import numpy as np
+    import pyrender
+    from PIL import Image
+
+    from data_gen.meshes import prepare_scene
+    from data_gen.rigs import fixed
+    from data_gen.shapes import make
+    from data_gen.sources import Procedural, list_items
+
+    rig = fixed(VIEWS, RESOLUTION)
+    opengl = rig.world_from_camera * [1.0, -1.0, -1.0, 1.0]
+    focal = rig.intrinsics[0, 0, 0]
+    for item in list_items(Procedural("car", objects), 0):
+        mesh = prepare_scene(make("car", int(item.seed or 0)), item.name)
+        scene = pyrender.Scene.from_trimesh_scene(mesh.scene, bg_color=[0.0, 0.0, 0.0, 0.0], ambient_light=[0.3] * 3)
+        camera = scene.add(pyrender.IntrinsicsCamera(focal, focal, RESOLUTION / 2, RESOLUTION / 2))
+        light = scene.add(pyrender.DirectionalLight(intensity=3.0))
+        renderer = pyrender.OffscreenRenderer(RESOLUTION, RESOLUTION)
+        for index, pose in enumerate(opengl):
+            scene.set_pose(camera, pose)
+            scene.set_pose(light, pose)
+            colour, _ = renderer.render(scene, flags=pyrender.RenderFlags.RGBA)
+            path = out / item.name / f"{index:03d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(np.array(colour)).save(path)
+        renderer.delete()
+    return {"images": objects * VIEWS, "seconds": time.perf_counter() - begun}

@@ -1,0 +1,93 @@
+"""Source of truth: the pictures of conftest; counts of what is read from disk."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from hyperplanes.data import Dataset
+from hyperplanes.data.catalogue import FORMAT
+from hyperplanes.data.files import encode_npz, encode_png, read_json, write_whole
+
+
+@pytest.fixture
+def folder(scene, tmp_path):
+    document = scene.document(scene_sphere={"centre": [0, 0, 0], "radius": 1})
+    for name in ("a", "b", "c"):
+        scene.write(tmp_path / name, document)
+    splits = {"train": ["a", "b"], "val": [], "test": ["c"]}
+    (tmp_path / "manifest.json").write_text(json.dumps({"format": FORMAT, "version": 1, "splits": splits}))
+    return tmp_path
+
+
+def test_names_and_length(folder):
+    data = Dataset(folder)
+    assert (data.names("train"), data.names("val"), data.names("test")) == (["a", "b"], [], ["c"])
+    assert data.names() == data.names("all") == ["a", "b", "c"]
+    assert len(data) == 3
+    assert [task.name for task in data] == ["a", "b", "c"]
+    assert data.manifest["format"] == FORMAT
+    with pytest.raises(ValueError, match="split: expected one of train, val, test, all, got 'dev'"):
+        data.names("dev")
+
+
+def test_pictures_are_kept_and_callers_cannot_spoil_them(folder, scene):
+    data = Dataset(folder)
+    first = data.task("a")
+    first.support.images.zero_()
+    first.support.masks.zero_()
+    shutil.rmtree(folder / "a")
+    again = data.task("a")
+    assert torch.allclose(again.support.images, scene.over_white()[::2], atol=1e-6)
+    assert float(again.support.masks.max()) == 1.0
+
+
+def test_the_budget_is_kept_and_the_least_recently_used_goes_first(folder):
+    one = Dataset(folder).posed("a").nbytes
+    data = Dataset(folder, budget=2 * one)
+    for name in ("a", "b", "a", "c"):
+        data.task(name)
+    kept = [name for name in data.names() if data.posed(name) is data.posed(name)]
+    assert kept == ["a", "b", "c"]
+    for name in ("a", "b", "a", "c"):
+        data.task(name)
+    shutil.rmtree(folder / "a")
+    assert data.task("a").name == "a", "used after b, so b went"
+    shutil.rmtree(folder / "b")
+    with pytest.raises(ValueError, match="expected transforms.json"):
+        data.task("b")
+    small = Dataset(folder, budget=one - 1)
+    assert small.posed("c") is not small.posed("c")
+
+
+def test_files_are_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "deep/file"
+    write_whole(path, b"first")
+    write_whole(path, b"second")
+    assert path.read_bytes() == b"second"
+    with pytest.raises(ValueError, match="expected room to write 5 bytes, found .*; check the folder"):
+        write_whole(path / "below", b"third")
+    assert [entry.name for entry in path.parent.iterdir()] == ["file"]
+
+
+def test_encoding_is_deterministic(scene):
+    assert encode_png(scene.pictures[0]) == encode_png(scene.pictures[0].copy())
+    arrays = {"depth": scene.matrix}
+    assert encode_npz(arrays) == encode_npz(arrays)
+
+
+def test_a_huge_json_is_refused_unread(tmp_path):
+    path = tmp_path / "transforms.json"
+    with open(path, "wb") as file:
+        file.truncate(300 * 2**20)
+    with pytest.raises(ValueError, match="expected at most 268435456 bytes, found 314572800"):
+        read_json(path)
+
+
+def test_writing_needs_no_torch():
+    """Property: workers of the generator start without torch, in a third of the time and of the memory."""
+    code = "import hyperplanes.data.files, hyperplanes.data.transforms_document, sys; print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
