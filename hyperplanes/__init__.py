@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hyperplanes.data import DataError, Dataset, open_dataset, read_task, read_views
     from hyperplanes.evaluation import evaluate
     from hyperplanes.export import extract_mesh, save_images, save_mesh, save_turntable
-    from hyperplanes.geometry.image_planes import ImagePlanes, Lookup
+    from hyperplanes.geometry import ImagePlanes, Lookup
     from hyperplanes.metrics import psnr, ssim
     from hyperplanes.presets import preset
     from hyperplanes.rendering.renderer import render
@@ -35,8 +35,8 @@ _HOMES = {
     "Dataset": "data",
     "FineTuned": "adaptation.fine_tuning",
     "HyperPlanes": "adaptation.hyperplanes",
-    "ImagePlanes": "geometry.image_planes",
-    "Lookup": "geometry.image_planes",
+    "ImagePlanes": "geometry",
+    "Lookup": "geometry",
     "ModelConfig": "adaptation.hyperplanes",
     "NearestView": "adaptation.nearest_view",
     "Task": "views",

@@ -28,6 +28,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0 done, 1 done but something is wrong, 2 wrong input, 130 interrupted.
+
+    Raises:
+        ValueError: wrong input, only where a traceback was asked for.
+        OSError: a file that cannot be read or written, only where a traceback was asked for.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     traceback = "--traceback" in given or os.environ.get(TRACEBACK_VARIABLE, "") not in ("", "0")

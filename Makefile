@@ -1,0 +1,44 @@
+# Everything runs from a virtual environment that is made on the first call; later calls find it made.
+VENV ?= .venv
+BIN := $(VENV)/bin
+USE := $(VENV)/.ready
+DEVELOP := $(VENV)/.ready-dev
+WHAT_DECIDES := pyproject.toml setup.cfg constraints.txt scripts/setup
+
+.PHONY: demo test lint types bench docs clean setup dev
+
+demo: $(USE)  ## meshes, training, new views and a page about them: runs/demo/report.html
+	$(BIN)/hyperplanes demo $(DEMO)
+
+test: $(DEVELOP)  ## all tests, on the CPU
+	$(BIN)/python -m pytest $(TESTS)
+
+lint: $(DEVELOP)  ## style and docstrings
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(DEVELOP)  ## static types
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+bench: $(DEVELOP)  ## every benchmark, the short way
+	for name in lookup rendering training generation; do \
+		if [ -f benchmarks/$$name.py ]; then $(BIN)/python -m benchmarks $$name --quick || exit 1; fi; \
+	done
+
+docs: $(DEVELOP)  ## the interfaces as web pages in build/docs
+	$(BIN)/pdoc --docformat google --output-directory build/docs hyperplanes data_gen
+
+clean:  ## what was built; environments and runs/ stay
+	rm -rf build dist *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+setup: $(USE)
+dev: $(DEVELOP)
+
+$(USE): $(WHAT_DECIDES)
+	scripts/setup $(VENV)
+	touch $@
+
+$(DEVELOP): $(WHAT_DECIDES)
+	scripts/setup $(VENV) dev
+	touch $@ $(USE)

@@ -1,0 +1,46 @@
+"""Say what works on this machine: torch and its device, the renderers (each is made to draw), lookups, optional parts.
+
+Ends with exit code 0 when the main job can run, optional parts missing or not, and with 1 when it cannot.
+
+Example:
+    hyperplanes doctor
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hyperplanes.commands.console import Console
+
+if TYPE_CHECKING:
+    from hyperplanes.doctor import Check
+
+__all__ = ["Arguments", "line", "run"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Nothing to choose."""
+
+
+def line(check: Check) -> str:
+    """One check for people."""
+    mark = "ok    " if check.works else ("BROKEN" if check.needed else "-     ")
+    remedy = "" if check.works or not check.remedy else f"; to mend it: {check.remedy}"
+    return f"{mark}  {check.name:<26}{check.detail}{remedy}"
+
+
+def run(arguments: Arguments) -> int:
+    """Examine everything and print a line for each."""
+    from hyperplanes.doctor import examine, healthy
+
+    console, checks = Console(), examine()
+    for check in checks:
+        console.say(line(check))
+    if healthy(checks):
+        console.say("everything that `hyperplanes demo` needs works here")
+        return 0
+    broken = [check.name for check in checks if check.needed and not check.works]
+    console.warn(f"`hyperplanes demo` cannot run here: {', '.join(broken)}; the remedies are above")
+    return 1

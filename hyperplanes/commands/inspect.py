@@ -1,0 +1,81 @@
+"""Say what is in a data set or a checkpoint, and whether it is as it should be.
+
+Of a data set: counts, splits, bounds, what was skipped, whether the poses agree with the masks (OpenCV poses declared
+as OpenGL are recognised), and two pictures: a contact sheet, and the cameras around the object. Ends with exit code 1
+when something is wrong with it.
+
+Example:
+    hyperplanes inspect data/cars
+    hyperplanes inspect runs/demo/hyperplanes
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.options import OptionalFolder
+
+__all__ = ["Arguments", "checkpoint_lines", "run"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to look at.
+
+    Attributes:
+        path: A data set in any layout, a folder of posed images, or a checkpoint.
+        out: Where the pictures go; runs/inspect/NAME when not given.
+        objects: How many objects to look at closely.
+    """
+
+    path: tyro.conf.Positional[Path]
+    out: OptionalFolder = None
+    objects: int = 8
+
+
+def checkpoint_lines(folder: Path) -> list[str]:
+    """What a checkpoint holds, a line a fact."""
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+    from hyperplanes.checkpoints import read_json
+
+    model = HyperPlanes.from_pretrained(folder)
+    config = model.config
+    lines = [
+        f"target: {config.target}, {config.network.depth} layers of {config.network.width}, "
+        f"{config.network.planes} planes, {sum(p.numel() for p in model.networks.parameters()):,} weights",
+        f"sampling: {config.sampling}",
+    ]
+    if config.hypernetwork is not None and model.hypernetwork is not None:
+        hyper = config.hypernetwork
+        lines.append(
+            f"hypernetwork: {hyper.encoder} reads {hyper.views} views and updates {', '.join(hyper.layers)}, "
+            f"{sum(p.numel() for p in model.hypernetwork.parameters()):,} weights"
+        )
+    else:
+        lines.append("hypernetwork: none, the same weights for every object")
+    if (folder / "training.json").exists():
+        state = read_json(folder / "training.json")
+        looked = [entry["psnr"] for entry in state["curve"] if "psnr" in entry]
+        quality = f", {looked[-1]:.2f} dB on held-out objects when last looked at" if looked else ""
+        lines.append(f"training: {state['step']:,} of {state['config']['steps']:,} steps{quality}")
+    return lines
+
+
+def run(arguments: Arguments) -> int:
+    """Describe it; 1 when a data set is not as it should be."""
+    console = Console()
+    if (arguments.path / "model.json").exists():
+        for line in checkpoint_lines(arguments.path):
+            console.say(line)
+        return 0
+    from data_gen.inspect import inspect
+
+    out = arguments.out or Path("runs/inspect") / arguments.path.resolve().name
+    found = inspect(arguments.path, out, arguments.objects)
+    for line in found.lines():
+        console.say(line)
+    return int(found.trouble)

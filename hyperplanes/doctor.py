@@ -1,0 +1,168 @@
+"""What works on this machine: tried, not guessed, and each trouble with what mends it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+
+__all__ = ["REQUIRED", "Check", "examine", "examine_renderers", "healthy"]
+
+REQUIRED = {
+    "kornia": "kornia",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "skimage": "scikit-image",
+    "trimesh": "trimesh",
+    "safetensors": "safetensors",
+    "jaxtyping": "jaxtyping",
+    "PIL": "pillow",
+    "rich": "rich",
+    "tyro": "tyro",
+    "charset_normalizer": "charset-normalizer",
+}
+"""What everything needs: modules and the packages they come from."""
+
+OPTIONAL = {
+    "matplotlib": "plots of benchmarks and cameras",
+    "ray": "data generation on a cluster",
+}
+"""What some things need: modules, each the package of its name, and what for."""
+
+SMALLEST_FREE = 2 * 2**30
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at.
+
+    Attributes:
+        name: of it.
+        works: whether it does.
+        needed: whether the main job cannot run without it.
+        detail: what was found.
+        remedy: what to do where it does not work; one command where there is one.
+    """
+
+    name: str
+    works: bool
+    needed: bool
+    detail: str
+    remedy: str = ""
+
+
+def healthy(checks: Sequence[Check]) -> bool:
+    """Whether all that the main job needs works."""
+    return all(check.works or not check.needed for check in checks)
+
+
+def examine(folder: Path = Path()) -> list[Check]:
+    """Look at everything.
+
+    Args:
+        folder: where results would go, for the room that is left.
+
+    Returns:
+        The outcomes, needed things first.
+    """
+    checks = [_python(), _torch(), _packages()]
+    if all(check.works for check in checks):
+        checks += _lookups()
+        checks += examine_renderers()
+    return [*checks, _disk(folder), *(_optional(module) for module in OPTIONAL)]
+
+
+def _python() -> Check:
+    found = ".".join(map(str, sys.version_info[:3]))
+    remedy = "install Python 3.11 or newer and make the environment again"
+    return Check("Python", sys.version_info >= (3, 11), True, found, remedy)
+
+
+def _torch() -> Check:
+    try:
+        torch = import_module("torch")
+        if float(torch.ones(2).sum()) != 2:
+            return Check("torch", False, True, "computes wrong sums", "pip install --force-reinstall torch")
+    except (ImportError, OSError, RuntimeError) as error:
+        return Check("torch", False, True, _first_line(error), "pip install torch, or make a new environment")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    where = f"CPU, {torch.get_num_threads()} threads on {cores} cores"
+    if torch.cuda.is_available():
+        where = f"GPU {torch.cuda.get_device_name()}, and {where}"
+    elif torch.version.cuda:
+        where += f"; built for CUDA {torch.version.cuda}, which sees no GPU here"
+    return Check("torch", True, True, f"{torch.__version__} on {where}")
+
+
+def _packages() -> Check:
+    missing = [package for module, package in REQUIRED.items() if find_spec(module) is None]
+    if missing:
+        return Check("packages", False, True, f"missing: {', '.join(missing)}", f"pip install {' '.join(missing)}")
+    return Check(
+        "packages", True, True, ", ".join(f"{name} {_version(name)}" for name in ("kornia", "trimesh", "numpy"))
+    )
+
+
+def _lookups() -> list[Check]:
+    from hyperplanes.geometry.lookup import backends
+
+    remedies = {"cpu": "pip install numba", "triton": "an NVIDIA GPU with torch built for CUDA"}
+    return [
+        Check(f"lookup {found.name}", found.available, False, found.reason, remedies.get(found.name, ""))
+        for found in backends()
+    ]
+
+
+def examine_renderers() -> list[Check]:
+    """Draw a triangle with each renderer, each in a process of its own; any one that works will do.
+
+    Returns:
+        One outcome a renderer, and one for all of them.
+    """
+    from data_gen.backends import probe_all
+
+    probes = probe_all()
+    working = [probe for probe in probes if probe.works]
+    best = f"{working[0].name} draws" if working else "none draws"
+    summary = Check("renderer", bool(working), True, best, probes[0].remedy)
+    return [
+        summary,
+        *(Check(f"renderer {each.name}", each.works, False, _reason(each.message), each.remedy) for each in probes),
+    ]
+
+
+def _reason(message: str) -> str:
+    """A message without the class it was raised as and the remedy, which is told apart."""
+    text = message.partition(" Remedy:")[0].rstrip(".")
+    kind, found, rest = text.partition(": ")
+    return rest if found and kind.endswith("Error") and " " not in kind else text
+
+
+def _disk(folder: Path) -> Check:
+    free = shutil.disk_usage(folder).free
+    detail = f"{free / 2**30:.1f} GiB free in {folder.resolve()}"
+    return Check("disk", free > SMALLEST_FREE, False, detail, "free some, a data set of 70 objects takes 20 MB")
+
+
+def _optional(module: str) -> Check:
+    purpose = OPTIONAL[module]
+    there = find_spec(module) is not None
+    detail = f"{_version(module)}: {purpose}" if there else f"absent: {purpose}"
+    return Check(module, there, False, detail, f"pip install {module}")
+
+
+def _version(module: str) -> str:
+    try:
+        return version(module.replace("_", "-"))
+    except PackageNotFoundError:
+        return "installed"
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
