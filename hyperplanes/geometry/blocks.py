@@ -13,16 +13,32 @@ from numba import njit
 
 from hyperplanes.geometry.vector_memory import bits_of, load, read, store
 
-__all__ = ["BLOCK", "FIRST_CHANNEL", "back_project", "fetch_packed", "fetch_plane", "inner", "place", "project",
-           "pull_packed", "pull_plane", "start_pull"]  # fmt: skip
+__all__ = [
+    "BLOCK",
+    "CHANNELS",
+    "FIRST_RECORD",
+    "PITCH",
+    "back_project",
+    "fetch_packed",
+    "fetch_plane",
+    "inner",
+    "place",
+    "project",
+    "pull_packed",
+    "pull_plane",
+    "start_pull",
+]  # fmt: skip
 
 BLOCK = 128
-# Rows of the scratch: the point; its pixel before and after clamping; 1 / depth, zero behind the camera; whether it is
-# inside the image; its coordinates in [-1, 1]; the gradient with respect to the pixel and to the point.
-X, Y, Z, RAW_U, RAW_V, RECIPROCAL, U, V, INSIDE, COLUMN, ROW, GRAD_U, GRAD_V, GRAD_X, GRAD_Y, GRAD_Z = (
-    BLOCK * row for row in range(16)
-)
-FIRST_CHANNEL = BLOCK * 16  # one row a channel: its colour, or the gradient with respect to it
+# Rows of the scratch: the point; its pixel before and after clamping; 1 / depth, zero behind the camera; the gradients
+# with respect to the pixel and to the point.
+X, Y, Z, RAW_U, RAW_V, RECIPROCAL, U, V, GRAD_U, GRAD_V, GRAD_X, GRAD_Y, GRAD_Z = (BLOCK * row for row in range(13))
+# After them one record a view, of rows that lie PITCH apart (a little more than BLOCK, lest records compete for the
+# same cache sets): coordinates in [-1, 1], whether the point is inside the image, and one row a channel. Going back,
+# the coordinates' and channels' rows hold the gradients with respect to them.
+FIRST_RECORD = BLOCK * 13
+PITCH = BLOCK + 16
+COLUMN, ROW, INSIDE, CHANNELS = (PITCH * row for row in range(4))
 
 # Everything of fast maths but the assumption that there are no NaN and no infinities.
 inner = njit(fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy", nogil=True)
@@ -48,7 +64,7 @@ def project(s, matrices, view, nearest):
 
 @inner
 @no_type_check
-def place(s, height, width):
+def place(s, record, height, width):
     """RAW_U, RAW_V, RECIPROCAL -> clamped U, V; INSIDE; COLUMN, ROW. Comparisons are written so that NaN falls to 0."""
     one, zero = s.dtype.type(1), s.dtype.type(0)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
@@ -64,15 +80,15 @@ def place(s, height, width):
         v = v if v < bottom else bottom
         store(s, U + i, u)
         store(s, V + i, v)
-        store(s, INSIDE + i, one if inside else zero)
-        store(s, COLUMN + i, u * per_column - one if front else zero)
-        store(s, ROW + i, v * per_row - one if front else zero)
+        store(s, record + INSIDE + i, one if inside else zero)
+        store(s, record + COLUMN + i, u * per_column - one if front else zero)
+        store(s, record + ROW + i, v * per_row - one if front else zero)
 
 
 @inner
 @no_type_check
-def fetch_plane(s, images, offset, height, width, row, background):
-    """U, V, INSIDE -> bilinear values of the float plane that starts at `offset`, into scratch row `row`."""
+def fetch_plane(s, record, images, offset, height, width, channel, background):
+    """U, V, INSIDE -> bilinear values of the float plane that starts at `offset`, into the channel's row."""
     last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
     right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
     stride, diagonal, zero = np.int32(width), np.int32(right + below), s.dtype.type(0)
@@ -85,7 +101,7 @@ def fetch_plane(s, images, offset, height, width, row, background):
         c, d = read(images, offset, np.int32(k + below)), read(images, offset, np.int32(k + diagonal))
         top = a + fx * (b - a)
         value = top + fy * (c + fx * (d - c) - top)
-        store(s, row + i, value if load(s, INSIDE + i) > zero else background)
+        store(s, record + CHANNELS + channel * PITCH + i, value if load(s, record + INSIDE + i) > zero else background)
 
 
 @inner
@@ -98,7 +114,7 @@ def _format(bits):
 
 @inner
 @no_type_check
-def fetch_packed(s, packed, offset, height, width, bits, background):
+def fetch_packed(s, record, packed, offset, height, width, bits, background):
     """As `fetch_plane`, for three channels packed into 32 bits: (8, 8, 8) or (11, 11, 10), first channel lowest."""
     last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
     right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
@@ -115,22 +131,22 @@ def fetch_packed(s, packed, offset, height, width, bits, background):
         wd = fx * fy
         wb, wc = fx - wd, fy - wd
         wa = one - fx - wc
-        inside = load(s, INSIDE + i) > zero
+        inside = load(s, record + INSIDE + i) > zero
         first = wa * bits_of(a, low, mask) + wb * bits_of(b, low, mask)
         first += wc * bits_of(c, low, mask) + wd * bits_of(d, low, mask)
         second = wa * bits_of(a, shift, mask) + wb * bits_of(b, shift, mask)
         second += wc * bits_of(c, shift, mask) + wd * bits_of(d, shift, mask)
         third = wa * bits_of(a, twice, mask_last) + wb * bits_of(b, twice, mask_last)
         third += wc * bits_of(c, twice, mask_last) + wd * bits_of(d, twice, mask_last)
-        store(s, FIRST_CHANNEL + i, first * unit if inside else background)
-        store(s, FIRST_CHANNEL + BLOCK + i, second * unit if inside else background)
-        store(s, FIRST_CHANNEL + 2 * BLOCK + i, third * unit_last if inside else background)
+        store(s, record + CHANNELS + i, first * unit if inside else background)
+        store(s, record + CHANNELS + PITCH + i, second * unit if inside else background)
+        store(s, record + CHANNELS + 2 * PITCH + i, third * unit_last if inside else background)
 
 
 @inner
 @no_type_check
-def pull_plane(s, images, offset, height, width, row):
-    """Adds one channel's part to GRAD_U, GRAD_V: its gradient in scratch row `row` times the slope of its plane."""
+def pull_plane(s, record, images, offset, height, width, channel):
+    """Adds one channel's part to GRAD_U, GRAD_V: its gradient times the slope of its plane."""
     last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
     right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
     stride, diagonal = np.int32(width), np.int32(right + below)
@@ -141,7 +157,7 @@ def pull_plane(s, images, offset, height, width, row):
         k = np.int32(y * stride + x)
         a, b = read(images, offset, k), read(images, offset, np.int32(k + right))
         c, d = read(images, offset, np.int32(k + below)), read(images, offset, np.int32(k + diagonal))
-        gradient = load(s, row + i) * load(s, INSIDE + i)
+        gradient = load(s, record + CHANNELS + channel * PITCH + i) * load(s, record + INSIDE + i)
         twist = (d - c) - (b - a)
         store(s, GRAD_U + i, load(s, GRAD_U + i) + gradient * ((b - a) + fy * twist))
         store(s, GRAD_V + i, load(s, GRAD_V + i) + gradient * ((c - a) + fx * twist))
@@ -149,7 +165,7 @@ def pull_plane(s, images, offset, height, width, row):
 
 @inner
 @no_type_check
-def pull_packed(s, packed, offset, height, width, bits):
+def pull_packed(s, record, packed, offset, height, width, bits):
     """As `pull_plane`, for all three channels of packed images."""
     last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
     right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
@@ -163,10 +179,10 @@ def pull_packed(s, packed, offset, height, width, bits):
         k = np.int32(y * stride + x)
         a, b = read(packed, offset, k), read(packed, offset, np.int32(k + right))
         c, d = read(packed, offset, np.int32(k + below)), read(packed, offset, np.int32(k + diagonal))
-        inside = load(s, INSIDE + i)
-        first = load(s, FIRST_CHANNEL + i) * inside * unit
-        second = load(s, FIRST_CHANNEL + BLOCK + i) * inside * unit
-        third = load(s, FIRST_CHANNEL + 2 * BLOCK + i) * inside * unit_last
+        inside = load(s, record + INSIDE + i)
+        first = load(s, record + CHANNELS + i) * inside * unit
+        second = load(s, record + CHANNELS + PITCH + i) * inside * unit
+        third = load(s, record + CHANNELS + 2 * PITCH + i) * inside * unit_last
         # The gradient with respect to a tap is the same sum for each: contract channels first, then interpolate.
         ga = first * bits_of(a, low, mask) + second * bits_of(a, shift, mask)
         ga += third * bits_of(a, twice, mask_last)
@@ -183,7 +199,7 @@ def pull_packed(s, packed, offset, height, width, bits):
 
 @inner
 @no_type_check
-def start_pull(s, height, width):
+def start_pull(s, record, height, width):
     """GRAD_U, GRAD_V from the gradient of the coordinates in COLUMN, ROW; none passes where they were clamped."""
     zero = s.dtype.type(0)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
@@ -194,8 +210,8 @@ def start_pull(s, height, width):
         front = load(s, RECIPROCAL + i) > zero
         free_u = front & (u >= zero) & (u <= right)
         free_v = front & (v >= zero) & (v <= bottom)
-        store(s, GRAD_U + i, load(s, COLUMN + i) * per_column if free_u else zero)
-        store(s, GRAD_V + i, load(s, ROW + i) * per_row if free_v else zero)
+        store(s, GRAD_U + i, load(s, record + COLUMN + i) * per_column if free_u else zero)
+        store(s, GRAD_V + i, load(s, record + ROW + i) * per_row if free_v else zero)
 
 
 @inner

@@ -65,7 +65,7 @@ def _empty(points: Tensor, images: Tensor, views: Tensor | None) -> tuple[Tensor
 
 
 def _kernel(name: str, dtype: torch.dtype, chosen: bool) -> Any:
-    from hyperplanes.geometry.kernels_cpu import compiled
+    from hyperplanes.geometry.compiling import compiled
 
     return compiled(name, str(dtype).removeprefix("torch."), chosen)
 
@@ -100,7 +100,7 @@ def _geometry_gradient(
         kernel(*fixed, sums, start, stop)
         return sums
 
-    total = np.sum(share(work, len(points), _CHUNK), axis=0)
+    total = sum(share(work, len(points), _CHUNK), np.zeros((len(matrices), 12)))
     return grad_points, torch.from_numpy(total).to(matrices).reshape(matrices.shape)
 
 

@@ -9,15 +9,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import torch
 
 __all__ = ["share"]
 
+Result = TypeVar("Result")
+
 _pools: dict[int, ThreadPoolExecutor] = {}
 
 
-def share(work: Callable[[int, int], object], total: int, chunk: int) -> list[object]:
+def share(work: Callable[[int, int], Result], total: int, chunk: int) -> list[Result]:
     """The results of work(start, stop) over 0..total in steps of `chunk`, in no order, the caller's thread included.
 
     Args:
@@ -31,7 +34,7 @@ def share(work: Callable[[int, int], object], total: int, chunk: int) -> list[ob
     starts = iter(range(0, total, chunk))
     threads = min(torch.get_num_threads(), -(-total // chunk))
 
-    def some(starts: Iterable[int]) -> list[object]:
+    def some(starts: Iterable[int]) -> list[Result]:
         return [work(start, min(start + chunk, total)) for start in starts]
 
     futures = [_pool(threads - 1).submit(some, starts) for _ in range(threads - 1)]

@@ -1,4 +1,4 @@
-"""Array reads and writes, and the unpacking of bits, that let LLVM vectorise a loop over a block of points (numba only).
+"""Array access and unpacking of bits that let LLVM vectorise a loop over a block of points (numba only).
 
 A loop that reads pixels at computed places and writes results cannot be vectorised unless the compiler knows that the
 writes never touch the pixels. `read`, `load` and `store` carry that promise as LLVM `alias.scope` and `noalias`

@@ -1,0 +1,63 @@
+"""Machine code of the CPU kernels, made once and kept on disk."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from numba import njit
+from numba.core import config
+
+from hyperplanes.geometry import kernels_cpu
+
+__all__ = ["compiled"]
+
+_LOOKUP = "T[:, ::1], {views}T[:, :, ::1], T[:, :, :, ::1], uint32[::1], int64, int64, int64, "
+_SIGNATURES = {
+    "forward": _LOOKUP + "T, T, T[::1], T[::1], uint8[::1], int64, int64",
+    "backward": _LOOKUP + "T, T[:, :, :], T[:, :, :], T[:, ::1], float64[:, ::1], int64, int64",
+    "image_backward": "T[:, ::1], {views}T[:, :, ::1], int64, int64, T, T[:, :, :], T[:, :, ::1], int64, int64",
+}
+_SOURCES = ("vector_memory.py", "blocks.py", "kernels_cpu.py")
+
+
+def _cache_folder() -> str:
+    """Where machine code is kept.
+
+    Numba notices a change of the file that a kernel stands in, not of the files it calls: so all sources are in the
+    folder's name.
+    """
+    here = Path(__file__).parent
+    sources = b"".join((here / name).read_bytes() for name in _SOURCES)
+    base = getattr(config, "CACHE_DIR", "") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "hyperplanes" / f"kernels-{hashlib.sha256(sources).hexdigest()[:12]}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return str(folder)
+    except OSError:
+        return tempfile.mkdtemp(prefix="hyperplanes-kernels-")
+
+
+@functools.cache
+def compiled(name: str, dtype: str, chosen: bool) -> Callable[..., None]:
+    """A kernel for one kind of numbers.
+
+    Args:
+        name: "forward", "backward" or "image_backward".
+        dtype: "float32" or "float64".
+        chosen: whether each point brings its own planes.
+    """
+    function = getattr(kernels_cpu, f"{name}_chosen" if chosen else name)
+    signature = _SIGNATURES[name].format(views="int64[:, ::1], " if chosen else "").replace("T", dtype)
+    options = {"fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy", "nogil": True}
+    kept = getattr(config, "CACHE_DIR", "")
+    setattr(config, "CACHE_DIR", _cache_folder())  # noqa: B010 - the module's attributes are not declared
+    try:
+        return njit(f"void({signature})", cache=True, **options)(function)
+    finally:
+        setattr(config, "CACHE_DIR", kept)  # noqa: B010
