@@ -20,11 +20,11 @@ from data_gen.sources import list_items
 from hyperplanes.data import DataError, Dataset
 from hyperplanes.geometry import cameras as camera
 
-SMALL = {"views": 4, "resolution": 16, "workers": 2}
+SMALL = {"views": 4, "resolution": 16, "workers": 1}
 CARS = Procedural("car", 5, seed=3)
 SCRIPT = """
 from data_gen.dataset import *
-print(generate(Procedural("car", 5, seed=3), {out!r}, views=4, resolution=16, workers=2, held_out=2,
+print(generate(Procedural("car", 5, seed=3), {out!r}, views=4, resolution=16, workers=1, held_out=2,
     progress=lambda *state: print(*state, flush=True)))
 """
 
@@ -115,7 +115,7 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whol
 
 
 def test_the_number_of_workers_changes_nothing(whole, tmp_path):
-    generate(CARS, tmp_path / "cars", held_out=2, views=4, resolution=16, workers=1, recycle=2)
+    generate(CARS, tmp_path / "cars", held_out=2, views=4, resolution=16, workers=2, recycle=2)
     assert tree(tmp_path / "cars") == tree(whole[0])
 
 
