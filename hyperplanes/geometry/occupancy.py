@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
-from torch.nn.functional import max_pool2d, max_pool3d
+from torch.nn.functional import max_pool3d, pad
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import NEAREST_DEPTH
 from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["Occupancy", "carve", "full"]
+__all__ = ["Occupancy", "ball_reach", "carve", "full"]
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,9 @@ def carve(
 ) -> Occupancy:
     """The visual hull: voxels that no mask rules out.
 
-    A voxel goes when some camera that sees its centre sees only background around it: the mask's maximum within the
-    voxel's circumscribed footprint is zero. So the hull of the true object is never cut, whatever the resolution.
+    A voxel goes when some camera that sees its centre sees only background around it: no pixel of the mask is set in
+    the box that the ball about the voxel reaches. So the hull of the true object is never cut, whatever the resolution,
+    and does not depend on the order of the views.
 
     Args:
         masks: opacity in [0, 1].
@@ -78,23 +80,47 @@ def carve(
         side: voxels an axis.
     """
     grid = full(bounds, side, masks.device)
-    height, width = masks.shape[2:]
     kept = torch.arange(side**3, device=masks.device)
-    points = grid.centres()
-    matrices = camera.projection_matrices(cameras)
-    focal = camera.intrinsics(cameras)[:, 0, 0]
+    matrices, calibration = camera.projection_matrices(cameras), camera.intrinsics(cameras)
+    points = grid.centres().to(matrices)
     for view in range(len(masks)):
         homogeneous = points @ matrices[view, :, :3].T + matrices[view, :, 3]
         depth = homogeneous[:, 2]
         front = depth > max(NEAREST_DEPTH, grid.voxel)
         pixels = homogeneous[:, :2] / torch.where(front, depth, 1.0)[:, None]
-        column, row = pixels.round().long().unbind(-1)
-        inside = front & (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        nearest = depth[front].min() if front.any() else depth.new_tensor(1.0)
-        reach = int(torch.ceil(focal[view] * grid.voxel * 0.87 / nearest + 0.5))
-        seen = max_pool2d(masks[view][None], 2 * reach + 1, 1, reach)[0, 0] > 0
-        ruled_out = inside & ~seen[row.clamp(0, height - 1), column.clamp(0, width - 1)]
-        kept, points = kept[~ruled_out], points[~ruled_out]
+        last = pixels.new_tensor([masks.shape[3] - 1, masks.shape[2] - 1])
+        inside = (front[:, None] & (pixels >= -0.5) & (pixels <= last + 0.5)).all(1).nonzero()[:, 0]
+        pixels = pixels[inside]
+        reach = ball_reach(pixels, depth[inside], calibration[view], grid.voxel * math.sqrt(3) / 2) + 0.5
+        low = (pixels - reach).clamp_min(0).round().long()
+        high = (pixels + reach).minimum(last).round().long() + 1
+        table = pad((masks[view, 0] > 0).int().cumsum(0).cumsum(1), (1, 0, 1, 0))
+        (left, top), (right, bottom) = low.unbind(1), high.unbind(1)
+        count = table[bottom, right] - table[bottom, left] - table[top, right] + table[top, left]
+        stays = torch.ones(len(kept), dtype=torch.bool, device=kept.device)
+        stays[inside[count == 0]] = False
+        kept, points = kept[stays], points[stays]
     occupied = torch.zeros(side**3, dtype=torch.bool, device=masks.device)
     occupied[kept] = True
     return Occupancy(occupied.reshape(side, side, side), bounds)
+
+
+def ball_reach(
+    pixels: Float[Tensor, "point 2"], depth: Float[Tensor, " point"], calibration: Float[Tensor, "3 3"], radius: float
+) -> Float[Tensor, "point 2"]:
+    """How many pixels (across, down) a ball about each point reaches in a picture.
+
+    A point within r of one at slope u = x / z has a slope within r sqrt(1 + u^2) / (z - r) of u: more towards the
+    border of a picture than in its middle.
+
+    Args:
+        pixels: where the points project.
+        depth: along the optical axis, beyond `radius`.
+        calibration: of the camera.
+        radius: of the balls, in world units.
+    """
+    down = (pixels[:, 1] - calibration[1, 2]) / calibration[1, 1]
+    across = (pixels[:, 0] - calibration[0, 2] - calibration[0, 1] * down) / calibration[0, 0]
+    slopes = torch.stack([across, down], -1)
+    change = radius * (1 + slopes.square()).sqrt() / (depth - radius)[:, None]
+    return change @ calibration[:2, :2].abs().T

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.occupancy import Occupancy, ball_reach
 
 __all__ = ["footprint"]
 
@@ -35,7 +35,7 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
             result[view] = True
             continue
         pixels = homogeneous[:, :2] / homogeneous[:, 2:]
-        reach = _reach(pixels, homogeneous[:, 2], calibration[view], occupancy.voxel * math.sqrt(3) / 2)
+        reach = ball_reach(pixels, homogeneous[:, 2], calibration[view], occupancy.voxel * math.sqrt(3) / 2)
         touching = ((pixels + reach >= 0) & (pixels - reach <= pixels.new_tensor([width - 1, height - 1]))).all(-1)
         if not touching.any():
             continue
@@ -48,16 +48,3 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
         padded[row + down, column + across] = 1.0
         result[view] = max_pool2d(max_pool2d(padded[None], (2 * down + 1, 1), 1), (1, 2 * across + 1), 1)[0] > 0
     return result
-
-
-def _reach(pixels: Tensor, depth: Tensor, calibration: Tensor, radius: float) -> Tensor:
-    """How many pixels (across, down) a ball about each point reaches.
-
-    A point within r of one at slope u = x / z has a slope within r sqrt(1 + u^2) / (z - r) of u: more towards the
-    border of a picture than in its middle.
-    """
-    down = (pixels[:, 1] - calibration[1, 2]) / calibration[1, 1]
-    across = (pixels[:, 0] - calibration[0, 2] - calibration[0, 1] * down) / calibration[0, 0]
-    slopes = torch.stack([across, down], -1)
-    change = radius * (1 + slopes.square()).sqrt() / (depth - radius)[:, None]
-    return change @ calibration[:2, :2].abs().T
