@@ -7,8 +7,12 @@ import math
 import torch
 from torch import Tensor
 
+from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import fibonacci_sphere, look_at, pinhole, symmetric_intrinsics
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
+from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.rendering import Marched
 from hyperplanes.views import Task, Views
 
 
@@ -114,3 +118,24 @@ class Balls:
         support = ball_views(ring(self.views, self.size), colour=colour, radius=radius)
         query = ball_views(ring(self.views, self.size, shift=1), colour=colour, radius=radius)
         return Task(support, query, name)
+
+
+def small_model(**changes):
+    """A HyperPlanes model of four planes with weights that say something; milliseconds to train and render."""
+    torch.manual_seed(0)
+    parts = {
+        "network": TargetConfig(depth=2, width=24, planes=4, point_octaves=3, direction_octaves=1),
+        "hypernetwork": HyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16),
+        "sampling": Marched(24),
+        "hull_side": 16,
+    }
+    model = HyperPlanes(ModelConfig(**{**parts, **changes}))
+    model.set_rig(ball_views(ring(model.config.network.planes)))
+    return model
+
+
+def awaken(model):
+    """Let the hypernetwork, whose outputs start at zero, change something."""
+    for output in model.hypernetwork.outputs:
+        torch.nn.init.normal_(output.weight, std=0.3)
+    return model

@@ -1,0 +1,180 @@
+import pytest
+import torch
+
+from hyperplanes.adaptation import AdaptedField
+from hyperplanes.adaptation.base import hull
+from hyperplanes.geometry.cameras import concatenate, look_at, pinhole
+from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering import Hierarchical, Marched, composite
+from hyperplanes.views import Views
+from tests.reference_rendering import ball_views, camera_at, composite_ray, ring
+
+SOLID = Sphere(radius=0.5)
+
+
+def solid_ball(points, directions):
+    """A ball of radius 0.5 with a hard surface, coloured by place and direction."""
+    colour = (0.5 + 0.4 * torch.sin(3 * points) + 0.1 * directions).clamp(0, 1)
+    return colour, 30.0 * (points.norm(dim=-1) < 0.5)
+
+
+def adapted(sampling=None, bounds=None, side=16):
+    return AdaptedField(solid_ball, full(bounds or Sphere(), side), sampling or Marched(60))
+
+
+@pytest.mark.parametrize("sampling", [Marched(60, 1e-6), Hierarchical(48, 0), Hierarchical(24, 24)])
+@pytest.mark.parametrize("size", [(9, 14), (14, 9)])
+@torch.no_grad()
+def test_a_picture_is_what_its_rays_see(sampling, size):
+    cameras, field = ring(2, size), adapted(sampling)
+    pictures = field.render(cameras)
+    assert pictures.images.shape == (2, 3, *size)
+    assert pictures.opacity.shape == pictures.depth.shape == (2, 1, *size)
+    posed = Views(pictures.images, cameras)
+    for view in range(2):
+        seen = field.trace(posed.rays(view, span="sphere" if isinstance(sampling, Marched) else "depth"))
+        torch.testing.assert_close(pictures.images[view].flatten(1).T, seen.colour, atol=1e-4, rtol=0)
+        torch.testing.assert_close(pictures.opacity[view].flatten(), seen.opacity, atol=1e-4, rtol=0)
+        torch.testing.assert_close(pictures.depth[view].flatten(), seen.depth, atol=1e-3, rtol=0)
+
+
+@torch.no_grad()
+def test_one_pixel_against_the_loop():
+    cameras = camera_at((0.0, 0.0, 3.0), (5, 5))
+    pictures = adapted(Hierarchical(40, 0)).render(cameras)
+    # the middle pixel looks along -z from 2 to 4 away: 40 intervals of 0.05
+    edges = [2 + 0.05 * index for index in range(41)]
+    points = torch.tensor([[0.0, 0.0, 3 - (a + b) / 2] for a, b in zip(edges, edges[1:], strict=False)])
+    colour, density = solid_ball(points, torch.tensor([[0.0, 0.0, -1.0]]).expand(40, 3))
+    expected = composite_ray(colour.tolist(), density.tolist(), edges)
+    assert pictures.images[0, :, 2, 2].tolist() == pytest.approx(expected[0], abs=1e-4)
+    assert pictures.depth[0, 0, 2, 2].item() == pytest.approx(expected[2], abs=1e-4)
+    composed, _ = composite(colour[None], density[None], torch.tensor([edges]))
+    assert pictures.images[0, :, 2, 2].tolist() == pytest.approx(composed.colour[0].tolist(), abs=1e-4)
+
+
+@torch.no_grad()
+def test_a_solid_ball_looks_like_one():
+    # pictures of the ball by geometry alone: covered where the ray hits it, the depth that of the hit
+    cameras = ring(2, (20, 20))
+    pictures, truth = adapted(Marched(150)).render(cameras), ball_views(cameras)
+    inner = -torch.nn.functional.max_pool2d(-truth.masks, 3, 1, 1) > 0
+    outer = torch.nn.functional.max_pool2d(truth.masks, 3, 1, 1) == 0
+    assert inner.any()
+    assert (pictures.opacity[inner] > 0.99).all()
+    assert (pictures.opacity[outer] == 0).all()
+    assert (pictures.images.permute(0, 2, 3, 1)[outer[:, 0]] == 1).all()
+    for view in range(2):
+        near = Views(truth.images, cameras, bounds=SOLID).rays(view).near.reshape(20, 20)
+        # E[t] lies 1 / sigma = 0.033 behind the surface
+        error = (pictures.depth[view, 0] - near - 1 / 30)[inner[view, 0]]
+        assert error.abs().max() < 0.02
+
+
+@pytest.mark.parametrize("sampling", [Marched(60), Hierarchical(48, 16)])
+@torch.no_grad()
+def test_a_scene_moved_and_scaled_with_its_cameras_gives_the_same_picture(sampling):
+    shift, scale = torch.tensor([2.0, -1.0, 0.5]), 3.0
+
+    def moved_ball(points, directions):
+        colour, density = solid_ball((points - shift) / scale, directions)
+        return colour, density / scale
+
+    eye = torch.tensor([0.6, 1.0, 2.8])
+    here = adapted(sampling).render(camera_at(tuple(eye.tolist()), (12, 17)))
+    camera = camera_at(tuple((eye * scale + shift).tolist()), (12, 17), target=tuple(shift.tolist()))
+    bounds = Sphere(tuple(shift.tolist()), scale)
+    there = AdaptedField(moved_ball, full(bounds, 16), sampling).render(camera)
+    # a hard surface: rays that graze it may fall on either side by rounding
+    close = (there.images - here.images).abs().amax(1) < 1e-3
+    assert close.float().mean() > 0.97
+    depth = (there.depth / scale - here.depth).abs()[:, 0]
+    assert (depth < 1e-3).float().mean() > 0.97
+
+
+@torch.no_grad()
+def test_each_view_is_rendered_by_itself():
+    one, other = camera_at((0.0, 0.5, 3.0)), camera_at((2.0, 1.0, 2.0))
+    field = adapted()
+    both = field.render(concatenate([one, other]))
+    torch.testing.assert_close(both.images[:1], field.render(one).images)
+    torch.testing.assert_close(both.images[1:], field.render(other).images)
+    assert both.samples == field.render(one).samples + field.render(other).samples
+
+
+@torch.no_grad()
+def test_a_camera_inside_the_bounds_sees_what_is_ahead():
+    ahead = adapted().render(camera_at((0.0, 0.0, 0.8), (9, 9)))
+    assert ahead.opacity[0, 0, 4, 4] > 0.99
+    assert ahead.depth[0, 0, 4, 4].item() == pytest.approx(0.3 + 1 / 30, abs=0.05)
+    away = adapted().render(camera_at((0.0, 0.0, 0.8), (9, 9), target=(0.0, 0.0, 2.0)))
+    assert (away.opacity == 0).all()
+    assert (away.images == 1).all()
+
+
+@torch.no_grad()
+def test_an_empty_hull_is_a_white_picture():
+    nothing = Occupancy(torch.zeros(8, 8, 8, dtype=torch.bool), Sphere())
+    pictures = AdaptedField(solid_ball, nothing, Marched()).render(ring(2))
+    assert (pictures.images == 1).all()
+    assert pictures.samples == 0
+
+
+@torch.no_grad()
+def test_another_protocol_can_be_asked_for():
+    field = adapted(Marched(60))
+    pictures = field.render(ring(1, (8, 8)), sampling=Hierarchical(10, 6))
+    assert pictures.samples == 64 * (10 + 10 + 6)
+    marched = field.render(ring(1, (8, 8)))
+    assert 0 < marched.samples < pictures.samples
+
+
+def test_pictures_carry_no_gradients_but_traces_do():
+    level = torch.tensor(0.5, requires_grad=True)
+
+    def field(points, directions):
+        return level.expand(len(points), 3), solid_ball(points, directions)[1]
+
+    whole = AdaptedField(field, full(Sphere(), 8), Marched(40))
+    pictures = whole.render(ring(1))
+    assert not pictures.images.requires_grad
+    whole.trace(Views(pictures.images, ring(1)).rays(0)).colour.sum().backward()
+    assert level.grad > 0
+
+
+@torch.no_grad()
+def test_it_answers_as_its_field():
+    points, directions = torch.rand(7, 3), torch.rand(7, 3)
+    for mine, own in zip(adapted()(points, directions), solid_ball(points, directions), strict=True):
+        assert torch.equal(mine, own)
+
+
+def ball_surface(radius):
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
+    return radius * points / points.norm(dim=1, keepdim=True)
+
+
+def test_the_hull_holds_the_object_and_is_everything_without_masks():
+    views = ball_views(ring(6, (32, 32)), bounds=Sphere((0.1, 0.0, 0.0), 1.2))
+    carved = hull(views, 24)
+    assert carved.contains(ball_surface(0.49)).all()
+    assert carved.occupied.float().mean() < 0.3
+    assert carved.bounds == views.bounds
+    plain = hull(Views(views.images, views.cameras, bounds=views.bounds), 24)
+    assert plain.occupied.all()
+    assert plain.occupied.shape == (24, 24, 24)
+
+
+@pytest.mark.parametrize("focal", [(60.0, 240.0), (240.0, 60.0)])
+def test_the_hull_is_not_cut_by_cameras_whose_pixels_are_not_square(focal):
+    size = (int(focal[1]), int(focal[0]))
+    matrix = torch.tensor([[focal[0], 0, size[1] / 2 - 0.5], [0, focal[1], size[0] / 2 - 0.5], [0, 0, 1.0]])
+    eyes = torch.tensor([[0.0, 0.4, 3.0], [3.0, 0.2, 0.0], [0.0, 0.1, -3.0]])
+    views = ball_views(pinhole(matrix, look_at(eyes), *size), radius=0.3)
+    assert hull(views, 8).contains(ball_surface(0.29)).all()
+
+
+def test_the_hull_does_not_depend_on_the_order_of_the_views():
+    views = ball_views(ring(6, (20, 20)))
+    assert torch.equal(hull(views, 16).occupied, hull(views[[3, 0, 5, 1, 4, 2]], 16).occupied)

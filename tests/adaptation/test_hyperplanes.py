@@ -1,0 +1,234 @@
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.checkpoints import CheckpointError
+from hyperplanes.fields import TargetConfig
+from hyperplanes.geometry.cameras import camera_from_world, centres, look_at, pinhole, viewing_directions
+from hyperplanes.geometry.cameras import intrinsics as calibration
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.rendering import Hierarchical
+from hyperplanes.views import Views
+from tests.reference_rendering import awaken, ball_views, ring, small_model
+
+CAMERAS = ring(2, (10, 13), shift=1)
+
+
+@pytest.fixture
+def model():
+    return awaken(small_model())
+
+
+@pytest.fixture
+def support():
+    return ball_views(ring(4))
+
+
+def picture(model, support):
+    return model.adapt(support).render(CAMERAS).images
+
+
+def test_an_untrained_model_is_its_target(model, support):
+    # the outputs of the hypernetwork start at zero: theta + delta = theta
+    asleep = small_model()
+    plain = small_model(hypernetwork=None)
+    plain.networks.load_state_dict(asleep.networks.state_dict())
+    assert torch.equal(picture(asleep, support), picture(plain, support))
+    assert not torch.equal(picture(model, support), picture(asleep, support))
+
+
+def test_adapting_binds_theta_plus_delta(model, support):
+    with torch.no_grad():
+        prepared = model.prepare(support)
+        update = model.eval().update(prepared)
+        assert set(update) == {f"fine.{layer}.{kind}" for layer in ("colour", "density") for kind in ("weight", "bias")}
+        points, directions = torch.rand(9, 3) - 0.5, torch.nn.functional.normalize(torch.rand(9, 3), dim=1)
+        expected = model.field(prepared, model.theta + update)(points, directions)
+        found = model.adapt(support)(points, directions)
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_what_the_hypernetwork_reads(model, support):
+    """Eq. 7: k images of the support with the viewing directions of the same cameras, and theta."""
+    seen = []
+    model.hypernetwork.register_forward_pre_hook(lambda module, given: seen.append(given))
+    model.adapt(support)
+    images, directions, theta = seen[0]
+    assert images.shape == (2, 3, 16, 16)
+    assert set(theta) == set(model.theta)
+    for image, direction in zip(images, directions, strict=True):
+        view = next(i for i in range(4) if torch.equal(support.images[i], image))
+        torch.testing.assert_close(direction, viewing_directions(support.cameras)[view])
+        torch.testing.assert_close(direction, -torch.nn.functional.normalize(centres(support.cameras)[view], dim=0))
+
+
+@pytest.mark.parametrize("order", [[1, 2, 3, 0], [3, 1, 0, 2]])
+def test_support_views_in_another_order_make_the_same_field(model, support, order):
+    torch.testing.assert_close(picture(model, support[order]), picture(model, support))
+
+
+def test_a_scene_moved_and_scaled_with_its_cameras_gives_the_same_picture(model, support):
+    shift, scale = torch.tensor([1.5, -2.0, 0.7]), 2.5
+
+    def moved(cameras):
+        pose = camera_from_world(cameras).clone()
+        pose[:, :3, 3] = scale * pose[:, :3, 3] - pose[:, :3, :3] @ shift
+        return pinhole(calibration(cameras), pose, int(cameras.height[0]), int(cameras.width[0]))
+
+    there = replace(support, cameras=moved(support.cameras), bounds=Sphere(tuple(shift.tolist()), scale))
+    images = model.adapt(there).render(moved(CAMERAS)).images
+    # rounding may move a sample across the side of a voxel
+    assert ((images - picture(model, support)).abs() < 1e-3).float().mean() > 0.98
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_fewer_views_than_planes_stand_for_several(model, support, count):
+    arranged = model.arrange(support[:count])
+    assert len(arranged) == 4
+    sources = [int((support.images == image).flatten(1).all(1).nonzero()[0]) for image in arranged.images]
+    assert set(sources) == set(range(count))
+    assert max(map(sources.count, sources)) <= -(-4 // count)
+    assert torch.isfinite(picture(model, support[:count])).all()
+
+
+def test_of_more_views_the_ones_nearest_to_the_rig_are_taken(model, support):
+    others = ball_views(ring(5, shift=2))
+    many = Views(torch.cat([others.images, support.images]), _joined(others, support))
+    arranged = model.arrange(many)
+    assert torch.equal(arranged.images, support.images)
+    torch.testing.assert_close(centres(arranged.cameras), centres(support.cameras))
+
+
+def _joined(*parts):
+    pose = torch.cat([camera_from_world(part.cameras) for part in parts])
+    return pinhole(calibration(parts[0].cameras)[0], pose, *parts[0].size)
+
+
+def test_an_object_seen_from_farther_away_is_matched_by_direction(model, support):
+    far = pinhole(calibration(support.cameras)[0], look_at(centres(support.cameras)[[2, 0, 3, 1]] * 2), 16, 16)
+    arranged = model.arrange(replace(support, cameras=far))
+    torch.testing.assert_close(centres(arranged.cameras), 2 * centres(support.cameras))
+
+
+def test_hyperplanes_are_spread_as_far_as_they_can_be():
+    wide = small_model(network=TargetConfig(depth=1, width=8, planes=6))
+    # six standpoints on the axes; the farthest from the first is its opposite
+    eyes = 3 * torch.tensor([[0, 0, 1.0], [1, 0, 0], [0, 1, 0], [0, 0, -1], [-1, 0, 0], [0, -1, 0]])
+    cameras = pinhole(torch.tensor([[20.0, 0, 7.5], [0, 20, 7.5], [0, 0, 1]]), look_at(eyes), 16, 16)
+    wide.set_rig(ball_views(cameras))
+    assert wide.hyperplanes().tolist() == [0, 3]
+
+
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_hyperplanes_are_k_different_planes(count):
+    shape = HyperNetworkConfig(views=count, normalisation="group", code=4, depth=1, width=8)
+    chosen = small_model(hypernetwork=shape).hyperplanes().tolist()
+    assert len(set(chosen)) == len(chosen) == count
+
+
+def test_no_view_at_all_is_refused(model, support):
+    with pytest.raises(ValueError, match="support: expected at least one view, got none"):
+        model.adapt(support[:0])
+    with pytest.raises(ValueError, match="support: expected at least 4 views, got 3"):
+        model.set_rig(support[:3])
+
+
+@pytest.mark.parametrize("target", ["nerf", "multiplane", "point_multiplane"])
+def test_every_field_adapts_and_renders_with_and_without_masks(target, support):
+    whole = awaken(small_model(target=target))
+    for views in (support, replace(support, masks=None)):
+        images = picture(whole, views)
+        assert images.shape == (2, 3, 10, 13)
+        assert torch.isfinite(images).all()
+        assert images.std() > 0
+
+
+def test_an_unknown_target_is_refused():
+    with pytest.raises(ValueError, match="target: expected one of .*, got 'voxels'"):
+        small_model(target="voxels")
+
+
+def test_a_coarse_network_proposes_and_is_updated_too(support):
+    both = awaken(small_model(coarse_network=True, sampling=Hierarchical(6, 6)))
+    assert {name.split(".")[0] for name in both.theta} == {"fine", "coarse"}
+    prepared = both.prepare(support)
+    assert {name.split(".")[0] for name in both.update(prepared)} == {"fine", "coarse"}
+    seen = both.adapt(support).trace(support.rays(0, span="depth"))
+    assert (seen.coarse - seen.colour).abs().max() > 1e-3
+
+
+def test_a_saved_model_is_the_same_model(model, support, tmp_path):
+    model.save(tmp_path)
+    again = HyperPlanes.from_pretrained(tmp_path)
+    assert not again.training
+    assert again.config == model.config
+    assert all(torch.equal(value, again.state_dict()[name]) for name, value in model.state_dict().items())
+    assert torch.equal(picture(again, support), picture(model, support))
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        ModelConfig(),
+        ModelConfig(hypernetwork=None, sampling=Hierarchical(3, 4), coarse_network=True),
+        ModelConfig(target="nerf", hypernetwork=HyperNetworkConfig(layers=("0", "colour")), hull_side=7),
+    ],
+)
+def test_a_configuration_survives_json(config):
+    assert ModelConfig.of_json(json.loads(json.dumps(config.as_json()))) == config
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"surprise": 1},
+        {"protocol": "guessed"},
+        {"network": {"depth": 2, "breadth": 3}},
+        {"network": None},
+        {"hypernetwork": "large"},
+        {"sampling": {"coarse": 3}},
+    ],
+)
+def test_a_configuration_that_does_not_fit_is_a_checkpoint_error(change):
+    value = {**ModelConfig().as_json(), **change}
+    with pytest.raises(CheckpointError, match="expected the entries of this version's models") as caught:
+        ModelConfig.of_json(value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("missing", ["network", "sampling", "protocol", "hypernetwork"])
+def test_a_configuration_with_a_hole_is_a_checkpoint_error(missing):
+    value = ModelConfig().as_json()
+    del value[missing]
+    with pytest.raises(CheckpointError, match=missing):
+        ModelConfig.of_json(value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"network": {"depth": 3, "width": 24, "planes": 4, "point_octaves": 3, "direction_octaves": 1}},
+        {"network": {"depth": 2, "width": 20, "planes": 4, "point_octaves": 3, "direction_octaves": 1}},
+        {"hypernetwork": None},
+        {"coarse_network": True},
+    ],
+)
+def test_weights_of_another_architecture_are_a_checkpoint_error(model, tmp_path, change):
+    model.save(tmp_path)
+    written = json.loads((tmp_path / "model.json").read_text())
+    (tmp_path / "model.json").write_text(json.dumps({**written, **change}))
+    with pytest.raises(CheckpointError, match="model.safetensors: expected .* found .* of another model"):
+        HyperPlanes.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("missing", ["model.json", "model.safetensors"])
+def test_a_missing_part_of_a_checkpoint_is_named(model, tmp_path, missing):
+    model.save(tmp_path)
+    (tmp_path / missing).unlink()
+    with pytest.raises(CheckpointError, match=f"{missing}: expected"):
+        HyperPlanes.from_pretrained(tmp_path)
