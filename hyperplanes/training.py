@@ -13,6 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
 from hyperplanes.checkpoints import CheckpointError, load_tensors, read_json, save_tensors, write_json
 from hyperplanes.metrics import psnr
@@ -21,6 +22,9 @@ from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Task, Views
 
 __all__ = ["Progress", "Tasks", "Trainer", "TrainingConfig", "train"]
+
+
+EMPTINESS = 0.01  # weight of the opacity of empty space beside the squared error of pixels
 
 
 class Tasks(Protocol):
@@ -43,6 +47,8 @@ class TrainingConfig:
         steps: Adam steps.
         tasks: objects a step.
         rays: query rays an object and step.
+        empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
+            training sees nothing there, but a field that is rendered without masks must know.
         learning_rate: of theta.
         hypernetwork_learning_rate: of the hypernetwork.
         warmup: steps in which the learning rates rise from zero.
@@ -57,6 +63,7 @@ class TrainingConfig:
     steps: int = 2000
     tasks: int = 1
     rays: int = 512
+    empty_points: int = 0
     learning_rate: float = 1e-4
     hypernetwork_learning_rate: float = 1e-4
     warmup: int = 0
@@ -160,6 +167,8 @@ class Trainer:
             span = "sphere" if isinstance(field.sampling, Marched) else "depth"
             rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
             seen = field.trace(rays, generator)
+            if config.empty_points:
+                total = total + self._emptiness(field, generator)
             total = total + (seen.colour - truth).square().mean()
             if seen.coarse is not None:
                 total = total + (seen.coarse - truth).square().mean()
@@ -217,6 +226,16 @@ class Trainer:
                     blank["state"].setdefault(int(place), {})[name] = value
             optimiser.load_state_dict(blank)
         self.step, self.curve = int(saved["step"]), list(saved["curve"])
+
+    def _emptiness(self, field: AdaptedField, generator: torch.Generator) -> Tensor:
+        """Mean opacity, a tenth of a radius thick, of random points of the sphere that the hull rules out."""
+        bounds, device = field.occupancy.bounds, field.occupancy.occupied.device
+        unit = torch.randn(self.config.empty_points, 3, generator=generator)
+        unit = unit / unit.norm(dim=1, keepdim=True) * torch.rand(len(unit), 1, generator=generator) ** (1 / 3)
+        points = (unit * bounds.radius + torch.tensor(bounds.centre)).to(device)
+        points = points[~field.occupancy.contains(points)]
+        opacity = [1 - torch.exp(-density(points) * bounds.radius / 10) for density in field.densities]
+        return EMPTINESS * sum((each.sum() for each in opacity), torch.zeros((), device=device)) / len(unit)
 
     def _schedule(self) -> float:
         config = self.config

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import torch
@@ -12,13 +14,14 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve, full
-from hyperplanes.geometry.rays import Rays, cast, pixel_grid
+from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
+from hyperplanes.rendering.refinement import refine
 from hyperplanes.rendering.renderer import FieldFunction, Hierarchical, Marched, render, render_in_chunks
 from hyperplanes.views import Views
 
-__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
+__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull", "photograph"]
 
 
 @dataclass(frozen=True)
@@ -60,15 +63,28 @@ class AdaptedField:
 
     Attributes:
         field: (points, directions) -> (colour, density).
-        occupancy: where it can be anything but empty.
+        occupancy: where it can be anything but empty, by the masks of the support views.
         sampling: the protocol to render it by.
         proposal: the coarse field of `Hierarchical` sampling, where it is another one.
+        densities: points -> density alone, of the field and of its proposal.
     """
 
     field: FieldFunction
     occupancy: Occupancy
     sampling: Hierarchical | Marched
     proposal: FieldFunction | None = None
+    densities: tuple[Callable[[Tensor], Tensor], ...] = ()
+
+    @cached_property
+    def filled(self) -> Occupancy:
+        """Where it is anything but empty, by its own word: asked once, when the first view is rendered."""
+        return refine(self.occupancy, self.density)
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density alone, as the field gives it."""
+        if self.densities:
+            return self.densities[0](points)
+        return self.field(points, torch.nn.functional.normalize(points, dim=-1))[1]
 
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
@@ -94,25 +110,56 @@ class AdaptedField:
             One picture a camera.
         """
         sampling = sampling or self.sampling
-        height, width = camera.image_size(cameras)
-        pixels = pixel_grid(height, width, cameras.intrinsics.device)
-        marched = isinstance(sampling, Marched)
-        live = footprint(self.occupancy, cameras).flatten(1) if marched else None
-        values = pixels.new_zeros(cameras.batch_size, height * width, 5)
-        values[..., :3] = 1.0
-        samples = 0
-        for view in range(cameras.batch_size):
-            chosen = slice(None) if live is None else live[view].nonzero()[:, 0]
-            seen = pixels[chosen]
-            if not len(seen):
-                continue
-            index = torch.full((len(seen),), view, dtype=torch.long, device=pixels.device)
-            rays = cast(cameras, index, seen, self.occupancy.bounds, span="sphere" if marched else "depth")
-            part = render_in_chunks(self.field, rays, sampling, occupancy=self.occupancy, proposal=self.proposal)
-            values[view, chosen] = torch.cat([part.colour, part.opacity[:, None], part.depth[:, None]], 1)
-            samples += part.samples
-        maps = values.reshape(cameras.batch_size, height, width, 5).permute(0, 3, 1, 2)
-        return Pictures(maps[:, :3], maps[:, 3:4], maps[:, 4:], samples)
+        if isinstance(sampling, Hierarchical):
+            return photograph(
+                cameras,
+                self.occupancy.bounds,
+                lambda rays: render_in_chunks(self.field, rays, sampling, proposal=self.proposal),
+                span="depth",
+            )
+        return photograph(
+            cameras,
+            self.occupancy.bounds,
+            lambda rays: render_in_chunks(self.field, rays, sampling, occupancy=self.filled),
+            seen=self.filled,
+        )
+
+
+def photograph(
+    cameras: PinholeCamera,
+    bounds: Sphere,
+    see: Callable[[Rays], Rendered],
+    *,
+    seen: Occupancy | None = None,
+    span: str = "sphere",
+) -> Pictures:
+    """Pictures from anything that sees along rays.
+
+    Args:
+        cameras: any number, one image size.
+        bounds: what near and far of the rays are taken from.
+        see: the pixels of rays.
+        seen: where anything can be; pixels that do not look there stay white and are never asked for.
+        span: as in `geometry.cast`.
+
+    Returns:
+        One picture a camera.
+    """
+    height, width = camera.image_size(cameras)
+    pixels = pixel_grid(height, width, cameras.intrinsics.device)
+    live = None if seen is None else footprint(seen, cameras).flatten(1)
+    values = pixels.new_zeros(cameras.batch_size, height * width, 5)
+    values[..., :3] = 1.0
+    samples = 0
+    for view in range(cameras.batch_size):
+        chosen = torch.arange(len(pixels), device=pixels.device) if live is None else live[view].nonzero()[:, 0]
+        if not len(chosen):
+            continue
+        part = see(cast(cameras, torch.full_like(chosen, view), pixels[chosen], bounds, span=span))
+        values[view, chosen] = torch.cat([part.colour, part.opacity[:, None], part.depth[:, None]], 1)
+        samples += part.samples
+    maps = values.reshape(cameras.batch_size, height, width, 5).permute(0, 3, 1, 2)
+    return Pictures(maps[:, :3], maps[:, 3:4], maps[:, 4:], samples)
 
 
 def hull(support: Views, side: int) -> Occupancy:

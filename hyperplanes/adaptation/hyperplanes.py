@@ -184,7 +184,8 @@ class HyperPlanes(nn.Module):
             name: cast(Target, network).bind(parameters.under(name), planes, bounds)
             for name, network in self.networks.items()
         }
-        return AdaptedField(bound["fine"], prepared.occupancy, self.config.sampling, bound.get("coarse"))
+        densities = tuple(field.density for field in bound.values())
+        return AdaptedField(bound["fine"], prepared.occupancy, self.config.sampling, bound.get("coarse"), densities)
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:

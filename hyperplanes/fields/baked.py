@@ -1,0 +1,132 @@
+"""A field as a sparse voxel grid: density and spherical harmonics of colour, interpolated between voxel centres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
+from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["HARMONICS", "LARGEST_SIDE", "BakedField", "spherical_harmonics"]
+
+HARMONICS = 9
+LARGEST_SIDE = 512
+
+
+def spherical_harmonics(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
+    """The real spherical harmonics up to degree 2 at unit directions, orthonormal over the sphere.
+
+    >>> float(spherical_harmonics(torch.tensor([0.0, 0.0, 1.0]))[0] ** 2 * 4 * torch.pi)  # doctest: +ELLIPSIS
+    1.0...
+    """
+    x, y, z = directions.unbind(-1)
+    return torch.stack(
+        [
+            torch.full_like(x, 0.28209479),
+            -0.48860251 * y,
+            0.48860251 * z,
+            -0.48860251 * x,
+            1.09254843 * x * y,
+            -1.09254843 * y * z,
+            0.31539157 * (3 * z * z - 1),
+            -1.09254843 * x * z,
+            0.54627422 * (x * x - y * y),
+        ],
+        -1,
+    )
+
+
+@dataclass(frozen=True)
+class BakedField:
+    """Rows of numbers at the centres of the voxels that can be seen.
+
+    Attributes:
+        index: row of every voxel of the cube around the bounds, -1 where there is none; indexed [x, y, z].
+        values: density per world unit, then 3 x 9 coefficients of colour, red first.
+        bounds: the sphere of the scene.
+    """
+
+    index: Int[Tensor, "x y z"]
+    values: Float[Tensor, "row 28"]
+    bounds: Sphere
+
+    @property
+    def side(self) -> int:
+        """Voxels an axis."""
+        return self.index.shape[0]
+
+    @property
+    def occupancy(self) -> Occupancy:
+        """Where interpolation may find a row: the voxels that have one and their neighbours."""
+        return Occupancy(self.index >= 0, self.bounds).dilated()
+
+    def __call__(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
+        """Colour and density: trilinear between voxel centres, density zero where a voxel has no row.
+
+        Colour is interpolated over the corners that have one, weighted by their density, so that it does not fade
+        towards empty voxels.
+        """
+        side = self.side
+        place = (self.bounds.normalise(points) + 1) * (side / 2) - 0.5
+        low = place.floor()
+        fraction = place - low
+        low = low.long()
+        density = points.new_zeros(len(points))
+        coefficients = points.new_zeros(len(points), 3 * HARMONICS)
+        padded = torch.cat([self.values, self.values.new_zeros(1, self.values.shape[1])])
+        for corner in range(8):
+            step = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=points.device)
+            cell = low + step
+            inside = ((cell >= 0) & (cell < side)).all(-1)
+            cell = cell.clamp(0, side - 1)
+            row = torch.where(inside, self.index[cell[:, 0], cell[:, 1], cell[:, 2]].long(), -1)
+            weight = torch.where(step.bool(), fraction, 1 - fraction).prod(-1)
+            found = padded[row]
+            share = weight * found[:, 0]
+            density = density + share
+            coefficients = coefficients + share[:, None] * found[:, 1:]
+        coefficients = (coefficients / density.clamp_min(1e-8)[:, None]).reshape(-1, 3, HARMONICS)
+        colour = (coefficients * spherical_harmonics(directions)[:, None]).sum(-1)
+        return colour.clamp(0, 1), density
+
+    def save(self, path: Path | str) -> None:
+        """Write one compact file: a bit a voxel, half precision a row."""
+        bits = (self.index >= 0).flatten().reshape(-1, 8).to(torch.uint8)
+        packed = (bits * (2 ** torch.arange(8, device=bits.device)).to(torch.uint8)).sum(1, dtype=torch.uint8)
+        order = self.index.flatten()
+        rows = self.values[order[order >= 0].long()]
+        sphere = torch.tensor([*self.bounds.centre, self.bounds.radius])
+        save_tensors(Path(path), {"occupied": packed, "values": rows.half(), "sphere": sphere})
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """The field that `save` wrote.
+
+        Raises:
+            CheckpointError: a missing or damaged file, or one that holds something else.
+        """
+        path = Path(path)
+        found = load_tensors(path)
+        if set(found) != {"occupied", "values", "sphere"} or found["occupied"].dtype != torch.uint8:
+            raise CheckpointError(f"{path}: expected a baked field, found tensors {sorted(found)}; `hyperplanes bake`")
+        bits = found["occupied"][:, None].bitwise_and((2 ** torch.arange(8)).to(torch.uint8)).bool().flatten()
+        side = round(len(bits) ** (1 / 3))
+        rows = int(bits.sum())
+        if side**3 != len(bits) or side > LARGEST_SIDE or tuple(found["values"].shape) != (rows, 1 + 3 * HARMONICS):
+            raise CheckpointError(
+                f"{path}: expected a cube of voxels and {rows} rows of {1 + 3 * HARMONICS} numbers, found {len(bits)} "
+                f"voxels and {tuple(found['values'].shape)}; bake again"
+            )
+        index = torch.full((len(bits),), -1, dtype=torch.int32)
+        index[bits] = torch.arange(rows, dtype=torch.int32)
+        x, y, z, radius = found["sphere"].tolist()
+        return cls(index.reshape(side, side, side), found["values"].float(), Sphere((x, y, z), radius))
