@@ -192,9 +192,9 @@ def obvious_loop(objects: int, out: Path) -> dict[str, float]:
         for index, pose in enumerate(opengl):
             scene.set_pose(camera, pose)
             scene.set_pose(light, pose)
-            colour, _ = renderer.render(scene, flags=pyrender.RenderFlags.RGBA)
+            drawn: Any = renderer.render(scene, flags=pyrender.RenderFlags.RGBA)
             path = out / item.name / f"{index:03d}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(np.array(colour)).save(path)
+            Image.fromarray(np.array(drawn[0])).save(path)
         renderer.delete()
     return {"images": objects * VIEWS, "seconds": time.perf_counter() - begun}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ def run_on_ray(
     workers: int | None,
     timeout: float = 300.0,
     recycle: int = 200,
-) -> Iterator[Outcome]:
+) -> Generator[Outcome, None, None]:
     """Do items in Ray actors, as they come; `data_gen.workers.run_isolated` with the cluster's processors.
 
     Args:
@@ -91,7 +91,7 @@ def _run(
     count: int,
     timeout: float,
     recycle: int,
-) -> Iterator[Outcome]:
+) -> Generator[Outcome, None, None]:
     make = ray.remote(num_cpus=1, max_restarts=0)(_Renderer)
     idle: list[tuple[Any, int]] = []  # actors, and how many items each may still do
     again: deque[tuple[dict[str, Any], int]] = deque()
@@ -112,13 +112,16 @@ def _run(
         late = [future for future, state in running.items() if state[-1] <= time.monotonic() and future not in ready]
         for future in [*ready, *late]:
             actor, left, item, attempt, _ = running.pop(future)
-            reply = {"lost": f"no answer within {timeout:g} s"} if future in late else _reply(ray, future)
+            reply: dict[str, Any] = (
+                {"lost": f"no answer within {timeout:g} s"} if future in late else _reply(ray, future)
+            )
             if "fatal" in reply:
                 raise WorkerError(reply["fatal"])
             if "lost" not in reply:
                 if left > 0:
                     idle.append((actor, left))
-                yield Outcome(item, reply.get("ok"), reply.get("skip"))
+                result, reason = reply.get("ok"), reply.get("skip")
+                yield Outcome(item, result, reason)
                 continue
             ray.kill(actor)
             if attempt < ATTEMPTS:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -116,16 +117,17 @@ def generate(
         todo = (asdict(item) for item in items if item.name not in done)
         count, skipped, images = reused, [], 0
         try:
-            for outcome in _outcomes(engine, settings, todo, workers, timeout, recycle):
-                count += 1
-                name = outcome.item["name"]
-                if outcome.result is None:
-                    skipped.append((name, str(outcome.reason)))
-                else:
-                    done[name] = outcome.result
-                    images += outcome.result["record"]["views"]
-                if progress is not None:
-                    progress(count, len(items), name)
+            with closing(_outcomes(engine, settings, todo, workers, timeout, recycle)) as outcomes:
+                for outcome in outcomes:
+                    count += 1
+                    name = outcome.item["name"]
+                    if outcome.result is None:
+                        skipped.append((name, str(outcome.reason)))
+                    else:
+                        done[name] = outcome.result
+                        images += outcome.result["record"]["views"]
+                    if progress is not None:
+                        progress(count, len(items), name)
         except WorkerError as error:
             raise DataError(str(error)) from error
         if not any(item.name in done for item in items):
@@ -209,10 +211,11 @@ def _outcomes(
     workers: int | None,
     timeout: float,
     recycle: int,
-) -> Iterator[Outcome]:
+) -> Generator[Outcome, None, None]:
     if engine == "ray":
         from data_gen.cluster import run_on_ray
 
         return run_on_ray(TARGET, settings, items, workers=workers, timeout=timeout, recycle=recycle)
-    count = workers if workers is not None else len(os.sched_getaffinity(0))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = cores if workers is None else workers
     return run_isolated(TARGET, settings, items, workers=count, timeout=timeout, recycle=recycle)

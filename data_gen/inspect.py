@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from data_gen.contact_sheet import contact_sheet
+from data_gen.manifest import Verification, verify
 from hyperplanes.data.files import encode_png, write_whole
 
 __all__ = ["Inspection", "inspect"]
@@ -24,30 +25,35 @@ class Inspection:
         description: `hyperplanes.data.describe.Description` of the data set.
         files: the pictures that were written.
         notes: what could not be done and why, one line each.
+        verification: of the checksums, where it was asked for.
     """
 
     description: Any
     files: tuple[Path, ...]
     notes: tuple[str, ...]
+    verification: Verification | None = None
 
     @property
     def trouble(self) -> bool:
-        """Whether an object cannot be read, or its poses contradict its masks."""
+        """Whether an object cannot be read, its poses contradict its masks, or a file has changed."""
         objects = self.description.objects
-        return bool(self.description.broken) or not all(one.conventions.consistent for one in objects)
+        damaged = self.verification is not None and not self.verification.intact
+        return damaged or bool(self.description.broken) or not all(one.conventions.consistent for one in objects)
 
     def lines(self) -> list[str]:
         """All of it for people, a line a fact."""
-        return [*self.description.lines(), *(f"wrote {path}" for path in self.files), *self.notes]
+        checked = [] if self.verification is None else self.verification.lines()
+        return [*self.description.lines(), *checked, *(f"wrote {path}" for path in self.files), *self.notes]
 
 
-def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS) -> Inspection:
+def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS, *, checksums: bool = False) -> Inspection:
     """Describe a data set, and draw it.
 
     Args:
         path: a data set in any layout, or a posed scene.
         out: the folder for contact_sheet.png and cameras.png.
         objects: how many objects to look at.
+        checksums: compare every file with its checksum in the manifest, too.
 
     Returns:
         The description and the files. A data set that cannot be opened is a DataError; without matplotlib there is
@@ -59,6 +65,7 @@ def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS) -> Inspe
     data, out = open_dataset(path), Path(out)
     description = describe(data, objects)
     files, notes = [], []
+    verification = verify(path) if checksums else None
     names = [one.name for one in description.objects]
     if names:
         pictures, labels = _pictures(data, names)
@@ -70,7 +77,7 @@ def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS) -> Inspe
             write_whole(files[1], drawing)
         except ImportError:
             notes.append("cameras.png: not drawn, matplotlib is not installed; pip install matplotlib")
-    return Inspection(description, tuple(files), tuple(notes))
+    return Inspection(description, tuple(files), tuple(notes), verification)
 
 
 def _pictures(data: Any, names: list[str]) -> tuple[list[np.ndarray], list[str]]:

@@ -44,6 +44,14 @@ class Verification:
         """Whether every file is there and as it was written."""
         return not self.missing and not self.changed
 
+    def lines(self) -> list[str]:
+        """The outcome for people, a line a fact."""
+        if self.intact:
+            return [f"checksums: {self.files:,} files as they were written"]
+        return [f"checksums: {name} is missing" for name in self.missing] + [
+            f"checksums: {name} has changed since it was written" for name in self.changed
+        ]
+
 
 def build_manifest(
     configuration: dict[str, Any],

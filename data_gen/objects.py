@@ -83,7 +83,7 @@ def _draw(rasteriser: Any, item: Item, settings: dict[str, Any]) -> RenderedObje
         seed=seed_of(settings["seed"], "lighting", item.name) % 2**32,
     )
     extra = {channel: getattr(rendering, channel) for channel in channels if channel != "rgba"}
-    model = mesh.scene.export(file_type="glb") if "mesh" in settings["channels"] else None
+    model: Any = mesh.scene.export(file_type="glb") if "mesh" in settings["channels"] else None
     return RenderedObject(item, rig, rendering.rgba, extra, model, mesh)
 
 

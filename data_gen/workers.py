@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -55,7 +55,7 @@ def run_isolated(
     workers: int,
     timeout: float = 300.0,
     recycle: int = 200,
-) -> Iterator[Outcome]:
+) -> Generator[Outcome, None, None]:
     """Do items in worker processes, as they come.
 
     Args:
@@ -140,7 +140,9 @@ class _Worker:
             env={**os.environ, **threads, "PYTHONPATH": path},
             start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends its workers
         )
-        self.answers = self.process.stdout
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.items, self.answers = self.process.stdin, self.process.stdout
         self.buffer = b""
         self._send(settings)
 
@@ -182,7 +184,7 @@ class _Worker:
         """End the process: by the end of its input, or at once."""
         if kill:
             self.process.kill()
-        for pipe in (self.process.stdin, self.process.stdout):
+        for pipe in (self.items, self.answers):
             try:
                 pipe.close()
             except BrokenPipeError:
@@ -211,7 +213,7 @@ class _Worker:
 
     def _send(self, value: dict[str, Any]) -> None:
         try:
-            self.process.stdin.write(json.dumps(value).encode() + b"\n")
-            self.process.stdin.flush()
+            self.items.write(json.dumps(value).encode() + b"\n")
+            self.items.flush()
         except BrokenPipeError:  # it has ended already, which shows when its answer is read
             pass

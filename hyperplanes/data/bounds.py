@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+from typing import Any
+
 import torch
 from jaxtyping import Float, UInt8
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from hyperplanes.data.errors import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["estimate_bounds", "nearest_point"]
+__all__ = ["estimate_bounds", "nearest_point", "stated_bounds"]
 
 HULL_SIDE = 48
 HULL_MARGIN = 1.05
@@ -48,6 +53,32 @@ def estimate_bounds(cameras: PinholeCamera, alpha: UInt8[Tensor, "view 1 height 
         radius = HULL_MARGIN * (ball.radius + sphere.radius / HULL_SIDE * 3**0.5)
         sphere = Sphere(ball.centre, min(radius, outer.radius))
     return sphere
+
+
+def stated_bounds(document: dict[str, Any], path: Path) -> Sphere | None:
+    """The "scene_sphere" of a transforms.json or a manifest, or None where there is none.
+
+    Args:
+        document: its content.
+        path: of the file, for the message.
+
+    Returns:
+        The sphere in the world of the poses.
+
+    Raises:
+        DataError: no centre and radius, or numbers that make no sphere.
+    """
+    stated = document.get("scene_sphere")
+    if stated is None:
+        return None
+    try:
+        x, y, z = (float(value) for value in stated["centre"])
+        radius = float(stated["radius"])
+    except (TypeError, KeyError, ValueError) as error:
+        raise DataError(path, "scene_sphere with centre and radius", repr(stated), "correct the file") from error
+    if not all(map(math.isfinite, (x, y, z, radius))) or radius <= 0:
+        raise DataError(path, "a scene_sphere of finite numbers, radius > 0", repr(stated), "correct the file")
+    return Sphere((x, y, z), radius)
 
 
 def nearest_point(centres: Float[Tensor, "view 3"], directions: Float[Tensor, "view 3"]) -> Float[Tensor, " 3"]:

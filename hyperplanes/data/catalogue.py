@@ -11,9 +11,8 @@ from hyperplanes.data.errors import DataError
 from hyperplanes.data.files import read_json
 from hyperplanes.data.posed import PosedTask
 from hyperplanes.data.transforms_json import find_transforms, read_transforms_task
-from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["FORMAT", "SPLITS", "Catalogue", "find_catalogue", "manifest_bounds", "native"]
+__all__ = ["FORMAT", "SPLITS", "Catalogue", "find_catalogue", "native"]
 
 FORMAT = "hyperplanes-dataset"
 """The value of "format" in a native manifest.json."""
@@ -123,14 +122,6 @@ def is_plain(name: str) -> bool:
     (True, False, False)
     """
     return PurePosixPath(name).name == name and name not in {"", ".", ".."} and "\\" not in name and "\0" not in name
-
-
-def manifest_bounds(manifest: dict[str, Any]) -> Sphere | None:
-    """The scene sphere that a manifest states for all its objects, or None."""
-    stated = manifest.get("scene_sphere")
-    if not isinstance(stated, dict) or len(stated.get("centre", ())) != 3:
-        return None
-    return Sphere(tuple(float(value) for value in stated["centre"]), float(stated["radius"]))
 
 
 def posed_folder(folder: Path) -> Catalogue:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.catalogue import SPLITS, Catalogue, is_plain, manifest_bounds
+from hyperplanes.data.bounds import stated_bounds
+from hyperplanes.data.catalogue import SPLITS, Catalogue, is_plain
 from hyperplanes.data.errors import DataError
 from hyperplanes.data.files import read_json
 from hyperplanes.data.posed import Posed, PosedTask, check_pose, posed
@@ -117,7 +118,7 @@ def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -
     Returns:
         The catalogue; None when it is something else.
     """
-    bounds = manifest_bounds(manifest)
+    bounds = stated_bounds(manifest, folder / "manifest.json")
     archives = sorted(folder.glob("*/sampled/*.npz")) or sorted(folder.glob("sampled/*.npz"))
     if archives:
         return _authors(archives, manifest, bounds, legacy)

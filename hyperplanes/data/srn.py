@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.catalogue import Catalogue, manifest_bounds
+from hyperplanes.data.bounds import stated_bounds
+from hyperplanes.data.catalogue import Catalogue
 from hyperplanes.data.errors import DataError
 from hyperplanes.data.images import image_size, read_image
 from hyperplanes.data.posed import Posed, PosedTask, check_pose, posed
@@ -97,7 +98,7 @@ def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
         return None
     paths = {path.name: path for found in homes.values() for path in found}
     splits = {split: tuple(path.name for path in homes.get(split, [])) for split in ("train", "val", "test")}
-    bounds = manifest_bounds(manifest)
+    bounds = stated_bounds(manifest, folder / "manifest.json")
     return Catalogue(
         "srn", splits, lambda name: PosedTask.alternating(read_srn(paths[name], bounds=bounds), name), manifest
     )

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hyperplanes.data.bounds import stated_bounds
 from hyperplanes.data.errors import DataError
 from hyperplanes.data.files import inside, read_json
 from hyperplanes.data.images import image_size, read_image
@@ -89,7 +90,7 @@ def read_transforms(
         opencv_from_opengl(np.stack(poses)),
         np.stack(matrices),
         has_alpha=any(alphas),
-        bounds=bounds or _sphere(documents[0], paths[0]),
+        bounds=bounds or stated_bounds(documents[0], paths[0]),
         names=tuple(frame.name for frame in frames),
         source=source,
     )
@@ -182,20 +183,6 @@ def _picture(frame: _Frame, size: tuple[int, int], folder: Path) -> tuple[npt.ND
         picture[..., 3] = values[..., :3].max(-1)
         alpha = True
     return picture, alpha
-
-
-def _sphere(document: dict[str, Any], path: Path) -> Sphere | None:
-    stated = document.get("scene_sphere")
-    if stated is None:
-        return None
-    try:
-        centre = tuple(float(value) for value in stated["centre"])
-        radius = float(stated["radius"])
-    except (TypeError, KeyError, ValueError) as error:
-        raise DataError(path, "scene_sphere with centre and radius", repr(stated), "correct the file") from error
-    if len(centre) != 3 or not np.isfinite([*centre, radius]).all() or radius <= 0:
-        raise DataError(path, "a scene_sphere of finite numbers, radius > 0", repr(stated), "correct the file")
-    return Sphere(centre, radius)
 
 
 def _same_size(task: PosedTask, folder: str | Path) -> PosedTask:

@@ -15,6 +15,7 @@ import trimesh
 
 from data_gen import dataset
 from data_gen.dataset import MeshFolder, Procedural, generate, verify
+from data_gen.inspect import inspect
 from data_gen.rigs import fixed
 from data_gen.sources import list_items
 from hyperplanes.data import DataError, Dataset
@@ -86,6 +87,9 @@ def test_verify_finds_what_is_missing_and_what_has_changed(whole, tmp_path):
     found = verify(out)
     assert found.missing == ["car_00000/images/000.png"]
     assert found.changed == ["car_00001/images/001.png"]
+    lines = inspect(out, tmp_path / "pictures", 1, checksums=True).lines()
+    assert "checksums: car_00000/images/000.png is missing" in lines
+    assert "checksums: car_00001/images/001.png has changed since it was written" in lines
     report = generate(CARS, out, held_out=2, **SMALL)
     assert (report.written, report.reused) == (5, 4), "what is missing is made again"
 
