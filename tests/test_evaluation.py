@@ -1,0 +1,114 @@
+import json
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import NearestView, Pictures
+from hyperplanes.adaptation.fine_tuning import FineTuned
+from hyperplanes.evaluation import METHODS, ObjectScore, Score, evaluate, make_method
+from hyperplanes.metrics import psnr, ssim
+from tests.reference_rendering import Balls, small_model
+
+
+class Shifted:
+    """A method that knows the answer and adds a constant to it."""
+
+    def __init__(self, data, error):
+        self.data, self.error, self.number = data, error, 0
+
+    def adapt(self, support):
+        task = self.data.task(self.data.names("test")[self.number])
+        assert torch.equal(support.images, task.support.images)
+        self.number += 1
+        return Answer(task.query.images, self.error)
+
+
+@dataclass
+class Answer:
+    images: torch.Tensor
+    error: float
+
+    def render(self, cameras):
+        assert cameras.batch_size == len(self.images)
+        images = torch.where(self.images + self.error > 1, self.images - self.error, self.images + self.error)
+        return Pictures(images, images[:, :1], images[:, :1], 0)
+
+
+def test_a_constant_error_scores_as_calculated():
+    # an error of 0.1 in every number of every image: 20 dB
+    data = Balls(test=3)
+    score = evaluate("shifted", Shifted(data, 0.1), data, data.names("test"))
+    assert [each.name for each in score.objects] == data.names("test")
+    assert [each.psnr for each in score.objects] == pytest.approx([20.0] * 3, abs=1e-3)
+    assert score.mean("psnr") == pytest.approx(20.0, abs=1e-3)
+
+
+def test_scores_are_means_over_the_query_views():
+    data = Balls(test=1)
+    task = data.task("test0")
+    score = evaluate("nearest_view", NearestView(), data, ["test0"])
+    images = NearestView().adapt(task.support).render(task.query.cameras).images
+    assert score.objects[0].psnr == pytest.approx(psnr(images, task.query.images).mean().item())
+    assert score.objects[0].ssim == pytest.approx(ssim(images, task.query.images).mean().item())
+
+
+def test_pictures_are_clamped_before_they_are_compared():
+    data = Balls(test=1)
+
+    class Overshooting(Shifted):
+        def adapt(self, support):
+            answer = super().adapt(support)
+            answer.images = torch.where(answer.images >= 1, 3.0, answer.images)  # clamped to white, which is right
+            answer.error = 0.0
+            return answer
+
+    assert evaluate("over", Overshooting(data, 0.0), data, ["test0"]).objects[0].psnr == float("inf")
+
+
+def test_every_object_is_shown_to_the_caller():
+    data, seen = Balls(test=2), []
+    evaluate("nearest_view", NearestView(), data, data.names("test"), lambda *shown: seen.append(shown))
+    assert [score.name for score, _, _ in seen] == [task.name for _, task, _ in seen] == data.names("test")
+    assert all(pictures.images.shape == task.query.images.shape for _, task, pictures in seen)
+
+
+def test_a_row_in_json():
+    score = Score("m", (ObjectScore("a", 20.0, 0.8, 1.0, 0.5), ObjectScore("b", 30.0, 0.6, 3.0, 1.5)))
+    assert json.loads(json.dumps(score.as_json())) == {
+        "psnr": 25.0,
+        "ssim": pytest.approx(0.7),
+        "adapt_seconds": 2.0,
+        "render_seconds": 1.0,
+        "objects": {
+            "a": {"psnr": 20.0, "ssim": 0.8, "adapt_seconds": 1.0, "render_seconds": 0.5},
+            "b": {"psnr": 30.0, "ssim": 0.6, "adapt_seconds": 3.0, "render_seconds": 1.5},
+        },
+    }
+
+
+def test_nothing_to_evaluate_on_is_refused():
+    with pytest.raises(ValueError, match="names: expected at least one object to evaluate on, got none"):
+        evaluate("nearest_view", NearestView(), Balls(), [])
+
+
+def test_methods_by_name(tmp_path):
+    full, plain = tmp_path / "full", tmp_path / "plain"
+    small_model().save(full)
+    small_model(hypernetwork=None).save(plain)
+    folders = {"hyperplanes": full, "point_multiplane": plain}
+    made = {name: make_method(name, folders) for name in METHODS}
+    assert isinstance(made["nearest_view"], NearestView)
+    assert made["point_multiplane"].hypernetwork is None
+    assert made["hyperplanes"].hypernetwork is not None
+    for name, steps in (("hyperplanes_10", 10), ("hyperplanes_100", 100)):
+        assert isinstance(made[name], FineTuned)
+        assert made[name].steps == steps
+
+
+def test_unknown_methods_and_missing_checkpoints_are_refused():
+    with pytest.raises(ValueError, match="method: expected one of nearest_view, .*, got 'magic'"):
+        make_method("magic", {})
+    for name, family in (("hyperplanes_10", "hyperplanes"), ("point_multiplane", "point_multiplane")):
+        with pytest.raises(ValueError, match=f"method {name}: expected a checkpoint of {family}, got none"):
+            make_method(name, {})

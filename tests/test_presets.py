@@ -1,0 +1,95 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.hypernetwork import ConvNet, ResNet101
+from hyperplanes.presets import PRESETS, preset
+from hyperplanes.rendering import Hierarchical
+from hyperplanes.training import Trainer
+from tests.reference_rendering import Balls, ring
+
+
+def shapes(name):
+    """A preset's model without memory for its weights."""
+    with torch.device("meta"):
+        return HyperPlanes(preset(name).model)
+
+
+@pytest.mark.parametrize("name", ["paper-128", "paper-200"])
+def test_the_papers_target_network(name):
+    # Appendix B: 8 layers of 256, 25 ImagePlanes; five numbers a plane and 3 (1 + 2 * 10) of the encoded point
+    model = shapes(name)
+    for network in model.networks.values():
+        assert [layer.out_features for layer in network.layers] == [256] * 8
+        assert network.layers[0].in_features == 25 * 5 + 63
+    assert set(model.networks) == {"fine", "coarse"}
+    assert len(model.rig) == 25
+
+
+@pytest.mark.parametrize(("name", "depth", "views"), [("paper-128", 3, 5), ("paper-200", 10, 25)])
+def test_the_papers_hypernetwork(name, depth, views):
+    hypernetwork = shapes(name).hypernetwork
+    assert [layer.out_features for layer in hypernetwork.head] == [256] * depth
+    assert hypernetwork.config.views == views
+    assert hypernetwork.config.see_weights
+    assert hypernetwork.config.see_directions
+    # the colour and opacity layers of both networks, 128 x 3 + 3 and 256 + 1 numbers
+    assert sorted(layer.out_features for layer in hypernetwork.outputs) == sorted([384, 3, 256, 1] * 2)
+
+
+def test_the_papers_encoders():
+    small, large = (shapes(name).hypernetwork.encoder for name in ("paper-128", "paper-200"))
+    assert isinstance(small, ConvNet)
+    assert any(isinstance(layer, nn.BatchNorm2d) for layer in small.modules())
+    assert isinstance(large, ResNet101)
+    assert sum(value.numel() for name, value in large.named_parameters() if "code" not in name) == 42_500_160
+
+
+@pytest.mark.parametrize("name", ["paper-128", "paper-200"])
+def test_the_papers_protocol_and_training(name):
+    chosen = preset(name)
+    assert chosen.model.sampling == Hierarchical(64, 128)
+    training = chosen.training
+    assert (training.tasks, training.rays, training.learning_rate) == (1, 512, 1e-4)
+    assert training.hypernetwork_learning_rate == 1e-4
+    assert (training.warmup, training.final) == (0, 1.0)
+    assert str(chosen.resolution) in name
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_survives_json_and_fits_its_own_parts(name):
+    chosen = preset(name)
+    assert ModelConfig.of_json(chosen.model.as_json()) == chosen.model
+    assert chosen.model.hypernetwork.views <= chosen.model.network.planes
+    assert chosen.without_hypernetwork().model == replace(chosen.model, hypernetwork=None)
+    assert chosen.without_hypernetwork().training == chosen.training
+    assert "\n" not in chosen.about
+
+
+@pytest.mark.parametrize("name", ["paper-128", "quick"])
+def test_a_preset_trains_and_renders_at_toy_resolution(name):
+    """The architecture as it is; 25 pictures of 12 x 12 and few rays and samples."""
+    chosen = preset(name)
+    sampling = Hierarchical(4, 4) if isinstance(chosen.model.sampling, Hierarchical) else chosen.model.sampling
+    torch.manual_seed(0)
+    model = HyperPlanes(replace(chosen.model, sampling=sampling, hull_side=12))
+    data = Balls(train=1, views=25, size=(12, 12))
+    trainer = Trainer(model, data, replace(chosen.training, rays=8))
+    before = {key: value.clone() for key, value in model.named_parameters()}
+    assert 0 < trainer.take_step() < 10
+    moved = {
+        key.split(".")[0] + "." + key.split(".")[1] for key, v in model.named_parameters() if (v != before[key]).any()
+    }
+    # the encoder behind outputs that start at zero moves from the second step on
+    assert {f"networks.{part}" for part in model.networks} | {"hypernetwork.outputs"} <= moved
+    pictures = model.adapt(data.task("train0").support).render(ring(1, (6, 6)))
+    assert torch.isfinite(pictures.images).all()
+    assert ((pictures.images >= 0) & (pictures.images <= 1.0001)).all()
+
+
+def test_an_unknown_preset_is_refused():
+    with pytest.raises(ValueError, match="preset: expected one of quick, .*, got 'huge'"):
+        preset("huge")
