@@ -122,7 +122,7 @@ def generate(
                     count += 1
                     name = outcome.item["name"]
                     if outcome.result is None:
-                        skipped.append((name, str(outcome.reason)))
+                        skipped.append((name, _without_path(str(outcome.reason), source)))
                     else:
                         done[name] = outcome.result
                         images += outcome.result["record"]["views"]
@@ -189,6 +189,16 @@ def _configuration(
             "names": sha256(repr(names).encode()),
         }
     return configuration | {"generator": GENERATOR, "source": described, "held_out": held_out}
+
+
+def _without_path(reason: str, source: Source) -> str:
+    """A reason in which mesh files are named from their folder on, so that no path of this machine is written."""
+    if isinstance(source, Procedural):
+        return reason
+    folder = Path(source.path)
+    for written in (folder, folder.resolve()):
+        reason = reason.replace(f"{written}/", "")
+    return reason
 
 
 def _facts(settings: dict[str, Any]) -> dict[str, Any]:

@@ -130,7 +130,8 @@ def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
 
     `images` float32 (view, 200, 200, 3) in [0, 1] over white, `cam_poses` float32 (view, 4, 4) OpenGL camera-to-world.
     Their loaders take 277.77 pixels as the focal length, near 2 and far 6, and split the files sorted by name 80/20.
-    For readers that care, and ignored by theirs: `rgba` uint8 with straight alpha, `focal` in pixels.
+    For readers that care, and ignored by theirs: `rgba` uint8 with straight alpha, `focal` in pixels. Underscores in
+    names become hyphens, for their loaders take what follows the last underscore as the name.
 
     Args:
         rendered: the object.

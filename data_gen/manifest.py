@@ -199,7 +199,7 @@ class Progress:
         self._lock = open(self.folder / "lock", "w")
         fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         shutil.rmtree(self.scratch, ignore_errors=True)
-        self.scratch.mkdir()
+        self.scratch.mkdir(exist_ok=True)  # a worker of a killed run may still be at its last file
         (self.folder / "done").mkdir(exist_ok=True)
 
     def _existing(self) -> dict[str, Any] | None:

@@ -157,6 +157,7 @@ def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path)
     report = generate(MeshFolder(meshes), tmp_path / "out", held_out=0, **SMALL)
     assert report.written == 2
     assert [name for name, _ in report.skipped] == ["broken", "empty"]
+    assert all(reason.startswith(f"{name}.") for name, reason in report.skipped), "no path of this machine"
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert [(entry["name"], entry["reason"]) for entry in manifest["skipped"]] == report.skipped
     assert Dataset(tmp_path / "out").names() == ["ball", "box"]
