@@ -21,6 +21,7 @@ __all__ = [
     "back_project",
     "fetch_packed",
     "fetch_plane",
+    "inlined",
     "inner",
     "place",
     "project",
@@ -40,8 +41,10 @@ FIRST_RECORD = BLOCK * 13
 PITCH = BLOCK + 16
 COLUMN, ROW, INSIDE, CHANNELS = (PITCH * row for row in range(4))
 
-# Everything of fast maths but the assumption that there are no NaN and no infinities.
+# Everything of fast maths but the assumption that there are no NaN and no infinities. What runs once a lookup is
+# forced inline; LLVM calls it otherwise, which costs more than its work.
 inner = njit(fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy", nogil=True)
+inlined = njit(fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy", nogil=True, forceinline=True)
 
 
 @inner

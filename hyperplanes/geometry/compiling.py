@@ -20,7 +20,7 @@ _LOOKUP = "T[:, ::1], {views}T[:, :, ::1], T[:, :, :, ::1], uint32[::1], int64, 
 _SIGNATURES = {
     "forward": _LOOKUP + "T, T, T[::1], T[::1], uint8[::1], int64, int64",
     "backward": _LOOKUP + "T, T[:, :, :], T[:, :, :], T[:, ::1], float64[:, ::1], int64, int64",
-    "image_backward": "T[:, ::1], {views}T[:, :, ::1], int64, int64, T, T[:, :, :], T[:, :, ::1], int64, int64",
+    "image_backward": "T[:, ::1], {views}T[:, :, ::1], int64, int64, T, T[:, :, :], int64, T[::1], int64, int64",
 }
 _SOURCES = ("vector_memory.py", "blocks.py", "kernels_cpu.py")
 

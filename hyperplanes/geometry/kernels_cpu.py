@@ -32,6 +32,7 @@ from hyperplanes.geometry.blocks import (
     back_project,
     fetch_packed,
     fetch_plane,
+    inlined,
     inner,
     place,
     project,
@@ -39,7 +40,7 @@ from hyperplanes.geometry.blocks import (
     pull_plane,
     start_pull,
 )
-from hyperplanes.geometry.vector_memory import load, store
+from hyperplanes.geometry.vector_memory import add_pixels, load, store
 
 __all__ = [
     "backward",
@@ -78,7 +79,7 @@ def _scratch(dtype, channels, records):
     return np.zeros(FIRST_RECORD + PITCH * (3 + channels) * records, dtype)
 
 
-@inner
+@inlined
 @no_type_check
 def _take(s, i, points, p):
     s[X + i] = points[p, 0]
@@ -99,7 +100,7 @@ def _look(s, record, view, matrices, images, packed, bits, height, width, backgr
             fetch_plane(s, record, images, (view * channels + c) * size, height, width, c, background)
 
 
-@inner
+@inlined
 @no_type_check
 def _write(s, first, count, planes, channels, colours, coordinates, valid):
     """All records of a block -> the flat outputs from point `first` on, one output at a time: streams of writes."""
@@ -169,7 +170,7 @@ def forward_chosen(points, views, matrices, images, packed, bits, height, width,
                     store(colours, k * channels + c, load(s, row + CHANNELS + c * PITCH))
 
 
-@inner
+@inlined
 @no_type_check
 def _read_gradients(s, first, count, grad_colours, grad_coordinates):
     """The gradients of all lookups of a block's points -> its records; zeros where the block is not full."""
@@ -189,7 +190,7 @@ def _read_gradients(s, first, count, grad_colours, grad_coordinates):
         _clear(s, FIRST_RECORD + view * step, count, channels)
 
 
-@inner
+@inlined
 @no_type_check
 def _clear(s, record, count, channels):
     """Zero gradients in the lanes from `count` on, which hold no lookup."""
@@ -267,32 +268,40 @@ def backward_chosen(points, views, matrices, images, packed, bits, height, width
                 grad_points[p, 2] += s[GRAD_Z + i]
 
 
-@inner
+@inlined
 @no_type_check
-def _splat(s, i, p, j, grad_colours, height, width, plane):
-    """Adds one lookup's gradient to the four pixels it was interpolated from; `plane` is (pixel, channel)."""
-    if load(s, FIRST_RECORD + INSIDE + i) == 0:
-        return
+def _splat(s, i, p, j, grad_colours, height, width, channels, pitch, start, plane):
+    """Adds one lookup's gradient to the four pixels it was interpolated from; pixels lie `pitch` numbers apart."""
     u, v = load(s, U + i), load(s, V + i)
-    x, y = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
-    right, below = 1 if width > 1 else 0, width if height > 1 else 0
+    x, y = min(np.int64(u), max(width - 2, 0)), min(np.int64(v), max(height - 2, 0))
     fx, fy = u - s.dtype.type(x), v - s.dtype.type(y)
-    k = y * width + x
     wd = fx * fy
     wb, wc = fx - wd, fy - wd
     wa = s.dtype.type(1) - fx - wc
-    for c in range(grad_colours.shape[2]):
-        gradient = grad_colours[p, j, c]
-        plane[k, c] += wa * gradient
-        plane[k + right, c] += wb * gradient
-        plane[k + below, c] += wc * gradient
-        plane[k + below + right, c] += wd * gradient
+    top = start + (y * width + x) * pitch
+    low = top + (width * pitch if height > 1 else 0)
+    if channels == 3:
+        first, second, third = grad_colours[p, j, 0], grad_colours[p, j, 1], grad_colours[p, j, 2]
+        add_pixels(plane, top, wa, wb, first, second, third)
+        add_pixels(plane, low, wc, wd, first, second, third)
+    else:
+        for c in range(channels):
+            gradient = grad_colours[p, j, c]
+            plane[top + c] += wa * gradient
+            plane[top + pitch + c] += wb * gradient
+            plane[low + c] += wc * gradient
+            plane[low + pitch + c] += wd * gradient
 
 
 @no_type_check
-def image_backward(points, matrices, height, width, nearest, grad_colours, grad_images, start, stop):
-    """The gradient with respect to planes start..stop; `grad_images` is (view, pixel, channel)."""
+def image_backward(points, matrices, height, width, nearest, grad_colours, pitch, grad_images, start, stop):
+    """The gradient with respect to planes start..stop.
+
+    `grad_images` is flat (view, pixel, pitch) with one spare pixel at the end, since an image one pixel wide has zero
+    weight on a neighbour that it lacks.
+    """
     s = _scratch(points.dtype, 0, 1)
+    channels = grad_colours.shape[2]
     for p in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - p)
         for i in range(count):
@@ -300,16 +309,18 @@ def image_backward(points, matrices, height, width, nearest, grad_colours, grad_
         for view in range(start, stop):
             project(s, matrices, view, nearest)
             place(s, FIRST_RECORD, height, width)
-            plane = grad_images[view]
+            plane = view * height * width * pitch
             for i in range(count):
-                _splat(s, i, p + i, view, grad_colours, height, width, plane)
+                if load(s, FIRST_RECORD + INSIDE + i) > 0:
+                    _splat(s, i, p + i, view, grad_colours, height, width, channels, pitch, plane, grad_images)
 
 
 @no_type_check
-def image_backward_chosen(points, views, matrices, height, width, nearest, grad_colours, grad_images, start, stop):
+def image_backward_chosen(points, views, matrices, height, width, nearest, grad_colours, pitch, grad_images,
+                          start, stop):  # fmt: skip
     """As `image_backward`, for chosen planes: only lookups in planes start..stop are followed."""
     s = _scratch(points.dtype, 0, 1)
-    m, planes = views.shape[1], matrices.shape[0]
+    m, planes, channels = views.shape[1], matrices.shape[0], grad_colours.shape[2]
     order = np.empty((planes, BLOCK), np.int64)
     filled = np.zeros(planes, np.int64)
     total = points.shape[0] * m
@@ -326,6 +337,9 @@ def image_backward_chosen(points, views, matrices, height, width, nearest, grad_
             _take(s, i, points, order[view, i] // m)
         project(s, matrices, view, nearest)
         place(s, FIRST_RECORD, height, width)
+        plane = view * height * width * pitch
         for i in range(filled[view]):
-            _splat(s, i, order[view, i] // m, order[view, i] % m, grad_colours, height, width, grad_images[view])
+            if load(s, FIRST_RECORD + INSIDE + i) > 0:
+                p, j = order[view, i] // m, order[view, i] % m
+                _splat(s, i, p, j, grad_colours, height, width, channels, pitch, plane, grad_images)
         filled[view] = 0

@@ -108,14 +108,21 @@ def _image_gradient(
     points: Tensor, matrices: Tensor, images: Tensor, views: Tensor | None, grad_colours: Tensor
 ) -> Tensor:
     count, channels, height, width = images.shape
-    gradient = torch.zeros(count, height * width, channels, dtype=images.dtype)
+    pitch = _pixel_pitch(channels)
+    flat = torch.zeros((count * height * width + 1) * pitch, dtype=images.dtype)
     if grad_colours.numel():
         kernel = _kernel("image_backward", points.dtype, views is not None)
         fixed = (*_geometry(points, matrices, views), height, width, _array(points).dtype.type(NEAREST_DEPTH))
-        fixed += (grad_colours.detach().numpy(), gradient.numpy())
-        step = 1 if views is None else -(-count // torch.get_num_threads())  # each call reads all the chosen views
+        fixed += (grad_colours.detach().numpy(), pitch, flat.numpy())
+        # A few planes at a time: they share the reads of the gradient, and their pixels stay in the cache.
+        step = min(4, -(-count // torch.get_num_threads())) if views is None else -(-count // torch.get_num_threads())
         share(lambda start, stop: kernel(*fixed, start, stop), count, step)
-    return gradient.reshape(count, height, width, channels).permute(0, 3, 1, 2)
+    return flat[:-pitch].reshape(count, height, width, pitch)[..., :channels].permute(0, 3, 1, 2)
+
+
+def _pixel_pitch(channels: int) -> int:
+    """Numbers a pixel's gradient takes in memory: three channels are padded to a vector of four."""
+    return 4 if channels == 3 else channels
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -152,10 +159,11 @@ def _(points, matrices, images, packed, bits, views, background):
 @lookup_backward.register_fake
 def _(points, matrices, images, packed, bits, views, grad_colours, grad_coordinates, geometry, pixels):
     count, channels, height, width = images.shape
+    size = (count, height, width, _pixel_pitch(channels))
     return (
         points.new_empty(points.shape if geometry else 0),
         points.new_empty(matrices.shape if geometry else 0),
-        points.new_empty(count, height, width, channels).permute(0, 3, 1, 2) if pixels else points.new_empty(0),
+        points.new_empty(size)[..., :channels].permute(0, 3, 1, 2) if pixels else points.new_empty(0),
     )
 
 

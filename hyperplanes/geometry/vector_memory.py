@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-__all__ = ["bits_of", "load", "read", "store"]
+__all__ = ["add_pixels", "bits_of", "load", "read", "store"]
 
 
 def _scope(module: ir.Module) -> ir.Value:
@@ -68,3 +68,28 @@ def bits_of(typing_context, value, shift, mask):
         return builder.sitofp(builder.and_(builder.lshr(word, by), ones), ir.FloatType())
 
     return types.float32(types.uint32, types.uint32, types.uint32), generate
+
+
+@intrinsic
+def add_pixels(typing_context, array, index, left, right, first, second, third):
+    """Adds left * (first, second, third) to the pixel of four numbers at `index`, right * the same to the next one."""
+
+    def generate(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        scalar = arguments[2].type
+        wide = ir.VectorType(scalar, 8)
+        colour = weight = ir.Constant(wide, [0.0] * 8)
+        for lane in range(8):
+            at = ir.Constant(ir.IntType(32), lane)
+            weight = builder.insert_element(weight, arguments[2 + lane // 4], at)
+            if lane % 4 < 3:
+                colour = builder.insert_element(colour, arguments[4 + lane % 4], at)
+        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), wide.as_pointer())
+        size = context.get_abi_sizeof(scalar)
+        total = builder.fadd(
+            builder.load(pointer, align=size), builder.fmul(weight, colour, flags=("contract",)), flags=("contract",)
+        )
+        builder.store(total, pointer, align=size)
+
+    number = array.dtype
+    return types.void(array, index, number, number, number, number, number), generate
