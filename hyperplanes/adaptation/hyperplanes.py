@@ -163,18 +163,19 @@ class HyperPlanes(nn.Module):
 
         Args:
             prepared: the object.
-            hypernetwork: another than the model's own, as fine-tuning makes one.
+            hypernetwork: another than the model's own, as fine-tuning makes one; theta is frozen then.
 
         Returns:
             One tensor a parameter of the updated layers.
         """
+        theta = self.theta if hypernetwork is None else self.theta.detach()
         hypernetwork = hypernetwork or self.hypernetwork
         if hypernetwork is None:
             return Parameters()
         chosen = self.hyperplanes()
         images = prepared.views.images[chosen]
         directions = camera.viewing_directions(prepared.views.cameras)[chosen]
-        return hypernetwork(images, directions, self.theta)
+        return hypernetwork(images, directions, theta)
 
     def field(self, prepared: Prepared, parameters: Parameters) -> AdaptedField:
         """The field of given weights on prepared planes (HyperPlanes, Eq. 5)."""

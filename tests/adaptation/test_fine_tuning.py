@@ -25,7 +25,6 @@ def test_the_model_stays_as_it_is_bit_for_bit(model, support):
     assert all(torch.equal(value, after[name]) for name, value in before.items())
 
 
-@pytest.mark.xfail(strict=True, reason="theta is read by the hypernetwork with its gradient")
 def test_no_gradient_is_left_in_the_model(model, support):
     model.fine_tune(support, 1, rays=64)
     assert all(value.grad is None for value in model.parameters())
