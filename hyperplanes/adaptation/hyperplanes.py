@@ -229,12 +229,17 @@ class HyperPlanes(nn.Module):
         theta = self.theta.detach()
         optimiser = torch.optim.Adam(tuned.parameters(), learning_rate)
         generator = torch.Generator().manual_seed(seed)
-        live = footprint(prepared.occupancy, support.cameras).flatten().nonzero()[:, 0]
+        marched = isinstance(self.config.sampling, Marched)
+        live = footprint(prepared.occupancy, support.cameras).flatten().nonzero()[:, 0] if marched else None
+        span = "sphere" if marched else "depth"
         with torch.enable_grad():
             for _ in range(steps):
                 field = self.field(prepared, theta + self.update(prepared, tuned))
-                sampled, truth = support.sample_rays(rays, generator=generator, among=live)
-                loss = (field.trace(sampled, generator).colour - truth).square().mean()
+                sampled, truth = support.sample_rays(rays, generator=generator, among=live, span=span)
+                seen = field.trace(sampled, generator)
+                loss = (seen.colour - truth).square().mean()
+                if seen.coarse is not None:
+                    loss = loss + (seen.coarse - truth).square().mean()
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
