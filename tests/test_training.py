@@ -47,6 +47,11 @@ def test_the_same_seed_makes_the_same_curve_and_the_same_weights():
     assert losses(third, with_(seed=1), 4) != curve
 
 
+def test_every_step_draws_anew():
+    still = with_(learning_rate=0.0, hypernetwork_learning_rate=0.0)
+    assert len(set(losses(small_model(), still, 6))) == 6
+
+
 @pytest.mark.parametrize("normalisation", ["batch", "group"])
 def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, normalisation):
     shape = HyperNetworkConfig(views=2, normalisation=normalisation, code=8, depth=2, width=16)
