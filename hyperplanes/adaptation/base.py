@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -41,6 +41,7 @@ class Pictures:
     samples: int
 
 
+@runtime_checkable
 class Renderable(Protocol):
     """Anything that can be looked at from new cameras."""
 
@@ -49,6 +50,7 @@ class Renderable(Protocol):
         ...
 
 
+@runtime_checkable
 class Adapter(Protocol):
     """A method: support views -> a field."""
 
