@@ -25,7 +25,9 @@ from hyperplanes.words import duration
 
 __all__ = ["describe", "how_it_was_made", "overview", "write_report"]
 
-TURNTABLE_SCALE = 1.5
+HERO_SCALE, SCALE = 2.5, 1.5
+"""Sides of turntables as multiples of the images': of the first object, which is shown large, and of the others."""
+
 GAP = 6
 
 
@@ -45,11 +47,11 @@ def write_report(
         The page.
     """
     model = load_model(folder / "hyperplanes")
-    size = round(TURNTABLE_SCALE * settings.resolution)
     exhibits, rounds = [], []
     for name in sorted(data.names("test"))[: settings.exhibits]:
         task = data.task(name)
         support = model.arrange(task.support)
+        size = round((SCALE if exhibits else HERO_SCALE) * settings.resolution)
         frames = to_pixels(model.adapt(support).render(orbit_cameras(support, settings.frames, size=size)).images)
         rounds.append(frames)
         truth = to_pixels(task.query.images)
@@ -61,20 +63,25 @@ def write_report(
             Exhibit(name, to_pixels(support.images), read, looks, quality, encode_animation(frames, "webp"))
         )
     curves = {method: read_json(folder / method / "training.json")["curve"] for method in MODELS}
-    write_whole(folder / "overview.png", encode_png(overview(exhibits[:3], rounds[:3])))
-    page = render_page(describe(settings, metrics, exhibits, curves, facts))
+    picture = overview(exhibits[:3], rounds[:3], round(SCALE * settings.resolution))
+    write_whole(folder / "overview.png", encode_png(picture))
+    page = render_page(describe(folder, settings, metrics, exhibits, curves, facts))
     write_whole(folder / "report.html", page.encode())
     return folder / "report.html"
 
 
 def _predictions(folder: Path, name: str, view: str) -> dict[str, Pixels]:
     file = f"{Path(view).stem}.png"
-    return {
-        method: np.asarray(Image.open(folder / "pictures" / method / name / file).convert("RGB")) for method in METHODS
-    }
+    return {method: _read(folder / "pictures" / method / name / file) for method in METHODS}
+
+
+def _read(path: Path) -> Pixels:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
 
 
 def describe(
+    folder: Path,
     settings: DemoSettings,
     metrics: Mapping[str, Any],
     exhibits: Sequence[Exhibit],
@@ -111,14 +118,14 @@ def describe(
         curves=curves,
         facts=facts,
         commands=[
-            ("this page again, or what is left of it after an interruption", "hyperplanes demo"),
+            ("this page again, or what is left of it after an interruption", f"hyperplanes demo --out {folder}"),
             (
                 "a turntable of your own posed images (transforms.json beside them)",
-                "hyperplanes render --checkpoint runs/demo --views photos/ --out new-views --orbit 48",
+                f"hyperplanes render --checkpoint {folder} --views photos/ --out new-views --orbit 48",
             ),
             (
                 "a mesh with coloured vertices",
-                "hyperplanes export --checkpoint runs/demo --views photos/ --out model --what mesh --mesh-format glb",
+                f"hyperplanes export --checkpoint {folder} --views photos/ --out model --what mesh --mesh-format glb",
             ),
         ],
     )
@@ -152,12 +159,13 @@ def _processor() -> str:
     return named[0] if named else platform.processor() or platform.machine()
 
 
-def overview(exhibits: Sequence[Exhibit], rounds: Sequence[Pixels], columns: int = 7) -> Pixels:
+def overview(exhibits: Sequence[Exhibit], rounds: Sequence[Pixels], side: int, columns: int = 7) -> Pixels:
     """One picture of it all: a row an object, on the left what was read, on the right new views around it.
 
     Args:
         exhibits: the objects.
         rounds: the frames of their turntables.
+        side: of every picture in it, in pixels.
         columns: new views a row.
 
     Returns:
@@ -165,9 +173,8 @@ def overview(exhibits: Sequence[Exhibit], rounds: Sequence[Pixels], columns: int
     """
     rows = []
     for exhibit, frames in zip(exhibits, rounds, strict=True):
-        side = frames.shape[1]
         read = [_resized(exhibit.support[index], side) for index in exhibit.read[:5]]
-        new = [frames[round(column * len(frames) / columns) % len(frames)] for column in range(columns)]
+        new = [_resized(frames[round(column * len(frames) / columns) % len(frames)], side) for column in range(columns)]
         edge = np.full((side, GAP, 3), 255, np.uint8)
         rule = np.full((side, 2, 3), 200, np.uint8)
         tiles = [piece for tile in read for piece in (tile, edge)] + [rule] + [p for tile in new for p in (edge, tile)]

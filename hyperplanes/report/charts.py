@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from html import escape
 
-__all__ = ["line_chart", "ticks"]
+__all__ = ["decade_ticks", "line_chart", "ticks"]
 
 WIDTH, HEIGHT = 560, 300
 LEFT, RIGHT, TOP, BOTTOM = 52, 118, 16, 40
@@ -27,6 +27,17 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
     step = next(size * factor for factor in (1, 2, 2.5, 5, 10) if size * factor >= raw * 0.999)
     first = math.ceil(low / step - 1e-9)
     return [round(index * step, 10) for index in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def decade_ticks(low: float, high: float) -> list[float]:
+    """Logarithms of 1, 2 and 5 times powers of ten that lie in a range of logarithms.
+
+    >>> [round(10**tick, 3) for tick in decade_ticks(-2.1, -1.2)]
+    [0.01, 0.02, 0.05]
+    """
+    decades = range(math.floor(low), math.ceil(high) + 1)
+    places = [decade + math.log10(factor) for decade in decades for factor in (1, 2, 5)]
+    return [place for place in places if low <= place <= high]
 
 
 def line_chart(series: Mapping[str, Points], title: str, unit: str, *, logarithmic: bool = False) -> str:
@@ -58,7 +69,7 @@ def line_chart(series: Mapping[str, Points], title: str, unit: str, *, logarithm
         return TOP + (HEIGHT - TOP - BOTTOM) * (high - value) / (high - low)
 
     parts = []
-    for tick in ticks(low, high):
+    for tick in decade_ticks(low, high) if logarithmic else ticks(low, high):
         label = f"{10**tick:.2g}" if logarithmic else f"{tick:g}"
         y = down(tick)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
@@ -71,7 +82,8 @@ def line_chart(series: Mapping[str, Points], title: str, unit: str, *, logarithm
     ends = _apart({name: down(form(max(points[-1][1], 1e-9))) for name, points in shown.items()})
     for index, (name, points) in enumerate(shown.items()):
         path = " ".join(f"{across(x):.1f},{down(form(max(y, 1e-9))):.1f}" for x, y in points)
-        x = across(points[-1][0])
+        x, y = across(points[-1][0]), down(form(max(points[-1][1], 1e-9)))
+        parts.append(f'<circle class="dot-{index % 4}" cx="{x:.1f}" cy="{y:.1f}" r="3.5"/>')
         parts.append(f'<polyline class="line line-{index % 4}" points="{path}"/>')
         parts.append(
             f'<text class="name name-{index % 4}" x="{x + 8:.1f}" y="{ends[name] + 4:.1f}">{escape(name)}</text>'

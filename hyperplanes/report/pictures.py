@@ -15,15 +15,15 @@ __all__ = ["ERROR_SCALE", "colour_scale", "error_map", "gradient", "inline", "in
 ERROR_SCALE = 0.25
 """The difference that is drawn in the last colour."""
 
-_ANCHORS = ("#0b0a1e", "#3b1467", "#85216b", "#cb3f52", "#f2813a", "#fccb4d", "#fdf6c6")
-"""Dark to bright, even in lightness."""
+_ANCHORS = ("#ffffff", "#fde8c8", "#f9bd74", "#ec7b3a", "#c5402d", "#7f1833", "#2c0b28")
+"""White, where nothing is wrong, to dark, even in lightness."""
 
 
 def colour_scale(values: npt.NDArray[np.floating]) -> Pixels:
     """Colours (..., 3) of values in [0, 1], interpolated between anchors; what lies outside is clamped.
 
     >>> colour_scale(np.array([0.0, 1.0])).tolist()
-    [[11, 10, 30], [253, 246, 198]]
+    [[255, 255, 255], [44, 11, 40]]
     """
     anchors = np.array([[int(hue[i : i + 2], 16) for i in (1, 3, 5)] for hue in _ANCHORS], dtype=np.float64)
     place = np.clip(values, 0, 1) * (len(anchors) - 1)

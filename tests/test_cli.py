@@ -1,0 +1,224 @@
+"""Source of truth: what the command line promises its users: exit codes, one line a mistake, files that are there."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_demo import demo_folder, only_object
+
+from hyperplanes.cli import main
+from hyperplanes.commands import VERBS
+from hyperplanes.demo import DemoSettings, recipes
+from hyperplanes.presets import PRESETS
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / "shared"
+
+
+def complaint(capsys):
+    """The only line on standard error."""
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def pixels(path):
+    with Image.open(path) as image:
+        return np.asarray(image).astype(int)
+
+
+def test_help_loads_nothing_heavy():
+    script = (
+        "import sys; from hyperplanes.cli import main; main(['--help']); "
+        "print([name for name in ('torch', 'kornia', 'trimesh', 'numba', 'tyro') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert all(verb in done.stdout for verb in VERBS)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help_with_an_example_and_no_torch(verb):
+    script = (
+        f"import sys; from hyperplanes.cli import main\ntry:\n    main([{verb!r}, '--help'])\n"
+        "except SystemExit as end:\n    print(end.code, 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.splitlines()[-1] == "0 False"
+    assert f"    hyperplanes {verb}" in done.stdout
+
+
+def test_an_unknown_verb_is_answered_with_the_nearest(capsys):
+    assert main(["trian"]) == 2
+    assert "did you mean train?" in complaint(capsys)
+
+
+def test_an_unknown_flag_is_wrong_input(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["train", "--dat", "x"])
+    assert end.value.code == 2
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("hyperplanes 0")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["generate", "--out", "OUT"], ["--class", "--meshes"]),
+        (["generate", "--meshes", "OUT/none", "--out", "OUT"], ["OUT/none", "found nothing"]),
+        (["generate", "--class", "car", "--count", "0", "--out", "OUT"], ["at least 1 object", "0"]),
+        (["train", "--data", "OUT/none", "--out", "OUT/run"], ["OUT/none", "hyperplanes generate"]),
+        (["train", "--data", "DATA", "--preset", "huge", "--out", "OUT/run"], ["quick", "huge"]),
+        (["train", "--data", "DATA", "--steps", "0", "--out", "OUT/run"], ["steps", "0"]),
+        (["train", "--data", "DATA", "--device", "abacus", "--out", "OUT/run"], ["device", "abacus"]),
+        (["evaluate", "--data", "DATA", "--method", "magic"], ["nearest_view", "magic"]),
+        (["evaluate", "--data", "DATA", "--method", "hyperplanes"], ["checkpoint", "hyperplanes train"]),
+        (
+            ["render", "--checkpoint", "OUT/none", "--views", "DATA", "--out", "OUT"],
+            ["OUT/none", "hyperplanes train"],
+        ),
+        (["export", "--checkpoint", "RUN", "--views", "OUT/none", "--out", "OUT/x"], ["OUT/none", "nothing"]),
+        (["demo", "--held-out", "80", "--out", "OUT/demo"], ["--held-out", "80"]),
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, capsys):
+    demo = demo_folder()
+    capsys.readouterr()
+    places = {"OUT": str(tmp_path), "DATA": str(demo / "data"), "RUN": str(demo / "hyperplanes")}
+
+    def placed(text):
+        for name, place in places.items():
+            text = text.replace(name, place)
+        return text
+
+    assert main([placed(argument) for argument in arguments]) == 2
+    line = complaint(capsys)
+    assert all(placed(part) in line for part in parts), line
+
+
+def test_a_traceback_is_shown_when_asked_for():
+    with pytest.raises(ValueError, match="--class"):
+        main(["generate", "--out", "nowhere", "--traceback"])
+
+
+def test_a_full_disk_is_one_line(monkeypatch, capsys):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/data/x.png")
+
+    monkeypatch.setattr("hyperplanes.commands.presets.run", full)
+    assert main(["presets"]) == 2
+    line = complaint(capsys)
+    assert "/data/x.png" in line
+    assert "full disk" in line
+
+
+def test_presets_and_inspect(capsys, tmp_path):
+    assert main(["presets"]) == 0
+    assert "paper-128" in capsys.readouterr().out
+    demo = demo_folder()
+    assert main(["inspect", str(demo / "hyperplanes")]) == 0
+    assert "20 of 20 steps" in capsys.readouterr().out
+    assert main(["inspect", str(demo / "data"), "--out", str(tmp_path)]) in (0, 1)
+    assert "3 (2 train, 1 test)" in capsys.readouterr().out
+    assert (tmp_path / "contact_sheet.png").exists()
+
+
+def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
+    demo = demo_folder()
+    table = tmp_path / "table.json"
+    methods = ["nearest_view", "point_multiplane", "hyperplanes"]
+    arguments = ["--data", str(demo / "data"), "--checkpoint", str(demo), "--json", str(table)]
+    assert main(["evaluate", "--method", *methods, *arguments]) == 0
+    written = json.loads(table.read_text())
+    assert list(written) == sorted(methods)
+    before = json.loads((demo / "metrics.json").read_text())
+    shown = capsys.readouterr().out
+    for name in methods:
+        assert written[name]["psnr"] == pytest.approx(before[name]["psnr"], abs=1e-3)
+        assert f"{written[name]['psnr']:.2f} dB" in shown
+
+
+def test_render_writes_the_query_views_under_their_names(tmp_path):
+    demo = demo_folder()
+    scene = only_object(demo)
+    assert main(["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path)]) == 0
+    document = json.loads((scene / "transforms.json").read_text())
+    assert {path.name for path in tmp_path.iterdir()} == {Path(name).name for name in document["test_filenames"]}
+    pictures = demo / "pictures" / "hyperplanes" / scene.name
+    for path in tmp_path.iterdir():
+        assert abs(pixels(path) - pixels(pictures / path.name)).max() <= 1
+
+
+def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
+    demo = demo_folder()
+    scene = str(only_object(demo))
+    weights, out, reference = (str(tmp_path / name) for name in ("weights", "out", "reference"))
+    assert main(["adapt", "--checkpoint", str(demo), "--views", scene, "--out", weights]) == 0
+    assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out]) == 0
+    assert main(["render", "--checkpoint", str(demo), "--views", scene, "--out", reference]) == 0
+    for path in Path(out).iterdir():
+        assert path.read_bytes() == (Path(reference) / path.name).read_bytes()
+    assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, "--steps", "2"]) == 2
+
+
+def test_an_orbit_is_pictures_and_a_turntable(tmp_path):
+    demo = demo_folder()
+    views = ["--views", str(only_object(demo)), "--out", str(tmp_path), "--all-views"]
+    assert main(["render", "--checkpoint", str(demo), *views, "--orbit", "3", "--turntable", "gif"]) == 0
+    with Image.open(tmp_path / "turntable.gif") as animation:
+        assert animation.n_frames == 3
+    assert len(list(tmp_path.glob("*.png"))) == 3
+
+
+def test_the_demonstration_does_nothing_twice(capsys):
+    demo = demo_folder()
+    before = {path: path.stat().st_mtime_ns for path in demo.rglob("*") if path.is_file()}
+    capsys.readouterr()
+    assert main(["demo", "--quick-check", "--out", str(demo)]) == 0
+    assert capsys.readouterr().out.count("done before") == 8
+    assert {path: path.stat().st_mtime_ns for path in demo.rglob("*") if path.is_file()} == before
+
+
+def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_path, monkeypatch, capsys):
+    tiny = recipes(DemoSettings.quick_check())["hyperplanes"]
+    monkeypatch.setitem(PRESETS, "tiny", tiny)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    command = ["train", "--data", str(demo_folder() / "data"), "--preset", "tiny", "--steps", "400", "--out"]
+    script = (
+        "import sys; from hyperplanes.cli import main; from hyperplanes.demo import DemoSettings, recipes; "
+        "from hyperplanes.presets import PRESETS; "
+        "PRESETS['tiny'] = recipes(DemoSettings.quick_check())['hyperplanes']; sys.exit(main(sys.argv[1:]))"
+    )
+    start = [sys.executable, "-c", script, *command, str(parts)]
+    first = subprocess.Popen(start, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    deadline = time.monotonic() + 120
+    while not (parts / "training.json").exists() and first.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    first.send_signal(signal.SIGINT)
+    _, errors = first.communicate(timeout=120)
+    assert first.returncode == 130, errors
+    assert len(errors.strip().splitlines()) == 1
+    assert "the same command goes on" in errors
+    assert main([*command, str(parts)]) == 0
+    assert "going on from step" in capsys.readouterr().out
+    assert main([*command, str(whole)]) == 0
+    assert (parts / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+
+
+@pytest.mark.skipif(not (SHARED / "posed" / "chair").is_dir(), reason="../shared/posed/chair is not here")
+def test_a_real_posed_scene_is_evaluated(tmp_path):
+    table = tmp_path / "chair.json"
+    data = ["--data", str(SHARED / "posed" / "chair"), "--json", str(table)]
+    assert main(["evaluate", "--method", "nearest_view", *data]) == 0
+    assert json.loads(table.read_text())["nearest_view"]["psnr"] > 10

@@ -1,0 +1,49 @@
+"""Source of truth: the README's own lines, run as they stand there."""
+
+import re
+from pathlib import Path
+
+from small_demo import demo_folder
+
+import hyperplanes
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks():
+    return re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def test_the_readme_runs(tmp_path, monkeypatch):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "demo").symlink_to(demo_folder())
+    monkeypatch.chdir(tmp_path)
+    here = {}
+    exec(blocks()[0].replace("frames=48", "frames=3"), here)
+    assert len(list((tmp_path / "new-views").glob("*.png"))) == len(here["task"].query)
+    assert (tmp_path / "turntable.webp").exists()
+    import torch
+
+    here["generator"] = torch.Generator().manual_seed(0)
+    exec(blocks()[1], here)
+    assert here["loss"].requires_grad
+
+
+def test_the_readme_shows_what_is_there():
+    for path in re.findall(r"\]\((?!https?:)([^)#]+)\)", README):
+        assert (ROOT / path).exists(), path
+
+
+def test_the_readme_names_verbs_that_exist():
+    from hyperplanes.commands import VERBS
+
+    for verb in re.findall(r"^hyperplanes (\w+)", README, re.MULTILINE):
+        assert verb in VERBS
+
+
+def test_every_public_name_is_there():
+    for name in hyperplanes.__all__:
+        assert getattr(hyperplanes, name) is not None
+    assert set(hyperplanes.__all__) <= set(dir(hyperplanes))
+    assert hyperplanes.__version__

@@ -1,0 +1,138 @@
+"""Source of truth: a ball of known density and colour, whose surface and volume have closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.export import (
+    encode_animation,
+    extract_mesh,
+    orbit_cameras,
+    save_images,
+    save_mesh,
+    save_turntable,
+    to_pixels,
+    upward,
+)
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering.renderer import Marched
+from hyperplanes.views import Views
+
+CENTRE, RADIUS = (0.3, -0.2, 0.1), 0.8
+BOUNDS = Sphere(CENTRE, 2.0)
+
+
+def ball():
+    """Density 100 that fades over the last 0.05 of the radius; red on +x's side, blue on the other."""
+
+    def field(points, directions):
+        local = points - points.new_tensor(CENTRE)
+        density = ((RADIUS - local.norm(dim=-1)) / 0.05 + 0.5).clamp(0, 1) * 100
+        right = (local[:, :1] > 0).float()
+        return torch.cat([right, torch.zeros_like(right), 1 - right], -1), density
+
+    return AdaptedField(field, full(BOUNDS, 16), Marched(steps=64))
+
+
+def views(count=6, size=16, up=(0.0, 1.0, 0.0)):
+    pose = camera.look_at(
+        torch.tensor(CENTRE) + 5 * torch.nn.functional.normalize(torch.randn(count, 3), dim=-1), CENTRE, up
+    )
+    cameras = camera.pinhole(camera.symmetric_intrinsics(size, size, 0.9), pose, size, size)
+    return Views(torch.ones(count, 3, size, size), cameras, bounds=BOUNDS)
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
+def test_the_mesh_of_a_ball():
+    surface = extract_mesh(ball(), voxels=48, level=50.0)
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.02)  # positive: faces look outwards
+    distance = np.linalg.norm(surface.vertices - np.array(CENTRE), axis=1)
+    assert np.abs(distance - RADIUS).max() < 0.03
+    side = surface.vertices[:, 0] - CENTRE[0]
+    clear = np.abs(side) > 0.02
+    np.testing.assert_array_equal(surface.colours[clear, 0] > 0.5, side[clear] > 0)
+
+
+def test_a_surface_that_leaves_the_cube_is_closed_there():
+    everywhere = AdaptedField(
+        lambda points, _: (torch.ones_like(points), points.new_full((len(points),), 99.0)), full(BOUNDS, 8), Marched()
+    )
+    surface = extract_mesh(everywhere, voxels=12, level=10.0)
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces)
+    assert mesh.is_watertight
+    assert mesh.volume > 4**3
+
+
+def test_a_level_that_is_never_reached():
+    with pytest.raises(ValueError, match=r"highest density, 100, got 1e\+03"):
+        extract_mesh(ball(), voxels=24, level=1000.0)
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
+def test_meshes_are_read_back_with_their_colours(kind, tmp_path):
+    surface = extract_mesh(ball(), voxels=24)
+    path = save_mesh(surface, tmp_path / f"ball.{kind}")
+    read = trimesh.load(path, force="mesh", process=False)
+    assert len(read.faces) == len(surface.faces)
+    colours = np.asarray(read.visual.vertex_colors)[:, :3]
+    assert {tuple(colour) for colour in colours} <= {(255, 0, 0), (0, 0, 255)}
+
+
+def test_a_mesh_of_another_kind(tmp_path):
+    with pytest.raises(ValueError, match="ply, glb, obj"):
+        save_mesh(extract_mesh(ball(), voxels=12), tmp_path / "ball.fbx")
+
+
+def test_up_is_found_whatever_the_world_calls_it():
+    for up in ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
+        assert np.dot(upward(views(40, up=up).cameras), up) > 0.98
+
+
+def test_an_orbit_looks_at_the_middle_from_one_height():
+    scene = views(up=(0.0, 0.0, 1.0), count=40)
+    cameras = orbit_cameras(scene, 8, size=32, elevation=0.4)
+    assert camera.image_size(cameras) == (32, 32)
+    offset = camera.centres(cameras) - torch.tensor(CENTRE)
+    torch.testing.assert_close(offset.norm(dim=1), torch.full((8,), 5.0), atol=1e-3, rtol=0)
+    height = offset @ torch.tensor(upward(scene.cameras))
+    torch.testing.assert_close(height, torch.full((8,), 5 * math.sin(0.4)), atol=1e-3, rtol=0)
+    middle = cameras.project(torch.tensor(CENTRE).expand(8, 1, 3)).reshape(8, 2)
+    torch.testing.assert_close(middle, torch.full((8, 2), 15.5), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("kind", ["webp", "gif"])
+def test_a_turntable_moves(kind, tmp_path):
+    path = save_turntable(ball(), views(), tmp_path / f"turn.{kind}", frames=5, size=24)
+    with Image.open(path) as animation:
+        assert (animation.n_frames, animation.size, animation.info["loop"]) == (5, (24, 24), 0)
+
+
+def test_a_turntable_of_another_kind(tmp_path):
+    with pytest.raises(ValueError, match="webp or gif"):
+        save_turntable(ball(), views(), tmp_path / "turn.mp4")
+    with pytest.raises(ValueError, match="webp, gif"):
+        encode_animation(np.zeros((1, 2, 2, 3), np.uint8), "mp4")
+
+
+def test_images_are_written_as_they_are(tmp_path):
+    images = torch.rand(3, 3, 4, 5)
+    paths = save_images(images, tmp_path / "new", ("a/x.png", "a/y.png", "b/z"))
+    assert [path.name for path in paths] == ["x.png", "y.png", "z.png"]
+    with Image.open(paths[1]) as image:
+        np.testing.assert_array_equal(np.asarray(image), to_pixels(images)[1])
+    assert [path.name for path in save_images(images, tmp_path, ("a/x.png", "b/x.png", "c"))][0] == "0000.png"
+    with pytest.raises(ValueError, match="expected 3"):
+        save_images(images, tmp_path, ("one",))

@@ -1,0 +1,108 @@
+"""Source of truth: the floors of CONTRIBUTING.md, held against every import statement in the packages."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+FLOORS = {
+    "hyperplanes": 6,
+    "hyperplanes.cli": 6,
+    "hyperplanes.commands": 6,
+    "benchmarks": 5,
+    "hyperplanes.presets": 5,
+    "hyperplanes.recipes": 5,
+    "hyperplanes.demo": 5,
+    "hyperplanes.demo_report": 5,
+    "hyperplanes.doctor": 5,
+    "data_gen": 4,
+    "hyperplanes.training": 4,
+    "hyperplanes.evaluation": 4,
+    "hyperplanes.models": 4,
+    "hyperplanes.adaptation": 3,
+    "hyperplanes.data": 3,
+    "hyperplanes.baking": 3,
+    "hyperplanes.export": 3,
+    "hyperplanes.report": 3,
+    "hyperplanes.fields": 2,
+    "hyperplanes.rendering": 2,
+    "hyperplanes.views": 2,
+    "hyperplanes.geometry": 1,
+    "hyperplanes.hypernetwork": 1,
+    "hyperplanes.metrics": 1,
+    "hyperplanes.checkpoints": 1,
+    "hyperplanes.parameters": 1,
+    "hyperplanes.stages": 1,
+    "hyperplanes.words": 1,
+}
+OURS = ("hyperplanes", "data_gen", "benchmarks")
+
+
+def unit(module):
+    """The entry of FLOORS that a module belongs to: its own name or that of its package."""
+    parts = module.split(".")
+    while parts:
+        name = ".".join(parts)
+        if name in FLOORS and (name != "hyperplanes" or module == "hyperplanes"):
+            return name
+        parts.pop()
+    return None
+
+
+def modules():
+    for package in OURS:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            yield name.removesuffix(".__init__"), path
+
+
+def imported(path):
+    """Every module of ours that a file imports, at its top or in a function."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: relative import"
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                yield whole if unit(whole) != unit(node.module) else node.module
+
+
+def is_package(name):
+    return (ROOT / Path(*name.split("."))).is_dir()
+
+
+def test_every_module_has_a_floor():
+    assert [name for name, _ in modules() if unit(name) is None] == []
+
+
+def test_imports_run_down():
+    wrong = []
+    for name, path in modules():
+        here = unit(name)
+        if name == "hyperplanes" or here is None:  # the front door names everything, lazily
+            continue
+        for target in imported(path):
+            there = unit(target) if target.split(".")[0] in OURS else None
+            if there is None or there == here:
+                continue
+            siblings = is_package(there) and is_package(here)
+            if FLOORS[there] > FLOORS[here] or (FLOORS[there] == FLOORS[here] and siblings):
+                wrong.append(f"{name} (floor {FLOORS[here]}) imports {target} (floor {FLOORS[there]})")
+    assert wrong == []
+
+
+def test_the_renderer_knows_no_field():
+    for name, path in modules():
+        if name.startswith("hyperplanes.rendering"):
+            assert not [target for target in imported(path) if target.startswith("hyperplanes.fields")], name
+
+
+def test_every_module_says_what_is_public():
+    silent = []
+    for name, path in modules():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        defines = any(isinstance(node, ast.FunctionDef | ast.ClassDef | ast.ImportFrom) for node in tree.body)
+        assigned = [ast.unparse(node.targets[0]) for node in tree.body if isinstance(node, ast.Assign)]
+        if defines and "__all__" not in assigned and path.name != "__main__.py":
+            silent.append(name)
+    assert silent == []

@@ -1,0 +1,123 @@
+"""Source of truth: the page itself: parsed as HTML, its pictures decoded and compared with what went in."""
+
+import base64
+import io
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_demo import demo_folder
+
+from hyperplanes.report import Exhibit, Look, Report, Row, render_page
+from hyperplanes.report.charts import line_chart, ticks
+from hyperplanes.report.pictures import ERROR_SCALE, colour_scale, error_map
+
+VOID = {"meta", "img", "input", "br", "hr", "link"}
+
+
+class Balance(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.open, self.sources, self.ids = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        self.ids.append(attributes.get("id"))
+        if tag == "img":
+            self.sources.append(attributes["src"])
+            assert attributes["alt"]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        """Nothing stays open."""
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def report(title="A <title> & more"):
+    generator = np.random.default_rng(0)
+    look = Look(*(generator.integers(0, 256, (8, 8, 3), np.uint8),), {"hyperplanes": np.zeros((8, 8, 3), np.uint8)})
+    exhibit = Exhibit("car", generator.integers(0, 256, (4, 8, 8, 3), np.uint8), [2, 0], [look], {"hyperplanes": 20.0})
+    row = Row("hyperplanes", "one step", 20.0, 0.5, "1 s", "2 s")
+    curve = [{"step": 25, "loss": 0.1}, {"step": 50, "loss": 0.01, "psnr": 20.0}]
+    return Report(title, "lead", [("1", "thing")], "hyperplanes", [exhibit], [row], {"hyperplanes": curve}, [], [])
+
+
+def checked(page):
+    parser = Balance()
+    parser.feed(page)
+    assert parser.open == []
+    names = [name for name in parser.ids if name]
+    assert len(names) == len(set(names))
+    return parser
+
+
+def test_the_page_is_whole_and_needs_nothing_else():
+    page = render_page(report())
+    parser = checked(page)
+    assert all(source.startswith("data:image/") for source in parser.sources)
+    assert not re.search(r"(src|href)=[\"']?(https?:)?//|url\(|@import|<script", page)
+    assert "A &lt;title&gt; &amp; more" in page
+
+
+def test_its_pictures_are_those_that_went_in():
+    content = report()
+    found = [
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(source.partition(",")[2]))))
+        for source in checked(render_page(content)).sources
+    ]
+    (exhibit,) = content.exhibits
+    np.testing.assert_array_equal(np.stack(found[:4]), exhibit.support[[2, 0, 1, 3]])
+    np.testing.assert_array_equal(found[4], exhibit.looks[0].truth)
+
+
+def test_a_method_that_no_exhibit_shows():
+    content = report()
+    with pytest.raises(ValueError, match="expected exhibits that show other"):
+        render_page(Report(**{**vars(content), "method": "other"}))
+
+
+def test_errors_are_on_the_scale():
+    truth = np.zeros((1, 3, 3), np.uint8)
+    prediction = np.array([[[0] * 3, [round(255 * ERROR_SCALE)] * 3, [255] * 3]], np.uint8)
+    seen = error_map(prediction, truth)
+    np.testing.assert_array_equal(seen[0, 0], colour_scale(np.array(0.0)))
+    np.testing.assert_array_equal(seen[0, 2], colour_scale(np.array(1.0)))
+    assert np.abs(seen[0, 1].astype(int) - seen[0, 2]).max() <= 2
+    with pytest.raises(ValueError, match="shape"):
+        error_map(prediction, truth[:, :2])
+
+
+def test_the_scale_never_turns_back():
+    lightness = colour_scale(np.linspace(0, 1, 100)) @ np.array([0.299, 0.587, 0.114])
+    assert (np.diff(lightness) < 0).all()
+
+
+def test_a_line_goes_where_its_points_are():
+    svg = line_chart({"a": [(0, 1.0), (50, 3.0), (100, 2.0)], "none": []}, "title", "dB")
+    (points,) = re.findall(r'points="([^"]+)"', svg)
+    (x0, y0), (x1, y1), (x2, y2) = (tuple(map(float, pair.split(","))) for pair in points.split())
+    assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2)
+    assert y1 < y2 < y0
+    assert y0 - y2 == pytest.approx(y2 - y1, abs=0.2)
+    assert "nothing was recorded" in line_chart({"a": []}, "title", "dB")
+
+
+@pytest.mark.parametrize("span", [(0.0, 7.0), (-3.0, 20_000.0), (1e-4, 3e-4)])
+def test_ticks_are_few_and_inside(span):
+    found = ticks(*span)
+    assert 3 <= len(found) <= 8
+    assert all(span[0] <= tick <= span[1] for tick in found)
+    np.testing.assert_allclose(np.diff(found), found[1] - found[0], rtol=1e-6)
+
+
+def test_the_page_of_a_demonstration():
+    page = (demo_folder() / "report.html").read_text(encoding="utf-8")
+    parser = checked(page)
+    assert any(source.startswith("data:image/webp") for source in parser.sources)
+    for name in ("nearest_view", "point_multiplane", "hyperplanes", "hyperplanes_10"):
+        assert f"<small>{name}</small>" in page

@@ -1,0 +1,48 @@
+"""Source of truth: the wheel itself, built from a copy of the tree, and setup.cfg that says what goes into it."""
+
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("hyperplanes", "data_gen", "benchmarks")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    tree, out = tmp_path_factory.mktemp("tree"), tmp_path_factory.mktemp("wheel")
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, tree / package, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "setup.cfg", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, tree)
+    (tree / "tests").mkdir()
+    (tree / "tests" / "__init__.py").touch()
+    build = "import setuptools.build_meta as backend, sys; backend.build_wheel(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", build, str(out)], cwd=tree, check=True, capture_output=True)
+    (path,) = out.glob("*.whl")
+    return zipfile.ZipFile(path)
+
+
+def test_it_holds_the_packages_and_nothing_else(wheel):
+    found = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    there = {
+        str(path.relative_to(ROOT))
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*")
+        if path.suffix == ".py" and (path.parent / "__init__.py").exists()
+    }
+    assert found == there | {"hyperplanes/report/style.css"}
+
+
+def test_its_metadata(wheel):
+    name = next(name for name in wheel.namelist() if name.endswith("METADATA"))
+    metadata = wheel.read(name).decode()
+    assert "License-Expression: Apache-2.0" in metadata
+    assert "Requires-Python: >=3.11" in metadata
+    scripts = next(name for name in wheel.namelist() if name.endswith("entry_points.txt"))
+    assert "hyperplanes = hyperplanes.cli:main" in wheel.read(scripts).decode()
+    assert any(name.endswith("licenses/LICENSE") for name in wheel.namelist())
