@@ -2,9 +2,8 @@
 
 import sys
 from importlib import import_module
-from pathlib import Path
 
-NAMES = sorted(path.stem for path in Path(__file__).parent.glob("[a-z]*.py"))
+NAMES = ("generation", "lookup", "rendering", "training")
 
 
 def main(arguments: list[str]) -> int:

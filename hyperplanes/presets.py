@@ -10,7 +10,11 @@ from hyperplanes.hypernetwork.hypernetwork import HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import TrainingConfig
 
-__all__ = ["PRESETS", "Preset", "preset"]
+__all__ = ["PRESETS", "PROTOCOLS", "Preset", "preset"]
+
+
+PROTOCOLS: dict[str, Hierarchical | None] = {"default": None, "paper": Hierarchical(64, 128)}
+"""How fields are sampled: as the preset says (packed samples where something is), or as the paper does."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,17 @@ class Preset:
     training: TrainingConfig
     resolution: int
     about: str
+
+    def by_protocol(self, name: str) -> Preset:
+        """The same model sampled by another protocol: "paper" is 64 coarse and 128 fine samples on every ray.
+
+        Raises:
+            ValueError: an unknown protocol.
+        """
+        if name not in PROTOCOLS:
+            raise ValueError(f"protocol: expected one of {', '.join(PROTOCOLS)}, got {name!r}")
+        sampling = PROTOCOLS[name]
+        return self if sampling is None else replace(self, model=replace(self.model, sampling=sampling))
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
@@ -62,7 +77,7 @@ PRESETS: dict[str, Preset] = {
         "128x128, hours on a few cores",
     ),
     "paper-128": Preset(
-        ModelConfig(hypernetwork=HyperNetworkConfig(), coarse_network=True, sampling=Hierarchical(64, 128)),
+        ModelConfig(coarse_network=True),
         TrainingConfig(steps=100_000),
         128,
         "the paper's ShapeNet 128x128 setting (Appendix B): ConvNet, 5 HyperPlanes",
@@ -71,7 +86,6 @@ PRESETS: dict[str, Preset] = {
         ModelConfig(
             hypernetwork=HyperNetworkConfig(views=25, encoder="resnet101", depth=10),
             coarse_network=True,
-            sampling=Hierarchical(64, 128),
         ),
         TrainingConfig(steps=100_000),
         200,

@@ -8,10 +8,11 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
+from torch.profiler import record_function
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
@@ -27,6 +28,7 @@ __all__ = ["Progress", "Tasks", "Trainer", "TrainingConfig", "train"]
 EMPTINESS = 0.01  # weight of the opacity of empty space beside the squared error of pixels
 
 
+@runtime_checkable
 class Tasks(Protocol):
     """Where tasks come from: a data set."""
 
@@ -162,24 +164,35 @@ class Trainer:
         total = torch.zeros(())
         for _ in range(config.tasks):
             name = self.names[int(torch.randint(len(self.names), (), generator=generator))]
-            episode = self._episode(name)
-            field = self.model.field(episode.prepared, self.model.theta + self.model.update(episode.prepared))
+            with record_function("step:data"):
+                episode = self._episode(name)
+            with record_function("step:update"):
+                field = self.model.field(episode.prepared, self.model.theta + self.model.update(episode.prepared))
             span = "sphere" if isinstance(field.sampling, Marched) else "depth"
-            rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
-            seen = field.trace(rays, generator)
+            with record_function("step:rays"):
+                rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
+            with record_function("step:rendering"):
+                seen = field.trace(rays, generator)
             if config.empty_points:
-                total = total + self._emptiness(field, generator)
+                with record_function("step:emptiness"):
+                    total = total + self._emptiness(field, generator)
             total = total + (seen.colour - truth).square().mean()
             if seen.coarse is not None:
                 total = total + (seen.coarse - truth).square().mean()
         for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
             optimiser.param_groups[0]["lr"] = rate * self._schedule()
             optimiser.zero_grad(set_to_none=True)
-        (total / config.tasks).backward()
-        for optimiser in self.optimisers:
-            optimiser.step()
+        with record_function("step:gradients"):
+            (total / config.tasks).backward()
+        with record_function("step:optimisers"):
+            for optimiser in self.optimisers:
+                optimiser.step()
         self.step += 1
         return float(total.detach()) / config.tasks
+
+    def warm(self, name: str) -> None:
+        """Have the planes and the hull of an object ready, as its first step otherwise makes them."""
+        self._episode(name)
 
     @torch.no_grad()
     def held_out_psnr(self) -> float | None:

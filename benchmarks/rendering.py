@@ -1,0 +1,263 @@
+"""Rendering by the default protocol against the paper's, with the same weights on the same held-out objects.
+
+The paper's protocol asks a coarse and a fine network at 64 + 192 places of every ray. The default one renders the same
+field where it is not empty. Both run in turn, in one process; the objects are procedural cars with seeds that no
+training of this project uses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.reporting import Row, finish
+from data_gen.meshes import prepare_scene, render_ready
+from data_gen.rasterise import Rasteriser
+from data_gen.rigs import fixed
+from data_gen.shapes import make
+from hyperplanes.adaptation.base import AdaptedField, Pictures
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.baking import BakedScene, bake
+from hyperplanes.fields.base import Field
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.metrics import psnr
+from hyperplanes.rendering.compositing import composite_packed, packed_weights
+from hyperplanes.rendering.footprint import footprint
+from hyperplanes.rendering.marching import march
+from hyperplanes.rendering.renderer import Hierarchical, Marched, render_in_chunks
+from hyperplanes.views import Task, Views
+
+__all__ = ["main"]
+
+CHECKPOINT = Path(__file__).parent / "weights" / "paper-network"
+FIRST_SEED = 900_000
+PAPER = Hierarchical(64, 128)
+RAYS_OF_A_LARGE_VIEW = 8192
+
+
+def main(arguments: list[str]) -> int:
+    """Measure, print, and write the rows where asked.
+
+    Args:
+        arguments: --quick, --json FILE, --checkpoint FOLDER.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks rendering", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="64 pixels and one object, about a minute")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="a trained model (default: %(default)s)")
+    parser.add_argument("--memory", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    model = HyperPlanes.from_pretrained(options.checkpoint)
+    if options.memory:
+        return large_view(model)
+    rows: list[Row] = []
+    for size in (64,) if options.quick else (64, 128, 200, 400):
+        tasks = held_out(1 if options.quick or size > 128 else 3, size)
+        rows += compare(model, tasks, repeats=3 if size == 64 else 1)
+        rows += parts(model, tasks[0])
+        rows += baked(model, tasks[0])
+    if not options.quick:
+        rows.append(fifty_views(model, held_out(1, 200)[0]))
+        rows.append(peak_memory(options.checkpoint))
+    return finish("rendering", rows, options.json)
+
+
+def held_out(count: int, size: int) -> list[Task]:
+    """Procedural cars never trained on, 25 support and 25 query views each, on the training rig."""
+    rig = fixed(50, size)
+    cameras = camera.pinhole(
+        torch.tensor(rig.intrinsics).float(), torch.tensor(rig.camera_from_world).float(), size, size
+    )
+    tasks = []
+    with Rasteriser() as rasteriser:
+        for seed in range(FIRST_SEED, FIRST_SEED + count):
+            mesh = prepare_scene(make("car", seed), f"car-{seed}")
+            pixels = torch.tensor(rasteriser.render(render_ready(mesh), rig).rgba).permute(0, 3, 1, 2).float() / 255
+            masks = pixels[:, 3:]
+            views = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks)
+            even = torch.arange(0, 50, 2)
+            tasks.append(Task(views[even], views[even + 1], mesh.name))
+    return tasks
+
+
+def timed(run: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds of a call, and what it returned."""
+    begun = time.perf_counter()
+    result = run()
+    return time.perf_counter() - begun, result
+
+
+def paper_view(adapted: AdaptedField, query: Views, view: int) -> tuple[float, float, float, float]:
+    """One view by the paper's protocol: seconds, samples a ray, its squared error and the default protocol's.
+
+    Of a picture with many rays an even subset is rendered and the time scaled; both errors are over the same rays.
+    """
+    height, width = query.size
+    total = height * width
+    chosen = torch.arange(0, total, max(1, total // RAYS_OF_A_LARGE_VIEW) if total > 200 * 200 else 1)
+    pixels = pixel_grid(height, width)[chosen]
+    rays = cast(query.cameras, torch.full_like(chosen, view), pixels, query.bounds, span="depth")
+    seconds, seen = timed(lambda: render_in_chunks(adapted.field, rays, PAPER, proposal=adapted.proposal))
+    truth = query.images[view].flatten(1).T[chosen]
+    ours = adapted.render(camera.select(query.cameras, [view])).images[0].flatten(1).T[chosen]
+    error = (seen.colour - truth).square().mean()
+    return (
+        seconds * total / len(chosen),
+        seen.samples / len(chosen),
+        float(error),
+        float((ours - truth).square().mean()),
+    )
+
+
+def compare(model: HyperPlanes, tasks: list[Task], repeats: int) -> list[Row]:
+    """One view of each object by both protocols, in turn."""
+    rows, ratios, paper_seconds, our_seconds, adapt_seconds = [], [], [], [], []
+    paper_errors, our_errors, samples, paper_samples = [], [], [], []
+    for number, task in enumerate(tasks * repeats):
+        view = (7 * number + 3) % len(task.query)
+        adapt, adapted = timed(lambda task=task: model.adapt(task.support))
+        refine, _ = timed(lambda adapted=adapted: adapted.filled)
+        one = camera.select(task.query.cameras, [view])
+        seconds, pictures = timed(lambda adapted=adapted, one=one: adapted.render(one))
+        slow, asked, paper_error, our_error = paper_view(adapted, task.query, view)
+        again, _ = timed(lambda adapted=adapted, one=one: adapted.render(one))
+        fast = (seconds + again) / 2
+        ratios.append(slow / fast)
+        paper_seconds.append(slow)
+        our_seconds.append(fast)
+        adapt_seconds.append(adapt + refine)
+        paper_errors.append(paper_error)
+        our_errors.append(our_error)
+        samples.append(pictures.samples / (task.query.size[0] * task.query.size[1]))
+        paper_samples.append(asked)
+    size = tasks[0].query.size[0]
+    paper_psnr, our_psnr = (statistics.fmean(_decibels(e) for e in errors) for errors in (paper_errors, our_errors))
+    rows.append(
+        {
+            "name": f"default protocol, {size}x{size}, one view",
+            "seconds": statistics.median(our_seconds),
+            "reference_seconds": statistics.median(paper_seconds),
+            "speedup": statistics.median(ratios),
+            "speedup_lowest": min(ratios),
+            "speedup_highest": max(ratios),
+            "samples_a_ray": statistics.fmean(samples),
+            "reference_samples_a_ray": statistics.fmean(paper_samples),
+            "psnr": our_psnr,
+            "reference_psnr": paper_psnr,
+            "psnr_loss": paper_psnr - our_psnr,
+            "adapt_seconds": statistics.median(adapt_seconds),
+        }
+    )
+    return rows
+
+
+def _decibels(error: float) -> float:
+    return -10 * torch.log10(torch.tensor(error)).item()
+
+
+def fifty_views(model: HyperPlanes, task: Task) -> Row:
+    """Seconds from support views to fifty pictures by the default protocol."""
+    cameras = camera.concatenate([task.support.cameras, task.query.cameras])
+    seconds, _ = timed(lambda: model.adapt(task.support).render(cameras))
+    size = task.query.size[0]
+    return {"name": f"default protocol, {size}x{size}, adapting and fifty views", "seconds": seconds}
+
+
+def parts(model: HyperPlanes, task: Task) -> list[Row]:
+    """Where the time of the default protocol goes, each part on the samples that one view asks for."""
+    adapted = model.adapt(task.support)
+    occupancy, query = adapted.filled, task.query
+    field, sampling = adapted.field, adapted.sampling
+    if not isinstance(field, Field) or not isinstance(sampling, Marched):
+        return []
+    one = camera.select(query.cameras, [3])
+    with torch.no_grad():
+        find, live = timed(lambda: footprint(occupancy, one)[0].flatten().nonzero()[:, 0])
+        rays = cast(one, torch.zeros_like(live), pixel_grid(*query.size)[live], query.bounds)
+        walk, samples = timed(lambda: march(rays, occupancy, 2 * query.bounds.radius / sampling.steps))
+        asked = min(len(samples), adapted.render(one).samples)
+        part = samples[torch.arange(asked)]
+        directions = rays.directions[part.ray]
+        points = rays.origins[part.ray] + part.middles[:, None] * directions
+        look = sum(timed(lambda p=p: field.target.inputs(p, field.planes, field.bounds))[0] for p in points.split(8192))
+        both = [
+            timed(lambda p=p, d=d: field(p, d)) for p, d in zip(points.split(8192), directions.split(8192), strict=True)
+        ]
+        colour, density = (torch.cat(values) for values in zip(*(answer for _, answer in both), strict=True))
+
+        def assemble() -> None:
+            weights = packed_weights(density * part.width, part.ray, len(rays))
+            composite_packed(colour, weights, part.middles, part.ray, len(rays))
+
+        compose, _ = timed(assemble)
+    ask = sum(seconds for seconds, _ in both)
+    shares = {"sampling": find + walk, "lookup": look, "network": max(ask - look, 0.0), "compositing": compose}
+    total = sum(shares.values())
+    return [
+        {"name": f"share of {part_name}, {query.size[0]}x{query.size[1]}", "share": seconds / total, "seconds": seconds}
+        for part_name, seconds in shares.items()
+    ]
+
+
+def baked(model: HyperPlanes, task: Task) -> list[Row]:
+    """The baked form against the field it was made from: speed and what it costs."""
+    adapted = model.adapt(task.support)
+    query = task.query[::5]
+    _ = adapted.filled
+    baking, field = timed(lambda: bake(adapted))
+    scene = BakedScene(field)
+    scene.render(camera.select(query.cameras, [0]))  # compiles
+    slow, fast = [], []
+    pictures: list[Pictures] = []
+    for _ in range(3):
+        seconds, before = timed(lambda: adapted.render(query.cameras))
+        slow.append(seconds / len(query))
+        seconds, after = timed(lambda: scene.render(query.cameras))
+        fast.append(seconds / len(query))
+        pictures = [before, after]
+    quality = [float(psnr(each.images.clamp(0, 1), query.images).mean()) for each in pictures]
+    return [
+        {
+            "name": f"baked, {query.size[0]}x{query.size[1]}",
+            "seconds": statistics.median(fast),
+            "reference_seconds": statistics.median(slow),
+            "speedup": statistics.median(a / b for a, b in zip(slow, fast, strict=True)),
+            "psnr": quality[1],
+            "reference_psnr": quality[0],
+            "psnr_loss": quality[0] - quality[1],
+            "baking_seconds": baking,
+            "rows": len(field.values),
+        }
+    ]
+
+
+def peak_memory(checkpoint: Path) -> Row:
+    """Peak resident memory of a process that adapts to 25 support views and renders one view of 800x800."""
+    command = [sys.executable, "-m", "benchmarks", "rendering", "--memory", "--checkpoint", str(checkpoint)]
+    answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    seconds, peak = answer.split()[-2:]
+    return {
+        "name": "default protocol, 800x800, one view with adapting",
+        "seconds": float(seconds),
+        "peak_gib": float(peak),
+    }
+
+
+def large_view(model: HyperPlanes) -> int:
+    """What the process of `peak_memory` does: prints its seconds and its peak in GiB."""
+    task = held_out(1, 200)[0]
+    one = camera.resized(camera.select(task.query.cameras, [3]), 800, 800)
+    seconds, _ = timed(lambda: model.adapt(task.support).render(one))
+    unit = 1 if sys.platform == "darwin" else 1024
+    print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30)
+    return 0
