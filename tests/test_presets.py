@@ -51,7 +51,8 @@ def test_the_papers_encoders():
 @pytest.mark.parametrize("name", ["paper-128", "paper-200"])
 def test_the_papers_protocol_and_training(name):
     chosen = preset(name)
-    assert chosen.model.sampling == Hierarchical(64, 128)
+    assert Hierarchical() == Hierarchical(64, 128)  # what `--protocol paper` renders by, with the coarse network
+    assert chosen.model.coarse_network
     training = chosen.training
     assert (training.tasks, training.rays, training.learning_rate) == (1, 512, 1e-4)
     assert training.hypernetwork_learning_rate == 1e-4

@@ -1,3 +1,4 @@
+import jaxtyping
 import pytest
 import torch
 
@@ -21,7 +22,6 @@ def views(size=(6, 9), **others):
         (slice(1, None, 2), [1, 3]),
         ([2, 0], [2, 0]),
         (torch.tensor([3, 3]), [3, 3]),
-        (torch.tensor([False, False, True, True]), [2, 3]),
         (slice(0, 0), []),
     ],
 )
@@ -100,6 +100,15 @@ def test_the_same_generator_draws_the_same_rays():
     assert torch.equal(before, torch.random.get_rng_state())
 
 
+@pytest.fixture
+def unchecked():
+    """Without the type checks of the tests, as users run it."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
