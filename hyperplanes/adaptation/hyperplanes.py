@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -52,7 +52,7 @@ class ModelConfig:
         return {**asdict(self), "protocol": type(self.sampling).__name__.lower()}
 
     @classmethod
-    def of_json(cls, value: dict[str, Any]) -> Self:
+    def of_json(cls, value: dict[str, Any]) -> ModelConfig:
         """The configuration that `as_json` wrote.
 
         Raises:
@@ -253,7 +253,7 @@ class HyperPlanes(nn.Module):
         write_json(folder / "model.json", self.config.as_json())
 
     @classmethod
-    def from_pretrained(cls, folder: Path | str) -> Self:
+    def from_pretrained(cls, folder: Path | str) -> HyperPlanes:
         """The model that `save` wrote; CheckpointError where a file is missing, damaged or of another architecture."""
         folder = Path(folder)
         model = cls(ModelConfig.of_json(read_json(folder / "model.json")))
