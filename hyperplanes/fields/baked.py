@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import torch
 from jaxtyping import Float, Int
@@ -108,7 +107,7 @@ class BakedField:
         save_tensors(Path(path), {"occupied": packed, "values": rows.half(), "sphere": sphere})
 
     @classmethod
-    def load(cls, path: Path | str) -> Self:
+    def load(cls, path: Path | str) -> BakedField:
         """The field that `save` wrote.
 
         Raises:

@@ -33,7 +33,7 @@ class Packed:
     def __len__(self) -> int:
         return len(self.ray)
 
-    def __getitem__(self, index: Tensor) -> Packed:
+    def __getitem__(self, index: slice | Tensor) -> Packed:
         return Packed(self.ray[index], self.middles[index], self.width)
 
 

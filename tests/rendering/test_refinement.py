@@ -1,0 +1,49 @@
+"""Refined occupancy: what a field fills is kept, what it does not fill goes."""
+
+import torch
+
+from hyperplanes.geometry import Sphere
+from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.rendering.refinement import refine
+
+
+def ball(radius, density=50.0):
+    return lambda points: density * (points.norm(dim=-1) < radius).float()
+
+
+def test_nothing_that_is_filled_is_lost_and_little_else_is_kept():
+    # Source of truth: a ball, whose volume is known.
+    grid = refine(full(Sphere(), 32), ball(0.5))
+    points = torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    inside = points.norm(dim=1) < 0.5
+    assert grid.contains(points[inside]).all()
+    grown = 4 / 3 * torch.pi * (0.5 + 3 * grid.voxel) ** 3
+    assert float(grid.occupied.float().mean()) * 8 < grown
+
+
+def test_a_refined_grid_never_grows():
+    start = refine(full(Sphere(), 32), ball(0.3))
+    again = refine(start, ball(0.9))
+    assert not (again.occupied & ~start.occupied).any()
+
+
+def test_a_large_grid_is_asked_coarsely_first_and_ends_the_same():
+    # Source of truth: the direct answer, asked in every voxel of the same large grid.
+    asked = []
+
+    def density(points):
+        asked.append(len(points))
+        return ball(0.5)(points)
+
+    large = refine(
+        full(Sphere((0.2, 0.0, 0.0), 1.0), 64), lambda points: density(points - points.new_tensor([0.2, 0, 0]))
+    )
+    assert sum(asked) < 64**3 / 2
+    direct = Occupancy(torch.zeros(64, 64, 64, dtype=torch.bool), Sphere((0.2, 0.0, 0.0), 1.0))
+    centres = full(direct.bounds, 64).centres()
+    direct.occupied.view(-1)[:] = ball(0.5)(centres - centres.new_tensor([0.2, 0, 0])) > 0
+    assert torch.equal(large.occupied, direct.dilated().occupied)
+
+
+def test_a_field_that_is_empty_leaves_nothing():
+    assert not refine(full(Sphere(), 16), lambda points: points.new_zeros(len(points))).occupied.any()

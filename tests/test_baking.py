@@ -1,0 +1,112 @@
+"""Baked fields against the fields they were made from."""
+
+import math
+
+import pytest
+import torch
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.baking import BakedScene, bake
+from hyperplanes.checkpoints import CheckpointError
+from hyperplanes.fields.baked import BakedField, spherical_harmonics
+from hyperplanes.geometry import Sphere
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Rays
+from hyperplanes.metrics import psnr
+from hyperplanes.rendering.renderer import Marched
+from hyperplanes.rendering.voxels import cast_through_voxels, compiled_caster
+
+CAMERAS = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(6, 3.0), 48, 48)
+
+
+def soft_ball(points, directions):
+    """A ball with a soft surface, coloured by place and, a little, by direction."""
+    density = 40 * torch.sigmoid((0.6 - points.norm(dim=-1)) * 30)
+    colour = 0.5 + 0.3 * torch.sin(2 * points) + 0.15 * directions
+    return colour.clamp(0, 1), density
+
+
+@pytest.fixture(scope="module")
+def adapted():
+    return AdaptedField(soft_ball, full(Sphere(), 48), Marched(128))
+
+
+@pytest.fixture(scope="module")
+def baked(adapted):
+    return bake(adapted, side=64)
+
+
+def test_harmonics_are_orthonormal():
+    # Source of truth: the integral over the sphere, by an even spread of directions.
+    directions = camera.fibonacci_sphere(20_000, 1.0)[:, 2, :3]
+    basis = spherical_harmonics(directions)
+    gram = basis.T @ basis * (4 * math.pi / len(directions))
+    assert torch.allclose(gram, torch.eye(9), atol=2e-3)
+
+
+def test_baked_pictures_are_those_of_the_field(adapted, baked):
+    # Source of truth: the field itself, rendered by marching.
+    truth = adapted.render(CAMERAS)
+    found = BakedScene(baked, steps=256).render(CAMERAS)
+    assert float(psnr(found.images, truth.images).min()) > 34
+    hit = truth.opacity > 0.99
+    assert float((found.depth - truth.depth)[hit].abs().mean()) < 0.02
+
+
+@pytest.mark.skipif(compiled_caster() is None, reason="numba, which compiles the caster, is not installed")
+def test_the_compiled_caster_agrees_with_packed_torch(baked):
+    # Source of truth: the same voxels as a callable through the generic renderer, at the same steps.
+    scene = BakedScene(baked)
+    generic = AdaptedField(baked, baked.occupancy, Marched(scene.steps)).render(CAMERAS)
+    compiled = scene.render(CAMERAS)
+    assert float((generic.images - compiled.images).abs().max()) < 5e-3
+    assert float((generic.images - compiled.images).abs().mean()) < 1e-4
+
+
+@pytest.mark.skipif(compiled_caster() is None, reason="numba, which compiles the caster, is not installed")
+def test_a_constant_slab_is_beer_lambert():
+    # Closed form: opacity = 1 - exp(-sigma L) for sigma = 2 over the interpolated length L = 2.
+    index = torch.arange(16**3, dtype=torch.int32).reshape(16, 16, 16)
+    values = torch.zeros(16**3, 28)
+    values[:, 0] = 2.0
+    rays = Rays(
+        torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([2.1]), torch.tensor([3.9])
+    )
+    seen = cast_through_voxels(
+        index, values, Sphere(), rays, spherical_harmonics(rays.directions), step=1.8 / 512, stop=1e-9
+    )
+    assert float(seen.opacity) == pytest.approx(1 - math.exp(-2 * 1.8), abs=1e-3)
+    assert torch.allclose(seen.colour, (1 - seen.opacity)[:, None].expand(1, 3), atol=1e-5)  # black over white
+
+
+def test_a_baked_field_survives_the_disk(baked, tmp_path):
+    baked.save(tmp_path / "ball.safetensors")
+    again = BakedField.load(tmp_path / "ball.safetensors")
+    assert torch.equal(again.index >= 0, baked.index >= 0)
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) - 0.5
+    directions = torch.nn.functional.normalize(points, dim=-1)
+    for before, after in zip(baked(points, directions), again(points, directions), strict=True):
+        assert torch.allclose(before, after, rtol=5e-3, atol=5e-3)
+    assert again.bounds == baked.bounds
+
+
+def test_a_file_that_is_no_baked_field_is_named(tmp_path):
+    from hyperplanes.checkpoints import save_tensors
+
+    save_tensors(tmp_path / "other.safetensors", {"weights": torch.zeros(3)})
+    with pytest.raises(CheckpointError, match=r"other\.safetensors: expected a baked field"):
+        BakedField.load(tmp_path / "other.safetensors")
+    (tmp_path / "cut.safetensors").write_bytes(b"\x10\x00")
+    with pytest.raises(CheckpointError, match=r"cut\.safetensors"):
+        BakedField.load(tmp_path / "cut.safetensors")
+
+
+def test_wrong_arguments_are_refused(adapted):
+    with pytest.raises(ValueError, match="directions: expected at least 9"):
+        bake(adapted, side=16, directions=4)
+    with pytest.raises(ValueError, match="side: expected an even number"):
+        bake(adapted, side=15)
+    empty = AdaptedField(lambda p, d: (torch.zeros_like(p), p.new_zeros(len(p))), full(Sphere(), 16), Marched())
+    with pytest.raises(ValueError, match="empty everywhere"):
+        bake(empty, side=16)
