@@ -26,7 +26,7 @@ bench: $(DEVELOP)  ## every benchmark, the short way
 	done
 
 docs: $(DEVELOP)  ## the interfaces as web pages in build/docs
-	$(BIN)/pdoc --docformat google --output-directory build/docs hyperplanes data_gen
+	$(BIN)/python scripts/docs.py build/docs
 
 clean:  ## what was built; environments and runs/ stay
 	rm -rf build dist *.egg-info .pytest_cache .ruff_cache
