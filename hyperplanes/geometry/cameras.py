@@ -8,11 +8,14 @@ new `PinholeCamera` with storage (view, 4, 4); none changes its argument.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
+
+from hyperplanes.geometry.distortion import DistortedCamera
 
 __all__ = [
     "camera_from_world",
@@ -169,35 +172,46 @@ def viewing_directions(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
     return camera_from_world(cameras)[:, 2, :3]
 
 
+def _rebuilt(cameras: PinholeCamera, change: Callable[[Tensor], Tensor]) -> PinholeCamera:
+    """The cameras with every tensor they hold changed, lenses included."""
+    values = (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
+    bare = PinholeCamera(*(change(value) for value in values))
+    return DistortedCamera(bare, change(cameras.distortion)) if isinstance(cameras, DistortedCamera) else bare
+
+
 def select(cameras: PinholeCamera, index: slice | list[int] | Int[Tensor, " chosen"]) -> PinholeCamera:
     """The cameras at `index`, in that order."""
-    return PinholeCamera(
-        cameras.intrinsics[index], cameras.extrinsics[index], cameras.height[index], cameras.width[index]
-    )
+    return _rebuilt(cameras, lambda value: value[index])
 
 
 def concatenate(batches: list[PinholeCamera]) -> PinholeCamera:
-    """All cameras of several batches in one batch.
+    """All cameras of several batches in one batch; those without a lens get one that does nothing if any has one.
 
     Raises:
         ValueError: an empty list.
     """
     if not batches:
         raise ValueError("batches: expected at least one batch of cameras, got none")
-    return PinholeCamera(
+    bare = PinholeCamera(
         torch.cat([batch.intrinsics for batch in batches]),
         torch.cat([batch.extrinsics for batch in batches]),
         torch.cat([batch.height for batch in batches]),
         torch.cat([batch.width for batch in batches]),
     )
+    if not any(isinstance(batch, DistortedCamera) for batch in batches):
+        return bare
+    lenses = [
+        batch.distortion if isinstance(batch, DistortedCamera) else batch.intrinsics.new_zeros(batch.batch_size, 5)
+        for batch in batches
+    ]
+    return DistortedCamera(bare, torch.cat(lenses))
 
 
 def to(
     cameras: PinholeCamera, device: torch.device | str | None = None, dtype: torch.dtype | None = None
 ) -> PinholeCamera:
     """The cameras on another device or in another precision."""
-    values = (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
-    return PinholeCamera(*(value.to(device=device, dtype=dtype) for value in values))
+    return _rebuilt(cameras, lambda value: value.to(device=device, dtype=dtype))
 
 
 def resized(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
@@ -215,9 +229,10 @@ def resized(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     matrix = cameras.intrinsics.clone()
     matrix[:, :2, :2] = matrix[:, :2, :2] * scale[:, None]
     matrix[:, :2, 2] = scale * (matrix[:, :2, 2] + 0.5) - 0.5
-    return PinholeCamera(
+    bare = PinholeCamera(
         matrix, cameras.extrinsics, torch.full_like(cameras.height, height), torch.full_like(cameras.width, width)
     )
+    return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
 
 
 def opencv_from_opengl(world_from_camera: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:

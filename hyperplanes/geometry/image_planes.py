@@ -10,6 +10,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry import lookup_torch
+from hyperplanes.geometry.distortion import DistortedCamera, distorted_pixels
 from hyperplanes.geometry.lookup import Lookup, lookup
 from hyperplanes.geometry.lookup_torch import NEAREST_DEPTH
 from hyperplanes.geometry.storage import Packed, pack
@@ -81,15 +83,18 @@ class ImagePlanes:
             One row a point, one column a plane. Differentiable in points, images and cameras.
         """
         matrices = camera.projection_matrices(self.cameras)
-        found = lookup(
-            points,
-            matrices,
-            self.images,
-            views,
-            background=self.background,
-            packed=self._words(points),
-            backend=self.backend,
-        )
+        if isinstance(self.cameras, DistortedCamera):
+            found = self._lookup_through_lenses(points, matrices, views)
+        else:
+            found = lookup(
+                points,
+                matrices,
+                self.images,
+                views,
+                background=self.background,
+                packed=self._words(points),
+                backend=self.backend,
+            )
         if not bearings:
             return found
         centres = camera.centres(self.cameras).to(points)
@@ -97,6 +102,15 @@ class ImagePlanes:
         distances = offsets.norm(dim=-1)
         directions = offsets / distances.clamp_min(torch.finfo(points.dtype).tiny)[..., None]
         return replace(found, directions=directions, distances=distances)
+
+    def _lookup_through_lenses(self, points: Tensor, matrices: Tensor, views: Tensor | None) -> Lookup:
+        """The same in plain PyTorch; points that a lens cannot show count as behind the camera."""
+        assert isinstance(self.cameras, DistortedCamera)
+        ideal, front = lookup_torch.project(points, matrices.to(points), views)
+        pixels, seen = distorted_pixels(self.cameras, ideal, views)
+        coordinates, valid = lookup_torch.place(pixels, front & seen, *self.images.shape[2:])
+        colours = lookup_torch.interpolate(self.images.to(points), coordinates, views)
+        return Lookup(torch.where(valid[..., None], colours, self.background), coordinates, valid)
 
     def _words(self, points: Tensor) -> Packed | None:
         """The packed images, made at the first lookup that can use them and again after the images were changed."""

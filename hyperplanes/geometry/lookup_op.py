@@ -18,10 +18,16 @@ from hyperplanes.geometry.threads import share
 
 __all__ = ["lookup", "lookup_backward"]
 
-_CHUNK = 4096  # lookups' points a call of a kernel
+_CHUNK = 4096  # points a call of a kernel
+_PLANES = "Tensor points, Tensor matrices, Tensor images, Tensor? packed, int bits, Tensor? views"
+_SCHEMA = f"({_PLANES}, float background) -> (Tensor, Tensor, Tensor)"
+_BACKWARD_SCHEMA = (
+    f"({_PLANES}, Tensor? grad_colours, Tensor? grad_coordinates, bool geometry, bool pixels)"
+    " -> (Tensor, Tensor, Tensor)"
+)
 
 
-@torch.library.custom_op("hyperplanes::lookup", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("hyperplanes::lookup", mutates_args=(), device_types="cpu", schema=_SCHEMA)
 def lookup(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
     background: float,
@@ -38,7 +44,7 @@ def lookup(
     return colours, coordinates, valid
 
 
-@torch.library.custom_op("hyperplanes::lookup_backward", mutates_args=(), device_types="cpu")
+@torch.library.custom_op("hyperplanes::lookup_backward", mutates_args=(), device_types="cpu", schema=_BACKWARD_SCHEMA)
 def lookup_backward(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
     grad_colours: Tensor | None, grad_coordinates: Tensor | None, geometry: bool, pixels: bool,

@@ -28,7 +28,8 @@ def place(pixels: Tensor, front: Tensor, height: int, width: int) -> tuple[Tenso
     """Clamped coordinates (point, view, 2) in [-1, 1], zero behind the camera, and validity (point, view)."""
     last = pixels.new_tensor([width - 1, height - 1])
     valid = front & ((pixels >= 0) & (pixels <= last)).all(-1)
-    coordinates = (pixels * (2 / last.clamp_min(1)) - 1).clamp(-1, 1)
+    highest = 2 * last.clamp_max(1) - 1  # an axis of one pixel has the one coordinate -1
+    coordinates = (pixels * (2 / last.clamp_min(1)) - 1).clamp(-torch.ones_like(last), highest)
     return torch.where(front[..., None], coordinates, 0.0), valid
 
 

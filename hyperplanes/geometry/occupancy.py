@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.image_planes import NEAREST_DEPTH
 from hyperplanes.geometry.rays import Sphere
 
@@ -78,7 +79,12 @@ def carve(
         cameras: one a mask.
         bounds: the region to carve from.
         side: voxels an axis.
+
+    Raises:
+        ValueError: cameras with lens distortion.
     """
+    if isinstance(cameras, DistortedCamera):
+        raise ValueError("cameras: expected pinholes to carve with, got lens distortion; undistort the masks first")
     grid = full(bounds, side, masks.device)
     kept = torch.arange(side**3, device=masks.device)
     matrices, calibration = camera.projection_matrices(cameras), camera.intrinsics(cameras)

@@ -10,6 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera, undistorted_pixels
 
 __all__ = ["Rays", "Sphere", "cast", "pixel_grid"]
 
@@ -53,7 +54,7 @@ class Rays:
     def __getitem__(self, index: slice | Tensor) -> Rays:
         return Rays(self.origins[index], self.directions[index], self.near[index], self.far[index])
 
-    def at(self, t: Float[Tensor, ray * sample]) -> Float[Tensor, "ray *sample 3"]:
+    def at(self, t: Float[Tensor, "ray ..."]) -> Float[Tensor, "ray ... 3"]:
         """The points at distances t."""
         shape = (len(self),) + (1,) * (t.ndim - 1) + (3,)
         return self.origins.reshape(shape) + t[..., None] * self.directions.reshape(shape)
@@ -84,7 +85,7 @@ def cast(
     Args:
         cameras: a batch (view,).
         view: which camera each ray starts from.
-        pixels: (column, row), integer pixel centres.
+        pixels: (column, row) in the picture, integer pixel centres; a lens is undone.
         bounds: what near and far are taken from; the unit sphere where absent.
         span: "sphere" clips each ray to the sphere (a miss gets near == far); "depth" gives every ray of a camera the
             same near and far, the distance of the sphere's centre minus and plus its radius, as NeRF does.
@@ -98,6 +99,8 @@ def cast(
     bounds = bounds or Sphere()
     pose = camera.camera_from_world(cameras)[view]
     matrix = camera.intrinsics(cameras)[view]
+    if isinstance(cameras, DistortedCamera):
+        pixels = undistorted_pixels(cameras, view, pixels)
     y = (pixels[:, 1] - matrix[:, 1, 2]) / matrix[:, 1, 1]
     x = (pixels[:, 0] - matrix[:, 0, 2] - matrix[:, 0, 1] * y) / matrix[:, 0, 0]
     local = torch.stack([x, y, torch.ones_like(x)], -1)

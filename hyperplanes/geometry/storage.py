@@ -30,7 +30,7 @@ class Packed:
 
 
 @torch.no_grad()
-def pack(images: Float[Tensor, "view 3 height width"]) -> Packed | None:
+def pack(images: Float[Tensor, "view channel height width"]) -> Packed | None:
     """The images in the better of the two formats, or None where they cannot be packed.
 
     Images that were 8-bit files come out exact. All others are off by at most 1/2046, a quarter of the 1/512 that the

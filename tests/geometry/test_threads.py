@@ -1,0 +1,57 @@
+"""Threads: the same result for any number of them, from several at once, and after a fork."""
+
+import os
+import signal
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from hyperplanes.geometry import ImagePlanes, cameras, threads
+from hyperplanes.geometry.threads import share
+
+
+def lookups(count):
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(8, 8, 0.8), cameras.orbit(3, 2.5), 8, 8)
+    images = torch.rand(3, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(1)) - 0.5
+    return ImagePlanes(images, ours).lookup(points).colours
+
+
+def test_share_covers_every_index_once():
+    spans = share(lambda start, stop: (start, stop), 10_001, 37)
+    assert sorted(spans)[0][0] == 0
+    assert sum(stop - start for start, stop in spans) == 10_001
+    assert share(lambda start, stop: 1, 0, 5) == []
+
+
+def test_the_result_does_not_depend_on_the_threads():
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            results.append(lookups(20_000))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(results[0], result) for result in results)
+
+
+def test_lookups_from_several_threads_at_once():
+    expected = lookups(9000)
+    with ThreadPoolExecutor(4) as pool:
+        assert all(torch.equal(expected, found) for found in pool.map(lookups, [9000] * 8))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork.*:DeprecationWarning")
+def test_lookups_after_a_fork():
+    """As PyTorch's own data loaders do: the child uses one thread for PyTorch's operators, which hang otherwise."""
+    expected = lookups(9000)
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)
+        torch.set_num_threads(1)
+        same = torch.equal(lookups(9000), expected)
+        os._exit(0 if same and threads._pool(1).submit(int).result() == 0 else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
