@@ -200,7 +200,7 @@ def _remember(backend: Backend) -> Backend:
 
 def _try(name: str) -> Probe:
     environment = {key: value for key, value in os.environ.items() if key != _FOUND_VARIABLE}
-    command = [sys.executable, "-m", "data_gen.backends", name]
+    command = [sys.executable, "-m", "data_gen.trial_picture", name]
     start = time.monotonic()
     try:
         # The package may be imported from a folder that a fresh interpreter does not look in.
@@ -221,33 +221,3 @@ def _try(name: str) -> Probe:
     else:
         message = noise[-1] if noise else f"exit code {done.returncode}"
     return Probe(name, False, seconds, message, _REMEDIES[name])
-
-
-def _draw_test_picture(name: str) -> str:
-    """Draw half a picture full of red triangle and check it: runs in the subprocess."""
-    import numpy as np
-    import trimesh
-
-    from data_gen.rasterise import Rasteriser
-    from data_gen.rigs import Rig, look_at_origin
-
-    corners = [[-9.0, -9.0, 0.0], [0.0, -9.0, 0.0], [0.0, 9.0, 0.0], [-9.0, 9.0, 0.0]]
-    sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
-    sheet.visual = trimesh.visual.ColorVisuals(sheet, vertex_colors=[[255, 0, 0, 255]] * 4)
-    intrinsics = np.array([[16.0, 0.0, 7.5], [0.0, 16.0, 7.5], [0.0, 0.0, 1.0]])
-    rig = Rig(look_at_origin([[0.0, 0.0, 2.0]]), intrinsics, 16, 16, 1.0, 3.0)
-    with Rasteriser(name) as rasteriser:
-        drawn = rasteriser.render([(sheet, np.eye(4), False)], rig)
-        picture = np.asarray(drawn.rgba)[0].astype(int)
-        detail = rasteriser.detail
-    left, right = picture[:, :8], picture[:, 8:]
-    red = (left[..., 3] == 255) & (left[..., 0] > 40) & (left[..., 0] > 2 * left[..., 1])
-    if not red.all() or right[..., 3].any():
-        raise RendererError(
-            f"expected a red left half, received {left[8, 4].tolist()} there, and alpha {right[..., 3].max()} outside"
-        )
-    return detail
-
-
-if __name__ == "__main__":
-    sys.stdout.write(_draw_test_picture(sys.argv[1]) + "\n")

@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from hyperplanes.data.catalogue import SPLITS, find_catalogue, posed_folder, read_posed_task
+from hyperplanes.data.catalogue import SPLITS
 from hyperplanes.data.errors import DataError
 from hyperplanes.data.posed import PosedTask
+from hyperplanes.data.recognise import find_catalogue, posed_folder, read_posed_task
 from hyperplanes.data.transforms_json import find_transforms, read_transforms
 from hyperplanes.views import Task, Views
 
