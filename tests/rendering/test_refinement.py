@@ -1,5 +1,8 @@
 """Refined occupancy: what a field fills is kept, what it does not fill goes."""
 
+import math
+
+import pytest
 import torch
 
 from hyperplanes.geometry import Sphere
@@ -27,7 +30,8 @@ def test_a_refined_grid_never_grows():
     assert not (again.occupied & ~start.occupied).any()
 
 
-def test_a_large_grid_is_asked_coarsely_first_and_ends_the_same():
+@pytest.mark.parametrize("side", [64, 65])
+def test_a_large_grid_is_asked_coarsely_first_and_ends_the_same(side):
     # Source of truth: the direct answer, asked in every voxel of the same large grid.
     asked = []
 
@@ -36,14 +40,35 @@ def test_a_large_grid_is_asked_coarsely_first_and_ends_the_same():
         return ball(0.5)(points)
 
     large = refine(
-        full(Sphere((0.2, 0.0, 0.0), 1.0), 64), lambda points: density(points - points.new_tensor([0.2, 0, 0]))
+        full(Sphere((0.2, 0.0, 0.0), 1.0), side), lambda points: density(points - points.new_tensor([0.2, 0, 0]))
     )
-    assert sum(asked) < 64**3 / 2
-    direct = Occupancy(torch.zeros(64, 64, 64, dtype=torch.bool), Sphere((0.2, 0.0, 0.0), 1.0))
-    centres = full(direct.bounds, 64).centres()
+    assert sum(asked) < side**3 / 2
+    direct = Occupancy(torch.zeros(side, side, side, dtype=torch.bool), Sphere((0.2, 0.0, 0.0), 1.0))
+    centres = full(direct.bounds, side).centres()
     direct.occupied.view(-1)[:] = ball(0.5)(centres - centres.new_tensor([0.2, 0, 0])) > 0
     assert torch.equal(large.occupied, direct.dilated().occupied)
 
 
 def test_a_field_that_is_empty_leaves_nothing():
     assert not refine(full(Sphere(), 16), lambda points: points.new_zeros(len(points))).occupied.any()
+
+
+@pytest.mark.parametrize("side", [16, 64])
+def test_what_is_dropped_is_less_opaque_than_it_may_be_whatever_the_resolution(side):
+    # Closed form: fog of density s fills the sphere; the longest ray crosses 2 r of it and is 1 - exp(-2 r s) opaque.
+    grid = full(Sphere(radius=2.0), side)
+    faint = -math.log(1 - 0.05) / 4
+    assert not refine(grid, lambda points: points.new_full((len(points),), 0.99 * faint)).occupied.any()
+    assert refine(grid, lambda points: points.new_full((len(points),), 1.01 * faint)).occupied.all()
+
+
+def test_a_thing_one_voxel_thick_is_kept_wherever_it_lies_between_the_centres():
+    # A tilted plate: at one end it passes through centres, at the other between them.
+    grid = full(Sphere(), 32)
+
+    def plate(points):
+        return 50.0 * ((points[:, 1] - points[:, 0] / 16 - 1 / 32).abs() <= grid.voxel / 2).float()
+
+    along = torch.linspace(-0.9, 0.9, 200)
+    points = torch.stack([along, along / 16 + 1 / 32, torch.zeros(200)], -1)
+    assert refine(grid, plate).contains(points).all()
