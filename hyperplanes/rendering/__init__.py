@@ -3,7 +3,7 @@
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
 from hyperplanes.rendering.marching import Packed, march
 from hyperplanes.rendering.renderer import FieldFunction, Hierarchical, Marched, render, render_in_chunks
-from hyperplanes.rendering.sampling import importance, stratified
+from hyperplanes.rendering.sampling import importance, intervals, stratified
 
 __all__ = [
     "FieldFunction",
@@ -14,6 +14,7 @@ __all__ = [
     "composite",
     "composite_packed",
     "importance",
+    "intervals",
     "march",
     "packed_weights",
     "render",

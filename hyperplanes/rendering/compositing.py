@@ -10,6 +10,8 @@ from torch import Tensor
 
 __all__ = ["Rendered", "composite", "composite_packed", "packed_weights"]
 
+SOLID = 1e3  # thickness above which nothing more can be hidden: exp(-1000) is 0, and a sum over all rays stays exact
+
 
 @dataclass(frozen=True)
 class Rendered:
@@ -35,8 +37,17 @@ def composite(
     density: Float[Tensor, "ray interval"],
     edges: Float[Tensor, "ray edge"],
     background: float = 1.0,
+    *,
+    at: Float[Tensor, "ray interval"] | None = None,
 ) -> tuple[Rendered, Float[Tensor, "ray interval"]]:
     """w_i = T_i (1 - exp(-sigma_i delta_i)), T_i = exp(-sum_{j<i} sigma_j delta_j) (NeRF, Eq. 3).
+
+    Args:
+        colour: one a sample.
+        density: of each sample, per world unit.
+        edges: of the intervals that the samples stand for, ascending; delta_i is the length of each.
+        background: grey value behind everything.
+        at: the distance of each sample, for the depth; the middles of the intervals where absent.
 
     Returns:
         The pixels, and the weights for importance sampling.
@@ -46,8 +57,8 @@ def composite(
     transmittance = torch.exp(-passed)
     weights = transmittance[:, :-1] - transmittance[:, 1:]
     opacity = 1 - transmittance[:, -1]
-    middles = (edges[:, 1:] + edges[:, :-1]) / 2
-    depth = (weights * middles).sum(1) / opacity.clamp_min(1e-10)
+    distances = (edges[:, 1:] + edges[:, :-1]) / 2 if at is None else at
+    depth = (weights * distances).sum(1) / opacity.clamp_min(1e-10)
     pixels = (weights[..., None] * colour).sum(1) + (1 - opacity)[:, None] * background
     return Rendered(pixels, opacity, depth, density.numel()), weights
 
@@ -63,14 +74,14 @@ def packed_weights(
         count: number of rays.
 
     Returns:
-        w_i as in `composite`.
+        w_i as in `composite`. A density that is infinite or not a number is the matter of its own ray alone.
     """
     if not len(thickness):
         return thickness
     # One running sum over all rays, in double precision so that a ray late in the batch loses nothing, less its value
     # where the ray begins.
-    total = thickness.double().cumsum(0)
-    before = total - thickness
+    finite = thickness.double().nan_to_num(0.0).clamp_max(SOLID)
+    before = finite.cumsum(0) - finite
     first = torch.searchsorted(ray, torch.arange(count, device=ray.device)).clamp_max(len(ray) - 1)
     before = (before - before[first][ray]).to(thickness.dtype)
     return torch.exp(-before) * -torch.expm1(-thickness)

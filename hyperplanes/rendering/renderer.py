@@ -13,7 +13,7 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
 from hyperplanes.rendering.marching import Packed, march
-from hyperplanes.rendering.sampling import importance, stratified
+from hyperplanes.rendering.sampling import importance, intervals, stratified
 
 __all__ = ["FieldFunction", "Hierarchical", "Marched", "render", "render_in_chunks", "samples_at_once"]
 
@@ -28,7 +28,8 @@ class Hierarchical:
 
     Attributes:
         coarse: stratified samples a ray.
-        fine: importance samples a ray; the field is asked again at all of both.
+        fine: importance samples a ray. They cut the coarse intervals further, and the field is asked once in each of
+            the coarse + fine intervals, where NeRF asks it at the coarse and the fine samples themselves.
     """
 
     coarse: int = 64
@@ -41,7 +42,7 @@ class Marched:
 
     Attributes:
         steps: samples along a diameter of the scene's sphere.
-        stop: transmittance below which a ray is finished (only where no gradient is wanted).
+        stop: transmittance below which a ray is finished (only where no gradient is wanted); 0 never stops.
     """
 
     steps: int = 96
@@ -101,14 +102,15 @@ def _hierarchical(
     generator: torch.Generator | None,
     background: float,
 ) -> Rendered:
-    edges = stratified(rays, sampling.coarse, generator)
-    colour, density = _ask(proposal, rays, (edges[:, 1:] + edges[:, :-1]) / 2)
-    coarse, weights = composite(colour, density, edges, background)
+    def see(function: FieldFunction, edges: Tensor) -> tuple[Rendered, Tensor]:
+        t = stratified(edges, generator)
+        return composite(*_ask(function, rays, t), edges, background, at=t)
+
+    edges = intervals(rays, sampling.coarse)
+    coarse, weights = see(proposal, edges)
     if not sampling.fine:
         return coarse
-    edges = torch.cat([edges, importance(edges, weights, sampling.fine, generator)], 1).sort(1).values
-    colour, density = _ask(field, rays, (edges[:, 1:] + edges[:, :-1]) / 2)
-    fine, _ = composite(colour, density, edges, background)
+    fine, _ = see(field, torch.cat([edges, importance(edges, weights, sampling.fine, generator)], 1).sort(1).values)
     return Rendered(fine.colour, fine.opacity, fine.depth, coarse.samples + fine.samples, coarse.colour)
 
 
@@ -141,28 +143,39 @@ def samples_at_once(device: torch.device) -> int:
 def _all_at_once(
     field: FieldFunction, rays: Rays, samples: Packed, proposal: FieldFunction | None, background: float
 ) -> Rendered:
-    """Every sample with its gradient. The proposal, where there is one, learns from every second sample."""
+    """Every sample with its gradient. The proposal, where there is one, learns from every second sample of each ray.
 
-    def see(function: FieldFunction, chosen: Packed) -> Rendered:
+    Each of those stands for the next one too, where there is one, so that both see the same length of a ray.
+    """
+
+    def see(function: FieldFunction, chosen: Packed, width: Tensor | float) -> Rendered:
         colour, density = _ask_packed(function, rays, chosen)
-        weights = packed_weights(density * chosen.width, chosen.ray, len(rays))
+        weights = packed_weights(density * width, chosen.ray, len(rays))
         return composite_packed(colour, weights, chosen.middles, chosen.ray, len(rays), background)
 
-    fine = see(field, samples)
+    fine = see(field, samples, samples.width)
     if proposal is None:
         return fine
-    half = samples[torch.arange(0, len(samples), 2, device=samples.ray.device)]
-    coarse = see(proposal, Packed(half.ray, half.middles, 2 * half.width))
+    rank, total = _ranks(samples.ray, len(rays))
+    even = (rank % 2 == 0).nonzero()[:, 0]
+    alone = rank[even] + 1 == total[samples.ray[even]]
+    coarse = see(proposal, samples[even], torch.where(alone, 1, 2) * samples.width)
     return Rendered(fine.colour, fine.opacity, fine.depth, fine.samples + coarse.samples, coarse.colour)
+
+
+def _ranks(ray: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Which sample of its ray each packed sample is, counted from 0, and how many each ray has."""
+    total = torch.bincount(ray, minlength=count)
+    first = total.cumsum(0) - total
+    return torch.arange(len(ray), device=ray.device) - first[ray], total
 
 
 def _front_to_back(field: FieldFunction, rays: Rays, samples: Packed, stop: float, background: float) -> Rendered:
     """Rounds of a few samples a ray, dropping the rays that have become opaque."""
     passed = torch.zeros(len(rays), dtype=samples.middles.dtype, device=samples.middles.device)
-    limit = -math.log(stop)
-    first = torch.searchsorted(samples.ray, torch.arange(len(rays), device=samples.ray.device))
+    limit = -math.log(stop) if stop > 0 else math.inf
     remaining = torch.arange(len(samples), device=samples.ray.device)
-    rank = remaining - first[samples.ray]
+    rank, _ = _ranks(samples.ray, len(rays))
     colours, weights, asked = [rays.origins.new_zeros(0, 3)], [passed[:0]], [remaining[:0]]
     reach = 0
     while len(remaining):
@@ -195,15 +208,17 @@ def render_in_chunks(
         options: as in `render`.
 
     Returns:
-        The pixels of all rays.
+        The pixels of all rays, those of the coarse pass where there was one.
     """
     parts = [
         render(field, rays[first : first + chunk], sampling, **options)  # pyright: ignore[reportArgumentType]
-        for first in range(0, len(rays), chunk)
+        for first in range(0, max(1, len(rays)), chunk)
     ]
+    coarse = [part.coarse for part in parts if part.coarse is not None]
     return Rendered(
         torch.cat([part.colour for part in parts]),
         torch.cat([part.opacity for part in parts]),
         torch.cat([part.depth for part in parts]),
         sum(part.samples for part in parts),
+        torch.cat(coarse) if coarse else None,
     )

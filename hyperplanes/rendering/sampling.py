@@ -12,25 +12,42 @@ from torch import Tensor
 
 from hyperplanes.geometry.rays import Rays
 
-__all__ = ["importance", "stratified"]
+__all__ = ["importance", "intervals", "stratified"]
 
 
-def stratified(rays: Rays, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "ray edge"]:
-    """Edges of `count` intervals from near to far, jittered where a generator is given (NeRF, Eq. 2).
+def intervals(rays: Rays, count: int) -> Float[Tensor, "ray edge"]:
+    """The edges of `count` equal intervals from near to far.
 
     Args:
         rays: with near <= far.
         count: intervals a ray.
-        generator: on the CPU; without one the intervals are equal.
 
     Returns:
         count + 1 edges a ray; the first is near, the last far.
     """
-    fraction = torch.linspace(0, 1, count + 1, dtype=rays.near.dtype, device=rays.near.device).expand(len(rays), -1)
-    if generator is not None:
-        jitter = torch.rand(len(rays), count - 1, generator=generator).to(fraction) - 0.5
-        fraction = torch.cat([fraction[:, :1], fraction[:, 1:-1] + jitter / count, fraction[:, -1:]], 1)
+    fraction = torch.linspace(0, 1, count + 1, dtype=rays.near.dtype, device=rays.near.device)
     return rays.near[:, None] + (rays.far - rays.near)[:, None] * fraction
+
+
+def stratified(
+    edges: Float[Tensor, "ray edge"], generator: torch.Generator | None = None
+) -> Float[Tensor, "ray interval"]:
+    """One distance in each interval, uniform within it where a generator is given (NeRF, Eq. 2).
+
+    A sample stands for the whole of its interval, so the sum over samples of density times length is right on average,
+    whatever the density.
+
+    Args:
+        edges: of the intervals, ascending.
+        generator: on the CPU; without one the samples are the middles.
+
+    Returns:
+        Ascending distances.
+    """
+    if generator is None:
+        return (edges[:, 1:] + edges[:, :-1]) / 2
+    place = torch.rand(len(edges), edges.shape[1] - 1, generator=generator).to(edges)
+    return edges[:, :-1] + place * edges.diff(dim=1)
 
 
 def importance(

@@ -190,3 +190,23 @@ def test_gradients_stay_finite_in_empty_and_in_opaque_space(sigma):
     seen, _ = composite(torch.ones(2, 4, 3), density, torch.linspace(1, 2, 5).repeat(2, 1), 0.0)
     (seen.colour.sum() + seen.depth.sum()).backward()
     assert torch.isfinite(density.grad).all()
+
+
+@pytest.mark.parametrize("poison", [math.inf, math.nan, 1e30])
+def test_a_broken_density_stays_in_its_own_ray(poison):
+    # Source of truth: the same rays without the broken one between them.
+    thickness = torch.tensor([0.3, 0.2, 0.5, 0.1, 0.7, 0.4])
+    ray = torch.tensor([0, 0, 1, 1, 2, 2])
+    whole = packed_weights(thickness, ray, 3)
+    thickness[3] = poison
+    found = packed_weights(thickness, ray, 3)
+    assert torch.equal(found[[0, 1, 2, 4, 5]], whole[[0, 1, 2, 4, 5]])
+    if not math.isnan(poison):
+        assert found[3].item() == pytest.approx(math.exp(-0.5))  # all that was left
+
+
+def test_the_depth_is_that_of_the_samples_where_they_are_given():
+    # two samples of weights 1/2 and 1/4 at 1.1 and 2.4 in the intervals (1, 2) and (2, 3): (0.55 + 0.6) / 0.75
+    density = torch.full((1, 2), math.log(2.0))
+    seen, _ = composite(torch.ones(1, 2, 3), density, torch.tensor([[1.0, 2.0, 3.0]]), at=torch.tensor([[1.1, 2.4]]))
+    assert seen.depth.item() == pytest.approx(1.15 / 0.75)

@@ -266,3 +266,50 @@ def test_gradients_of_cameras():
     turn, shift = torch.full((3,), 0.1, dtype=DOUBLE), torch.full((3,), 0.05, dtype=DOUBLE)
     inputs = (turn, shift, torch.tensor(1.1, dtype=DOUBLE))
     assert torch.autograd.gradcheck(pixels, tuple(value.requires_grad_() for value in inputs))
+
+
+@pytest.mark.parametrize("sampling", PROTOCOLS)
+def test_jittered_pictures_of_fog_are_those_of_fog(sampling):
+    # one density everywhere: where in its interval a sample lies makes no difference to the dense protocols
+    rays = some_rays(20)
+    still = render(fog(0.7), rays, sampling, occupancy=GRID)
+    jittered = render(fog(0.7), rays, sampling, occupancy=GRID, generator=torch.Generator().manual_seed(0))
+    slack = 0.7 * 2 / 64 if isinstance(sampling, Marched) else 1e-9
+    assert (still.opacity - jittered.opacity).abs().max() < slack
+
+
+def test_a_proposal_sees_each_ray_by_itself_and_its_whole_length():
+    # rays of 1, 2, 3 and 8 samples in fog: the proposal's opacity is that of all samples, 1 - exp(-sigma n step)
+    count, step = torch.tensor([1, 2, 3, 8]), 2 / 20
+    straight = torch.tensor([[0.0, 0.0, 1.0]], dtype=DOUBLE).expand(4, 3)
+    start = torch.tensor([[0.0, 0.0, -0.9]], dtype=DOUBLE).expand(4, 3)
+    rays = Rays(start, straight, torch.zeros(4, dtype=DOUBLE), count.double() * step - step / 4)
+    asked = []
+
+    def proposal(points, directions):
+        asked.append(len(points))
+        return fog(0.9)(points, directions)
+
+    seen = render(fog(0.5), rays, Marched(20), occupancy=GRID, proposal=proposal, background=0.0)
+    assert asked == [1 + 1 + 2 + 4]
+    opacity = 1 - torch.exp(-0.9 * count * step)
+    torch.testing.assert_close(seen.coarse[:, 0], 0.2 * opacity.double())
+
+
+@torch.no_grad()
+def test_a_threshold_of_zero_never_stops():
+    rays = some_rays(30)
+    whole = render(fog(50.0), rays, Marched(64, 0.0), occupancy=GRID)
+    assert whole.samples == len(march(rays, GRID, 2 / 64))
+    torch.testing.assert_close(
+        whole.colour, render(fog(50.0), rays, Marched(64), occupancy=GRID).colour, atol=1e-3, rtol=0
+    )
+
+
+def test_chunks_keep_the_coarse_picture_and_no_rays_make_no_chunks():
+    rays = some_rays(11)
+    whole = render(soft_ball, rays, Hierarchical(8, 4))
+    parts = render_in_chunks(soft_ball, rays, Hierarchical(8, 4), chunk=4)
+    torch.testing.assert_close(parts.coarse, whole.coarse)
+    for sampling in PROTOCOLS:
+        assert render_in_chunks(soft_ball, rays[:0], sampling, occupancy=GRID).colour.shape == (0, 3)

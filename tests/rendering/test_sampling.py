@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.rendering import importance, stratified
+from hyperplanes.rendering import importance, intervals, stratified
 
 
 def rays_between(near, far, count):
@@ -14,8 +14,12 @@ def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
+def drawn_in_intervals(rays, count, generator):
+    return stratified(intervals(rays, count), generator)
+
+
 def resampled(rays, count, generator):
-    return importance(stratified(rays, 4), torch.ones(len(rays), 4), count, generator)
+    return importance(intervals(rays, 4), torch.ones(len(rays), 4), count, generator)
 
 
 def distance_to_uniform(values):
@@ -25,37 +29,46 @@ def distance_to_uniform(values):
     return (ordered - ranks).abs().max().item()
 
 
-def test_intervals_are_equal_without_a_generator():
-    assert stratified(rays_between(2.0, 6.0, 2), 4).tolist() == [[2.0, 3.0, 4.0, 5.0, 6.0]] * 2
+def test_intervals_are_equal_and_samples_their_middles_without_a_generator():
+    edges = intervals(rays_between(2.0, 6.0, 2), 4)
+    assert edges.tolist() == [[2.0, 3.0, 4.0, 5.0, 6.0]] * 2
+    assert stratified(edges).tolist() == [[2.5, 3.5, 4.5, 5.5]] * 2
 
 
-def test_edges_begin_near_end_far_and_ascend():
-    edges = stratified(rays_between(2.0, 6.0, 500), 16, generator())
-    assert edges.shape == (500, 17)
-    assert (edges[:, 0] == 2).all()
-    assert (edges[:, -1] == 6).all()
-    assert (edges.diff(dim=1) >= 0).all()
-
-
-def test_inner_edges_are_uniform_and_one_a_stratum():
+def test_samples_are_uniform_within_their_intervals_each_its_own():
+    # NeRF, Eq. 2: t_i ~ U(near + (i - 1) / N (far - near), near + i / N (far - near))
     count = 8
-    edges = stratified(rays_between(0.0, 1.0, 4000), count, generator())[:, 1:-1]
-    place = edges * count - torch.arange(1, count) + 0.5  # within its stratum, [0, 1]
+    drawn = stratified(intervals(rays_between(2.0, 6.0, 4000), count), generator())
+    place = (drawn - 2) / 4 * count - torch.arange(count)
     assert place.min() >= -1e-5
     assert place.max() <= 1 + 1e-5
     # the 1e-6 quantile of the statistic is 2.7 / sqrt(n)
-    assert distance_to_uniform(place) < 2.7 / place.numel() ** 0.5
-    assert abs(torch.corrcoef(place.T)[0, 1]) < 0.1  # each its own
+    for interval in range(count):
+        assert distance_to_uniform(place[:, interval]) < 2.7 / len(place) ** 0.5
+    assert abs(torch.corrcoef(place.T)[0, 1]) < 0.1
+
+
+def test_samples_of_intervals_of_any_length_stay_in_them():
+    edges = torch.tensor([[0.0, 0.1, 2.0, 2.0, 5.0]]).expand(100, -1)
+    drawn = stratified(edges, generator())
+    assert ((drawn >= edges[:, :-1]) & (drawn <= edges[:, 1:])).all()
+
+
+def test_the_sum_over_samples_is_the_integral_on_average():
+    # density t^2 from 0 to 1 in 3 intervals: 1/3; the middles would give 35/108 = 0.324 every time
+    drawn = stratified(intervals(rays_between(0.0, 1.0, 40_000), 3), generator())
+    assert (drawn.square().sum(1) / 3).mean().item() == pytest.approx(1 / 3, abs=2e-3)
 
 
 def test_a_ray_that_misses_has_intervals_of_no_length():
-    edges = stratified(rays_between(3.0, 3.0, 2), 5, generator())
+    edges = intervals(rays_between(3.0, 3.0, 2), 5)
     assert (edges == 3).all()
+    assert (stratified(edges, generator()) == 3).all()
     again = importance(edges, torch.zeros(2, 5), 4, generator())
     assert (again == 3).all()
 
 
-@pytest.mark.parametrize("draw", [stratified, resampled])
+@pytest.mark.parametrize("draw", [drawn_in_intervals, resampled])
 def test_the_same_generator_draws_the_same(draw):
     rays = rays_between(1.0, 2.0, 3)
     assert torch.equal(draw(rays, 6, generator(1)), draw(rays, 6, generator(1)))
