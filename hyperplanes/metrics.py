@@ -16,9 +16,13 @@ def psnr(
 
     Equal images give infinity.
 
+    Raises:
+        ValueError: images of different shapes.
+
     >>> psnr(torch.full((1, 3, 4, 4), 0.6), torch.full((1, 3, 4, 4), 0.5)).round().tolist()
     [20.0]
     """
+    _check(predicted, truth)
     return -10 * torch.log10((predicted - truth).square().flatten(1).mean(1))
 
 
@@ -30,10 +34,19 @@ def ssim(
     Equals scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)`.
 
     Raises:
-        ValueError: images smaller than the window.
+        ValueError: images of different shapes, or smaller than the window.
     """
     from kornia.metrics import ssim as kornia_ssim
 
+    _check(predicted, truth)
     if min(truth.shape[2:]) < 11:
         raise ValueError(f"images: expected at least 11 x 11 pixels, got {truth.shape[2]} x {truth.shape[3]}")
     return kornia_ssim(predicted, truth, 11, padding="valid").flatten(1).mean(1)
+
+
+def _check(predicted: Tensor, truth: Tensor) -> None:
+    """Pictures of one shape: otherwise they would be stretched over each other without a word."""
+    if predicted.shape != truth.shape:
+        raise ValueError(
+            f"predicted: expected the shape of the truth, {tuple(truth.shape)}, got {tuple(predicted.shape)}"
+        )

@@ -152,3 +152,13 @@ def test_what_cannot_be_written_as_json_leaves_nothing(tmp_path):
     with pytest.raises(TypeError):
         write_json(tmp_path / "model.json", {"tensor": torch.ones(1)})
     assert os.listdir(tmp_path) == []
+
+
+def test_what_json_has_no_number_for_is_null(tmp_path):
+    # Source of truth: RFC 8259, section 6: "Infinity and NaN are not permitted"
+    path = tmp_path / "metrics.json"
+    write_json(path, {"psnr": float("inf"), "rows": [(float("nan"), 1.5)], "down": -float("inf")})
+    text = path.read_text()
+    assert "Infinity" not in text
+    assert "NaN" not in text
+    assert read_json(path) == {"psnr": None, "rows": [[None, 1.5]], "down": None}

@@ -1,5 +1,6 @@
 import math
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -63,3 +64,18 @@ def test_ssim_refuses_images_smaller_than_its_window():
     with pytest.raises(ValueError, match="images: expected at least 11 x 11 pixels, got 10 x 20"):
         ssim(torch.rand(1, 3, 10, 20), torch.rand(1, 3, 10, 20))
     assert torch.isfinite(ssim(torch.rand(1, 3, 11, 11), torch.rand(1, 3, 11, 11))).all()
+
+
+@pytest.fixture
+def unchecked():
+    """Runs without the type checks, as a user's program does."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("measure", [psnr, ssim])
+def test_pictures_of_different_shapes_are_refused(measure):
+    with pytest.raises(ValueError, match=r"predicted: expected the shape of the truth, \(2, 3, 12, 12\), got \(1,"):
+        measure(torch.rand(1, 3, 12, 12), torch.rand(2, 3, 12, 12))

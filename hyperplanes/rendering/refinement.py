@@ -25,9 +25,8 @@ def refine(
 
     The field is asked at the centre of every occupied voxel; what it fills is grown by `margin` voxels, since a surface
     may pass between centres, and never beyond the grid that was given. So a voxel goes only where it and all its
-    neighbours are empty at their centres; what is thinner than a voxel may be missed, as it may by samples a voxel apart.
-    A grid with very many occupied voxels (no masks, so no hull) is asked at half
-    its resolution first.
+    neighbours are empty at their centres: what is thinner than a voxel may be missed, as samples a voxel apart may miss
+    it. A grid with very many occupied voxels (no masks, so no hull) is asked at half its resolution first.
 
     Empty is a density that a ray could cross the whole sphere in and be at most `lost` opaque: haze in many voxels
     counts as much as in one. On cars of 64 pixels a picture then differs from one without refinement by 68 dB where
