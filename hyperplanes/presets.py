@@ -58,7 +58,7 @@ PRESETS: dict[str, Preset] = {
             hull_side=64,
         ),
         TrainingConfig(
-            steps=2000, rays=768, learning_rate=1e-3, hypernetwork_learning_rate=5e-4, warmup=100, final=0.05
+            steps=2000, rays=768, learning_rate=3e-3, hypernetwork_learning_rate=1.5e-3, warmup=100, final=0.03
         ),
         64,
         "64x64, minutes on two cores: what `make demo` trains",
@@ -71,7 +71,7 @@ PRESETS: dict[str, Preset] = {
             hull_side=96,
         ),
         TrainingConfig(
-            steps=30_000, rays=1024, learning_rate=1e-3, hypernetwork_learning_rate=5e-4, warmup=500, final=0.02
+            steps=30_000, rays=1024, learning_rate=2e-3, hypernetwork_learning_rate=1e-3, warmup=500, final=0.02
         ),
         128,
         "128x128, hours on a few cores",
