@@ -21,27 +21,27 @@ _pools: dict[int, ThreadPoolExecutor] = {}
 
 
 def share(work: Callable[[int, int], Result], total: int, chunk: int) -> list[Result]:
-    """The results of work(start, stop) over 0..total in steps of `chunk`, in no order, the caller's thread included.
+    """The results of work(start, stop) over 0..total in steps of `chunk`, in order, the caller's thread included.
 
     Args:
         work: releases the interpreter lock where it matters.
         total: how much there is.
         chunk: how much of it one call takes.
 
-    >>> sorted(share(lambda start, stop: stop - start, 10, 4))
-    [2, 4, 4]
+    >>> share(lambda start, stop: stop - start, 10, 4)
+    [4, 4, 2]
     """
     starts = iter(range(0, total, chunk))
     threads = min(torch.get_num_threads(), -(-total // chunk))
 
-    def some(starts: Iterable[int]) -> list[Result]:
-        return [work(start, min(start + chunk, total)) for start in starts]
+    def some(starts: Iterable[int]) -> list[tuple[int, Result]]:
+        return [(start, work(start, min(start + chunk, total))) for start in starts]
 
     futures = [_pool(threads - 1).submit(some, starts) for _ in range(threads - 1)]
     results = some(starts)
     for future in futures:
         results += future.result()
-    return results
+    return [result for _, result in sorted(results, key=lambda pair: pair[0])]
 
 
 def _pool(size: int) -> ThreadPoolExecutor:

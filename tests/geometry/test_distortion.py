@@ -1,0 +1,78 @@
+"""Lens distortion: OpenCV's projectPoints and undistortPoints are the truth."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from hyperplanes.geometry import ImagePlanes, Sphere, cameras, carve, cast
+from hyperplanes.geometry.distortion import DistortedCamera, distorted
+from tests.test_conventions import HEIGHT, WIDTH, K, opencv_pixels, poses, some_points
+
+LENS = torch.tensor([-0.28, 0.07, 0.002, -0.001, -0.01], dtype=torch.float64)
+
+
+def lenses():
+    return distorted(cameras.pinhole(K, poses(), HEIGHT, WIDTH), LENS)
+
+
+@pytest.mark.parametrize("chosen", [False, True])
+def test_lookups_see_through_the_lens_as_opencv_does(chosen):
+    images = torch.zeros(6, 1, HEIGHT, WIDTH, dtype=torch.float64)
+    views = torch.arange(6).flip(0).expand(200, 6) if chosen else None
+    found = ImagePlanes(images, lenses()).lookup(some_points(), views)
+    pixels = ((found.coordinates + 1) / 2 * torch.tensor([WIDTH - 1, HEIGHT - 1])).transpose(0, 1).numpy()
+    expected = opencv_pixels(some_points(), K, poses(), LENS)
+    expected = expected[::-1] if chosen else expected
+    inside = found.valid.T.numpy()
+    assert inside.mean() > 0.8
+    np.testing.assert_allclose(pixels[inside], expected[inside], atol=1e-9)
+
+
+def test_rays_undo_the_lens_as_opencv_does():
+    pixels = torch.rand(50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    pixels = pixels * torch.tensor([WIDTH - 1, HEIGHT - 1])
+    rays = cast(lenses(), torch.full((50,), 2), pixels)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    ideal = cv2.undistortPoints(pixels.numpy()[:, None], K.numpy(), LENS.numpy(), criteria=criteria)[:, 0]
+    local = np.concatenate([ideal, np.ones((50, 1))], 1)
+    expected = (local / np.linalg.norm(local, axis=1, keepdims=True)) @ poses()[2, :3, :3].numpy()
+    np.testing.assert_allclose(rays.directions.numpy(), expected, atol=1e-7)
+
+
+def test_what_the_polynomial_folds_back_is_not_seen():
+    """Closed form: with k1 = -1/3 alone r - r^3 / 3 turns at r = 1; beyond, points come back towards the middle."""
+    matrix = torch.tensor([[10.0, 0.0, 20.0], [0.0, 10.0, 20.0], [0.0, 0.0, 1.0]])
+    bare = cameras.pinhole(matrix, torch.eye(4)[None], 41, 41)
+    planes = ImagePlanes(torch.zeros(1, 1, 41, 41), distorted(bare, torch.tensor([-1 / 3, 0.0, 0.0, 0.0, 0.0])))
+    points = torch.tensor([[0.9, 0.0, 1.0], [1.1, 0.0, 1.0], [3**0.5, 0.0, 1.0]])
+    assert planes.lookup(points).valid[:, 0].tolist() == [True, False, False]
+
+
+def test_lenses_are_kept():
+    ours = cameras.to(cameras.resized(cameras.select(lenses(), [3, 1]), 96, 160), dtype=torch.float32)
+    assert isinstance(ours, DistortedCamera)
+    torch.testing.assert_close(ours.distortion, LENS.float().expand(2, 5))
+    both = cameras.concatenate([lenses(), cameras.pinhole(K, poses(), HEIGHT, WIDTH)])
+    assert isinstance(both, DistortedCamera)
+    assert both.distortion[6:].abs().max() == 0
+
+
+def test_no_distortion_changes_nothing():
+    images = torch.rand(6, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    bare = cameras.pinhole(K, poses(), HEIGHT, WIDTH)
+    plain = ImagePlanes(images, bare).lookup(some_points())
+    behind_glass = ImagePlanes(images, distorted(bare, torch.zeros(5))).lookup(some_points())
+    torch.testing.assert_close(behind_glass.colours, plain.colours)
+
+
+def test_wrong_lenses_are_stopped():
+    bare = cameras.pinhole(K, poses(), HEIGHT, WIDTH)
+    with pytest.raises(ValueError, match=r"expected shape \(5,\) or \(6, 5\), got \(2, 5\)"):
+        distorted(bare, torch.zeros(2, 5))
+    skewed = K.clone()
+    skewed[0, 1] = 1.0
+    with pytest.raises(ValueError, match="no skew"):
+        distorted(cameras.pinhole(skewed, poses(), HEIGHT, WIDTH), LENS)
+    with pytest.raises(ValueError, match="undistort the masks first"):
+        carve(torch.ones(6, 1, HEIGHT, WIDTH, dtype=torch.float64), lenses(), Sphere(), 8)
