@@ -11,7 +11,7 @@ import torch
 from hyperplanes.adaptation.base import AdaptedField, Adapter
 from hyperplanes.adaptation.fine_tuning import FineTuned
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
-from hyperplanes.checkpoints import CheckpointError, read_json
+from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.fields.base import Field
 from hyperplanes.training import Tasks
 from hyperplanes.views import Task, Views
@@ -97,7 +97,7 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
                 "`hyperplanes train` writes one, `hyperplanes demo` makes a small one in minutes"
             )
         for path in inside:
-            config = ModelConfig.of_json(read_json(path / "model.json"))
+            config = ModelConfig.load(path)
             found.setdefault("hyperplanes" if config.hypernetwork else config.target, path)
     return found
 

@@ -53,9 +53,7 @@ def recipe(name: str, method: str = "hyperplanes", *, steps: int | None = None, 
 
 def new_model(config: ModelConfig, seed: int) -> HyperPlanes:
     """An untrained model; the same seed gives the same weights, and the global random state is left alone."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return HyperPlanes(config)
+    return HyperPlanes(config, seed)
 
 
 def score_all(

@@ -64,17 +64,22 @@ class Views:
         )
 
     @property
+    def nbytes(self) -> int:
+        """Memory of images and masks."""
+        return self.images.nbytes + (0 if self.masks is None else self.masks.nbytes)
+
+    @property
     def size(self) -> tuple[int, int]:
         """(height, width) of every image."""
         return self.images.shape[2], self.images.shape[3]
 
-    def to(self, device: torch.device | str) -> Views:
-        """The views on another device."""
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Views:
+        """The views on another device or in another precision, cameras included."""
         return replace(
             self,
-            images=self.images.to(device),
-            cameras=camera.to(self.cameras, device),
-            masks=None if self.masks is None else self.masks.to(device),
+            images=self.images.to(device=device, dtype=dtype),
+            cameras=camera.to(self.cameras, device, dtype),
+            masks=None if self.masks is None else self.masks.to(device=device, dtype=dtype),
         )
 
     def rays(self, view: int, *, span: str = "sphere") -> Rays:
@@ -101,9 +106,14 @@ class Views:
 
         Returns:
             The rays and their true colours.
+
+        Raises:
+            ValueError: no pixel to draw from.
         """
         height, width = self.size
         total = len(self) * height * width if among is None else len(among)
+        if not total:
+            raise ValueError(f"among: expected at least one pixel of {len(self)} views to draw rays from, got none")
         flat = torch.randint(total, (count,), generator=generator).to(self.images.device)
         flat = flat if among is None else among[flat]
         view, pixel = flat // (height * width), flat % (height * width)

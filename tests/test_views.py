@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jaxtyping
 import pytest
 import torch
@@ -98,6 +100,19 @@ def test_the_same_generator_draws_the_same_rays():
     assert torch.equal(draw(1), draw(1))
     assert not torch.equal(draw(1), draw(2))
     assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_views_in_another_precision_and_their_memory():
+    double = views().to(dtype=torch.float64)
+    assert double.images.dtype == double.masks.dtype == double.cameras.extrinsics.dtype == torch.float64
+    # 4 views of 6 x 9 pixels, 3 + 1 numbers of 8 bytes
+    assert double.nbytes == 4 * 6 * 9 * 4 * 8
+    assert replace(double, masks=None).nbytes == 4 * 6 * 9 * 3 * 8
+
+
+def test_no_pixel_to_draw_from_is_refused():
+    with pytest.raises(ValueError, match="among: expected at least one pixel of 4 views to draw rays from, got none"):
+        views().sample_rays(3, among=torch.zeros(0, dtype=torch.long))
 
 
 @pytest.fixture

@@ -105,13 +105,14 @@ class AdaptedField:
         """The pictures that the cameras see.
 
         Args:
-            cameras: any number, one image size.
+            cameras: any number, one image size, on any device and in any precision.
             sampling: another protocol than the field's own.
 
         Returns:
-            One picture a camera.
+            One picture a camera, where the field is.
         """
         sampling = sampling or self.sampling
+        cameras = camera.to(cameras, self.occupancy.occupied.device)
         if isinstance(sampling, Hierarchical):
             return photograph(
                 cameras,
@@ -137,6 +138,8 @@ def photograph(
 ) -> Pictures:
     """Pictures from anything that sees along rays.
 
+    Rays are cast in the precision of the cameras and seen in single precision, as pictures are.
+
     Args:
         cameras: any number, one image size.
         bounds: what near and far of the rays are taken from.
@@ -157,15 +160,29 @@ def photograph(
         chosen = torch.arange(len(pixels), device=pixels.device) if live is None else live[view].nonzero()[:, 0]
         if not len(chosen):
             continue
-        part = see(cast(cameras, torch.full_like(chosen, view), pixels[chosen], bounds, span=span))
-        values[view, chosen] = torch.cat([part.colour, part.opacity[:, None], part.depth[:, None]], 1)
+        rays = cast(cameras, torch.full_like(chosen, view), pixels[chosen], bounds, span=span)
+        part = see(Rays(rays.origins.float(), rays.directions.float(), rays.near.float(), rays.far.float()))
+        values[view, chosen] = torch.cat([part.colour, part.opacity[:, None], part.depth[:, None]], 1).to(values)
         samples += part.samples
     maps = values.reshape(cameras.batch_size, height, width, 5).permute(0, 3, 1, 2)
     return Pictures(maps[:, :3], maps[:, 3:4], maps[:, 4:], samples)
 
 
 def hull(support: Views, side: int) -> Occupancy:
-    """The visual hull of the support masks, or a full grid where there are none."""
+    """The visual hull of the support masks, or a full grid where there are none.
+
+    Raises:
+        ValueError: masks that leave nothing.
+    """
     if support.masks is None:
         return full(support.bounds, side, support.images.device)
-    return carve(support.masks, support.cameras, support.bounds, side)
+    carved = carve(support.masks, support.cameras, support.bounds, side)
+    seen = int((support.masks > 0).flatten(1).any(1).sum())
+    if not (seen and carved.occupied.any()):
+        found = f"{seen} of {len(support)} with a pixel set, and no point that all of them may show"
+        views = f" ({support.names[0]} to {support.names[-1]})" if support.names else ""
+        raise ValueError(
+            f"masks of the support views{views}: expected an object, got {found if seen else 'none with a pixel set'}; "
+            "check alpha and poses, or leave the masks out"
+        )
+    return carved

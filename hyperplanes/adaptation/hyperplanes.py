@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import asdict, dataclass, field
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -13,63 +15,19 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from hyperplanes.adaptation.base import AdaptedField, hull
-from hyperplanes.checkpoints import CheckpointError, load_tensors, read_json, save_tensors, write_json
-from hyperplanes.fields import TARGETS, Target, TargetConfig
+from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
+from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors, write_json
+from hyperplanes.fields import TARGETS, Target
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.hypernetwork.hypernetwork import HyperNetwork, HyperNetworkConfig
+from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.hypernetwork.hypernetwork import HyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.footprint import footprint
-from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanes", "ModelConfig", "Prepared"]
-
-
-@dataclass(frozen=True)
-class ModelConfig:
-    """What a model is made of; saved beside its weights.
-
-    Attributes:
-        target: which field: "point_multiplane", "multiplane" or "nerf".
-        network: the shape of the target.
-        hypernetwork: the shape of the hypernetwork, or None for one set of weights for all objects.
-        coarse_network: whether a second network of the same shape proposes where to sample (NeRF's coarse network).
-        sampling: how fields are rendered by default, in training too.
-        hull_side: voxels an axis of the visual hull.
-    """
-
-    target: str = "point_multiplane"
-    network: TargetConfig = field(default_factory=TargetConfig)
-    hypernetwork: HyperNetworkConfig | None = field(default_factory=HyperNetworkConfig)
-    coarse_network: bool = False
-    sampling: Hierarchical | Marched = field(default_factory=Marched)
-    hull_side: int = 64
-
-    def as_json(self) -> dict[str, Any]:
-        """A JSON object from which `of_json` makes the same configuration."""
-        return {**asdict(self), "protocol": type(self.sampling).__name__.lower()}
-
-    @classmethod
-    def of_json(cls, value: dict[str, Any]) -> ModelConfig:
-        """The configuration that `as_json` wrote.
-
-        Raises:
-            CheckpointError: an unknown or missing entry.
-        """
-        value = dict(value)
-        try:
-            protocol = {"hierarchical": Hierarchical, "marched": Marched}[value.pop("protocol")]
-            hyper = value.pop("hypernetwork")
-            if hyper is not None:
-                hyper = HyperNetworkConfig(**{**hyper, "layers": tuple(hyper["layers"])})
-            network, sampling = TargetConfig(**value.pop("network")), protocol(**value.pop("sampling"))
-            return cls(network=network, sampling=sampling, hypernetwork=hyper, **value)
-        except (KeyError, TypeError) as error:
-            raise CheckpointError(
-                f"configuration: expected the entries of this version's models, got a misfit ({error})"
-            ) from None
 
 
 @dataclass(frozen=True)
@@ -93,23 +51,37 @@ class HyperPlanes(nn.Module):
     Without a hypernetwork the same weights serve every object: the plain target network that the paper compares with.
 
     An MLP that concatenates what n planes say knows each plane by its place, so views of any other rig are matched to
-    the one of the training (`arrange`).
+    the one of the training (`arrange`). Views are taken to where the weights are.
+
+    Args:
+        config: what it is made of.
+        seed: of the weights; the global random state is left alone.
+
+    Raises:
+        ValueError: an unknown field, encoder or layer, or more HyperPlanes than planes.
     """
 
     rig: Tensor
 
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self, config: ModelConfig, seed: int = 0) -> None:
         super().__init__()
         if config.target not in TARGETS:
             raise ValueError(f"target: expected one of {sorted(TARGETS)}, got {config.target!r}")
+        planes = config.network.planes
+        if config.hypernetwork and config.hypernetwork.views > planes:
+            raise ValueError(
+                f"views: expected at most as many HyperPlanes as planes, {planes}, got {config.hypernetwork.views}"
+            )
         self.config = config
         make = TARGETS[config.target]
-        self.networks = nn.ModuleDict({"fine": make(config.network)})
-        if config.coarse_network:
-            self.networks["coarse"] = make(config.network)
-        shapes = {name: value.shape for name, value in self.networks.named_parameters()}
-        self.hypernetwork = HyperNetwork(config.hypernetwork, shapes) if config.hypernetwork else None
-        self.register_buffer("rig", torch.zeros(config.network.planes, 3))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.networks = nn.ModuleDict({"fine": make(config.network)})
+            if config.coarse_network:
+                self.networks["coarse"] = make(config.network)
+            shapes = {name: value.shape for name, value in self.networks.named_parameters()}
+            self.hypernetwork = HyperNetwork(config.hypernetwork, shapes) if config.hypernetwork else None
+        self.register_buffer("rig", torch.zeros(planes, 3))
 
     @property
     def theta(self) -> Parameters:
@@ -132,31 +104,59 @@ class HyperPlanes(nn.Module):
         More views than planes: the best matching ones, none twice. Fewer: some stand for several planes.
 
         Raises:
-            ValueError: no view.
+            ValueError: no view, or a model that was never shown its rig.
         """
         from scipy.optimize import linear_sum_assignment
 
         if not len(support):
             raise ValueError("support: expected at least one view, got none")
-        cost = (1 - self.rig @ _standpoints(support).T).double().cpu().numpy()
+        cost = (1 - self._known_rig() @ _standpoints(support).cpu().T).double().numpy()
         repeats = -(-len(self.rig) // len(support))
         _, column = linear_sum_assignment(np.tile(cost, (1, repeats)))
-        return support[torch.as_tensor(column % len(support))]
+        return support[torch.as_tensor(column % len(support), device=support.images.device)]
 
-    def prepare(self, support: Views) -> Prepared:
-        """The planes in order and the hull."""
+    def prepare(self, support: Views, *, carved: bool = True) -> Prepared:
+        """The planes in order and the hull.
+
+        Args:
+            support: the views of one object, on any device and in any precision.
+            carved: without, one voxel that may hold anything stands for the hull, for who never asks it.
+
+        Returns:
+            All that depends on the support views and not on weights.
+        """
+        support = self._at_home(support)
         views = self.arrange(support)
-        return Prepared(views, ImagePlanes(views.images, views.cameras), hull(support, self.config.hull_side))
+        side = self.config.hull_side
+        region = hull(support, side) if carved else full(support.bounds, 1, support.images.device)
+        return Prepared(views, ImagePlanes(views.images, views.cameras), region)
 
     def hyperplanes(self) -> Int[Tensor, " k"]:
-        """Which planes the hypernetwork reads: k of the rig, spread as far apart as they can be."""
+        """Which planes the hypernetwork reads: k of the rig, spread as far apart as they can be.
+
+        A model that was never shown its rig raises ValueError.
+        """
         count = self.hypernetwork.config.views if self.hypernetwork else 0
+        rig = self._known_rig()
         chosen = [0]
-        nearest = self.rig @ self.rig[0]
+        nearest = rig @ rig[0]
         while len(chosen) < count:
             chosen.append(int(nearest.argmin()))
-            nearest = torch.maximum(nearest, self.rig @ self.rig[chosen[-1]])
-        return torch.tensor(chosen[:count])
+            nearest = torch.maximum(nearest, rig @ rig[chosen[-1]])
+        return torch.tensor(chosen[:count], device=self.rig.device)
+
+    def _known_rig(self) -> Float[Tensor, "plane 3"]:
+        """The rig on the CPU, where views are matched to it."""
+        rig = self.rig.float().cpu()
+        if not rig.any():
+            raise ValueError(
+                "rig: expected the standpoints of the training's views, got none; set_rig takes them from views"
+            )
+        return rig
+
+    def _at_home(self, support: Views) -> Views:
+        """The views where the weights are, in their precision or at least single."""
+        return support.to(self.rig.device, torch.promote_types(self.rig.dtype, torch.float32))
 
     def update(self, prepared: Prepared, hypernetwork: HyperNetwork | None = None) -> Parameters:
         """The update of theta, in one forward pass (HyperPlanes, Eq. 7); empty without a hypernetwork.
@@ -191,9 +191,9 @@ class HyperPlanes(nn.Module):
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6)."""
-        self.eval()
         prepared = self.prepare(support)
-        return self.field(prepared, self.theta + self.update(prepared))
+        with _in_use(self):
+            return self.field(prepared, self.theta + self.update(prepared))
 
     def fine_tune(
         self,
@@ -223,9 +223,9 @@ class HyperPlanes(nn.Module):
         """
         if self.hypernetwork is None:
             raise ValueError("fine_tune: expected a model with a hypernetwork, got one without")
-        self.eval()
+        support = self._at_home(support)
         prepared = self.prepare(support)
-        tuned = copy.deepcopy(self.hypernetwork)
+        tuned = copy.deepcopy(self.hypernetwork).eval()
         theta = self.theta.detach()
         optimiser = torch.optim.Adam(tuned.parameters(), learning_rate)
         generator = torch.Generator().manual_seed(seed)
@@ -253,15 +253,45 @@ class HyperPlanes(nn.Module):
         write_json(folder / "model.json", self.config.as_json())
 
     @classmethod
-    def from_pretrained(cls, folder: Path | str) -> HyperPlanes:
-        """The model that `save` wrote; CheckpointError where a file is missing, damaged or of another architecture."""
-        folder = Path(folder)
-        model = cls(ModelConfig.of_json(read_json(folder / "model.json")))
-        model.load_state_dict(load_tensors(folder / "model.safetensors", model.state_dict()))
+    def from_pretrained(cls, name: Path | str) -> HyperPlanes:
+        """The model that `save` wrote.
+
+        Args:
+            name: its folder, or the name of a model that comes with the package; a folder of that name goes first.
+
+        Returns:
+            The model, ready for use.
+
+        Raises:
+            CheckpointError: no such folder or name, a file that is missing or damaged, or weights of another
+                architecture than the configuration says; nothing is allocated for those.
+        """
+        folder = checkpoint_folder(name)
+        config = ModelConfig.load(folder)
+        try:
+            with torch.device("meta"):  # names and shapes alone, to be compared with what the file holds
+                model = cls(config)
+        except ValueError as error:
+            raise CheckpointError(f"{folder / 'model.json'}: {error}; train again with this version") from None
+        expected = model.state_dict()
+        weights = load_tensors(folder / "model.safetensors", expected)
+        model.load_state_dict({name: weights[name].to(value.dtype) for name, value in expected.items()}, assign=True)
         return model.eval()
+
+
+@contextmanager
+def _in_use(module: nn.Module) -> Generator[None]:
+    """The module as it is used and not trained (batch statistics), and afterwards as it was."""
+    before = {part: part.training for part in module.modules()}
+    module.eval()
+    try:
+        yield
+    finally:
+        for part, training in before.items():
+            part.training = training
 
 
 def _standpoints(views: Views) -> Float[Tensor, "view 3"]:
     """Unit vectors from the scene's centre to the cameras."""
-    centre = views.images.new_tensor(views.bounds.centre)
-    return torch.nn.functional.normalize(camera.centres(views.cameras) - centre, dim=-1)
+    standing = camera.centres(views.cameras)
+    return torch.nn.functional.normalize(standing - standing.new_tensor(views.bounds.centre), dim=-1).float()

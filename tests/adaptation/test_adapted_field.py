@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
 from hyperplanes.adaptation import AdaptedField
 from hyperplanes.adaptation.base import hull
-from hyperplanes.geometry.cameras import concatenate, look_at, pinhole
+from hyperplanes.geometry.cameras import concatenate, look_at, pinhole, to
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering import Hierarchical, Marched, composite
@@ -178,3 +180,25 @@ def test_the_hull_is_not_cut_by_cameras_whose_pixels_are_not_square(focal):
 def test_the_hull_does_not_depend_on_the_order_of_the_views():
     views = ball_views(ring(6, (20, 20)))
     assert torch.equal(hull(views, 16).occupied, hull(views[[3, 0, 5, 1, 4, 2]], 16).occupied)
+
+
+@pytest.mark.parametrize("sampling", [Marched(60), Hierarchical(24, 24)])
+@torch.no_grad()
+def test_cameras_in_double_precision_see_the_same(sampling):
+    cameras, field = ring(2, (12, 15)), adapted(sampling)
+    single, double = field.render(cameras), field.render(to(cameras, dtype=torch.float64))
+    assert double.images.dtype == torch.float32
+    # a hard surface: rays that graze it may fall on either side by rounding
+    assert ((single.images - double.images).abs().amax(1) < 1e-3).float().mean() > 0.97
+
+
+def test_masks_that_leave_nothing_are_named():
+    views = replace(ball_views(ring(3)), names=("front", "side", "back"))
+    blank = replace(views, masks=torch.zeros_like(views.masks))
+    with pytest.raises(ValueError, match=r"masks of the support views \(front to back\): expected an object, got none"):
+        hull(blank, 8)
+    # each camera sees something, but none of it lies within the bounds
+    apart = torch.zeros_like(views.masks)
+    apart[0, 0, 0, 0] = apart[1, 0, -1, -1] = apart[2, 0, 0, -1] = 1.0
+    with pytest.raises(ValueError, match="got 3 of 3 with a pixel set, and no point that all of them may show; check"):
+        hull(replace(views, masks=apart, bounds=Sphere(radius=0.3)), 32)

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.adaptation import HyperPlanes, ModelConfig, configuration
 from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import camera_from_world, centres, look_at, pinhole, viewing_directions
@@ -232,3 +232,117 @@ def test_a_missing_part_of_a_checkpoint_is_named(model, tmp_path, missing):
     (tmp_path / missing).unlink()
     with pytest.raises(CheckpointError, match=f"{missing}: expected"):
         HyperPlanes.from_pretrained(tmp_path)
+
+
+def config_of(model):
+    return json.loads(json.dumps(model.config.as_json()))
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "words"),
+    [
+        ("network", {"width": "16"}, "width: '16' instead of int"),
+        ("network", {"depth": True}, "depth: True instead of int"),
+        ("network", {"width": 10**12}, "width: 1000000000000 instead of a number from 1 to 8192"),
+        ("network", {"planes": 0}, "planes: 0 instead of a number from 1 to 1024"),
+        ("network", {"density_scale": float("inf")}, "density_scale: inf instead of float"),
+        ("hypernetwork", {"layers": "colour"}, "layers: 'colour' instead of tuple"),
+        ("hypernetwork", {"encoder": "vgg"}, "encoder: expected one of .*, got 'vgg'"),
+        ("hypernetwork", {"views": 5}, "views: expected at most as many HyperPlanes as planes, 4, got 5"),
+        (None, {"target": "voxels"}, "target: expected one of .*, got 'voxels'"),
+        (None, {"target": 3}, "target: 3 instead of str"),
+        (None, {"hull_side": 10**6}, "hull_side: 1000000 instead of a number from 1 to 512"),
+        ("sampling", {"steps": 0}, "steps: 0 instead of a number from 1 to 16384"),
+    ],
+)
+def test_a_checkpoint_of_wrong_types_or_absurd_sizes_names_its_file(model, tmp_path, part, change, words):
+    model.save(tmp_path)
+    value = config_of(model)
+    value = {**value, part: {**value[part], **change}} if part else {**value, **change}
+    (tmp_path / "model.json").write_text(json.dumps(value))
+    with pytest.raises(CheckpointError, match=words) as caught:
+        HyperPlanes.from_pretrained(tmp_path)
+    assert str(caught.value).startswith(str(tmp_path / "model.json"))
+    assert "\n" not in str(caught.value)
+    assert "; " in str(caught.value)
+
+
+def test_entries_that_a_newer_version_added_may_be_missing(model):
+    value = config_of(model)
+    del value["network"]["density_scale"], value["hull_side"]
+    assert ModelConfig.of_json(value) == replace(model.config, hull_side=64)
+
+
+def test_differences_of_configurations_are_named():
+    one = ModelConfig()
+    other = replace(one, sampling=replace(one.sampling, steps=7), hypernetwork=replace(one.hypernetwork, gain=2.0))
+    assert one.differences(one) == []
+    assert one.differences(other) == ["hypernetwork.gain", "sampling.steps"]
+    assert "hypernetwork" in one.differences(replace(one, hypernetwork=None))
+    assert "protocol" in one.differences(replace(one, sampling=Hierarchical()))
+
+
+def test_a_packaged_model_is_found_by_its_name(model, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(configuration, "PACKAGED", tmp_path / "package")
+    model.save(tmp_path / "package" / "cars-8")
+    found = HyperPlanes.from_pretrained("cars-8")
+    assert all(torch.equal(value, found.state_dict()[name]) for name, value in model.state_dict().items())
+    with pytest.raises(CheckpointError, match=r"boats-8: expected .* packaged model \(cars-8\), found neither; "):
+        HyperPlanes.from_pretrained("boats-8")
+    with pytest.raises(CheckpointError, match="model.json: expected a checkpoint's JSON file, found none"):
+        HyperPlanes.from_pretrained("runs/boats-8")  # a path is a path
+
+
+def test_a_loaded_model_can_be_trained_further(model, tmp_path):
+    model.save(tmp_path)
+    again = HyperPlanes.from_pretrained(tmp_path)
+    assert all(value.requires_grad and value.device.type == "cpu" for value in again.parameters())
+
+
+def test_the_seed_decides_the_weights_and_global_randomness_does_not():
+    config = small_model().config
+    before = torch.random.get_rng_state()
+    first, second, third = HyperPlanes(config, 1), HyperPlanes(config, 1), HyperPlanes(config, 2)
+    assert torch.equal(before, torch.random.get_rng_state())
+    weights = [each.networks["fine"].layers[0].weight for each in (first, second, third)]
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
+def test_a_model_that_was_never_shown_its_rig_is_refused(support):
+    fresh = HyperPlanes(small_model().config)
+    for call in (fresh.hyperplanes, lambda: fresh.adapt(support)):
+        with pytest.raises(ValueError, match="rig: expected the standpoints of the training's views, got none"):
+            call()
+
+
+def test_more_hyperplanes_than_planes_are_refused():
+    with pytest.raises(ValueError, match="views: expected at most as many HyperPlanes as planes, 4, got 5"):
+        small_model(hypernetwork=HyperNetworkConfig(views=5))
+
+
+def test_adapting_and_fine_tuning_leave_the_model_in_its_mode(support):
+    batch = awaken(small_model(hypernetwork=HyperNetworkConfig(views=2, code=8, depth=2, width=16)))
+    batch.train()
+    batch.hypernetwork.encoder.eval()
+    before = {name: part.training for name, part in batch.named_modules()}
+    statistics = {name: value.clone() for name, value in batch.named_buffers()}
+    batch.adapt(support)
+    batch.fine_tune(support, 1, rays=8)
+    assert {name: part.training for name, part in batch.named_modules()} == before
+    assert all(torch.equal(value, statistics[name]) for name, value in batch.named_buffers())
+    assert torch.equal(picture(batch, support), picture(batch.eval(), support))
+
+
+def test_views_in_double_precision_are_taken_to_where_the_weights_are(model, support):
+    double = support.to(dtype=torch.float64)
+    torch.testing.assert_close(picture(model, double), picture(model, support), atol=1e-4, rtol=0)
+    model.fine_tune(double, 1, rays=8)
+
+
+def test_without_a_hull_one_voxel_holds_everything(model, support):
+    prepared = model.prepare(support, carved=False)
+    assert prepared.occupancy.occupied.shape == (1, 1, 1)
+    assert prepared.occupancy.occupied.all()
+    assert prepared.occupancy.bounds == support.bounds

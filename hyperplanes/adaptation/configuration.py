@@ -1,0 +1,152 @@
+"""What a model is made of, and how that is written to a file and read from one that nobody here made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+from hyperplanes.checkpoints import CheckpointError, read_json
+from hyperplanes.fields import TargetConfig
+from hyperplanes.hypernetwork.hypernetwork import HyperNetworkConfig
+from hyperplanes.rendering.renderer import Hierarchical, Marched
+
+__all__ = ["ModelConfig", "checkpoint_folder"]
+
+PACKAGED = Path(__file__).parent.parent / "pretrained"  # a folder a model, by its name
+
+Made = TypeVar("Made")
+
+SMALLEST = {"point_octaves": 0, "direction_octaves": 0, "fine": 0}  # of whole numbers; 1 for all others
+LARGEST = {
+    "depth": 256,
+    "width": 8192,
+    "code": 8192,
+    "planes": 1024,
+    "views": 1024,
+    "point_octaves": 32,
+    "direction_octaves": 32,
+    "hull_side": 512,
+    "coarse": 16384,
+    "fine": 16384,
+    "steps": 16384,
+}
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What a model is made of; saved beside its weights.
+
+    Attributes:
+        target: which field: "point_multiplane", "multiplane" or "nerf".
+        network: the shape of the target.
+        hypernetwork: the shape of the hypernetwork, or None for one set of weights for all objects.
+        coarse_network: whether a second network of the same shape proposes where to sample (NeRF's coarse network).
+        sampling: how fields are rendered by default, in training too.
+        hull_side: voxels an axis of the visual hull.
+    """
+
+    target: str = "point_multiplane"
+    network: TargetConfig = field(default_factory=TargetConfig)
+    hypernetwork: HyperNetworkConfig | None = field(default_factory=HyperNetworkConfig)
+    coarse_network: bool = False
+    sampling: Hierarchical | Marched = field(default_factory=Marched)
+    hull_side: int = 64
+
+    def as_json(self) -> dict[str, Any]:
+        """A JSON object from which `of_json` makes the same configuration."""
+        return {**asdict(self), "protocol": type(self.sampling).__name__.lower()}
+
+    @classmethod
+    def of_json(cls, value: Mapping[str, Any], where: Path | str = "configuration") -> ModelConfig:
+        """The configuration that `as_json` wrote. Entries that newer versions added may be missing.
+
+        Args:
+            value: what a file holds.
+            where: the file, for the message.
+
+        Returns:
+            A configuration whose numbers are of a size that can be allocated.
+
+        Raises:
+            CheckpointError: an unknown or missing entry, one of another type, or an absurd number.
+        """
+        try:
+            rest = dict(value)
+            sampling = {"hierarchical": Hierarchical, "marched": Marched}[rest.pop("protocol")]
+            hyper = rest.pop("hypernetwork")
+            parts = {
+                "network": _made(TargetConfig, rest.pop("network")),
+                "sampling": _made(sampling, rest.pop("sampling")),
+                "hypernetwork": None if hyper is None else _made(HyperNetworkConfig, hyper),
+            }
+            return _made(cls, rest, parts)
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(
+                f"{where}: expected the entries of this version's models, found a misfit ({error}); "
+                "copy the file again, or train again with this version"
+            ) from None
+
+    @classmethod
+    def load(cls, folder: Path) -> ModelConfig:
+        """The configuration of a checkpoint; CheckpointError where model.json is missing or does not fit."""
+        return cls.of_json(read_json(folder / "model.json"), folder / "model.json")
+
+    def differences(self, other: ModelConfig) -> list[str]:
+        """The names of the entries in which two models differ, such as "sampling.steps"."""
+        mine, others = _flat(self.as_json()), _flat(other.as_json())
+        return sorted(name for name in mine | others if mine.get(name, ...) != others.get(name, ...))
+
+
+def checkpoint_folder(name: Path | str) -> Path:
+    """The folder of a checkpoint, or of a packaged one by its name.
+
+    Raises:
+        CheckpointError: a bare name that is neither a folder here nor a packaged model.
+    """
+    folder = Path(name)
+    if folder.exists() or len(folder.parts) != 1:
+        return folder
+    packaged = sorted(path.parent.name for path in PACKAGED.glob("*/model.json"))
+    if folder.name not in packaged:
+        known = ", ".join(packaged) or "this installation has none"
+        raise CheckpointError(
+            f"{name}: expected a checkpoint's folder or the name of a packaged model ({known}), found neither; "
+            "`hyperplanes train` writes a checkpoint"
+        )
+    return PACKAGED / folder.name
+
+
+def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, part in value.items():
+        flat |= _flat(part, f"{prefix}{name}.") if isinstance(part, Mapping) else {f"{prefix}{name}": part}
+    return flat
+
+
+def _made(kind: type[Made], value: object, parts: Mapping[str, Any] | None = None) -> Made:
+    """A dataclass of entries that are what they are declared to be; `parts` are ready already."""
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{kind.__name__}: {value!r} instead of its entries")
+    hints = get_type_hints(kind)
+    checked = {name: _checked(name, hints.get(name), entry) for name, entry in value.items()}
+    return kind(**checked, **(parts or {}))
+
+
+def _checked(name: str, hint: object, value: object) -> object:
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        return float(value)
+    if hint is int and isinstance(value, int) and not isinstance(value, bool):
+        low, high = SMALLEST.get(name, 1), LARGEST[name]
+        if not low <= value <= high:
+            raise ValueError(f"{name}: {value} instead of a number from {low} to {high}")
+        return value
+    if (hint is str and isinstance(value, str)) or (hint is bool and isinstance(value, bool)):
+        return value
+    if hint == tuple[str, ...] and isinstance(value, list | tuple) and all(isinstance(each, str) for each in value):
+        return tuple(value)
+    if hint is None:
+        raise TypeError(f"an unknown entry {name!r}")
+    raise TypeError(f"{name}: {value!r} instead of {getattr(hint, '__name__', hint)}")
