@@ -99,6 +99,8 @@ def evaluate(
 ) -> Score:
     """Adapt to the support views of each object and compare all its query views.
 
+    The method computes where its weights are; pictures are compared where the data is.
+
     Args:
         method: the name of the row.
         adapter: the method.
@@ -110,19 +112,24 @@ def evaluate(
         The row.
 
     Raises:
-        ValueError: no object.
+        ValueError: no object, or one without query views or with views that cannot be used; it is named.
     """
     if not names:
         raise ValueError("names: expected at least one object to evaluate on, got none")
     scores = []
     for name in names:
         task = data.task(name)
+        if not len(task.query):
+            raise ValueError(f"{name}: expected at least one query view to compare with, got none")
         start = time.perf_counter()
-        adapted = adapter.adapt(task.support)
+        try:
+            adapted = adapter.adapt(task.support)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
         adapted_at = time.perf_counter()
         pictures = adapted.render(task.query.cameras)
         rendered_at = time.perf_counter()
-        images = pictures.images.clamp(0, 1)
+        images = pictures.images.to(task.query.images).clamp(0, 1)
         score = ObjectScore(
             name,
             float(psnr(images, task.query.images).mean()),

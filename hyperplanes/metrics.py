@@ -14,10 +14,7 @@ def psnr(
 ) -> Float[Tensor, " view"]:
     """Peak signal-to-noise ratio in dB of each image, both in [0, 1]: -10 log10 of the mean squared error.
 
-    Equal images give infinity.
-
-    Raises:
-        ValueError: images of different shapes.
+    Equal images give infinity, images of different shapes a ValueError.
 
     >>> psnr(torch.full((1, 3, 4, 4), 0.6), torch.full((1, 3, 4, 4), 0.5)).round().tolist()
     [20.0]

@@ -1,5 +1,5 @@
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -112,3 +112,31 @@ def test_unknown_methods_and_missing_checkpoints_are_refused():
     for name, family in (("hyperplanes_10", "hyperplanes"), ("point_multiplane", "point_multiplane")):
         with pytest.raises(ValueError, match=f"method {name}: expected a checkpoint of {family}, got none"):
             make_method(name, {})
+
+
+@pytest.mark.parametrize("broken", ["query", "masks"])
+def test_an_object_that_cannot_be_judged_is_named(broken):
+    class Broken(Balls):
+        def task(self, name):
+            task = super().task(name)
+            if broken == "query":
+                return replace(task, query=task.query[:0])
+            return replace(task, support=replace(task.support, masks=torch.zeros_like(task.support.masks)))
+
+    words = {"query": "test0: expected at least one query view", "masks": "test0: masks of the support views: expected"}
+    with pytest.raises(ValueError, match=words[broken]):
+        evaluate("hyperplanes", small_model(), Broken(), ["test0"])
+
+
+def test_pictures_are_compared_in_the_precision_of_the_data():
+    data = Balls(test=1)
+    score = evaluate("nearest_view", NearestView(), data, ["test0"]).objects[0]
+
+    class Double(Balls):
+        def task(self, name):
+            task = super().task(name)
+            return replace(task, support=task.support, query=task.query.to(dtype=torch.float64))
+
+    assert evaluate("nearest_view", NearestView(), Double(), ["test0"]).objects[0].psnr == pytest.approx(
+        score.psnr, abs=1e-4
+    )

@@ -19,17 +19,21 @@ class _Copies:
     support: Views
 
     def render(self, cameras: PinholeCamera) -> Pictures:
-        """The support image whose camera stands in the most similar direction from the scene's centre."""
+        """The support image whose camera stands in the most similar direction from the scene's centre.
+
+        Its mask is the opacity; without masks all that is in a picture counts as there. Depth is not known: 0.
+        """
         centre = self.support.images.new_tensor(self.support.bounds.centre)
-        known = torch.nn.functional.normalize(camera.centres(self.support.cameras) - centre, dim=-1)
-        asked = torch.nn.functional.normalize(camera.centres(cameras) - centre, dim=-1)
+        known = torch.nn.functional.normalize(camera.centres(self.support.cameras).to(centre) - centre, dim=-1)
+        asked = torch.nn.functional.normalize(camera.centres(cameras).to(centre) - centre, dim=-1)
         nearest = (asked @ known.T).argmax(1)
-        images = self.support.images[nearest]
+        masks = self.support.masks
+        opacity = torch.ones_like(self.support.images[nearest, :1]) if masks is None else masks[nearest]
+        copied = torch.cat([self.support.images[nearest], opacity], 1)
         size = camera.image_size(cameras)
         if size != self.support.size:
-            images = torch.nn.functional.interpolate(images, size, mode="bilinear", antialias=True)
-        empty = images.new_zeros(len(images), 1, *size)
-        return Pictures(images, empty, empty, 0)
+            copied = torch.nn.functional.interpolate(copied, size, mode="bilinear", antialias=True)
+        return Pictures(copied[:, :3], copied[:, 3:], torch.zeros_like(copied[:, 3:]), 0)
 
 
 class NearestView:

@@ -47,3 +47,13 @@ def test_images_of_another_size_are_scaled():
     pictures = NearestView().adapt(views).render(ring(1, (24, 20)))
     assert pictures.images.shape == (1, 3, 24, 20)
     torch.testing.assert_close(pictures.images, torch.full((1, 3, 24, 20), 0.25))
+
+
+def test_the_opacity_is_the_mask_of_the_copied_view_and_one_without_masks():
+    plain = support()
+    masked = Views(plain.images, plain.cameras, (plain.images[:, :1] > 0.5).float())
+    order = torch.tensor([2, 0])
+    pictures = NearestView().adapt(masked).render(select(masked.cameras, order))
+    assert torch.equal(pictures.opacity, masked.masks[order])
+    assert torch.equal(pictures.images, plain.images[order])
+    assert (NearestView().adapt(plain).render(select(plain.cameras, order)).opacity == 1).all()
