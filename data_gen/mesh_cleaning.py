@@ -9,6 +9,8 @@ import numpy.typing as npt
 import trimesh
 from trimesh.visual import ColorVisuals, TextureVisuals
 
+from data_gen.visuals import visual_of
+
 __all__ = ["CREASE", "clean", "decimate", "shades_smoothly"]
 
 CREASE = 40.0
@@ -65,7 +67,7 @@ def shades_smoothly(mesh: trimesh.Trimesh) -> bool:
     A mesh with normals of its own does; one with face colours cannot. Otherwise what the file says counts (an OBJ's
     smoothing groups), and last how many of its edges are sharper than CREASE: hard things stay hard.
     """
-    if mesh.visual.kind == "face":
+    if visual_of(mesh).kind == "face":
         return False
     if "vertex_normals" in mesh._cache.cache:
         return True
@@ -103,11 +105,11 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
         merged = trimesh.Trimesh(part.vertices, part.faces, process=True)
         points, faces = fast_simplification.simplify(
             np.asarray(merged.vertices, dtype=np.float64), np.asarray(merged.faces, dtype=np.int32), target_count=target
-        )
-        visual = part.visual.copy()
-        if part.visual.kind == "vertex":
+        )[:2]
+        visual = visual_of(part).copy()
+        if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
             nearest = KDTree(np.asarray(part.vertices)).query(points)[1]
-            visual = ColorVisuals(vertex_colors=np.asarray(part.visual.vertex_colors)[nearest])
+            visual = ColorVisuals(vertex_colors=np.asarray(visual.vertex_colors)[nearest])
         small = trimesh.Trimesh(points, faces, visual=visual, process=False)
         small.metadata["smooth"] = shades_smoothly(part)
         result.append(small)
@@ -115,7 +117,7 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
 
 
 def _is_simple(mesh: trimesh.Trimesh) -> bool:
-    if mesh.visual.kind == "face":
+    if visual_of(mesh).kind == "face":
         return False
     material = getattr(mesh.visual, "material", None)
     return not any(
@@ -171,15 +173,14 @@ def _part(
     faces: npt.NDArray[Any],
     normals: npt.NDArray[np.float64] | None,
 ) -> trimesh.Trimesh:
-    visual = mesh.visual
+    visual = visual_of(mesh)
     if isinstance(visual, TextureVisuals):
         visual = TextureVisuals(uv=None if visual.uv is None else visual.uv[used], material=visual.material)
     elif visual.kind == "face":
         visual = ColorVisuals(face_colors=np.asarray(visual.face_colors)[kept])
     else:
         visual = ColorVisuals(vertex_colors=np.asarray(visual.vertex_colors)[used])
-    keywords = {} if normals is None else {"vertex_normals": normals}
-    result = trimesh.Trimesh(mesh.vertices[used], faces, visual=visual, process=False, **keywords)
+    result = trimesh.Trimesh(mesh.vertices[used], faces, vertex_normals=normals, visual=visual, process=False)
     result.metadata.update({key: mesh.metadata[key] for key in ("smooth",) if key in mesh.metadata})
     return result
 

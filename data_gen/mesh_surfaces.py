@@ -16,6 +16,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 
 from data_gen.mesh_files import IMAGE_FORMATS
+from data_gen.visuals import visual_of
 
 __all__ = ["DEFAULT_COLOUR", "ColourSpace", "canonical_visual", "linear_from_srgb", "srgb_from_linear"]
 
@@ -80,13 +81,13 @@ def canonical_visual(
     Returns:
         The visual, warnings that name what was lost, and whether the surface can be seen at all.
     """
-    visual = mesh.visual
+    visual = visual_of(mesh)
     images = {} if images is None else images
     if isinstance(visual, TextureVisuals):
         return _textured(visual, mesh, label, colours, images)
     if not visual.defined:
         return TextureVisuals(material=PBRMaterial(baseColorFactor=DEFAULT_COLOUR, metallicFactor=0.0)), [], True
-    kind = visual.kind
+    kind = str(visual.kind)
     return _coloured(visual.vertex_colors if kind == "vertex" else visual.face_colors, kind, label, colours)
 
 

@@ -227,13 +227,13 @@ def _parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], source:
         if not np.isfinite(transform).all():
             found.append(f"{key}: left out, its transform is not finite")
             continue
-        visual, lines, visible = canonical_visual(geometry, key, colours=colours, images=images)
+        visual, lines, visible = canonical_visual(geometry, str(key), colours=colours, images=images)
         found += lines
         if not visible:
             found.append(f"{key}: fully transparent, left out")
             continue
         try:
-            part, lines = clean(_moved(geometry, transform, visual), key)
+            part, lines = clean(_moved(geometry, transform, visual), str(key))
         except ValueError as error:
             raise MeshError(f"{source}: {error}; the file is damaged") from error
         found += lines

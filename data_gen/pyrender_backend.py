@@ -42,7 +42,7 @@ class PyrenderBackend:
         from OpenGL import GL
 
         names = (GL.glGetString(GL.GL_RENDERER), GL.glGetString(GL.GL_VERSION))
-        self.detail = ", OpenGL ".join(name.decode() for name in names)
+        self.detail = ", OpenGL ".join((name or b"unknown").decode() for name in names)
 
     def draw(
         self, surfaces: Sequence[Surface], rig: Rig, lighting: Lighting, supersample: int

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from ctypes import c_void_p
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -221,7 +221,7 @@ class SurfaceRenderer(Renderer):
         GL.glDisable(GL.GL_BLEND)
         GL.glEnable(GL.GL_CULL_FACE)
         GL.glClearColor(0.0, 0.0, 0.0, 0.0)
-        GL.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
+        GL.glClear(int(GL.GL_COLOR_BUFFER_BIT) | int(GL.GL_DEPTH_BUFFER_BIT))
         # Upside down, so that the rows that OpenGL reads from the bottom come out with the first on top;
         # which turns every triangle around.
         far_side, near_side = GL.GL_FRONT, GL.GL_BACK
@@ -295,7 +295,7 @@ class SurfaceRenderer(Renderer):
         program.set_material(drawable, layer)
         for unit, texture in enumerate((drawable.base_texture, drawable.emissive_texture)):
             if texture is not None:
-                GL.glActiveTexture(GL.GL_TEXTURE0 + unit)
+                GL.glActiveTexture(int(GL.GL_TEXTURE0) + unit)
                 texture._bind()
         drawable.primitive._bind()
         GL.glDrawElements(GL.GL_TRIANGLES, surface.faces.size, GL.GL_UNSIGNED_INT, c_void_p(0))
@@ -304,7 +304,7 @@ class SurfaceRenderer(Renderer):
     def _read(self) -> npt.NDArray[np.uint8]:
         width, height = self.viewport_width, self.viewport_height
         pixels = GL.glReadPixels(0, 0, width, height, GL.GL_RGBA, GL.GL_UNSIGNED_BYTE)
-        return np.frombuffer(pixels, dtype=np.uint8).reshape(height, width, 4)
+        return np.frombuffer(cast(bytes, pixels), dtype=np.uint8).reshape(height, width, 4)
 
 
 class _Program:

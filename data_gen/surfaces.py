@@ -19,6 +19,10 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 from PIL import Image
+from trimesh.visual import ColorVisuals
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from data_gen.visuals import texture_of, visual_of
 
 __all__ = ["MAX_METALLIC", "MAX_TEXTURE_SIDE", "MIN_ROUGHNESS", "RasteriseError", "Surface", "linear", "surfaces_of"]
 
@@ -131,10 +135,13 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
     positions = np.where(finite[:, None], vertices, 0.0) @ matrix[:3, :3].T + matrix[:3, 3]
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    kind = mesh.visual.kind if mesh.visual.defined else None
-    material = _material(mesh.visual.material if kind == "texture" else None, images, where)
+    visual, texture = visual_of(mesh), texture_of(mesh)
+    kind = visual.kind if visual.defined else None
+    material = _material(None if texture is None else texture.material, images, where)
     uv = _texture_coordinates(mesh, material, where)
-    colours = _linear_colours(mesh.visual.vertex_colors) if kind == "vertex" else None
+    colours = None
+    if isinstance(visual, ColorVisuals) and kind == "vertex":
+        colours = _linear_colours(visual.vertex_colors)
     if smooth and kind != "face":
         normals = _unit(np.asarray(mesh.vertex_normals, dtype=np.float64) @ np.linalg.pinv(matrix[:3, :3]))
     else:
@@ -142,8 +149,8 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
         positions = positions[corners]
         uv = None if uv is None else uv[corners]
         colours = None if colours is None else colours[corners]
-        if kind == "face":
-            colours = np.repeat(_linear_colours(mesh.visual.face_colors), 3, axis=0)
+        if isinstance(visual, ColorVisuals) and kind == "face":
+            colours = np.repeat(_linear_colours(visual.face_colors), 3, axis=0)
         faces = np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
         edges = positions[1::3] - positions[0::3], positions[2::3] - positions[0::3]
         normals = np.repeat(_unit(np.cross(*edges)), 3, axis=0)
@@ -168,12 +175,14 @@ def _linear_colours(colours: Any) -> Floats:
 def _texture_coordinates(mesh: trimesh.Trimesh, material: dict[str, Any], where: str) -> Floats | None:
     if material["texture"] is None and material["emissive_texture"] is None:
         return None
-    if mesh.visual.uv is None or len(mesh.visual.uv) != len(mesh.vertices):
-        found = "none" if mesh.visual.uv is None else str(len(mesh.visual.uv))
+    texture = texture_of(mesh)
+    given = None if texture is None else texture.uv
+    if given is None or len(given) != len(mesh.vertices):
+        found = "none" if given is None else str(len(given))
         raise RasteriseError(
             f"{where}: expected texture coordinates for its {len(mesh.vertices)} textured vertices, received {found}"
         )
-    uv = np.asarray(mesh.visual.uv, dtype=np.float64)[:, :2]
+    uv = np.asarray(given, dtype=np.float64)[:, :2]
     return np.where(np.isfinite(uv), uv, 0.0)
 
 
@@ -189,9 +198,9 @@ def _material(material: Any, images: dict[Any, Any], where: str) -> dict[str, An
         "cutoff": None,
         "opaque": True,
     }
-    if isinstance(material, trimesh.visual.material.PBRMaterial):
+    if isinstance(material, PBRMaterial):
         _fill_from_gltf(fields, material, images)
-    elif isinstance(material, trimesh.visual.material.SimpleMaterial):
+    elif isinstance(material, SimpleMaterial):
         _fill_from_mtl(fields, material, images)
     elif material is not None:
         raise RasteriseError(f"{where}: expected a PBRMaterial or a SimpleMaterial, received {type(material).__name__}")

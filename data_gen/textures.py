@@ -61,4 +61,4 @@ class MipTexture:
 
         upper = texel(top, left) * (1 - across) + texel(top, left + 1) * across
         lower = texel(top + 1, left) * (1 - across) + texel(top + 1, left + 1) * across
-        return upper * (1 - down) + lower * down
+        return (upper * (1 - down) + lower * down).astype(np.float32, copy=False)

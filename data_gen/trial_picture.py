@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import trimesh
+from trimesh.visual import ColorVisuals
 
 from data_gen.backends import RendererError
 from data_gen.rasterise import Rasteriser
@@ -31,7 +32,7 @@ def draw_trial_picture(name: str) -> str:
     """
     corners = [[-9.0, -9.0, 0.0], [0.0, -9.0, 0.0], [0.0, 9.0, 0.0], [-9.0, 9.0, 0.0]]
     sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
-    sheet.visual = trimesh.visual.ColorVisuals(sheet, vertex_colors=[[255, 0, 0, 255]] * 4)
+    sheet.visual = ColorVisuals(sheet, vertex_colors=[[255, 0, 0, 255]] * 4)
     intrinsics = np.array([[16.0, 0.0, 7.5], [0.0, 16.0, 7.5], [0.0, 0.0, 1.0]])
     rig = Rig(look_at_origin([[0.0, 0.0, 2.0]]), intrinsics, 16, 16, 1.0, 3.0)
     with Rasteriser(name) as rasteriser:

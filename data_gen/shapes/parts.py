@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import trimesh
 from PIL import Image
+from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from data_gen.shapes.materials import Material
@@ -157,7 +158,7 @@ def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> tr
         vertices=unique[:, :3],
         faces=inverse.reshape(-1, 3),
         vertex_normals=unique[:, 3:6],
-        visual=trimesh.visual.TextureVisuals(
+        visual=TextureVisuals(
             uv=unique[:, 6:],
             material=PBRMaterial(
                 name=name, baseColorTexture=Image.fromarray(image), metallicFactor=0.0, roughnessFactor=roughness

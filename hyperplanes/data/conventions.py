@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
@@ -116,7 +116,7 @@ def _overlap(masks: Tensor, cameras: PinholeCamera, pose: Tensor) -> float:
 
 def _silhouettes(
     points: Float[Tensor, "voxel 3"], hull: Occupancy, cameras: PinholeCamera
-) -> Float[Tensor, "view height width"]:
+) -> Bool[Tensor, "view height width"]:
     """Which pixels see a voxel: its centre's pixel, and those around it as far as half the voxel reaches."""
     height, width = camera.image_size(cameras)
     matrices = camera.projection_matrices(cameras)
