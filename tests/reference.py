@@ -56,10 +56,10 @@ def hull(masks, matrices, centres, half_diagonal):
                 continue
             column, row = round(seen[0]), round(seen[1])
             height, width = mask.shape
-            if not (0 <= column < width and 0 <= row < height):
-                continue
             focal = max(np.linalg.norm(matrix[0][:3]), np.linalg.norm(matrix[1][:3]))
             reach = math.ceil(2 * focal * half_diagonal / seen[2]) + 1
-            if not mask[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1].any():
+            if min(column, row) < reach or column + reach >= width or row + reach >= height:
+                continue  # part of the ball may lie beyond the picture
+            if not mask[row - reach : row + reach + 1, column - reach : column + reach + 1].any():
                 kept[index] = False
     return kept

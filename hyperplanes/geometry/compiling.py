@@ -12,7 +12,7 @@ from pathlib import Path
 from numba import njit
 from numba.core import config
 
-from hyperplanes.geometry import kernels_cpu
+from hyperplanes.geometry import kernels_carving, kernels_cpu, kernels_gradient
 
 __all__ = ["compiled"]
 
@@ -21,8 +21,15 @@ _SIGNATURES = {
     "forward": _LOOKUP + "T, T, T[::1], T[::1], uint8[::1], int64, int64",
     "backward": _LOOKUP + "T, T[:, :, :], T[:, :, :], T[:, ::1], float64[:, ::1], int64, int64",
     "image_backward": "T[:, ::1], {views}T[:, :, ::1], int64, int64, T, T[:, :, :], int64, T[::1], int64, int64",
+    "carve": "T[:, :, ::1], T[:, :, ::1], int32[:, :, ::1], T[::1], T, T, T, uint8[:, :, ::1], int64, int64",
 }
-_SOURCES = ("vector_memory.py", "blocks.py", "kernels_cpu.py")
+_MODULES = {
+    "forward": kernels_cpu,
+    "backward": kernels_gradient,
+    "image_backward": kernels_gradient,
+    "carve": kernels_carving,
+}
+_SOURCES = ("vector_memory.py", "blocks.py", "kernels_cpu.py", "kernels_gradient.py", "kernels_carving.py")
 
 
 def _cache_folder() -> str:
@@ -44,15 +51,15 @@ def _cache_folder() -> str:
 
 
 @functools.cache
-def compiled(name: str, dtype: str, chosen: bool) -> Callable[..., None]:
+def compiled(name: str, dtype: str, chosen: bool = False) -> Callable[..., None]:
     """A kernel for one kind of numbers.
 
     Args:
-        name: "forward", "backward" or "image_backward".
+        name: "forward", "backward", "image_backward" or "carve".
         dtype: "float32" or "float64".
         chosen: whether each point brings its own planes.
     """
-    function = getattr(kernels_cpu, f"{name}_chosen" if chosen else name)
+    function = getattr(_MODULES[name], f"{name}_chosen" if chosen else name)
     signature = _SIGNATURES[name].format(views="int64[:, ::1], " if chosen else "").replace("T", dtype)
     options = {"fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy", "nogil": True}
     kept = getattr(config, "CACHE_DIR", "")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from importlib.util import find_spec
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
@@ -15,6 +17,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.image_planes import NEAREST_DEPTH
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.threads import share
 
 __all__ = ["Occupancy", "ball_reach", "carve", "full"]
 
@@ -70,9 +73,9 @@ def carve(
 ) -> Occupancy:
     """The visual hull: voxels that no mask rules out.
 
-    A voxel goes when some camera that sees its centre sees only background around it: no pixel of the mask is set in
-    the box that the ball about the voxel reaches. So the hull of the true object is never cut, whatever the resolution,
-    and does not depend on the order of the views.
+    A voxel goes when a camera whose picture holds all of the ball about the voxel sees only background there: no pixel
+    of the mask is set in the box that the ball reaches. So the hull of the true object is never cut, whatever the
+    resolution and wherever the pictures end, and does not depend on the order of the views.
 
     Args:
         masks: opacity in [0, 1].
@@ -85,30 +88,49 @@ def carve(
     """
     if isinstance(cameras, DistortedCamera):
         raise ValueError("cameras: expected pinholes to carve with, got lens distortion; undistort the masks first")
-    grid = full(bounds, side, masks.device)
-    kept = torch.arange(side**3, device=masks.device)
-    matrices, calibration = camera.projection_matrices(cameras), camera.intrinsics(cameras)
-    points = grid.centres().to(matrices)
-    for view in range(len(masks)):
-        homogeneous = points @ matrices[view, :, :3].T + matrices[view, :, 3]
+    tables = pad((masks[:, 0] > 0).int().cumsum(1).cumsum(2).int(), (1, 0, 1, 0))
+    matrices, calibrations = camera.projection_matrices(cameras).float(), camera.intrinsics(cameras).float()
+    carver = _carve_compiled if masks.device.type == "cpu" and find_spec("numba") else _carve_plainly
+    return Occupancy(carver(tables.contiguous(), matrices, calibrations, full(bounds, side, masks.device)), bounds)
+
+
+def _carve_compiled(tables: Tensor, matrices: Tensor, calibrations: Tensor, grid: Occupancy) -> Tensor:
+    """What is left of the grid, by the compiled kernel."""
+    from hyperplanes.geometry.compiling import compiled
+
+    occupied = grid.occupied.to(torch.uint8)
+    corner = np.asarray(grid.bounds.centre, np.float32) - np.float32(grid.bounds.radius)
+    numbers = [np.float32(value) for value in (grid.voxel, grid.voxel * math.sqrt(3) / 2, _nearest(grid))]
+    arrays = (matrices.contiguous().numpy(), calibrations.contiguous().numpy(), tables.numpy())
+    kernel = compiled("carve", "float32")
+    share(lambda a, b: kernel(*arrays, corner, *numbers, occupied.numpy(), a, b), len(occupied), 2)
+    return occupied.bool()
+
+
+def _carve_plainly(tables: Tensor, matrices: Tensor, calibrations: Tensor, grid: Occupancy) -> Tensor:
+    """What is left of the grid, in plain PyTorch."""
+    kept, points = torch.arange(grid.occupied.numel(), device=tables.device), grid.centres()
+    last = points.new_tensor([tables.shape[2] - 1.5, tables.shape[1] - 1.5])
+    for matrix, calibration, table in zip(matrices, calibrations, tables, strict=True):
+        homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
         depth = homogeneous[:, 2]
-        front = depth > max(NEAREST_DEPTH, grid.voxel)
+        front = depth > _nearest(grid)
         pixels = homogeneous[:, :2] / torch.where(front, depth, 1.0)[:, None]
-        last = pixels.new_tensor([masks.shape[3] - 1, masks.shape[2] - 1])
-        inside = (front[:, None] & (pixels >= -0.5) & (pixels <= last + 0.5)).all(1).nonzero()[:, 0]
-        pixels = pixels[inside]
-        reach = ball_reach(pixels, depth[inside], calibration[view], grid.voxel * math.sqrt(3) / 2) + 0.5
-        low = (pixels - reach).clamp_min(0).round().long()
-        high = (pixels + reach).minimum(last).round().long() + 1
-        table = pad((masks[view, 0] > 0).int().cumsum(0).cumsum(1), (1, 0, 1, 0))
-        (left, top), (right, bottom) = low.unbind(1), high.unbind(1)
+        reach = ball_reach(pixels, depth, calibration, grid.voxel * math.sqrt(3) / 2) + 0.5
+        inside = front & ((pixels - reach >= -0.5) & (pixels + reach <= last)).all(1)
+        low, high = pixels[inside] - reach[inside], pixels[inside] + reach[inside]
+        (left, top), (right, bottom) = (low + 0.5).long().unbind(1), ((high + 0.5).long() + 1).unbind(1)
+        right, bottom = right.clamp_max(table.shape[1] - 1), bottom.clamp_max(table.shape[0] - 1)
         count = table[bottom, right] - table[bottom, left] - table[top, right] + table[top, left]
-        stays = torch.ones(len(kept), dtype=torch.bool, device=kept.device)
-        stays[inside[count == 0]] = False
+        stays = torch.ones_like(kept, dtype=torch.bool)
+        stays[inside.nonzero()[count == 0, 0]] = False
         kept, points = kept[stays], points[stays]
-    occupied = torch.zeros(side**3, dtype=torch.bool, device=masks.device)
-    occupied[kept] = True
-    return Occupancy(occupied.reshape(side, side, side), bounds)
+    return torch.zeros_like(grid.occupied).flatten().index_fill_(0, kept, True).reshape(grid.occupied.shape)
+
+
+def _nearest(grid: Occupancy) -> float:
+    """Depth of the nearest voxel centre that a camera can judge: its ball must lie in front."""
+    return max(NEAREST_DEPTH, grid.voxel)
 
 
 def ball_reach(

@@ -1,0 +1,209 @@
+"""The CPU kernels of the fused lookup's gradient; see `kernels_cpu` for how they are arranged."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+
+from hyperplanes.geometry.blocks import (
+    BLOCK,
+    CHANNELS,
+    COLUMN,
+    FIRST_RECORD,
+    GRAD_X,
+    GRAD_Y,
+    GRAD_Z,
+    INSIDE,
+    PITCH,
+    ROW,
+    U,
+    V,
+    back_project,
+    inlined,
+    inner,
+    place,
+    project,
+    pull_packed,
+    pull_plane,
+    start_pull,
+)
+from hyperplanes.geometry.kernels_cpu import grouped, scratch, take
+from hyperplanes.geometry.vector_memory import add_pixels, load
+
+__all__ = ["backward", "backward_chosen", "image_backward", "image_backward_chosen"]
+
+
+@inlined
+@no_type_check
+def _read_gradients(s, first, count, grad_colours, grad_coordinates):
+    """The gradients of all lookups of a block's points -> its records; zeros where the block is not full."""
+    planes, channels = grad_colours.shape[1], grad_colours.shape[2]
+    step = (3 + channels) * PITCH
+    for i in range(count):
+        for view in range(planes):
+            row = FIRST_RECORD + view * step + CHANNELS + i
+            for c in range(channels):
+                s[row + c * PITCH] = grad_colours[first + i, view, c]
+    for i in range(count):
+        for view in range(planes):
+            row = FIRST_RECORD + view * step + i
+            s[row + COLUMN] = grad_coordinates[first + i, view, 0]
+            s[row + ROW] = grad_coordinates[first + i, view, 1]
+    for view in range(planes):
+        _clear(s, FIRST_RECORD + view * step, count, channels)
+
+
+@inlined
+@no_type_check
+def _clear(s, record, count, channels):
+    """Zero gradients in the lanes from `count` on, which hold no lookup."""
+    for i in range(count, BLOCK):
+        s[record + COLUMN + i] = 0
+        s[record + ROW + i] = 0
+        for c in range(channels):
+            s[record + CHANNELS + c * PITCH + i] = 0
+
+
+@inner
+@no_type_check
+def _pull(s, record, view, matrices, images, packed, bits, height, width, nearest, sums):
+    """A record's gradients -> GRAD_X, GRAD_Y, GRAD_Z and the matrix sums."""
+    project(s, matrices, view, nearest)
+    start_pull(s, record, height, width)
+    place(s, record, height, width)
+    size, channels = height * width, images.shape[1]
+    if bits:
+        pull_packed(s, record, packed, view * size, height, width, bits)
+    else:
+        for c in range(channels):
+            pull_plane(s, record, images, (view * channels + c) * size, height, width, c)
+    back_project(s, matrices, view, sums)
+
+
+@no_type_check
+def backward(points, matrices, images, packed, bits, height, width, nearest, grad_colours, grad_coordinates,
+             grad_points, sums, start, stop):  # fmt: skip
+    """Gradients with respect to points start..stop, and their share of the matrices' gradient, added to `sums`."""
+    planes, channels = images.shape[0], images.shape[1]
+    s = scratch(points.dtype, channels, planes)
+    step = (3 + channels) * PITCH
+    for p in range(start, stop, BLOCK):
+        count = min(BLOCK, stop - p)
+        s[GRAD_X : GRAD_Z + BLOCK] = 0
+        for i in range(count):
+            take(s, i, points, p + i)
+        _read_gradients(s, p, count, grad_colours, grad_coordinates)
+        for view in range(planes):
+            record = FIRST_RECORD + view * step
+            _pull(s, record, view, matrices, images, packed, bits, height, width, nearest, sums)
+        for i in range(count):
+            grad_points[p + i, 0] = s[GRAD_X + i]
+            grad_points[p + i, 1] = s[GRAD_Y + i]
+            grad_points[p + i, 2] = s[GRAD_Z + i]
+
+
+@no_type_check
+def backward_chosen(points, views, matrices, images, packed, bits, height, width, nearest, grad_colours,
+                    grad_coordinates, grad_points, sums, start, stop):  # fmt: skip
+    """As `backward`, for chosen planes; `grad_points` starts at zero."""
+    planes, channels, m = images.shape[0], images.shape[1], views.shape[1]
+    s = scratch(points.dtype, channels, 1)
+    first = np.empty(planes + 1, np.int64)
+    order = np.empty((stop - start) * m, np.int64)
+    grouped(views, start, stop, planes, first, order)
+    for view in range(planes):
+        for begin in range(first[view], first[view + 1], BLOCK):
+            count = min(BLOCK, first[view + 1] - begin)
+            s[GRAD_X : GRAD_Z + BLOCK] = 0
+            for i in range(count):
+                p, j, row = order[begin + i] // m, order[begin + i] % m, FIRST_RECORD + i
+                take(s, i, points, p)
+                s[row + COLUMN] = grad_coordinates[p, j, 0]
+                s[row + ROW] = grad_coordinates[p, j, 1]
+                for c in range(channels):
+                    s[row + CHANNELS + c * PITCH] = grad_colours[p, j, c]
+            _clear(s, FIRST_RECORD, count, channels)
+            _pull(s, FIRST_RECORD, view, matrices, images, packed, bits, height, width, nearest, sums)
+            for i in range(count):
+                p = order[begin + i] // m
+                grad_points[p, 0] += s[GRAD_X + i]
+                grad_points[p, 1] += s[GRAD_Y + i]
+                grad_points[p, 2] += s[GRAD_Z + i]
+
+
+@inlined
+@no_type_check
+def _splat(s, i, p, j, grad_colours, height, width, channels, pitch, start, plane):
+    """Adds one lookup's gradient to the four pixels it was interpolated from; pixels lie `pitch` numbers apart."""
+    u, v = load(s, U + i), load(s, V + i)
+    x, y = min(np.int64(u), max(width - 2, 0)), min(np.int64(v), max(height - 2, 0))
+    fx, fy = u - s.dtype.type(x), v - s.dtype.type(y)
+    wd = fx * fy
+    wb, wc = fx - wd, fy - wd
+    wa = s.dtype.type(1) - fx - wc
+    top = start + (y * width + x) * pitch
+    low = top + (width * pitch if height > 1 else 0)
+    if channels == 3:
+        first, second, third = grad_colours[p, j, 0], grad_colours[p, j, 1], grad_colours[p, j, 2]
+        add_pixels(plane, top, wa, wb, first, second, third)
+        add_pixels(plane, low, wc, wd, first, second, third)
+    else:
+        for c in range(channels):
+            gradient = grad_colours[p, j, c]
+            plane[top + c] += wa * gradient
+            plane[top + pitch + c] += wb * gradient
+            plane[low + c] += wc * gradient
+            plane[low + pitch + c] += wd * gradient
+
+
+@no_type_check
+def image_backward(points, matrices, height, width, nearest, grad_colours, pitch, grad_images, start, stop):
+    """The gradient with respect to planes start..stop.
+
+    `grad_images` is flat (view, pixel, pitch) with one spare pixel at the end, since an image one pixel wide has zero
+    weight on a neighbour that it lacks.
+    """
+    s = scratch(points.dtype, 0, 1)
+    channels = grad_colours.shape[2]
+    for p in range(0, points.shape[0], BLOCK):
+        count = min(BLOCK, points.shape[0] - p)
+        for i in range(count):
+            take(s, i, points, p + i)
+        for view in range(start, stop):
+            project(s, matrices, view, nearest)
+            place(s, FIRST_RECORD, height, width)
+            plane = view * height * width * pitch
+            for i in range(count):
+                if load(s, FIRST_RECORD + INSIDE + i) > 0:
+                    _splat(s, i, p + i, view, grad_colours, height, width, channels, pitch, plane, grad_images)
+
+
+@no_type_check
+def image_backward_chosen(points, views, matrices, height, width, nearest, grad_colours, pitch, grad_images,
+                          start, stop):  # fmt: skip
+    """As `image_backward`, for chosen planes: only lookups in planes start..stop are followed."""
+    s = scratch(points.dtype, 0, 1)
+    m, planes, channels = views.shape[1], matrices.shape[0], grad_colours.shape[2]
+    order = np.empty((planes, BLOCK), np.int64)
+    filled = np.zeros(planes, np.int64)
+    total = points.shape[0] * m
+    for k in range(total + planes):  # the last rounds empty the half-full blocks
+        view = views[k // m, k % m] if k < total else k - total
+        if view < start or view >= stop:
+            continue
+        if k < total:
+            order[view, filled[view]] = k
+            filled[view] += 1
+        if filled[view] < BLOCK and k < total:
+            continue
+        for i in range(filled[view]):
+            take(s, i, points, order[view, i] // m)
+        project(s, matrices, view, nearest)
+        place(s, FIRST_RECORD, height, width)
+        plane = view * height * width * pitch
+        for i in range(filled[view]):
+            if load(s, FIRST_RECORD + INSIDE + i) > 0:
+                p, j = order[view, i] // m, order[view, i] % m
+                _splat(s, i, p, j, grad_colours, height, width, channels, pitch, plane, grad_images)
+        filled[view] = 0

@@ -1,0 +1,115 @@
+"""The visual hull against a loop (tests/reference.py) and against shapes whose pictures are known exactly."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from hyperplanes.geometry import Sphere, cameras, carve, cast
+from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.rays import pixel_grid
+from tests import reference
+
+
+def pictures(hits, ours, size, centre=(0.0, 0.0, 0.0)):
+    """Exact masks: a pixel is set where `hits(origins, directions)` of the rays through it."""
+    masks = []
+    for view in range(ours.batch_size):
+        rays = cast(ours, torch.full((size * size,), view), pixel_grid(size, size))
+        masks.append(hits(rays.origins - torch.tensor(centre), rays.directions).reshape(1, size, size))
+    return torch.stack(masks).float()
+
+
+def ball(radius):
+    def hits(origins, directions):
+        along = (origins * directions).sum(-1)
+        return origins.square().sum(-1) - along.square() < radius**2
+
+    return hits
+
+
+def box(half):
+    def hits(origins, directions):
+        first, second = (-half - origins) / directions, (half - origins) / directions
+        return torch.minimum(first, second).amax(-1) < torch.maximum(first, second).amin(-1)
+
+    return hits
+
+
+@pytest.mark.parametrize("side", [7, 24, 48])
+@pytest.mark.parametrize("shape", ["ball", "box"])
+@pytest.mark.parametrize("size", [9, 40])
+def test_the_hull_never_cuts_the_object(side, shape, size):
+    """Property: every voxel that the object touches is kept, for coarse grids and coarse pictures too."""
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(size, size, 0.9), cameras.fibonacci_sphere(12, 2.7), size, size)
+    masks = pictures(ball(0.5) if shape == "ball" else box(0.35), ours, size)
+    hull = carve(masks, ours, Sphere(), side)
+    points = torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    solid = points.norm(dim=-1) < 0.5 if shape == "ball" else points.abs().amax(-1) < 0.35
+    assert hull.contains(points[solid]).all()
+    if side == 48 and size == 40:  # and it is not the whole cube: a ball of radius 0.5 fills 6.5 % of it
+        assert hull.occupied.float().mean() < 0.2
+
+
+def test_an_object_that_the_pictures_cut_off_is_kept():
+    """Property: what a picture does not show, it does not rule out."""
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(30, 30, 0.3), cameras.fibonacci_sphere(9, 2.7), 30, 30)
+    hull = carve(pictures(ball(0.3), ours, 30, (0.35, 0.0, 0.0)), ours, Sphere(), 20)
+    points = torch.randn(5000, 3, generator=torch.Generator().manual_seed(0))
+    points = 0.3 * points / points.norm(dim=-1, keepdim=True) + torch.tensor([0.35, 0.0, 0.0])
+    assert hull.contains(points).all()
+    assert hull.occupied.float().mean() < 0.9
+
+
+def test_the_compiled_hull_is_the_plain_one(monkeypatch):
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(33, 33, 0.8), cameras.fibonacci_sphere(7, 2.2), 33, 33)
+    masks = pictures(box(0.4), ours, 33, (0.1, 0.0, -0.1))
+    fast = carve(masks, ours, Sphere((0.05, 0.0, 0.0), 0.9), 30).occupied
+    monkeypatch.setattr("hyperplanes.geometry.occupancy.find_spec", lambda name: None)
+    plain = carve(masks, ours, Sphere((0.05, 0.0, 0.0), 0.9), 30).occupied
+    assert (fast != plain).float().mean() < 1e-3  # rounding may decide a voxel on the edge of a pixel
+    assert 0.05 < plain.float().mean() < 0.5
+
+
+def test_the_hull_is_no_larger_than_the_loops():
+    """The loop's footprint is a little larger than needed, so its hull holds ours."""
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(24, 24, 0.9), cameras.fibonacci_sphere(6, 2.7), 24, 24)
+    masks = pictures(ball(0.4), ours, 24, (0.1, -0.2, 0.0))
+    hull = carve(masks, ours, Sphere(), 10)
+    everything = full(Sphere(), 10).centres().numpy()
+    slow = reference.hull(
+        masks[:, 0].numpy() > 0, cameras.projection_matrices(ours).numpy(), everything, 0.1 * math.sqrt(3)
+    )
+    ours_kept = hull.occupied.flatten().numpy()
+    assert not (ours_kept & ~slow).any()
+    assert slow.mean() < 0.9
+
+
+def test_the_hull_does_not_depend_on_the_order_of_views():
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(20, 20, 0.9), cameras.fibonacci_sphere(8, 2.7), 20, 20)
+    masks = pictures(box(0.4), ours, 20)
+    order = torch.randperm(8, generator=torch.Generator().manual_seed(0))
+    turned = carve(masks[order], cameras.select(ours, order), Sphere(), 16)
+    assert torch.equal(turned.occupied, carve(masks, ours, Sphere(), 16).occupied)
+
+
+def test_no_view_keeps_everything_and_empty_masks_what_no_camera_sees():
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(20, 20, 0.3), cameras.orbit(2, 2.7), 20, 20)
+    assert carve(torch.zeros(0, 1, 20, 20), cameras.select(ours, []), Sphere(), 8).occupied.all()
+    hull = carve(torch.zeros(2, 1, 20, 20), ours, Sphere(), 8)
+    assert 0 < hull.occupied.float().mean() < 1
+    assert not hull.contains(torch.zeros(1, 3)).any()
+
+
+def test_contains_and_centres_agree():
+    """Closed form: a grid of side 2 over [-1, 1]^3 with only the voxel of positive x, y and negative z set."""
+    occupied = torch.zeros(2, 2, 2, dtype=torch.bool)
+    occupied[1, 1, 0] = True
+    grid = Occupancy(occupied, Sphere((1.0, 0.0, 0.0), 2.0))
+    assert grid.voxel == 2.0
+    assert grid.centres().tolist() == [[2.0, 1.0, -1.0]]
+    points = torch.tensor([[2.0, 1.0, -1.0], [2.0, 1.0, 1.0], [9.0, 1.0, -1.0], [1.1, 0.1, -0.1]])
+    assert grid.contains(points).tolist() == [True, False, False, True]
+    assert grid.dilated().occupied.all()
+    np.testing.assert_array_equal(grid.dilated(0).occupied.numpy(), occupied.numpy())
