@@ -11,7 +11,15 @@ from typing import Any
 
 from torch import Tensor
 
-__all__ = ["CheckpointError", "load_tensors", "read_json", "save_tensors", "write_json", "write_whole"]
+__all__ = [
+    "CheckpointError",
+    "check_tensors",
+    "load_tensors",
+    "read_json",
+    "save_tensors",
+    "write_json",
+    "write_whole",
+]
 
 
 class CheckpointError(ValueError):
@@ -95,8 +103,22 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
         raise CheckpointError(
             f"{path}: expected whole safetensors, found a damaged file ({error}); copy it again"
         ) from None
-    if expected is None:
-        return found
+    if expected is not None:
+        check_tensors(path, found, expected)
+    return found
+
+
+def check_tensors(path: Path, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Compare names and shapes, no more and no less; where the expected tensors are allocated does not matter.
+
+    Args:
+        path: where they were found, for the message.
+        found: tensors by name.
+        expected: what they should look like.
+
+    Raises:
+        CheckpointError: a missing or a surplus name, or another shape.
+    """
     for name, value in expected.items():
         if name not in found:
             raise CheckpointError(
@@ -112,4 +134,3 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
             f"{path}: expected {len(expected)} tensors, found {len(surplus)} more, as {surplus[0]!r}; "
             "the configuration is of another model"
         )
-    return found

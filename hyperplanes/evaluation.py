@@ -12,6 +12,7 @@ from hyperplanes.adaptation.base import Adapter, Pictures
 from hyperplanes.adaptation.fine_tuning import FineTuned
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
+from hyperplanes.episodes import naming
 from hyperplanes.metrics import psnr, ssim
 from hyperplanes.training import Tasks
 from hyperplanes.views import Task
@@ -122,10 +123,8 @@ def evaluate(
         if not len(task.query):
             raise ValueError(f"{name}: expected at least one query view to compare with, got none")
         start = time.perf_counter()
-        try:
+        with naming(name):
             adapted = adapter.adapt(task.support)
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from error
         adapted_at = time.perf_counter()
         pictures = adapted.render(task.query.cameras)
         rendered_at = time.perf_counter()

@@ -10,7 +10,6 @@ import torch
 
 from hyperplanes.adaptation.base import Adapter
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
-from hyperplanes.checkpoints import CheckpointError, read_json
 from hyperplanes.evaluation import ObjectScore, Score, evaluate
 from hyperplanes.models import OnDevice
 from hyperplanes.presets import Preset, preset
@@ -95,13 +94,7 @@ def start_training(chosen: Preset, data: Tasks, folder: Path, device: torch.devi
         device: where to compute.
 
     Returns:
-        A trainer; its `step` says how far it is.
-
-    Raises:
-        CheckpointError: the folder holds another model.
+        A trainer; its `step` says how far it is. CheckpointError where the folder holds another model or training.
     """
-    config = folder / "model.json"
-    if config.exists() and ModelConfig.of_json(read_json(config)) != chosen.model:
-        raise CheckpointError(f"{config}: expected the model that is to be trained, found another; name another folder")
     model = new_model(chosen.model, chosen.training.seed).to(device)
     return Trainer(model, OnDevice(data, torch.device(device)), chosen.training, folder)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -15,17 +14,18 @@ from torch import Tensor
 from torch.profiler import record_function
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
-from hyperplanes.checkpoints import CheckpointError, load_tensors, read_json, save_tensors, write_json
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.episodes import Episode, Kept, naming, prepare_episode
 from hyperplanes.metrics import psnr
-from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.renderer import Marched
-from hyperplanes.views import Task, Views
+from hyperplanes.training_state import Curve, check_model, load_state, save_state
+from hyperplanes.views import Task
 
 __all__ = ["Progress", "Tasks", "Trainer", "TrainingConfig", "train"]
 
 
 EMPTINESS = 0.01  # weight of the opacity of empty space beside the squared error of pixels
+FREE = ("steps", "evaluate_every", "held_out", "checkpoint_every", "memory")  # may differ in a training that is resumed
 
 
 @runtime_checkable
@@ -56,9 +56,9 @@ class TrainingConfig:
         warmup: steps in which the learning rates rise from zero.
         final: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
         evaluate_every: steps between looks at held-out objects.
-        held_out: how many of them are looked at.
+        held_out: how many of them are looked at: objects of the "val" split, or where there is none of "test".
         checkpoint_every: steps between checkpoints.
-        cached: objects whose planes and hulls are kept in memory.
+        memory: bytes of images, planes and hulls that are kept for later steps; the last object always is.
         seed: of the objects, rays and samples of every step.
     """
 
@@ -73,7 +73,7 @@ class TrainingConfig:
     evaluate_every: int = 250
     held_out: int = 4
     checkpoint_every: int = 500
-    cached: int = 512
+    memory: int = 2 * 2**30
     seed: int = 0
 
 
@@ -98,18 +98,20 @@ class Progress:
     seconds_left: float
 
 
-@dataclass(frozen=True)
-class _Episode:
-    prepared: Prepared
-    query: Views
-    live: Tensor | None
-
-
 class Trainer:
     """The state of one training: model, two optimisers, step count, the curve so far.
 
     Every step draws from a generator seeded by (seed, step), so a training that is stopped and resumed ends exactly
-    where an uninterrupted one does.
+    where an uninterrupted one does. It computes where the model is.
+
+    Args:
+        model: trained in place.
+        data: tasks with a "train" split and perhaps a "val" or "test" split.
+        config: how.
+        folder: for checkpoints; a training that lies there already goes on.
+
+    Raises:
+        ValueError: no object to train on.
     """
 
     def __init__(self, model: HyperPlanes, data: Tasks, config: TrainingConfig, folder: Path | None = None) -> None:
@@ -118,20 +120,24 @@ class Trainer:
         self.config = config
         self.folder = folder
         self.step = 0
-        self.curve: list[dict[str, float]] = []
+        self.curve: Curve = []
         self.names = sorted(data.names("train"))
         if not self.names:
             raise ValueError("data: expected at least one training object, got none")
-        self._episodes: OrderedDict[str, _Episode] = OrderedDict()
+        self._kept = Kept(config.memory)
+        self._held_out: dict[str, Episode] = {}
         groups: list[tuple[Sequence[Tensor], float]] = [(list(model.networks.parameters()), config.learning_rate)]
         if model.hypernetwork is not None:
             groups.append((list(model.hypernetwork.parameters()), config.hypernetwork_learning_rate))
         self.optimisers = [torch.optim.Adam(parameters, rate) for parameters, rate in groups]
         self.rates = [rate for _, rate in groups]
+        if folder is not None:
+            check_model(folder, model.config)
         if folder is not None and (folder / "training.json").exists():
-            self._resume(folder)
+            self.step, self.curve = load_state(folder, model, self.optimisers, asdict(config), FREE)
         else:
-            model.set_rig(data.task(self.names[0]).support)
+            with naming(self.names[0]):
+                model.set_rig(data.task(self.names[0]).support)
 
     def run(self) -> Iterator[Progress]:
         """Train until the last step, reporting every 25 steps; checkpoints are written on the way and at the end.
@@ -144,14 +150,16 @@ class Trainer:
             loss = self.take_step()
             step, last = self.step, self.step == self.config.steps
             look = step % self.config.evaluate_every == 0 or last
-            if not (look or step % 25 == 0):
-                continue
+            report = look or step % 25 == 0
             now = time.perf_counter()
-            rays = (step - reported[1]) * self.config.rays * self.config.tasks / max(now - reported[0], 1e-9)
             quality = self.held_out_psnr() if look else None
-            self.curve.append({"step": step, "loss": loss, **({} if quality is None else {"psnr": quality})})
+            if report:
+                self.curve.append({"step": step, "loss": loss, **({} if quality is None else {"psnr": quality})})
             if step % self.config.checkpoint_every == 0 or last:
                 self.save()
+            if not report:
+                continue
+            rays = (step - reported[1]) * self.config.rays * self.config.tasks / max(now - reported[0], 1e-9)
             left = (time.perf_counter() - started) / (step - first) * (self.config.steps - step)
             reported = (time.perf_counter(), step)
             yield Progress(step, self.config.steps, loss, rays, quality, left)
@@ -169,7 +177,7 @@ class Trainer:
             with record_function("step:update"):
                 field = self.model.field(episode.prepared, self.model.theta + self.model.update(episode.prepared))
             span = "sphere" if isinstance(field.sampling, Marched) else "depth"
-            with record_function("step:rays"):
+            with record_function("step:rays"), naming(name):
                 rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
             with record_function("step:rendering"):
                 seen = field.trace(rays, generator)
@@ -196,49 +204,27 @@ class Trainer:
 
     @torch.no_grad()
     def held_out_psnr(self) -> float | None:
-        """Mean PSNR in dB of two query views of some held-out objects, or None where there are none."""
-        names = sorted(self.data.names("test"))[: self.config.held_out]
+        """Mean PSNR in dB of two query views of some held-out objects, or None where there are none.
+
+        The objects are those of the "val" split, or of "test" where a data set has no other; nothing is chosen by this
+        number.
+        """
+        names = sorted(self.data.names("val")) or sorted(self.data.names("test"))
         values = []
-        for name in names:
-            task = self.data.task(name)
-            views = task.query[:: max(1, len(task.query) // 2)][:2]
-            values.append(psnr(self.model.adapt(task.support).render(views.cameras).images, views.images))
+        for name in names[: self.config.held_out]:
+            if name not in self._held_out:
+                task = self.data.task(name)
+                few = replace(task, query=task.query[:: max(1, len(task.query) // 2)][:2])
+                self._held_out[name] = prepare_episode(self.model, few, carved=self._reads_hull)
+            episode = self._held_out[name]
+            pictures = self.model.adapt(episode.prepared).render(episode.query.cameras)
+            values.append(psnr(pictures.images, episode.query.images))
         return float(torch.cat(values).mean()) if values else None
 
     def save(self) -> None:
-        """Write model and training state to the folder, where there is one."""
-        if self.folder is None:
-            return
-        self.model.save(self.folder)
-        state: dict[str, Tensor] = {}
-        for index, optimiser in enumerate(self.optimisers):
-            for place, entries in optimiser.state_dict()["state"].items():
-                state |= {f"{index}.{place}.{name}": torch.as_tensor(value) for name, value in entries.items()}
-        save_tensors(self.folder / "optimisers.safetensors", state)
-        write_json(
-            self.folder / "training.json", {"step": self.step, "curve": self.curve, "config": asdict(self.config)}
-        )
-
-    def _resume(self, folder: Path) -> None:
-        saved = read_json(folder / "training.json")
-        known = asdict(self.config)
-        differing = [name for name in known if name != "steps" and saved["config"].get(name) != known[name]]
-        if differing:
-            raise CheckpointError(
-                f"{folder / 'training.json'}: expected the same training to resume, found other "
-                f"{', '.join(differing)}; give another --out folder or the same options"
-            )
-        self.model.load_state_dict(load_tensors(folder / "model.safetensors", self.model.state_dict()))
-        state = load_tensors(folder / "optimisers.safetensors")
-        for index, optimiser in enumerate(self.optimisers):
-            blank = optimiser.state_dict()
-            blank["state"] = {}
-            for key, value in state.items():
-                group, place, name = key.split(".")
-                if int(group) == index:
-                    blank["state"].setdefault(int(place), {})[name] = value
-            optimiser.load_state_dict(blank)
-        self.step, self.curve = int(saved["step"]), list(saved["curve"])
+        """Write model and training state to the folder, where there is one; whole or not at all."""
+        if self.folder is not None:
+            save_state(self.folder, self.model, self.optimisers, self.step, self.curve, asdict(self.config))
 
     def _emptiness(self, field: AdaptedField, generator: torch.Generator) -> Tensor:
         """Mean opacity, a tenth of a radius thick, of random points of the sphere that the hull rules out."""
@@ -257,19 +243,17 @@ class Trainer:
         done = (self.step - config.warmup) / max(1, config.steps - config.warmup)
         return config.final + (1 - config.final) * (1 + math.cos(math.pi * done)) / 2
 
-    def _episode(self, name: str) -> _Episode:
-        if name in self._episodes:
-            self._episodes.move_to_end(name)
-            return self._episodes[name]
-        task = self.data.task(name)
-        prepared = self.model.prepare(task.support)
-        live = None
-        if isinstance(self.model.config.sampling, Marched):
-            live = footprint(prepared.occupancy, task.query.cameras).flatten().nonzero()[:, 0]
-        self._episodes[name] = _Episode(prepared, task.query, live)
-        while len(self._episodes) > self.config.cached:
-            self._episodes.popitem(last=False)
-        return self._episodes[name]
+    @property
+    def _reads_hull(self) -> bool:
+        """Whether any sample depends on the hull; the paper's protocol samples without one."""
+        return isinstance(self.model.config.sampling, Marched) or self.config.empty_points > 0
+
+    def _episode(self, name: str) -> Episode:
+        episode = self._kept.get(name)
+        if episode is None:
+            episode = prepare_episode(self.model, self.data.task(name), carved=self._reads_hull)
+            self._kept.add(name, episode)
+        return episode
 
 
 def train(
@@ -283,7 +267,7 @@ def train(
 
     Args:
         model: trained in place.
-        data: tasks with a "train" and perhaps a "test" split.
+        data: tasks, as in `Trainer`.
         config: how.
         folder: for checkpoints.
         report: called with every progress.

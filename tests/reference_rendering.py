@@ -109,7 +109,7 @@ class Balls:
         }
 
     def names(self, split: str) -> list[str]:
-        return self.splits[split]
+        return self.splits.get(split, [])
 
     def task(self, name: str) -> Task:
         number = int(name[-1]) + (5 if name.startswith("test") else 0)

@@ -16,6 +16,8 @@ FLOORS = {
     "hyperplanes.doctor": 5,
     "data_gen": 4,
     "hyperplanes.training": 4,
+    "hyperplanes.training_state": 4,
+    "hyperplanes.episodes": 4,
     "hyperplanes.evaluation": 4,
     "hyperplanes.models": 4,
     "hyperplanes.adaptation": 3,

@@ -1,11 +1,16 @@
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
+from hyperplanes import checkpoints
+from hyperplanes.adaptation import HyperPlanes, base
 from hyperplanes.checkpoints import CheckpointError
+from hyperplanes.geometry import occupancy
 from hyperplanes.hypernetwork import HyperNetworkConfig
-from hyperplanes.rendering import Hierarchical
+from hyperplanes.metrics import psnr
+from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer, TrainingConfig, train
 from tests.reference_rendering import Balls, small_model
 
@@ -95,7 +100,9 @@ def test_a_training_with_other_options_is_not_resumed(tmp_path):
 
 def test_a_checkpoint_of_another_model_is_not_resumed(tmp_path):
     train(small_model(), Balls(), with_(steps=1), tmp_path)
-    with pytest.raises(CheckpointError, match="of another model"):
+    with pytest.raises(
+        CheckpointError, match="model.json: expected the model that is to be trained, found other hyper"
+    ):
         Trainer(small_model(hypernetwork=None), Balls(), with_(steps=1), tmp_path)
 
 
@@ -148,7 +155,7 @@ def test_several_objects_a_step_are_averaged():
 
 
 def test_objects_that_fall_out_of_memory_change_nothing():
-    assert losses(small_model(), with_(cached=1), 5) == losses(small_model(), FAST, 5)
+    assert losses(small_model(), with_(memory=1), 5) == losses(small_model(), FAST, 5)
 
 
 def test_only_training_objects_are_trained_on():
@@ -184,3 +191,154 @@ def test_no_held_out_objects_have_no_quality():
 def test_no_training_object_is_refused():
     with pytest.raises(ValueError, match="data: expected at least one training object, got none"):
         Trainer(small_model(), Balls(train=0), FAST)
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, monkeypatch):
+    """Killed before each write of the second checkpoint in turn: the first or the second is there, never a mixture."""
+    trainer = Trainer(small_model(), Balls(), FAST, tmp_path)
+    states = {}
+    for step in (1, 2):
+        trainer.take_step()
+        states[step] = state_of(trainer.model)
+        if step == 1:
+            trainer.save()
+    write, found = checkpoints.write_whole, []
+    for survived in range(5):
+        left = iter(range(survived))
+
+        def write_some(path, content, left=left):
+            if next(left, None) is None:
+                raise Killed
+            write(path, content)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(checkpoints, "write_whole", write_some)
+            if survived < 4:
+                with pytest.raises(Killed):
+                    trainer.save()
+            else:
+                trainer.save()
+        loaded = HyperPlanes.from_pretrained(tmp_path)
+        assert any(same(loaded.state_dict(), state) for state in states.values())
+        resumed = Trainer(small_model(), Balls(), FAST, tmp_path)
+        found.append(resumed.step)
+        assert same(resumed.model.state_dict(), states[resumed.step])
+        assert {int(o.state_dict()["state"][0]["step"]) for o in resumed.optimisers} == {resumed.step}
+    assert found == [1, 1, 1, 1, 2]
+    names = {"model.json", "model.safetensors", "training-00000002.safetensors", "training.json"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_checkpoints_are_written_when_they_are_due_and_not_only_with_a_report(tmp_path, monkeypatch):
+    saved = []
+    trainer = Trainer(small_model(), Balls(), with_(steps=30, rays=4, checkpoint_every=7), tmp_path)
+    monkeypatch.setattr(trainer, "save", lambda: saved.append(trainer.step))
+    reported = [progress.step for progress in trainer.run()]
+    assert saved == [7, 14, 21, 28, 30]
+    assert reported == [25, 30]
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"sampling": Marched(25)}, "sampling.steps"),
+        ({"sampling": Hierarchical(4, 4)}, "protocol"),
+        ({"hull_side": 17}, "hull_side"),
+        ({"network": replace(small_model().config.network, density_scale=3.0)}, "network.density_scale"),
+        ({"hypernetwork": replace(small_model().config.hypernetwork, gain=0.5)}, "hypernetwork.gain"),
+    ],
+)
+def test_a_model_that_differs_in_no_weight_is_another_all_the_same(tmp_path, change, name):
+    train(small_model(), Balls(), with_(steps=1), tmp_path)
+    with pytest.raises(CheckpointError, match=f"model.json: .*found other .*{name}.*; give another --out"):
+        Trainer(small_model(**change), Balls(), with_(steps=1), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["step", "curve", "config", "state"])
+@pytest.mark.parametrize("value", [None, "missing", "../../elsewhere"])
+def test_a_training_file_with_a_hole_is_a_checkpoint_error(tmp_path, name, value):
+    train(small_model(), Balls(), with_(steps=1), tmp_path)
+    saved = json.loads((tmp_path / "training.json").read_text())
+    saved = (
+        {key: entry for key, entry in saved.items() if key != name} if value == "missing" else {**saved, name: value}
+    )
+    (tmp_path / "training.json").write_text(json.dumps(saved))
+    with pytest.raises(CheckpointError, match="training.json: expected ") as caught:
+        Trainer(small_model(), Balls(), with_(steps=1), tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_state_of_another_shape_is_a_checkpoint_error(tmp_path):
+    train(small_model(), Balls(), with_(steps=1), tmp_path)
+    (path,) = tmp_path.glob("training-*.safetensors")
+    tensors = checkpoints.load_tensors(path)
+    for change in ({"0.0.exp_avg": torch.zeros(3)}, {"0.99.step": torch.zeros(())}, {"model.rig": torch.zeros(1, 3)}):
+        checkpoints.save_tensors(path, {**tensors, **change})
+        with pytest.raises(CheckpointError, match="training-00000001.safetensors: expected"):
+            Trainer(small_model(), Balls(), with_(steps=1), tmp_path)
+
+
+def test_memory_is_bounded_in_bytes():
+    whole = Trainer(small_model(), Balls(), FAST)
+    whole.warm("train0")
+    one = whole._kept.nbytes
+    # 4 support and 4 query views of 16 x 16 pixels, 4 floats each, a third of the colours again for lookups, a hull
+    # of 16^3 bytes, and 8 bytes a pixel that sees it
+    least = 8 * 16 * 16 * 4 * 4 + 4 * 16 * 16 * 4 + 16**3
+    assert least < one <= least + 4 * 16 * 16 * 8
+    tight = Trainer(small_model(), Balls(), with_(memory=int(2.5 * one)))
+    for name in ("train0", "train1", "train2", "train1"):
+        tight.warm(name)
+        assert tight._kept.nbytes <= 2.5 * one
+    assert len(tight._kept) == 2
+    assert tight._kept.get("train0") is None
+    assert tight._kept.get("train1") is not None
+
+
+def test_the_papers_protocol_carves_no_hull_unless_empty_space_is_asked_for(monkeypatch):
+    carved = []
+    monkeypatch.setattr(base, "carve", lambda *given: carved.append(given) or occupancy.carve(*given))
+    dense = {"coarse_network": True, "sampling": Hierarchical(4, 4)}
+    trainer = Trainer(small_model(**dense), Balls(), FAST)
+    trainer.take_step()
+    trainer.held_out_psnr()
+    assert not carved
+    Trainer(small_model(**dense), Balls(), with_(empty_points=8)).take_step()
+    assert carved
+
+
+def test_held_out_objects_are_of_the_validation_split_where_there_is_one():
+    data, asked = Balls(test=2), []
+    task = data.task
+    data.task = lambda name: asked.append(name) or task(name)
+    data.splits["val"] = ["test1"]
+    trainer = Trainer(small_model(), data, FAST)
+    asked.clear()
+    first = trainer.held_out_psnr()
+    assert trainer.held_out_psnr() == first
+    assert asked == ["test1"]  # and its planes and hull are kept between looks
+
+
+def test_a_look_at_held_out_objects_is_adapting_and_rendering():
+    data = Balls()
+    trainer = Trainer(small_model(), data, FAST)
+    trainer.take_step()
+    task = data.task("test0")
+    views = task.query[[0, 2]]
+    expected = psnr(trainer.model.adapt(task.support).render(views.cameras).images, views.images).mean()
+    assert trainer.held_out_psnr() == pytest.approx(expected.item())
+    assert trainer.model.training
+
+
+def test_an_object_that_cannot_be_trained_on_is_named():
+    class Blank(Balls):
+        def task(self, name):
+            task = super().task(name)
+            return replace(task, support=replace(task.support, masks=torch.zeros_like(task.support.masks)))
+
+    with pytest.raises(ValueError, match="train[0-2]: masks of the support views: expected an object"):
+        Trainer(small_model(), Blank(), FAST).take_step()

@@ -189,9 +189,9 @@ class HyperPlanes(nn.Module):
         return AdaptedField(bound["fine"], prepared.occupancy, self.config.sampling, bound.get("coarse"), densities)
 
     @torch.no_grad()
-    def adapt(self, support: Views) -> AdaptedField:
+    def adapt(self, support: Views | Prepared) -> AdaptedField:
         """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6)."""
-        prepared = self.prepare(support)
+        prepared = support if isinstance(support, Prepared) else self.prepare(support)
         with _in_use(self):
             return self.field(prepared, self.theta + self.update(prepared))
 

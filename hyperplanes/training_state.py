@@ -1,0 +1,126 @@
+"""A training on disk: one consistent state at any moment, whenever the power goes.
+
+training.json                   step, curve, configuration, and the name of the file of that step; written last
+training-00000500.safetensors   weights and optimisers of step 500
+model.json, model.safetensors   the model alone, for everybody else
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+from torch import Tensor
+
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
+from hyperplanes.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors, write_json
+
+__all__ = ["Curve", "check_model", "load_state", "save_state"]
+
+Curve: TypeAlias = list[dict[str, float]]
+
+ENTRIES = {"step": int, "curve": list, "config": dict, "state": str}
+STATE = re.compile(r"training-\d{8,}\.safetensors")
+REMEDY = "give another --out folder or the same options"
+
+
+def save_state(
+    folder: Path,
+    model: HyperPlanes,
+    optimisers: Sequence[torch.optim.Optimizer],
+    step: int,
+    curve: Curve,
+    config: Mapping[str, Any],
+) -> None:
+    """Put a new state in the place of the last one.
+
+    Args:
+        folder: the checkpoint.
+        model: with its weights.
+        optimisers: with their moments.
+        step: steps done.
+        curve: what was reported so far.
+        config: of the training.
+    """
+    name = f"training-{step:08d}.safetensors"
+    tensors = {f"model.{key}": value for key, value in model.state_dict().items()}
+    for index, optimiser in enumerate(optimisers):
+        for place, entries in optimiser.state_dict()["state"].items():
+            tensors |= {f"{index}.{place}.{key}": torch.as_tensor(value) for key, value in entries.items()}
+    save_tensors(folder / name, tensors)
+    model.save(folder)
+    write_json(folder / "training.json", {"step": step, "curve": curve, "config": dict(config), "state": name})
+    for old in folder.glob("training-*.safetensors"):
+        if old.name != name and STATE.fullmatch(old.name):
+            old.unlink(missing_ok=True)
+
+
+def load_state(
+    folder: Path,
+    model: HyperPlanes,
+    optimisers: Sequence[torch.optim.Optimizer],
+    config: Mapping[str, Any],
+    free: Sequence[str],
+) -> tuple[int, Curve]:
+    """Continue where `save_state` stopped: weights and moments are set.
+
+    Args:
+        folder: the checkpoint.
+        model: of the same configuration.
+        optimisers: over the same parameters.
+        config: of the training that is to go on.
+        free: entries of it that may differ.
+
+    Returns:
+        The steps done, and the curve.
+
+    Raises:
+        CheckpointError: another training, or files that are damaged, missing or do not belong together.
+    """
+    path = folder / "training.json"
+    saved = read_json(path)
+    for name, kind in ENTRIES.items():
+        if not isinstance(saved.get(name), kind):
+            found = "none" if name not in saved else type(saved[name]).__name__
+            raise CheckpointError(f"{path}: expected an entry {name!r} ({kind.__name__}), found {found}; {REMEDY}")
+    differing = [name for name in config if name not in free and saved["config"].get(name, ...) != config[name]]
+    if differing:
+        raise CheckpointError(
+            f"{path}: expected the same training to resume, found other {', '.join(differing)}; {REMEDY}"
+        )
+    if not STATE.fullmatch(saved["state"]):
+        raise CheckpointError(f"{path}: expected the name of a file of states, found {saved['state']!r}; {REMEDY}")
+    found = load_tensors(folder / saved["state"])
+    weights = {f"model.{name}": value for name, value in model.state_dict().items()}
+    moments: dict[str, Tensor] = {}
+    for index, optimiser in enumerate(optimisers):
+        for place, parameter in enumerate(value for group in optimiser.param_groups for value in group["params"]):
+            if f"{index}.{place}.step" in found:
+                moments[f"{index}.{place}.step"] = torch.zeros(())
+                moments |= {f"{index}.{place}.{name}": parameter for name in ("exp_avg", "exp_avg_sq")}
+    check_tensors(folder / saved["state"], found, {**weights, **moments})
+    model.load_state_dict({name: found[f"model.{name}"] for name in model.state_dict()})
+    for index, optimiser in enumerate(optimisers):
+        state: dict[int, dict[str, Tensor]] = {}
+        for key in moments:
+            group, place, name = key.split(".")
+            if int(group) == index:
+                state.setdefault(int(place), {})[name] = found[key]
+        optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
+    return saved["step"], saved["curve"]
+
+
+def check_model(folder: Path, config: ModelConfig) -> None:
+    """Nothing, where the folder holds no model or this one.
+
+    Raises:
+        CheckpointError: it holds another one; the message says in what.
+    """
+    path = folder / "model.json"
+    if path.exists() and (differing := ModelConfig.load(folder).differences(config)):
+        raise CheckpointError(
+            f"{path}: expected the model that is to be trained, found other {', '.join(differing)}; {REMEDY}"
+        )
