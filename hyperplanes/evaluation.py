@@ -21,6 +21,8 @@ __all__ = ["METHODS", "ObjectScore", "Score", "evaluate", "make_method"]
 
 METHODS: dict[str, str] = {
     "nearest_view": "the nearest support view, copied",
+    "nerf": "NeRF, one set of weights for all objects",
+    "multiplane": "MultiPlaneNeRF, one set of weights for all objects",
     "point_multiplane": "PointMultiPlaneNeRF, one set of weights for all objects",
     "hyperplanes": "HyperPlanes in one step",
     "hyperplanes_10": "HyperPlanes after 10 fine-tuning steps",
@@ -72,7 +74,7 @@ def make_method(name: str, checkpoints: Mapping[str, Path]) -> Adapter:
 
     Args:
         name: one of METHODS.
-        checkpoints: folders by "hyperplanes" and "point_multiplane".
+        checkpoints: folders by "hyperplanes", "point_multiplane" and so on.
 
     Returns:
         An adapter.

@@ -8,15 +8,19 @@ from pathlib import Path
 
 import torch
 
-from hyperplanes.adaptation.base import AdaptedField, Adapter
+from hyperplanes.adaptation.base import AdaptedField, Adapter, Renderable
+from hyperplanes.adaptation.configuration import checkpoint_folder
 from hyperplanes.adaptation.fine_tuning import FineTuned
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.checkpoints import CheckpointError
+from hyperplanes.data.upright import upright_task
 from hyperplanes.fields.base import Field
+from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import Tasks
 from hyperplanes.views import Task, Views
 
 __all__ = [
+    "ByProtocol",
     "OnDevice",
     "adapt",
     "adapted_model",
@@ -46,15 +50,17 @@ def choose_device(name: str) -> torch.device:
 
 @dataclass(frozen=True)
 class OnDevice:
-    """Tasks whose views lie on a device.
+    """Tasks whose views lie on a device, in a world with y up.
 
     Attributes:
         data: where they come from.
         device: where they go.
+        up: the axis that points up in the data's world.
     """
 
     data: Tasks
     device: torch.device
+    up: str = "y"
 
     def names(self, split: str) -> Sequence[str]:
         """The objects of a split."""
@@ -62,8 +68,28 @@ class OnDevice:
 
     def task(self, name: str) -> Task:
         """One object."""
-        task = self.data.task(name)
+        task = upright_task(self.data.task(name), self.up)
         return Task(task.support.to(self.device), task.query.to(self.device), task.name)
+
+
+@dataclass(frozen=True)
+class ByProtocol:
+    """A method whose fields are rendered by another protocol than the one they were trained by.
+
+    Attributes:
+        adapter: the method.
+        sampling: the protocol; None leaves all as it is. What is no field is not sampled, and stays as it is.
+    """
+
+    adapter: Adapter
+    sampling: Hierarchical | Marched | None
+
+    def adapt(self, support: Views) -> Renderable:
+        """What the method makes of one object."""
+        made = self.adapter.adapt(support)
+        if self.sampling is None or not isinstance(made, AdaptedField):
+            return made
+        return replace(made, sampling=self.sampling)
 
 
 def on_device(adapter: Adapter, device: torch.device) -> Adapter:
@@ -79,7 +105,7 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
     """Checkpoints by the method that trained them.
 
     Args:
-        folders: each a checkpoint, or a folder of checkpoints such as `runs/demo`.
+        folders: each a checkpoint, a folder of checkpoints such as `runs/demo`, or the name of a packaged model.
 
     Returns:
         Folders by "hyperplanes", "point_multiplane" and so on; the first of a kind counts.
@@ -88,7 +114,7 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
         CheckpointError: a folder that neither is nor holds a checkpoint.
     """
     found: dict[str, Path] = {}
-    for folder in folders:
+    for folder in map(checkpoint_folder, folders):
         inside = [folder] if (folder / "model.json").exists() else sorted(p.parent for p in folder.glob("*/model.json"))
         if not inside:
             what = "no model.json" if folder.is_dir() else "no such folder"

@@ -17,11 +17,13 @@ from hyperplanes.training import Tasks, Trainer
 
 __all__ = ["TRAINABLE", "new_model", "recipe", "score_all", "start_training"]
 
-TRAINABLE = ("hyperplanes", "point_multiplane", "multiplane")
-"""Methods that `train` knows; the last two are one set of weights for all objects."""
+TRAINABLE = ("hyperplanes", "point_multiplane", "multiplane", "nerf")
+"""Methods that `train` knows; all but the first are one set of weights for all objects."""
 
 
-def recipe(name: str, method: str = "hyperplanes", *, steps: int | None = None, seed: int = 0) -> Preset:
+def recipe(
+    name: str, method: str = "hyperplanes", *, steps: int | None = None, seed: int = 0, protocol: str = "default"
+) -> Preset:
     """The configuration of a method at the scale of a preset.
 
     Args:
@@ -29,23 +31,24 @@ def recipe(name: str, method: str = "hyperplanes", *, steps: int | None = None, 
         method: one of TRAINABLE.
         steps: other than the preset's.
         seed: of the training.
+        protocol: a name in PROTOCOLS: how rays are sampled.
 
     Returns:
         Model and training.
 
     Raises:
-        ValueError: an unknown preset or method, or no step.
+        ValueError: an unknown preset, method or protocol, or no step.
     """
     if method not in TRAINABLE:
         raise ValueError(f"method: expected one of {', '.join(TRAINABLE)}, got {method!r}")
     if steps is not None and steps < 1:
         raise ValueError(f"steps: expected at least 1, got {steps}")
-    chosen = preset(name)
+    chosen = preset(name).by_protocol(protocol)
     if method != "hyperplanes":
         chosen = chosen.without_hypernetwork()
     return replace(
         chosen,
-        model=replace(chosen.model, target="multiplane" if method == "multiplane" else chosen.model.target),
+        model=chosen.model if method == "hyperplanes" else replace(chosen.model, target=method),
         training=replace(chosen.training, steps=steps or chosen.training.steps, seed=seed),
     )
 

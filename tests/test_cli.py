@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,10 +15,16 @@ import pytest
 from PIL import Image
 from small_demo import demo_folder, only_object
 
+from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
 from hyperplanes.commands import VERBS
+from hyperplanes.data import read_task
 from hyperplanes.demo import DemoSettings, recipes
+from hyperplanes.fields.baked import BakedField
+from hyperplanes.metrics import psnr
+from hyperplanes.models import load_model
 from hyperplanes.presets import PRESETS
+from hyperplanes.rendering.renderer import Hierarchical
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
@@ -134,6 +141,18 @@ def test_presets_and_inspect(capsys, tmp_path):
     assert (tmp_path / "contact_sheet.png").exists()
 
 
+def test_inspect_compares_checksums_when_asked(tmp_path, capsys):
+    data = tmp_path / "data"
+    shutil.copytree(demo_folder() / "data", data)
+    command = ["inspect", str(data), "--out", str(tmp_path / "out"), "--checksums"]
+    main(command)
+    assert "files as they were written" in capsys.readouterr().out
+    changed = next(data.rglob("images/003.png"))
+    changed.write_bytes((changed.parent / "004.png").read_bytes())
+    assert main(command) == 1
+    assert f"{changed.relative_to(data)} has changed" in capsys.readouterr().out
+
+
 def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
     demo = demo_folder()
     table = tmp_path / "table.json"
@@ -179,6 +198,66 @@ def test_an_orbit_is_pictures_and_a_turntable(tmp_path):
     with Image.open(tmp_path / "turntable.gif") as animation:
         assert animation.n_frames == 3
     assert len(list(tmp_path.glob("*.png"))) == 3
+
+
+def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
+    out = tmp_path / "voxels.safetensors"
+    views = ["--views", str(only_object(demo_folder())), "--out", str(out)]
+    command = ["bake", "--checkpoint", str(demo_folder()), *views, "--voxels", "32"]
+    assert main([*command, "--orbit", "2", "--size", "16", "--turntable", "gif"]) == 0
+    assert "dB, the field" in capsys.readouterr().out
+    with Image.open(tmp_path / "voxels.gif") as animation:
+        assert animation.n_frames == 2
+    pictures = BakedScene(BakedField.load(out)).render(read_task(only_object(demo_folder())).query.cameras)
+    assert 0 < float(pictures.opacity.mean()) < 1
+    assert main([*command, "--voxels", "7"]) == 2
+    assert "7" in complaint(capsys)
+
+
+def test_the_paper_protocol_is_rendered_and_evaluated_when_asked_for(tmp_path, capsys):
+    demo, scene = demo_folder(), only_object(demo_folder())
+    command = ["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path)]
+    assert main([*command, "--protocol", "paper"]) == 0
+    task = read_task(scene)
+    expected = load_model(demo).adapt(task.support).render(task.query.cameras, Hierarchical(64, 128)).images
+    written = np.stack([pixels(tmp_path / Path(name).name) for name in task.query.names])
+    wanted = expected.clamp(0, 1).permute(0, 2, 3, 1).numpy() * 255
+    assert abs(written - wanted).max() <= 1
+    capsys.readouterr()
+    table = tmp_path / "table.json"
+    command = ["evaluate", "--data", str(demo / "data"), "--checkpoint", str(demo), "--json", str(table)]
+    assert main([*command, "--method", "hyperplanes", "nearest_view", "--protocol", "paper"]) == 0
+    score = json.loads(table.read_text())["hyperplanes"]["psnr"]
+    assert score == pytest.approx(float(psnr(expected.clamp(0, 1), task.query.images).mean()), abs=1e-3)
+
+
+def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(PRESETS, "tiny", recipes(DemoSettings.quick_check())["hyperplanes"])
+    data, run = str(demo_folder() / "data"), tmp_path / "run"
+    command = ["train", "--data", data, "--preset", "tiny", "--steps", "2", "--out", str(run)]
+    assert main([*command, "--method", "nerf", "--protocol", "paper"]) == 0
+    config = json.loads((run / "model.json").read_text())
+    assert (config["target"], config["hypernetwork"], config["protocol"]) == ("nerf", None, "hierarchical")
+    assert config["sampling"] == {"coarse": 64, "fine": 128}
+    assert main(["evaluate", "--data", data, "--checkpoint", str(run), "--method", "nerf"]) == 0
+    assert "nerf " in capsys.readouterr().out
+
+
+def test_views_of_a_world_with_z_up_are_adapted_to_as_if_y_were(tmp_path):
+    """Source of truth: the same scene, its cameras turned by hand as Blender would have written them."""
+    demo = demo_folder()
+    scene, turned = only_object(demo), tmp_path / only_object(demo).name
+    shutil.copytree(scene, turned)
+    document = json.loads((turned / "transforms.json").read_text())
+    for frame in document["frames"]:
+        x, y, z, last = frame["transform_matrix"]
+        frame["transform_matrix"] = [x, [-value for value in z], y, last]
+    (turned / "transforms.json").write_text(json.dumps(document))
+    common = ["--checkpoint", str(demo), "--all-views"]
+    assert main(["render", *common, "--views", str(scene), "--out", str(tmp_path / "y")]) == 0
+    assert main(["render", *common, "--views", str(turned), "--out", str(tmp_path / "z"), "--up", "z"]) == 0
+    for path in (tmp_path / "y").iterdir():
+        assert abs(pixels(path) - pixels(tmp_path / "z" / path.name)).max() <= 1
 
 
 def test_the_demonstration_does_nothing_twice(capsys):

@@ -96,7 +96,7 @@ def test_methods_by_name(tmp_path):
     full, plain = tmp_path / "full", tmp_path / "plain"
     small_model().save(full)
     small_model(hypernetwork=None).save(plain)
-    folders = {"hyperplanes": full, "point_multiplane": plain}
+    folders = {"hyperplanes": full} | dict.fromkeys(("nerf", "multiplane", "point_multiplane"), plain)
     made = {name: make_method(name, folders) for name in METHODS}
     assert isinstance(made["nearest_view"], NearestView)
     assert made["point_multiplane"].hypernetwork is None

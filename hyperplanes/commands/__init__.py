@@ -11,6 +11,7 @@ VERBS: dict[str, str] = {
     "evaluate": "compare methods on objects they have never seen, as one table",
     "render": "new views of one object from a few posed images",
     "export": "one object as images, a turntable and a coloured mesh",
+    "bake": "one object as a small file of voxels that renders at once, without any network",
     "adapt": "write the weights of one object, to be rendered later without the hypernetwork",
     "inspect": "say what is in a data set or a checkpoint",
     "presets": "list the named configurations",

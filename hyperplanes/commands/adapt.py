@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyperplanes.commands.console import Console
+from hyperplanes.commands.options import Up
 from hyperplanes.commands.render import read_scene
 from hyperplanes.words import duration
 
@@ -31,6 +32,7 @@ class Arguments:
         out: The folder for the weights.
         steps: Fine-tuning steps on the shown views; none is the paper's single step.
         all_views: Show the model every view, not only the support half.
+        up: The axis that points up in the world of the views: y as in training data, z as in Blender.
         device: auto, cpu or cuda.
     """
 
@@ -39,6 +41,7 @@ class Arguments:
     out: Path
     steps: int = 0
     all_views: bool = False
+    up: Up = "y"
     device: str = "auto"
 
 
@@ -48,11 +51,12 @@ def run(arguments: Arguments) -> int:
 
     console, device = Console(), choose_device(arguments.device)
     model = load_model(arguments.checkpoint).to(device)
-    task = read_scene(arguments.views, arguments.all_views)
+    task = read_scene(arguments.views, arguments.all_views, arguments.up)
     started = time.perf_counter()
     field = adapt(model, task.support.to(device), arguments.steps)
     seconds = time.perf_counter() - started
     adapted_model(model, field).save(arguments.out)
     console.say(f"{arguments.out}: adapted to {len(task.support)} views of {task.name} in {duration(seconds)}")
-    console.say(f"next: hyperplanes render --checkpoint {arguments.out} --views {arguments.views} --out new-views")
+    up = "" if arguments.up == "y" else f" --up {arguments.up}"
+    console.say(f"next: hyperplanes render --checkpoint {arguments.out} --views {arguments.views}{up} --out new-views")
     return 0

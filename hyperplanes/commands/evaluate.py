@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalInt, optional
+from hyperplanes.commands.options import OptionalInt, Protocol, Up, optional
 from hyperplanes.words import duration
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ class Arguments:
         json: Write the table here too, with every object.
         split: Which objects.
         objects: Only the first so many.
+        up: The axis that points up in the data's world: y as in training data, z as in Blender.
+        protocol: How fields are sampled: as they were trained, or 64 + 128 times a ray as in the paper.
         device: auto, cpu or cuda.
     """
 
@@ -47,6 +49,8 @@ class Arguments:
     json: Annotated[Path | None, optional("FILE")] = None
     split: Literal["test", "val", "train", "all"] = "test"
     objects: OptionalInt = None
+    up: Up = "y"
+    protocol: Protocol = "default"
     device: str = "auto"
 
 
@@ -69,7 +73,8 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.checkpoints import write_json
     from hyperplanes.data import open_dataset
     from hyperplanes.evaluation import make_method
-    from hyperplanes.models import OnDevice, choose_device, find_checkpoints, on_device
+    from hyperplanes.models import ByProtocol, OnDevice, choose_device, find_checkpoints, on_device
+    from hyperplanes.presets import PROTOCOLS
     from hyperplanes.recipes import score_all
 
     console, device = Console(), choose_device(arguments.device)
@@ -78,9 +83,12 @@ def run(arguments: Arguments) -> int:
     names = data.names(arguments.split)[: arguments.objects]
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
-    methods = {name: on_device(make_method(name, checkpoints), device) for name in arguments.method}
+    sampling = PROTOCOLS[arguments.protocol]
+    methods = {
+        name: ByProtocol(on_device(make_method(name, checkpoints), device), sampling) for name in arguments.method
+    }
     with console.bar("evaluating") as bar:
-        scores = score_all(methods, OnDevice(data, device), names, bar.show)
+        scores = score_all(methods, OnDevice(data, device, arguments.up), names, bar.show)
     if arguments.json is not None:
         write_json(arguments.json, {score.method: score.as_json() for score in scores})
     console.table(HEADINGS, rows(scores))

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalInt, optional
+from hyperplanes.commands.options import OptionalInt, Up, optional
 from hyperplanes.commands.render import read_scene
 
 __all__ = ["Arguments", "run"]
@@ -38,6 +38,8 @@ class Arguments:
         voxels: Along each side of the grid that the mesh is cut from.
         level: Density at the surface; half opaque within 1/64 of the scene when not given.
         all_views: Show the model every view, not only the support half.
+        up: The axis that points up in the world of the views: y as in training data, z as in Blender. What is written
+            has y up.
         device: auto, cpu or cuda.
     """
 
@@ -53,6 +55,7 @@ class Arguments:
     voxels: int = 128
     level: Annotated[float | None, optional("DENSITY")] = None
     all_views: bool = False
+    up: Up = "y"
     device: str = "auto"
 
 
@@ -63,7 +66,7 @@ def run(arguments: Arguments) -> int:
 
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     model = load_model(arguments.checkpoint).to(device)
-    task = read_scene(arguments.views, arguments.all_views)
+    task = read_scene(arguments.views, arguments.all_views, arguments.up)
     shown = task.support.to(device)
     field = adapt(model, shown, arguments.steps)
     console.say(f"adapted to {len(shown)} views of {task.name}")

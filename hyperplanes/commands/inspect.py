@@ -6,6 +6,7 @@ when something is wrong with it.
 
 Example:
     hyperplanes inspect data/cars
+    hyperplanes inspect data/cars --checksums
     hyperplanes inspect runs/demo/hyperplanes
 """
 
@@ -30,11 +31,13 @@ class Arguments:
         path: A data set in any layout, a folder of posed images, or a checkpoint.
         out: Where the pictures go; runs/inspect/NAME when not given.
         objects: How many objects to look at closely.
+        checksums: Compare every file with its checksum in the manifest, too.
     """
 
     path: tyro.conf.Positional[Path]
     out: OptionalFolder = None
     objects: int = 8
+    checksums: bool = False
 
 
 def checkpoint_lines(folder: Path) -> list[str]:
@@ -75,7 +78,7 @@ def run(arguments: Arguments) -> int:
     from data_gen.inspect import inspect
 
     out = arguments.out or Path("runs/inspect") / arguments.path.resolve().name
-    found = inspect(arguments.path, out, arguments.objects)
+    found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums)
     for line in found.lines():
         console.say(line)
     return int(found.trouble)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
-__all__ = ["OptionalFolder", "OptionalInt", "OptionalName", "OptionalNumber", "optional"]
+__all__ = ["OptionalFolder", "OptionalInt", "OptionalName", "OptionalNumber", "Protocol", "Up", "optional"]
 
 
 def optional(metavar: str, **options: Any) -> Any:
@@ -19,3 +19,9 @@ OptionalFolder = Annotated[Path | None, optional("FOLDER")]
 OptionalInt = Annotated[int | None, optional("INT")]
 OptionalName = Annotated[str | None, optional("NAME")]
 OptionalNumber = Annotated[int | float | None, optional("NUMBER")]
+
+Protocol = Literal["default", "paper"]
+"""A name in `hyperplanes.presets.PROTOCOLS`."""
+
+Up = Literal["y", "z"]
+"""The axis that points up in the world of posed images."""

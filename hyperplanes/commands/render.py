@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalInt, optional
+from hyperplanes.commands.options import OptionalInt, Protocol, Up, optional
 from hyperplanes.words import duration
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ class Arguments:
         size: Pixels along the longer side of an orbit's pictures; as the images when not given.
         turntable: The format of the turntable.
         all_views: Show the model every view, not only the support half.
+        up: The axis that points up in the world of the views: y as in training data, z as in Blender.
+        protocol: How the field is sampled: as it was trained, or 64 + 128 times a ray as in the paper.
         device: auto, cpu or cuda.
     """
 
@@ -50,17 +52,29 @@ class Arguments:
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"
     all_views: bool = False
+    up: Up = "y"
+    protocol: Protocol = "default"
     device: str = "auto"
 
 
-def read_scene(path: Path, all_views: bool) -> Task:
-    """The views to show and the views to ask for; the same ones where all are shown."""
+def read_scene(path: Path, all_views: bool, up: str = "y") -> Task:
+    """The views to show and the views to ask for; the same ones where all are shown.
+
+    Args:
+        path: of the posed images.
+        all_views: whether all are shown.
+        up: the axis that points up in their world; they are turned so that it is y.
+
+    Returns:
+        Views of a world with y up.
+    """
     from hyperplanes.data import read_task, read_views
+    from hyperplanes.data.upright import upright, upright_task
     from hyperplanes.views import Task
 
     if not all_views:
-        return read_task(path)
-    views = read_views(path)
+        return upright_task(read_task(path), up)
+    views = upright(read_views(path), up)
     return Task(views, views, path.resolve().name)
 
 
@@ -70,10 +84,11 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export import encode_animation, orbit_cameras, save_images, to_pixels
     from hyperplanes.metrics import psnr, ssim
     from hyperplanes.models import adapt, choose_device, load_model
+    from hyperplanes.presets import PROTOCOLS
 
     console, device = Console(), choose_device(arguments.device)
     model = load_model(arguments.checkpoint).to(device)
-    task = read_scene(arguments.views, arguments.all_views)
+    task = read_scene(arguments.views, arguments.all_views, arguments.up)
     shown, asked = task.support.to(device), task.query.to(device)
     started = time.perf_counter()
     field = adapt(model, shown, arguments.steps)
@@ -82,7 +97,7 @@ def run(arguments: Arguments) -> int:
     if arguments.orbit is not None:
         cameras = orbit_cameras(shown, arguments.orbit, size=arguments.size)
     started = time.perf_counter()
-    pictures = field.render(cameras)
+    pictures = field.render(cameras, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / cameras.batch_size
     if arguments.orbit is None:
         paths = save_images(pictures.images, arguments.out, asked.names)

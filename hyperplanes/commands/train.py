@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from hyperplanes.commands.console import Bar, Console
-from hyperplanes.commands.options import OptionalInt
+from hyperplanes.commands.options import OptionalInt, Protocol
 from hyperplanes.words import duration, rate
 
 if TYPE_CHECKING:
@@ -35,7 +35,8 @@ class Arguments:
         data: The data set.
         out: The folder for checkpoints; a training that was interrupted there goes on.
         preset: One of `hyperplanes presets`: how large the model is and how long it is trained.
-        method: HyperPlanes, or its target network alone with one set of weights for all objects.
+        method: HyperPlanes, or a target network alone with one set of weights for all objects.
+        protocol: How rays are sampled: as the preset says, or 64 + 128 times each as in the paper.
         steps: Other than the preset's.
         seed: Of the first weights and of every draw.
         device: auto, cpu or cuda.
@@ -44,7 +45,8 @@ class Arguments:
     data: Path
     out: Path
     preset: str = "quick"
-    method: Literal["hyperplanes", "point_multiplane", "multiplane"] = "hyperplanes"
+    method: Literal["hyperplanes", "point_multiplane", "multiplane", "nerf"] = "hyperplanes"
+    protocol: Protocol = "default"
     steps: OptionalInt = None
     seed: int = 0
     device: str = "auto"
@@ -106,7 +108,9 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.recipes import recipe, start_training
 
     console = Console()
-    chosen = recipe(arguments.preset, arguments.method, steps=arguments.steps, seed=arguments.seed)
+    chosen = recipe(
+        arguments.preset, arguments.method, steps=arguments.steps, seed=arguments.seed, protocol=arguments.protocol
+    )
     data = open_dataset(arguments.data)
     if not data.names("train"):
         raise ValueError(

@@ -1,0 +1,106 @@
+"""Turn one adapted object into a sparse voxel grid: one small file that renders at once, without any network.
+
+Density and view-dependent colour (spherical harmonics) are kept for the voxels that can be seen. What it costs is said:
+the baked pictures are compared with the field's own and with the true query views.
+
+Example:
+    hyperplanes bake --checkpoint runs/demo --views photos/ --out chair.safetensors
+    hyperplanes bake --checkpoint runs/demo --views photos/ --out chair.safetensors --voxels 192 --orbit 96
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.options import OptionalInt, Up, optional
+from hyperplanes.commands.render import read_scene
+from hyperplanes.words import duration
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["Arguments", "run"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to bake.
+
+    Attributes:
+        checkpoint: What `train`, `adapt` or `demo` wrote.
+        views: The posed images of the object.
+        out: The file to write.
+        voxels: Along each side of the grid.
+        steps: Fine-tuning steps on the shown views.
+        orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
+        size: Pixels along the longer side of the turntable; as the images when not given.
+        turntable: The format of the turntable.
+        all_views: Show the model every view, not only the support half.
+        up: The axis that points up in the world of the views: y as in training data, z as in Blender. What is written
+            has y up.
+        device: What adapts and bakes: auto, cpu or cuda.
+    """
+
+    checkpoint: Path
+    views: Path
+    out: Path
+    voxels: int = 128
+    steps: int = 0
+    orbit: Annotated[int | None, optional("FRAMES")] = None
+    size: OptionalInt = None
+    turntable: Literal["webp", "gif"] = "webp"
+    all_views: bool = False
+    up: Up = "y"
+    device: str = "auto"
+
+
+def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
+    started = time.perf_counter()
+    result = action()
+    return time.perf_counter() - started, result
+
+
+def run(arguments: Arguments) -> int:
+    """Adapt, bake, write, and say what it cost and what it brought."""
+    from hyperplanes.baking import BakedScene, bake
+    from hyperplanes.checkpoints import write_whole
+    from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
+    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.metrics import psnr
+    from hyperplanes.models import adapt, choose_device, load_model
+
+    console, device = Console(), choose_device(arguments.device)
+    model = load_model(arguments.checkpoint).to(device)
+    task = read_scene(arguments.views, arguments.all_views, arguments.up)
+    shown, query = task.support.to(device), task.query
+    field = adapt(model, shown, arguments.steps)
+    console.say(f"adapted to {len(shown)} views of {task.name}")
+    started = time.perf_counter()
+    baked = bake(field, side=arguments.voxels)
+    baked.save(arguments.out)
+    size = arguments.out.stat().st_size / 2**20
+    console.say(
+        f"{arguments.out}: {len(baked.values):,} voxels of {arguments.voxels}^3, {size:.1f} MiB, "
+        f"in {duration(time.perf_counter() - started)}"
+    )
+    scene = BakedScene(baked)
+    first = camera.select(query.cameras, [0])
+    for each in (scene, field):
+        each.render(first)  # compiles, and finds where the field is not empty
+    slow, before = _timed(lambda: field.render(query.cameras).images.clamp(0, 1).cpu())
+    fast, after = _timed(lambda: scene.render(query.cameras).images.clamp(0, 1))
+    console.say(
+        f"{len(query)} query views: {duration(fast / len(query))} each, {slow / fast:.0f} times the field's speed; "
+        f"{float(psnr(after, query.images).mean()):.2f} dB, the field {float(psnr(before, query.images).mean()):.2f} dB"
+    )
+    if arguments.orbit is not None:
+        cameras = orbit_cameras(task.support, arguments.orbit, size=arguments.size)
+        path = arguments.out.with_suffix(f".{arguments.turntable}")
+        write_whole(path, encode_animation(to_pixels(scene.render(cameras).images), arguments.turntable))
+        console.say(f"{path}: {arguments.orbit} frames")
+    return 0
