@@ -40,7 +40,10 @@ class ConvNet(nn.Module):
 
 
 class _Bottleneck(nn.Module):
-    """1x1, 3x3 (strided), 1x1 convolutions beside a shortcut (He et al. 2016, Fig. 5)."""
+    """1x1, 3x3, 1x1 convolutions beside a shortcut (He et al. 2016, Fig. 5).
+
+    The stride is that of the 3x3 convolution, as everybody has it since; the publication strides the first 1x1.
+    """
 
     def __init__(self, before: int, narrow: int, stride: int, normalisation: str) -> None:
         super().__init__()

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import relu
 
 from hyperplanes.hypernetwork.encoders import ENCODERS
+from hyperplanes.hypernetwork.weights import LowRankReader
 from hyperplanes.parameters import Parameters
 
 __all__ = ["HyperNetwork", "HyperNetworkConfig"]
@@ -27,8 +28,12 @@ class HyperNetworkConfig:
         code: length of the code of one image.
         depth: fully connected layers of the head before its outputs.
         width: of each of them.
-        layers: which layers of the target are updated; the colour and opacity layers by default.
+        layers: which layers of the target are updated; the colour and opacity layers by default, ("all",) for every
+            one of them, as an ablation.
         see_weights: theta is an input.
+        weights_seen: how much of it: "updated", the weights of the layers that are updated, or "all". The paper says
+            theta. It is the same for every object, so in use its code is a constant and tells nothing of the object;
+            in training it lets the update follow the weights it is added to, which are the updated ones.
         see_directions: the viewing directions are an input.
         gain: what the outputs are multiplied with.
     """
@@ -41,6 +46,7 @@ class HyperNetworkConfig:
     width: int = 256
     layers: tuple[str, ...] = ("colour", "density")
     see_weights: bool = True
+    weights_seen: str = "updated"
     see_directions: bool = True
     gain: float = 1.0
 
@@ -55,18 +61,25 @@ class HyperNetwork(nn.Module):
         super().__init__()
         if config.encoder not in ENCODERS:
             raise ValueError(f"encoder: expected one of {sorted(ENCODERS)}, got {config.encoder!r}")
+        if config.weights_seen not in ("updated", "all"):
+            raise ValueError(f"weights_seen: expected 'updated' or 'all', got {config.weights_seen!r}")
         self.config = config
-        self.shapes = {name: shape for name, shape in shapes.items() if name.split(".")[-2] in config.layers}
         known = {name.split(".")[-2] for name in shapes}
-        unknown = set(config.layers) - known
-        if unknown:
-            raise ValueError(f"layers: expected some of {sorted(known)}, got {sorted(unknown)}")
+        chosen = known if config.layers == ("all",) else set(config.layers)
+        if not chosen or chosen - known:
+            expected = f"('all',) or some of {sorted(known)}"
+            raise ValueError(f"layers: expected {expected}, got {sorted(chosen - known) or 'none'}")
+        self.shapes = {name: shape for name, shape in shapes.items() if name.split(".")[-2] in chosen}
         self.encoder = ENCODERS[config.encoder](config.code, config.normalisation)
-        self.weights_code = nn.Linear(sum(s.numel() for s in self.shapes.values()), config.code)
+        if config.weights_seen == "all":
+            self.weights_code = LowRankReader(shapes, config.code)
+        else:
+            self.weights_code = nn.Linear(sum(shape.numel() for shape in self.shapes.values()), config.code)
         sizes = [config.views * (config.code + 3) + config.code] + [config.width] * config.depth
         self.head = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
-        self.outputs = nn.ModuleList(nn.Linear(config.width, shape.numel()) for shape in self.shapes.values())
-        for output in self.outputs:
+        outputs = [nn.Linear(config.width, shape.numel()) for shape in self.shapes.values()]
+        self.outputs = nn.ModuleList(outputs)
+        for output in outputs:
             nn.init.zeros_(output.weight)
             nn.init.zeros_(output.bias)
 
@@ -96,8 +109,12 @@ class HyperNetwork(nn.Module):
             )
         codes = self.encoder(images)
         seen = directions if self.config.see_directions else torch.zeros_like(directions)
-        weights = torch.cat([theta[name].flatten() for name in self.shapes])
-        weights = self.weights_code(weights if self.config.see_weights else torch.zeros_like(weights))
+        if not self.config.see_weights:
+            theta = {name: torch.zeros_like(value) for name, value in theta.items()}
+        if isinstance(self.weights_code, LowRankReader):
+            weights = self.weights_code(theta)
+        else:
+            weights = self.weights_code(torch.cat([theta[name].flatten() for name in self.shapes]))
         value = torch.cat([relu(codes).flatten(), seen.flatten(), relu(weights)])[None]
         for layer in self.head:
             value = relu(layer(value))

@@ -3,7 +3,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from hyperplanes.fields import PointMultiPlaneNeRF, TargetConfig
 from hyperplanes.hypernetwork import HyperNetwork, HyperNetworkConfig
+from hyperplanes.hypernetwork.weights import LowRankReader
 
 CONFIG = HyperNetworkConfig(views=3, normalisation="group", code=8, depth=2, width=16)
 SHAPES = {
@@ -114,10 +116,54 @@ def test_gradients_reach_the_hypernetwork_the_images_and_theta():
 
 
 def test_wrong_shapes_of_the_network_are_refused():
-    with pytest.raises(ValueError, match=r"layers: expected some of \['0', 'colour', 'density'\], got \['sigma'\]"):
+    with pytest.raises(
+        ValueError, match=r"layers: expected \('all',\) or some of \['0', 'colour', 'density'\], got \['sigma'\]"
+    ):
         make(replace(CONFIG, layers=("sigma",)))
     with pytest.raises(ValueError, match=r"encoder: expected one of \['convnet', 'resnet101'\], got 'vgg'"):
         make(replace(CONFIG, encoder="vgg"))
     images, directions, theta = inputs()
     with pytest.raises(ValueError, match="HyperPlanes: expected 3 images and directions, got 2 and 2"):
         make()(images[:2], directions[:2], theta)
+
+
+def test_all_layers_can_be_updated_and_none_is_refused():
+    assert set(make(replace(CONFIG, layers=("all",)))(*inputs())) == set(SHAPES)
+    with pytest.raises(ValueError, match=r"layers: expected \('all',\) or some of .*, got none"):
+        make(replace(CONFIG, layers=()))
+
+
+@torch.no_grad()
+def test_all_of_theta_or_the_updated_layers_are_read():
+    images, directions, theta = inputs()
+    reads = {name: make(replace(CONFIG, weights_seen=name)) for name in ("updated", "all")}
+    for name in SHAPES:
+        changed = {**theta, name: theta[name] + 1}
+        for seen, network in reads.items():
+            told = differs(network(images, directions, theta), network(images, directions, changed))
+            assert told == (seen == "all" or "layers" not in name)
+    blind = make(replace(CONFIG, weights_seen="all", see_weights=False))
+    other = {name: value + 1 for name, value in theta.items()}
+    assert not differs(blind(images, directions, theta), blind(images, directions, other))
+    with pytest.raises(ValueError, match="weights_seen: expected 'updated' or 'all', got 'some'"):
+        make(replace(CONFIG, weights_seen="some"))
+
+
+@torch.no_grad()
+def test_what_is_read_of_a_matrix_and_a_bias():
+    # Closed form: the code of W and b is A (U W V, u b) + c, by hand from the reader's own numbers.
+    reader = LowRankReader({"w": torch.Size([6, 5]), "b": torch.Size([6])}, 3)
+    theta = {"w": torch.randn(6, 5), "b": torch.randn(6)}
+    products = torch.einsum("ri,ij,jc->rc", reader.left[0], theta["w"], reader.right[0]).flatten()
+    projected = (reader.left[1] * theta["b"]).sum(1) * reader.right[1].item()
+    expected = reader.code.weight @ torch.cat([products, projected]) + reader.code.bias
+    torch.testing.assert_close(reader(theta), expected)
+
+
+def test_reading_the_papers_network_takes_few_numbers():
+    with torch.device("meta"):
+        target = PointMultiPlaneNeRF(TargetConfig())
+        reader = LowRankReader({name: value.shape for name, value in target.named_parameters()}, 128)
+    theta = sum(value.numel() for value in target.parameters())
+    assert theta * 128 > 75e6
+    assert sum(value.numel() for value in reader.parameters()) < 120_000

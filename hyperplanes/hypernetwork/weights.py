@@ -1,0 +1,45 @@
+"""How the hypernetwork reads theta: a code of the target's own weights (HyperPlanes, Eq. 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+__all__ = ["LowRankReader"]
+
+RANK = 4
+
+
+class LowRankReader(nn.Module):
+    """Every weight of a network becomes one code, by few learned numbers.
+
+    Of a matrix W (out x in) the products U W V are read, U (4 x out) and V (in x 4) being learned, 16 numbers; of a
+    bias b as many, U b. A linear layer makes the code of all of them. At depth 8 and width 256 that is a hundred
+    thousand learned numbers, where a linear layer over theta itself would take 80 million.
+
+    Args:
+        shapes: of the parameters by name.
+        code: length of the code.
+    """
+
+    def __init__(self, shapes: Mapping[str, torch.Size], code: int) -> None:
+        super().__init__()
+        self.names = tuple(shapes)
+        self.left, self.right = nn.ParameterList(), nn.ParameterList()
+        for shape in shapes.values():
+            rows = RANK if len(shape) == 2 else RANK**2
+            self.left.append(nn.Parameter(torch.randn(rows, shape[0]) / shape[0] ** 0.5))
+            columns = (shape[1], RANK) if len(shape) == 2 else (1, 1)
+            self.right.append(nn.Parameter(torch.randn(columns) / columns[0] ** 0.5))
+        self.code = nn.Linear(RANK**2 * len(self.names), code)
+
+    def forward(self, theta: Mapping[str, Tensor]) -> Float[Tensor, " code"]:
+        """The code of these weights."""
+        read = [
+            left @ theta[name].reshape(left.shape[1], -1) @ right
+            for name, left, right in zip(self.names, self.left, self.right, strict=True)
+        ]
+        return self.code(torch.cat([each.flatten() for each in read]))
