@@ -10,6 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("hyperplanes", "data_gen", "benchmarks")
+PACKAGED = ("hyperplanes/pretrained/tiny/model.json", "hyperplanes/pretrained/tiny/model.safetensors")
 
 
 @pytest.fixture(scope="module")
@@ -19,6 +20,9 @@ def wheel(tmp_path_factory):
         shutil.copytree(ROOT / package, tree / package, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "setup.cfg", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, tree)
+    for name in PACKAGED:
+        (tree / name).parent.mkdir(parents=True, exist_ok=True)
+        (tree / name).touch()
     (tree / "tests").mkdir()
     (tree / "tests" / "__init__.py").touch()
     build = "import setuptools.build_meta as backend, sys; backend.build_wheel(sys.argv[1])"
@@ -35,7 +39,8 @@ def test_it_holds_the_packages_and_nothing_else(wheel):
         for path in (ROOT / package).rglob("*")
         if path.suffix == ".py" and (path.parent / "__init__.py").exists()
     }
-    assert found == there | {"hyperplanes/report/style.css"}
+    models = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/pretrained").glob("*/model.*")}
+    assert found == there | {"hyperplanes/report/style.css", *PACKAGED} | models
 
 
 def test_its_metadata(wheel):
