@@ -58,7 +58,7 @@ PRESETS: dict[str, Preset] = {
             hull_side=64,
         ),
         TrainingConfig(
-            steps=2000, rays=768, learning_rate=3e-3, hypernetwork_learning_rate=1.5e-3, warmup=100, final=0.03
+            steps=1200, rays=768, learning_rate=3e-3, hypernetwork_learning_rate=1.5e-3, warmup=100, final=0.03
         ),
         64,
         "64x64, minutes on two cores: what `make demo` trains",
@@ -81,6 +81,20 @@ PRESETS: dict[str, Preset] = {
         TrainingConfig(steps=100_000),
         128,
         "the paper's ShapeNet 128x128 setting (Appendix B): ConvNet, 5 HyperPlanes",
+    ),
+    "paper-128-brief": Preset(
+        ModelConfig(coarse_network=True),
+        TrainingConfig(
+            steps=1200,
+            learning_rate=5e-4,
+            hypernetwork_learning_rate=3e-4,
+            warmup=100,
+            final=0.02,
+            empty_points=256,
+            evaluate_every=200,
+        ),
+        128,
+        "the paper's 128x128 networks in half an hour on one core: the weights that the benchmarks render with",
     ),
     "paper-200": Preset(
         ModelConfig(
