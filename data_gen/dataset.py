@@ -7,24 +7,27 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from data_gen import SUPERSAMPLE
 from data_gen.layouts import LAYOUTS
-from data_gen.manifest import Progress, build_manifest, verify
+from data_gen.manifest import Progress, build_manifest
 from data_gen.objects import RIGS, make_rig
+from data_gen.rig_presets import RIG_PRESETS
 from data_gen.rigs import OBJECT_RADIUS
 from data_gen.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.workers import Outcome, WorkerError, run_isolated
 from hyperplanes.data.errors import DataError
 from hyperplanes.data.files import sha256
 
-__all__ = ["ENGINES", "MeshFolder", "Procedural", "Report", "generate", "verify"]
+__all__ = ["ENGINES", "MeshFolder", "Procedural", "Report", "generate"]
 
 ENGINES = ("local", "ray")
 """Where objects are rendered: worker processes of this machine, or a Ray cluster."""
 
-GENERATOR = "hyperplanes 0.1"
+VIEWS, RESOLUTION = 50, 64
 TARGET = "data_gen.objects:open_renderer"
 EXTRA_CHANNELS = ("depth", "normals", "coordinates", "mesh")
 
@@ -55,8 +58,8 @@ def generate(
     out: str | Path,
     *,
     rig: str = "fixed",
-    views: int = 50,
-    resolution: int = 64,
+    views: int | None = None,
+    resolution: int | None = None,
     lighting: str = "studio",
     channels: Sequence[str] = ("rgba",),
     held_out: float | int | None = None,
@@ -66,10 +69,11 @@ def generate(
     seed: int = 0,
     distance: float | None = None,
     field_of_view: float | None = None,
-    supersample: int = 3,
+    supersample: int = SUPERSAMPLE,
     renderer: str | None = None,
     timeout: float = 300.0,
     recycle: int = 200,
+    verify: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Report:
     """Render objects into a data set.
@@ -80,9 +84,10 @@ def generate(
     Args:
         source: procedural objects or mesh files.
         out: the folder; new, empty, or one in which the same generation was interrupted.
-        rig: "fixed" (the same poses for all objects), "random" (on the sphere), "hemisphere" or "orbit".
-        views: pictures an object, alternately support and query.
-        resolution: pixels along a side.
+        rig: "fixed" (the same poses for all objects), "random" (on the sphere), "hemisphere", "orbit", or a name in
+            `data_gen.rig_presets.RIG_PRESETS`.
+        views: pictures an object, alternately support and query; the preset's when None, else 50.
+        resolution: pixels along a side; what the layout or the preset takes for granted when None, else 64.
         lighting: "studio", "headlight" or "random".
         channels: "rgba" and any of "depth", "normals", "coordinates", "mesh"; more than rgba needs the native layout.
         held_out: objects for the test split, a count or a fraction below 1; see `data_gen.sources.list_items`.
@@ -90,12 +95,14 @@ def generate(
         engine: "local", or "ray" for a Ray cluster.
         layout: a name in `data_gen.layouts.LAYOUTS`.
         seed: of random rigs and lights; shapes have their own in the source.
-        distance: of the cameras from the object's centre in object radii; what suits the layout when None.
-        field_of_view: in degrees; the object just fits when None.
+        distance: of the cameras from the object's centre in object radii; what suits the layout or the preset when
+            None.
+        field_of_view: in degrees; the preset's when None, or the object just fits.
         supersample: samples along a side of a pixel.
         renderer: a name in `data_gen.backends.BACKENDS`; the best that works here when None.
         timeout: seconds an object may take.
         recycle: objects after which a worker is replaced.
+        verify: compare files of an earlier call with their checksums, and make objects anew where they differ.
         progress: called with (objects done, objects in all, name) after each object.
 
     Returns:
@@ -107,12 +114,13 @@ def generate(
     """
     begun = time.monotonic()
     out = Path(out)
-    _check(rig, channels, engine, layout, resolution)
+    _check(rig, channels, engine, layout)
+    views, resolution = _sizes(rig, layout, views, resolution)
     items = list_items(source, held_out)
     settings = _settings(source, locals())
     settings["out"] = str(out.resolve())
     with Progress(out, _configuration(source, items, settings, held_out)) as state:
-        done = state.done()
+        done = state.done(verified=verify)
         reused = sum(item.name in done for item in items)
         todo = (asdict(item) for item in items if item.name not in done)
         count, skipped, images = reused, [], 0
@@ -142,7 +150,7 @@ def generate(
     return Report(len(kept), sorted(skipped), seconds, images / seconds, reused, splits)
 
 
-def _check(rig: str, channels: Sequence[str], engine: str, layout: str, resolution: int) -> None:
+def _check(rig: str, channels: Sequence[str], engine: str, layout: str) -> None:
     for name, value, known in (("rig", rig, RIGS), ("engine", engine, ENGINES), ("layout", layout, tuple(LAYOUTS))):
         if value not in known:
             raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
@@ -151,9 +159,18 @@ def _check(rig: str, channels: Sequence[str], engine: str, layout: str, resoluti
         raise ValueError(f"channels: expected rgba and any of {', '.join(EXTRA_CHANNELS)}, got {tuple(channels)}")
     if layout != "native" and len(channels) > 1:
         raise ValueError(f"channels: expected rgba alone in the {layout} layout, got {tuple(channels)}")
-    wanted = LAYOUTS[layout].resolution
-    if wanted is not None and resolution != wanted:
+
+
+def _sizes(rig: str, layout: str, views: int | None, resolution: int | None) -> tuple[int, int]:
+    """How many pictures of how many pixels a side, by who has a say: the caller, the layout, the preset."""
+    wanted, preset = LAYOUTS[layout].resolution, RIG_PRESETS.get(rig)
+    if resolution is None:
+        resolution = wanted or (preset.resolution if preset else RESOLUTION)
+    elif wanted is not None and resolution != wanted:
         raise ValueError(f"resolution: the {layout} layout's loaders take {wanted} for granted, got {resolution}")
+    if views is None:
+        views = preset.views if preset else VIEWS
+    return views, resolution
 
 
 def _settings(source: Source, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -165,8 +182,14 @@ def _settings(source: Source, arguments: dict[str, Any]) -> dict[str, Any]:
         name: arguments[name]
         for name in ("rig", "views", "resolution", "lighting", "layout", "seed", "supersample", "field_of_view")
     }
-    settings["distance"] = layout.distance if arguments["distance"] is None else float(arguments["distance"])
-    settings["field_of_view"] = layout.field_of_view if layout.field_of_view else arguments["field_of_view"]
+    preset = RIG_PRESETS.get(arguments["rig"])
+    distance = arguments["distance"]
+    if distance is None:
+        distance = preset.distance if preset and arguments["layout"] == "native" else layout.distance
+    settings["distance"] = float(distance)
+    if preset and arguments["field_of_view"] is None:
+        settings["field_of_view"] = preset.field_of_view
+    settings["field_of_view"] = layout.field_of_view or settings["field_of_view"]
     settings["channels"] = ["rgba", *sorted(set(arguments["channels"]) - {"rgba"})]
     settings["up"] = source.up if isinstance(source, MeshFolder) else "y"
     settings["renderer"] = find_backend(arguments["renderer"]).name
@@ -188,7 +211,8 @@ def _configuration(
             "meshes": len(items),
             "names": sha256(repr(names).encode()),
         }
-    return configuration | {"generator": GENERATOR, "source": described, "held_out": held_out}
+    generator = f"hyperplanes {version('hyperplanes')}"
+    return configuration | {"generator": generator, "source": described, "held_out": held_out}
 
 
 def _without_path(reason: str, source: Source) -> str:

@@ -165,8 +165,20 @@ class Progress:
         if self._lock is not None:
             self._lock.close()
 
-    def done(self) -> dict[str, Entry]:
-        """The finished objects, by name, of which all files are there."""
+    def done(self, *, verified: bool = False) -> dict[str, Entry]:
+        """The finished objects, by name, of which all files are there.
+
+        Args:
+            verified: only those whose files are as they were written, by their checksums.
+
+        Returns:
+            What was noted of each when it was finished.
+        """
+
+        def stands(name: str, checksum: str) -> bool:
+            path = inside(self.out, name, self.out / MANIFEST)
+            return path.is_file() and (not verified or sha256(path.read_bytes()) == checksum)
+
         entries = {}
         manifest = self.out / MANIFEST
         if manifest.is_file():
@@ -178,7 +190,7 @@ class Progress:
         return {
             name: entry
             for name, entry in entries.items()
-            if all((self.out / path).is_file() for path in entry["files"])
+            if all(stands(path, checksum) for path, checksum in entry["files"].items())
         }
 
     def finish(self, manifest: dict[str, Any], others: dict[str, bytes]) -> None:

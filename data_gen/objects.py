@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.layouts import LAYOUTS, RenderedObject
+from data_gen.rig_presets import RIG_PRESETS
 from data_gen.rigs import Rig
 from data_gen.sources import Item, seed_of
 from hyperplanes.data.files import encode_json, sha256, write_whole
 
 __all__ = ["RIGS", "make_rig", "open_renderer"]
 
-RIGS = ("fixed", "random", "hemisphere", "orbit")
+RIGS = ("fixed", "random", "hemisphere", "orbit", *RIG_PRESETS)
 """Names of camera rigs."""
 
 
@@ -36,6 +37,8 @@ def make_rig(settings: dict[str, Any], name: str) -> Rig:
     common = {"distance": settings["distance"], "field_of_view": settings["field_of_view"]}
     views, resolution = settings["views"], settings["resolution"]
     kind = settings["rig"]
+    if kind in RIG_PRESETS:
+        kind = RIG_PRESETS[kind].kind
     if kind == "fixed":
         return rigs.fixed(views, resolution, **common)
     if kind == "orbit":

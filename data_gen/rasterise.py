@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from data_gen import SUPERSAMPLE
 from data_gen.backends import BACKENDS, Backend, RendererError, find_backend, remedy
 from data_gen.lighting import Lighting, resolve_lighting
 from data_gen.rigs import Rig
@@ -81,7 +82,7 @@ class Rasteriser:
         supersample: Samples along a side of a pixel.
     """
 
-    def __init__(self, backend: Backend | str | None = None, supersample: int = 3) -> None:
+    def __init__(self, backend: Backend | str | None = None, supersample: int = SUPERSAMPLE) -> None:
         if not 1 <= supersample <= MAX_SUPERSAMPLE:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, received {supersample}")
         self.name = backend if isinstance(backend, str) else (backend or find_backend()).name

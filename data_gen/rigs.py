@@ -8,7 +8,7 @@ expected inside the sphere of radius 1 around the origin, at which every camera 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,13 +18,11 @@ import numpy.typing as npt
 __all__ = [
     "DEFAULT_DISTANCE",
     "OBJECT_RADIUS",
-    "RIG_PRESETS",
     "Rig",
     "fitting_field_of_view",
     "fixed",
     "look_at_origin",
     "orbit",
-    "preset",
     "random_hemisphere",
     "random_sphere",
 ]
@@ -285,37 +283,7 @@ def orbit(
     return _rig(_directions(heights, azimuths), resolution, distance, field_of_view)
 
 
-def preset(name: str, *, seed: int = 0) -> Rig:
-    """The cameras of a named configuration.
-
-    Args:
-        name: A name in RIG_PRESETS.
-        seed: Seed of the presets that place cameras at random.
-
-    Returns:
-        The rig.
-
-    Raises:
-        ValueError: If no preset has that name.
-    """
-    if name not in RIG_PRESETS:
-        raise ValueError(f"rig preset: expected one of {', '.join(RIG_PRESETS)}, received {name!r}")
-    return RIG_PRESETS[name](seed)
-
-
-_BLENDER_FIELD_OF_VIEW = math.degrees(2.0 * math.atan(36.0 / 2.0 / 50.0))  # a lens of 50 mm before a film of 36 mm
 _HALF_TURN = _GOLDEN_ANGLE / 2.0
-
-RIG_PRESETS: dict[str, Callable[[int], Rig]] = {
-    "paper-128": lambda seed: random_sphere(50, 128, seed=seed, distance=4.0, field_of_view=_BLENDER_FIELD_OF_VIEW),
-    "paper-200": lambda seed: fixed(50, 200),
-}
-"""Named camera configurations of the paper's two data sets, each a function of a seed.
-
-`paper-128` follows the ShapeNet renders of "Learned Initializations" (Tancik et al. 2021), the paper's first data set:
-at random all over the sphere, at distance 4 (its loaders sample rays from 2 to 6), with Blender's field of view; the
-unit sphere spans 72 % of the picture. `paper-200` is the paper's second: the same 50 poses for every object.
-"""
 
 
 def _check_views(views: int) -> None:

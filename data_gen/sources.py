@@ -37,10 +37,12 @@ class MeshFolder:
     Attributes:
         path: the folder.
         up: which axis is up in the files, y or z.
+        split_file: ShapeNet's official all.csv; models that it does not list are trained on.
     """
 
     path: str | Path
     up: Literal["y", "z"] = "y"
+    split_file: str | Path | None = None
 
 
 Source = Procedural | MeshFolder
@@ -117,7 +119,11 @@ def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
 
     if source.up not in ("y", "z"):
         raise ValueError(f"up: expected y or z, got {source.up!r}")
-    found = find_meshes(source.path)
+    if source.split_file is not None and held_out is not None:
+        raise ValueError(f"held_out: expected none, for {source.split_file} decides, got {held_out}")
+    found = find_meshes(source.path, split_file=source.split_file)
+    if source.split_file is not None and not any(mesh.split for mesh in found):
+        raise ValueError(f"{source.split_file}: expected models of {source.path}, found none of them; check both")
     classes: dict[str | None, list[Any]] = defaultdict(list)
     for mesh in sorted(found, key=lambda mesh: mesh.name):
         classes[mesh.class_name].append(mesh)

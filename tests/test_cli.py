@@ -85,6 +85,7 @@ def test_version(capsys):
         (["generate", "--out", "OUT"], ["--class", "--meshes"]),
         (["generate", "--meshes", "OUT/none", "--out", "OUT"], ["OUT/none", "found nothing"]),
         (["generate", "--class", "car", "--count", "0", "--out", "OUT"], ["at least 1 object", "0"]),
+        (["generate", "--class", "car", "--split-file", "all.csv", "--out", "OUT"], ["split_file", "--meshes"]),
         (["train", "--data", "OUT/none", "--out", "OUT/run"], ["OUT/none", "hyperplanes generate"]),
         (["train", "--data", "DATA", "--preset", "huge", "--out", "OUT/run"], ["quick", "huge"]),
         (["train", "--data", "DATA", "--steps", "0", "--out", "OUT/run"], ["steps", "0"]),
@@ -139,6 +140,17 @@ def test_presets_and_inspect(capsys, tmp_path):
     assert main(["inspect", str(demo / "data"), "--out", str(tmp_path)]) in (0, 1)
     assert "3 (2 train, 1 test)" in capsys.readouterr().out
     assert (tmp_path / "contact_sheet.png").exists()
+
+
+def test_generate_verifies_and_mends_when_asked(tmp_path, capsys):
+    command = ["generate", "--class", "lamp", "--count", "2", "--views", "2", "--resolution", "16", "--workers", "1"]
+    assert main([*command, "--rig", "paper-128", "--verify", "--out", str(tmp_path)]) == 0
+    assert "files as they were written" in capsys.readouterr().out
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.png")}
+    next(iter(before)).write_bytes(b"worm")
+    assert main([*command, "--rig", "paper-128", "--verify", "--out", str(tmp_path)]) == 0
+    assert "1 of them from before" in capsys.readouterr().out
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.png")} == before
 
 
 def test_inspect_compares_checksums_when_asked(tmp_path, capsys):

@@ -7,6 +7,7 @@ Interrupted, the same command goes on where it stopped and ends with the same by
 Example:
     hyperplanes generate --class car --count 70 --resolution 64 --seed 0 --out data/cars
     hyperplanes generate --meshes my-models --up z --resolution 128 --out data/mine
+    hyperplanes generate --meshes ShapeNetCore.v2 --split-file all.csv --rig paper-128 --out data/shapenet
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from data_gen import SUPERSAMPLE
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, optional
 from hyperplanes.words import duration
@@ -35,19 +37,23 @@ class Arguments:
         meshes: A folder of mesh files, instead of --class.
         count: How many procedural objects, the held-out ones included.
         seed: Of the procedural shapes and of random rigs and lights.
-        resolution: Pixels along a side of the square images.
-        views: Cameras an object, alternately support and query.
+        resolution: Pixels along a side of the square images; what the rig or the layout is made for, else 64, when not
+            given.
+        views: Cameras an object, alternately support and query; 50 when not given.
         held_out: Objects for the test split: a count, or a fraction below 1. A seventh when not given; of mesh files
             the split that their tree states, else a fifth.
-        rig: Where the cameras stand: the same places for all objects, random ones, or a circle.
+        rig: Where the cameras stand: the same places for all objects, random ones, a circle, or as in one of the two
+            data sets of the paper, with its distance, lens and resolution.
         lighting: Where the light comes from.
         layout: How the files lie: native, or as another project's loader reads them.
         up: The axis that points up in the mesh files.
+        split_file: ShapeNet's official all.csv, which says what each model of the tree is for.
         channels: What is written of every view; more than rgba needs the native layout.
         workers: Processes; as many as there are cores when not given.
         engine: Worker processes of this machine, or a Ray cluster.
-        supersample: Samples along a side of a pixel.
+        supersample: Samples along a side of a pixel, each of them shaded.
         renderer: pyrender-egl, pyrender-osmesa or embree; the best that works here when not given.
+        verify: Compare all files with their checksums; objects of an interrupted call whose files differ are made anew.
     """
 
     out: Path
@@ -55,18 +61,20 @@ class Arguments:
     meshes: OptionalFolder = None
     count: int = 70
     seed: int = 0
-    resolution: int = 64
-    views: int = 50
+    resolution: OptionalInt = None
+    views: OptionalInt = None
     held_out: OptionalNumber = None
-    rig: Literal["fixed", "random", "hemisphere", "orbit"] = "fixed"
+    rig: Literal["fixed", "random", "hemisphere", "orbit", "paper-128", "paper-200"] = "fixed"
     lighting: Literal["studio", "headlight", "random"] = "studio"
     layout: Literal["native", "srn", "learnit-128", "hyperplanes-200"] = "native"
     up: Literal["y", "z"] = "y"
+    split_file: Annotated[Path | None, optional("FILE")] = None
     channels: tuple[Literal["rgba", "depth", "normals", "coordinates", "mesh"], ...] = ("rgba",)
     workers: OptionalInt = None
     engine: Literal["local", "ray"] = "local"
-    supersample: int = 2
+    supersample: int = SUPERSAMPLE
     renderer: OptionalName = None
+    verify: bool = False
 
 
 def source_of(arguments: Arguments) -> Procedural | MeshFolder:
@@ -81,7 +89,9 @@ def source_of(arguments: Arguments) -> Procedural | MeshFolder:
         found = "none" if arguments.meshes is None else "both"
         raise ValueError(f"expected --class NAME or --meshes FOLDER, found {found}; `hyperplanes generate --help`")
     if arguments.meshes is not None:
-        return MeshFolder(arguments.meshes, arguments.up)
+        return MeshFolder(arguments.meshes, arguments.up, arguments.split_file)
+    if arguments.split_file is not None:
+        raise ValueError("split_file: expected with --meshes and a ShapeNetCore tree, found with --class")
     return Procedural(str(arguments.class_name), arguments.count, arguments.seed)
 
 
@@ -99,6 +109,7 @@ def run(arguments: Arguments) -> int:
     """Generate the data set and say what was skipped."""
     from data_gen.backends import find_backend
     from data_gen.dataset import generate
+    from data_gen.manifest import verify
 
     console = Console()
     source = source_of(arguments)
@@ -122,9 +133,15 @@ def run(arguments: Arguments) -> int:
             seed=arguments.seed,
             supersample=arguments.supersample,
             renderer=backend.name,
+            verify=arguments.verify,
             progress=lambda done, total, name: bar.show(done, total, name),
         )
     for name, reason in report.skipped:
         console.warn(f"skipped {name}: {reason}")
     console.say(summary(report, arguments.out))
-    return 0
+    if not arguments.verify:
+        return 0
+    verification = verify(arguments.out)
+    for line in verification.lines():
+        console.say(line)
+    return int(not verification.intact)

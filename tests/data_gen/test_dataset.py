@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,11 @@ import pytest
 import torch
 import trimesh
 
-from data_gen import dataset
-from data_gen.dataset import MeshFolder, Procedural, generate, verify
+from data_gen import SUPERSAMPLE, dataset
+from data_gen.dataset import MeshFolder, Procedural, generate
 from data_gen.inspect import inspect
+from data_gen.manifest import verify
+from data_gen.rig_presets import preset
 from data_gen.rigs import fixed
 from data_gen.sources import list_items
 from hyperplanes.data import DataError, Dataset
@@ -23,6 +26,7 @@ from hyperplanes.geometry import cameras as camera
 
 SMALL = {"views": 4, "resolution": 16, "workers": 1}
 CARS = Procedural("car", 5, seed=3)
+SPLITS = ("test", "train", "val")
 SCRIPT = """
 from data_gen.dataset import *
 print(generate(Procedural("car", 5, seed=3), {out!r}, views=4, resolution=16, workers=1, held_out=2,
@@ -177,7 +181,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"rig": "circle"}, "rig: expected one of fixed, random, hemisphere, orbit, got 'circle'"),
+        ({"rig": "circle"}, "rig: expected one of fixed, random, hemisphere, orbit, .*, got 'circle'"),
         ({"layout": "tar"}, "layout: expected one of native, .*, got 'tar'"),
         ({"engine": "slurm"}, "engine: expected one of local, ray, got 'slurm'"),
         ({"channels": ("depth",)}, "channels: expected rgba and any of"),
@@ -220,3 +224,64 @@ def test_progress_is_told(tmp_path):
     told = []
     generate(Procedural("car", 2), tmp_path, progress=lambda *state: told.append(state), **SMALL)
     assert [state[:2] for state in told] == [(1, 2), (2, 2)]
+
+
+def test_the_manifest_names_the_version_that_made_it(whole):
+    manifest = json.loads((whole[0] / "manifest.json").read_text())
+    assert manifest["configuration"]["generator"] == f"hyperplanes {version('hyperplanes')}"
+    assert manifest["configuration"]["supersample"] == SUPERSAMPLE
+
+
+def test_files_that_have_changed_are_made_again_when_asked(tmp_path, whole):
+    out = tmp_path / "cars"
+    generate(CARS, out, held_out=2, **SMALL)
+    for name in ("car_00001/images/002.png", "car_test_00000/transforms.json"):
+        (out / name).write_bytes(b"worm")
+    assert generate(CARS, out, held_out=2, **SMALL).reused == 5
+    assert not verify(out).intact
+    assert generate(CARS, out, held_out=2, verify=True, **SMALL).reused == 3
+    assert tree(out) == tree(whole[0])
+
+
+def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
+    car = Procedural("car", 1, seed=3)
+    generate(car, tmp_path / "200", rig="paper-200", resolution=8, held_out=0, workers=1)
+    task = Dataset(tmp_path / "200").task("car_00000")
+    expected = preset("paper-200")
+    assert len(task.support) + len(task.query) == len(expected) == 50
+    poses = torch.tensor(expected.camera_from_world[::2]).float()
+    assert torch.allclose(camera.camera_from_world(task.support.cameras), poses, atol=1e-6)
+
+    generate(car, tmp_path / "128", rig="paper-128", views=2, held_out=0, workers=1)
+    support = Dataset(tmp_path / "128").task("car_00000").support
+    expected = preset("paper-128", seed=0)
+    assert support.size == (128, 128)
+    assert torch.allclose(camera.intrinsics(support.cameras)[0], torch.tensor(expected.intrinsics[0]).float())
+    assert float(camera.centres(support.cameras).norm(dim=-1)) == pytest.approx(4.0, abs=1e-5)
+    manifest = json.loads((tmp_path / "128" / "manifest.json").read_text())
+    assert (manifest["near"], manifest["far"]) == (3.0, 5.0)
+    with pytest.raises(ValueError, match="rig: expected one of .*paper-200, got 'paper-64'"):
+        generate(car, tmp_path / "64", rig="paper-64")
+
+
+def test_an_official_split_file_decides(tmp_path):
+    tree_of_cars = tmp_path / "ShapeNetCore.v1"
+    for name in "abcd":
+        path = tree_of_cars / "02958343" / name / "model.obj"
+        path.parent.mkdir(parents=True)
+        trimesh.creation.box().export(path)
+    official = tmp_path / "all.csv"
+    rows = [f"{i},02958343,02958343,{name},{split}" for i, (name, split) in enumerate(zip("abc", SPLITS, strict=True))]
+    official.write_text("\n".join(["id,synsetId,subSynsetId,modelId,split", *rows]))
+    items = list_items(MeshFolder(tree_of_cars, split_file=official), None)
+    assert [(item.name, item.split) for item in items] == [
+        ("car_b", "train"),
+        ("car_d", "train"),  # not listed
+        ("car_c", "val"),
+        ("car_a", "test"),
+    ]
+    with pytest.raises(ValueError, match="held_out: expected none, for .*all.csv decides, got 0.5"):
+        list_items(MeshFolder(tree_of_cars, split_file=official), 0.5)
+    official.write_text("id,synsetId,subSynsetId,modelId,split\n0,03001627,03001627,a,test")
+    with pytest.raises(ValueError, match="all.csv: expected models of .*, found none of them"):
+        list_items(MeshFolder(tree_of_cars, split_file=official), None)

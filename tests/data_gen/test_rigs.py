@@ -6,6 +6,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from data_gen import rigs
+from data_gen.rig_presets import RIG_PRESETS, preset
 
 
 def _nearest(directions):
@@ -91,14 +92,14 @@ def test_random_rigs_follow_their_seed_and_cover_their_part_of_the_sphere():
 
 
 def test_presets():
-    assert set(rigs.RIG_PRESETS) == {"paper-128", "paper-200"}
-    small, large = rigs.preset("paper-128", seed=5), rigs.preset("paper-200", seed=5)
+    assert set(RIG_PRESETS) == {"paper-128", "paper-200"}
+    small, large = preset("paper-128", seed=5), preset("paper-200", seed=5)
     assert (small.width, len(small)) == (128, 50)
     assert (large.width, len(large)) == (200, 50)
-    assert not np.array_equal(small.world_from_camera, rigs.preset("paper-128", seed=6).world_from_camera)
-    assert np.array_equal(large.world_from_camera, rigs.preset("paper-200", seed=6).world_from_camera)
+    assert not np.array_equal(small.world_from_camera, preset("paper-128", seed=6).world_from_camera)
+    assert np.array_equal(large.world_from_camera, preset("paper-200", seed=6).world_from_camera)
     with pytest.raises(ValueError, match="paper-128, paper-200, received 'paper-64'"):
-        rigs.preset("paper-64")
+        preset("paper-64")
 
 
 def test_select_keeps_views_and_bounds():
