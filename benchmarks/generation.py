@@ -18,6 +18,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.reporting import Row, finish
+from data_gen import SUPERSAMPLE
+
 __all__ = ["main"]
 
 VIEWS, RESOLUTION = 50, 128
@@ -41,20 +44,11 @@ def main(arguments: list[str]) -> int:
     objects = 8 if options.quick else 40
     with tempfile.TemporaryDirectory() as folder:
         rows = compare(objects, Path(folder))
-        rows += [extrapolate(rows[0]), memory(24 if options.quick else THOUSAND, Path(folder))]
-    for row in rows:
-        print(
-            "  ".join(
-                f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
-            )
-        )
-    if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps({"benchmark": "generation", "rows": rows}, indent=2) + "\n")
-    return 0
+        rows += [extrapolate(rows[-1]), memory(24 if options.quick else THOUSAND, Path(folder))]
+    return finish("generation", rows, options.json)
 
 
-def compare(objects: int, folder: Path) -> list[dict[str, Any]]:
+def compare(objects: int, folder: Path) -> list[Row]:
     """Images a second of `data_gen.dataset.generate` and of the obvious loop.
 
     Args:
@@ -70,8 +64,8 @@ def compare(objects: int, folder: Path) -> list[dict[str, Any]]:
     renderer = find_backend().name
     workers = len(os.sched_getaffinity(0))
     reference = loop_rate(max(4, objects // 4), folder, renderer)
-    rows = []
-    for supersample in (2, 3):
+    rows: list[Row] = []
+    for supersample in (2, SUPERSAMPLE):
         begun = time.perf_counter()
         generate(
             Procedural("car", objects),
@@ -83,7 +77,7 @@ def compare(objects: int, folder: Path) -> list[dict[str, Any]]:
             supersample=supersample,
         )
         ours = objects * VIEWS / (time.perf_counter() - begun)
-        row: dict[str, Any] = {"name": f"generate, {supersample**2} samples a pixel", "objects": objects}
+        row: Row = {"name": f"generate, {supersample**2} samples a pixel", "objects": objects}
         row |= {"renderer": renderer, "workers": workers, "images_per_second": ours}
         if reference is not None:
             row |= {"reference_images_per_second": reference, "speedup": ours / reference}
@@ -108,13 +102,13 @@ def loop_rate(objects: int, folder: Path, renderer: str) -> float | None:
     return loop["images"] / loop["seconds"]
 
 
-def extrapolate(row: dict[str, Any]) -> dict[str, Any]:
+def extrapolate(row: Row) -> Row:
     """The time that 1,000 objects of 50 views would take at a measured rate; extrapolated, not measured."""
-    seconds = THOUSAND * VIEWS / row["images_per_second"]
+    seconds = THOUSAND * VIEWS / float(row["images_per_second"])
     return {"name": "1,000 objects x 50 views at 128x128", "seconds_extrapolated": seconds}
 
 
-def memory(objects: int, folder: Path) -> dict[str, Any]:
+def memory(objects: int, folder: Path) -> Row:
     """The memory of parent and workers while many small objects stream through, workers not recycled.
 
     Args:

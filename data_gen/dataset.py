@@ -28,6 +28,7 @@ ENGINES = ("local", "ray")
 """Where objects are rendered: worker processes of this machine, or a Ray cluster."""
 
 VIEWS, RESOLUTION = 50, 64
+MOST_VIEWS, MOST_SAMPLES, MOST_BYTES = 10_000, 16_384, 4 * 2**30  # an object; along a side; of all its pictures
 TARGET = "data_gen.objects:open_renderer"
 EXTRA_CHANNELS = ("depth", "normals", "coordinates", "mesh")
 
@@ -116,6 +117,7 @@ def generate(
     out = Path(out)
     _check(rig, channels, engine, layout)
     views, resolution = _sizes(rig, layout, views, resolution)
+    _refuse_absurd(views, resolution, supersample, channels)
     items = list_items(source, held_out)
     settings = _settings(source, locals())
     settings["out"] = str(out.resolve())
@@ -171,6 +173,24 @@ def _sizes(rig: str, layout: str, views: int | None, resolution: int | None) -> 
     if views is None:
         views = preset.views if preset else VIEWS
     return views, resolution
+
+
+def _refuse_absurd(views: int, resolution: int, supersample: int, channels: Sequence[str]) -> None:
+    """Sizes are checked before anything is allocated; the pictures of one object are in memory at once."""
+    if views > MOST_VIEWS:
+        raise ValueError(f"views: expected at most {MOST_VIEWS:,} an object, got {views:,}")
+    if resolution * supersample > MOST_SAMPLES:
+        raise ValueError(
+            f"resolution: expected at most {MOST_SAMPLES:,} samples along a side, got {resolution:,} pixels of "
+            f"{supersample} each"
+        )
+    pixel = 4 + sum({"depth": 4, "normals": 12, "coordinates": 12}.get(channel, 0) for channel in channels)
+    needed = views * resolution**2 * pixel
+    if needed > MOST_BYTES:
+        raise ValueError(
+            f"resolution: expected at most {MOST_BYTES >> 30} GiB of pictures an object, got {needed / 2**30:,.1f} GiB "
+            f"({views:,} views of {resolution:,} x {resolution:,} pixels); take fewer of either"
+        )
 
 
 def _settings(source: Source, arguments: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 from small_demo import demo_folder, only_object
 
+from data_gen.backends import RendererError
 from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
 from hyperplanes.commands import VERBS
@@ -140,6 +141,25 @@ def test_presets_and_inspect(capsys, tmp_path):
     assert main(["inspect", str(demo / "data"), "--out", str(tmp_path)]) in (0, 1)
     assert "3 (2 train, 1 test)" in capsys.readouterr().out
     assert (tmp_path / "contact_sheet.png").exists()
+
+
+def test_without_any_renderer_one_line_says_what_to_install(tmp_path, monkeypatch, capsys):
+    def nothing(_):
+        raise RendererError("no renderer works here; apt-get install -y libegl1 libgl1")
+
+    monkeypatch.setattr("data_gen.backends.find_backend", nothing)
+    assert main(["generate", "--class", "car", "--out", str(tmp_path)]) == 2
+    assert "apt-get install -y libegl1 libgl1" in complaint(capsys)
+
+
+def test_generate_takes_cameras_of_any_distance_and_lens(tmp_path):
+    command = ["generate", "--class", "car", "--count", "1", "--views", "2", "--resolution", "16", "--held-out", "0"]
+    lens = ["--distance", "6", "--field-of-view", "30", "--workers", "1"]
+    assert main([*command, *lens, "--out", str(tmp_path)]) == 0
+    document = json.loads((tmp_path / "car_00000" / "transforms.json").read_text())
+    assert document["fl_x"] == pytest.approx(8 / np.tan(np.radians(15)))
+    pose = np.array(document["frames"][0]["transform_matrix"])
+    assert np.linalg.norm(pose[:3, 3]) == pytest.approx(6)
 
 
 def test_generate_verifies_and_mends_when_asked(tmp_path, capsys):

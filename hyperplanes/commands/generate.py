@@ -44,6 +44,9 @@ class Arguments:
             the split that their tree states, else a fifth.
         rig: Where the cameras stand: the same places for all objects, random ones, a circle, or as in one of the two
             data sets of the paper, with its distance, lens and resolution.
+        distance: Of the cameras from the object's centre, in radii of the object; what the rig or the layout is made
+            for, else 3, when not given.
+        field_of_view: Of the cameras in degrees; that of the rig or the layout, else the object just fits.
         lighting: Where the light comes from.
         layout: How the files lie: native, or as another project's loader reads them.
         up: The axis that points up in the mesh files.
@@ -65,6 +68,8 @@ class Arguments:
     views: OptionalInt = None
     held_out: OptionalNumber = None
     rig: Literal["fixed", "random", "hemisphere", "orbit", "paper-128", "paper-200"] = "fixed"
+    distance: Annotated[float | None, optional("RADII")] = None
+    field_of_view: Annotated[float | None, optional("DEGREES")] = None
     lighting: Literal["studio", "headlight", "random"] = "studio"
     layout: Literal["native", "srn", "learnit-128", "hyperplanes-200"] = "native"
     up: Literal["y", "z"] = "y"
@@ -124,6 +129,8 @@ def run(arguments: Arguments) -> int:
             rig=arguments.rig,
             views=arguments.views,
             resolution=arguments.resolution,
+            distance=arguments.distance,
+            field_of_view=arguments.field_of_view,
             lighting=arguments.lighting,
             channels=arguments.channels,
             held_out=arguments.held_out,

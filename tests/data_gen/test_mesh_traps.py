@@ -33,6 +33,8 @@ from mesh_writers import (
 from data_gen import mesh_files
 from data_gen.meshes import MeshError, load_mesh, prepare_scene, render_ready
 from data_gen.model_folder import ModelFolder
+from data_gen.rasterise import Rasteriser
+from data_gen.rigs import fixed
 
 PAINT = "newmtl paint\nKd 1 0 0\n"
 WOOD = PAINT + "map_Kd wood.png\n"
@@ -441,6 +443,25 @@ def test_too_many_faces_are_refused_where_it_would_not(tmp_path):
         prepare_scene(trimesh.Scene(ball), "ball", max_faces=1000)
     with pytest.raises(MeshError, match="before decimation, found 1280"):
         prepare_scene(trimesh.Scene(ball), "ball", max_faces=100)
+
+
+def test_a_million_faces_are_drawn_as_they_are(tmp_path):
+    """Source of truth: the silhouette of a sphere that just fits."""
+    rows, columns = 513, 1024
+    polar, around = np.meshgrid(np.linspace(1e-3, np.pi - 1e-3, rows), np.arange(columns) * 2 * np.pi / columns)
+    points = np.stack([np.sin(polar) * np.cos(around), np.cos(polar), np.sin(polar) * np.sin(around)], -1)
+    corner = np.arange(columns)[:, None] * rows + np.arange(rows - 1)
+    beside = (corner + rows) % (rows * columns)
+    faces = np.stack([corner, beside, corner + 1, beside, beside + 1, corner + 1], -1).reshape(-1, 3)
+    path = tmp_path / "ball.ply"
+    path.write_bytes(trimesh.Trimesh(points.reshape(-1, 3), faces, process=False).export(file_type="ply"))
+    mesh = load_mesh(path)
+    assert (mesh.face_count, mesh.warnings) == (2**20, ())
+    rig = fixed(1, 64)
+    with Rasteriser() as rasteriser:
+        alpha = rasteriser.render(render_ready(mesh), rig).rgba[0, ..., 3] / 255
+    radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(1 / 3.0))
+    assert alpha.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
 
 
 # --- what a glTF may ask for ----------------------------------------------------------------------------------------
