@@ -25,7 +25,7 @@ from hyperplanes.views import Task
 
 __all__ = ["main"]
 
-DENSE, PACKED = Hierarchical(64, 128), Marched()
+DENSE = Hierarchical(64, 128)
 
 
 class Objects:
@@ -73,7 +73,7 @@ def trainer(chosen: Preset, objects: Objects, sampling: Hierarchical | Marched) 
 
 def compare(name: str, chosen: Preset, objects: Objects, steps: int) -> list[Row]:
     """Steps of both paths in turn: two packed ones to each dense one, so that both see the same machine."""
-    dense, packed = trainer(chosen, objects, DENSE), trainer(chosen, objects, PACKED)
+    dense, packed = trainer(chosen, objects, DENSE), trainer(chosen, objects, chosen.model.sampling)
     for each in (dense, packed):
         each.take_step()
         for task in objects.names("train"):
@@ -102,7 +102,7 @@ def held_out_psnr(trained: Trainer, objects: Objects) -> float:
     """PSNR of two query views of the held-out object after the steps so far, both by the default protocol."""
     task = objects.task(objects.names("test")[0])
     query = task.query[3::12]
-    pictures = trained.model.adapt(task.support).render(query.cameras, PACKED)
+    pictures = trained.model.adapt(task.support).render(query.cameras, Marched())
     return float(psnr(pictures.images.clamp(0, 1), query.images).mean())
 
 

@@ -75,7 +75,7 @@ def cast_through_voxels(
         rays.far.float().numpy(),
         basis.contiguous().numpy(),
         np.float32(step),
-        np.float32(-math.log(stop)),
+        np.float32(-math.log(stop) if stop > 0 else math.inf),
         np.float32(background),
         out,
     )
