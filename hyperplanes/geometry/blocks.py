@@ -16,8 +16,6 @@ from hyperplanes.geometry.vector_memory import bits_of, load, read, store
 __all__ = [
     "BLOCK",
     "CHANNELS",
-    "FIRST_RECORD",
-    "PITCH",
     "back_project",
     "fetch_packed",
     "fetch_plane",
@@ -31,15 +29,12 @@ __all__ = [
 ]  # fmt: skip
 
 BLOCK = 128
-# Rows of the scratch: the point; its pixel before and after clamping; 1 / depth, zero behind the camera; the gradients
-# with respect to the pixel and to the point.
-X, Y, Z, RAW_U, RAW_V, RECIPROCAL, U, V, GRAD_U, GRAD_V, GRAD_X, GRAD_Y, GRAD_Z = (BLOCK * row for row in range(13))
-# After them one record a view, of rows that lie PITCH apart (a little more than BLOCK, lest records compete for the
-# same cache sets): coordinates in [-1, 1], whether the point is inside the image, and one row a channel. Going back,
-# the coordinates' and channels' rows hold the gradients with respect to them.
-FIRST_RECORD = BLOCK * 13
-PITCH = BLOCK + 16
-COLUMN, ROW, INSIDE, CHANNELS = (PITCH * row for row in range(4))
+# Rows of the scratch: a point, where points do not come as rows; its pixel before and after clamping; 1 / depth,
+# zero behind the camera; whether it is inside the image; the gradients with respect to the pixel and to the point;
+# coordinates in [-1, 1], or going back the gradients with respect to them; the same for the channels, one row each.
+X, Y, Z, RAW_U, RAW_V, RECIPROCAL, U, V, INSIDE, GRAD_U, GRAD_V, GRAD_X, GRAD_Y, GRAD_Z, COLUMN, ROW, CHANNELS = (
+    BLOCK * row for row in range(17)
+)
 
 # Everything of fast maths but the assumption that there are no NaN and no infinities. What runs once a lookup is
 # forced inline; LLVM calls it otherwise, which costs more than its work.
@@ -49,14 +44,17 @@ inlined = njit(fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="num
 
 @inner
 @no_type_check
-def project(s, matrices, view, nearest):
-    """X, Y, Z -> RAW_U, RAW_V, RECIPROCAL by the view's 3 x 4 matrix."""
+def project(s, points, at, pitch, matrices, view, nearest):
+    """Points -> RAW_U, RAW_V, RECIPROCAL by the view's 3 x 4 matrix.
+
+    The coordinates x, y, z lie in `points` from `at` on, `pitch` apart.
+    """
     one, zero = s.dtype.type(1), s.dtype.type(0)
     m00, m01, m02, m03 = matrices[view, 0, 0], matrices[view, 0, 1], matrices[view, 0, 2], matrices[view, 0, 3]
     m10, m11, m12, m13 = matrices[view, 1, 0], matrices[view, 1, 1], matrices[view, 1, 2], matrices[view, 1, 3]
     m20, m21, m22, m23 = matrices[view, 2, 0], matrices[view, 2, 1], matrices[view, 2, 2], matrices[view, 2, 3]
     for i in range(BLOCK):
-        x, y, z = load(s, X + i), load(s, Y + i), load(s, Z + i)
+        x, y, z = load(points, at + i), load(points, at + pitch + i), load(points, at + 2 * pitch + i)
         depth = m20 * x + m21 * y + m22 * z + m23
         front = depth > nearest
         reciprocal = one / (depth if front else one)
@@ -67,8 +65,11 @@ def project(s, matrices, view, nearest):
 
 @inner
 @no_type_check
-def place(s, record, height, width):
-    """RAW_U, RAW_V, RECIPROCAL -> clamped U, V; INSIDE; COLUMN, ROW. Comparisons are written so that NaN falls to 0."""
+def place(s, out, column, row, height, width):
+    """RAW_U, RAW_V, RECIPROCAL -> clamped U, V; INSIDE; coordinates, into `out` at `column` and `row`.
+
+    Comparisons are written so that NaN falls to 0.
+    """
     one, zero = s.dtype.type(1), s.dtype.type(0)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
     per_column = s.dtype.type(2) / s.dtype.type(max(width - 1, 1))
@@ -83,15 +84,15 @@ def place(s, record, height, width):
         v = v if v < bottom else bottom
         store(s, U + i, u)
         store(s, V + i, v)
-        store(s, record + INSIDE + i, one if inside else zero)
-        store(s, record + COLUMN + i, u * per_column - one if front else zero)
-        store(s, record + ROW + i, v * per_row - one if front else zero)
+        store(s, INSIDE + i, one if inside else zero)
+        store(out, column + i, u * per_column - one if front else zero)
+        store(out, row + i, v * per_row - one if front else zero)
 
 
 @inner
 @no_type_check
-def fetch_plane(s, record, images, offset, height, width, channel, background):
-    """U, V, INSIDE -> bilinear values of the float plane that starts at `offset`, into the channel's row."""
+def fetch_plane(s, out, first, images, offset, height, width, background):
+    """U, V, INSIDE -> bilinear values of the float plane that starts at `offset`, into `out` from `first` on."""
     last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
     right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
     stride, diagonal, zero = np.int32(width), np.int32(right + below), s.dtype.type(0)
@@ -104,7 +105,7 @@ def fetch_plane(s, record, images, offset, height, width, channel, background):
         c, d = read(images, offset, np.int32(k + below)), read(images, offset, np.int32(k + diagonal))
         top = a + fx * (b - a)
         value = top + fy * (c + fx * (d - c) - top)
-        store(s, record + CHANNELS + channel * PITCH + i, value if load(s, record + INSIDE + i) > zero else background)
+        store(out, first + i, value if load(s, INSIDE + i) > zero else background)
 
 
 @inner
@@ -117,8 +118,11 @@ def _format(bits):
 
 @inner
 @no_type_check
-def fetch_packed(s, record, packed, offset, height, width, bits, background):
-    """As `fetch_plane`, for three channels packed into 32 bits: (8, 8, 8) or (11, 11, 10), first channel lowest."""
+def fetch_packed(s, out, first, pitch, packed, offset, height, width, bits, background):
+    """As `fetch_plane`, for three channels packed into 32 bits: (8, 8, 8) or (11, 11, 10), first channel lowest.
+
+    The channels' values go `pitch` apart.
+    """
     last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
     right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
     stride, diagonal, zero, one = np.int32(width), np.int32(right + below), s.dtype.type(0), s.dtype.type(1)
@@ -134,21 +138,21 @@ def fetch_packed(s, record, packed, offset, height, width, bits, background):
         wd = fx * fy
         wb, wc = fx - wd, fy - wd
         wa = one - fx - wc
-        inside = load(s, record + INSIDE + i) > zero
-        first = wa * bits_of(a, low, mask) + wb * bits_of(b, low, mask)
-        first += wc * bits_of(c, low, mask) + wd * bits_of(d, low, mask)
-        second = wa * bits_of(a, shift, mask) + wb * bits_of(b, shift, mask)
-        second += wc * bits_of(c, shift, mask) + wd * bits_of(d, shift, mask)
-        third = wa * bits_of(a, twice, mask_last) + wb * bits_of(b, twice, mask_last)
-        third += wc * bits_of(c, twice, mask_last) + wd * bits_of(d, twice, mask_last)
-        store(s, record + CHANNELS + i, first * unit if inside else background)
-        store(s, record + CHANNELS + PITCH + i, second * unit if inside else background)
-        store(s, record + CHANNELS + 2 * PITCH + i, third * unit_last if inside else background)
+        inside = load(s, INSIDE + i) > zero
+        red = wa * bits_of(a, low, mask) + wb * bits_of(b, low, mask)
+        red += wc * bits_of(c, low, mask) + wd * bits_of(d, low, mask)
+        green = wa * bits_of(a, shift, mask) + wb * bits_of(b, shift, mask)
+        green += wc * bits_of(c, shift, mask) + wd * bits_of(d, shift, mask)
+        blue = wa * bits_of(a, twice, mask_last) + wb * bits_of(b, twice, mask_last)
+        blue += wc * bits_of(c, twice, mask_last) + wd * bits_of(d, twice, mask_last)
+        store(out, first + i, red * unit if inside else background)
+        store(out, first + pitch + i, green * unit if inside else background)
+        store(out, first + 2 * pitch + i, blue * unit_last if inside else background)
 
 
 @inner
 @no_type_check
-def pull_plane(s, record, images, offset, height, width, channel):
+def pull_plane(s, images, offset, height, width, channel):
     """Adds one channel's part to GRAD_U, GRAD_V: its gradient times the slope of its plane."""
     last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
     right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
@@ -160,7 +164,7 @@ def pull_plane(s, record, images, offset, height, width, channel):
         k = np.int32(y * stride + x)
         a, b = read(images, offset, k), read(images, offset, np.int32(k + right))
         c, d = read(images, offset, np.int32(k + below)), read(images, offset, np.int32(k + diagonal))
-        gradient = load(s, record + CHANNELS + channel * PITCH + i) * load(s, record + INSIDE + i)
+        gradient = load(s, CHANNELS + channel * BLOCK + i) * load(s, INSIDE + i)
         twist = (d - c) - (b - a)
         store(s, GRAD_U + i, load(s, GRAD_U + i) + gradient * ((b - a) + fy * twist))
         store(s, GRAD_V + i, load(s, GRAD_V + i) + gradient * ((c - a) + fx * twist))
@@ -168,7 +172,7 @@ def pull_plane(s, record, images, offset, height, width, channel):
 
 @inner
 @no_type_check
-def pull_packed(s, record, packed, offset, height, width, bits):
+def pull_packed(s, packed, offset, height, width, bits):
     """As `pull_plane`, for all three channels of packed images."""
     last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
     right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
@@ -182,10 +186,10 @@ def pull_packed(s, record, packed, offset, height, width, bits):
         k = np.int32(y * stride + x)
         a, b = read(packed, offset, k), read(packed, offset, np.int32(k + right))
         c, d = read(packed, offset, np.int32(k + below)), read(packed, offset, np.int32(k + diagonal))
-        inside = load(s, record + INSIDE + i)
-        first = load(s, record + CHANNELS + i) * inside * unit
-        second = load(s, record + CHANNELS + PITCH + i) * inside * unit
-        third = load(s, record + CHANNELS + 2 * PITCH + i) * inside * unit_last
+        inside = load(s, INSIDE + i)
+        first = load(s, CHANNELS + i) * inside * unit
+        second = load(s, CHANNELS + BLOCK + i) * inside * unit
+        third = load(s, CHANNELS + 2 * BLOCK + i) * inside * unit_last
         # The gradient with respect to a tap is the same sum for each: contract channels first, then interpolate.
         ga = first * bits_of(a, low, mask) + second * bits_of(a, shift, mask)
         ga += third * bits_of(a, twice, mask_last)
@@ -202,7 +206,7 @@ def pull_packed(s, record, packed, offset, height, width, bits):
 
 @inner
 @no_type_check
-def start_pull(s, record, height, width):
+def start_pull(s, height, width):
     """GRAD_U, GRAD_V from the gradient of the coordinates in COLUMN, ROW; none passes where they were clamped."""
     zero = s.dtype.type(0)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
@@ -213,14 +217,14 @@ def start_pull(s, record, height, width):
         front = load(s, RECIPROCAL + i) > zero
         free_u = front & (u >= zero) & (u <= right)
         free_v = front & (v >= zero) & (v <= bottom)
-        store(s, GRAD_U + i, load(s, record + COLUMN + i) * per_column if free_u else zero)
-        store(s, GRAD_V + i, load(s, record + ROW + i) * per_row if free_v else zero)
+        store(s, GRAD_U + i, load(s, COLUMN + i) * per_column if free_u else zero)
+        store(s, GRAD_V + i, load(s, ROW + i) * per_row if free_v else zero)
 
 
 @inner
 @no_type_check
-def back_project(s, matrices, view, sums):
-    """GRAD_U, GRAD_V -> added to GRAD_X, GRAD_Y, GRAD_Z, and to the view's row of `sums` for the matrix.
+def back_project(s, points, at, pitch, matrices, view, gradients, into, sums):
+    """GRAD_U, GRAD_V -> added to `gradients` of points, from `into` on, and to the view's row of `sums`.
 
     With h = M (x, 1) and (u, v) = (h0, h1) / h2: dL/dh = (g_u, g_v, -(g_u u + g_v v)) / h2.
     """
@@ -230,16 +234,16 @@ def back_project(s, matrices, view, sums):
     zero = s.dtype.type(0)
     s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = s20 = s21 = s22 = s23 = zero
     for i in range(BLOCK):
-        x, y, z = load(s, X + i), load(s, Y + i), load(s, Z + i)
+        x, y, z = load(points, at + i), load(points, at + pitch + i), load(points, at + 2 * pitch + i)
         reciprocal = load(s, RECIPROCAL + i)
         h0, h1 = load(s, GRAD_U + i) * reciprocal, load(s, GRAD_V + i) * reciprocal
         # Behind the camera RAW_U may be anything, but h0 is zero there only if it is finite.
         raw_u = load(s, RAW_U + i) if reciprocal > zero else zero
         raw_v = load(s, RAW_V + i) if reciprocal > zero else zero
         h2 = -(h0 * raw_u + h1 * raw_v)
-        store(s, GRAD_X + i, load(s, GRAD_X + i) + m00 * h0 + m10 * h1 + m20 * h2)
-        store(s, GRAD_Y + i, load(s, GRAD_Y + i) + m01 * h0 + m11 * h1 + m21 * h2)
-        store(s, GRAD_Z + i, load(s, GRAD_Z + i) + m02 * h0 + m12 * h1 + m22 * h2)
+        store(gradients, into + i, load(gradients, into + i) + m00 * h0 + m10 * h1 + m20 * h2)
+        store(gradients, into + pitch + i, load(gradients, into + pitch + i) + m01 * h0 + m11 * h1 + m21 * h2)
+        store(gradients, into + 2 * pitch + i, load(gradients, into + 2 * pitch + i) + m02 * h0 + m12 * h1 + m22 * h2)
         s00 += h0 * x
         s01 += h0 * y
         s02 += h0 * z

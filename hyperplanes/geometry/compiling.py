@@ -16,11 +16,11 @@ from hyperplanes.geometry import kernels_carving, kernels_cpu, kernels_gradient
 
 __all__ = ["compiled"]
 
-_LOOKUP = "T[:, ::1], {views}T[:, :, ::1], T[:, :, :, ::1], uint32[::1], int64, int64, int64, "
+_LOOKUP = "T[::1], int64, {views}T[:, :, ::1], T[:, :, :, ::1], uint32[::1], int64, int64, int64, "
 _SIGNATURES = {
     "forward": _LOOKUP + "T, T, T[::1], T[::1], uint8[::1], int64, int64",
-    "backward": _LOOKUP + "T, T[:, :, :], T[:, :, :], T[:, ::1], float64[:, ::1], int64, int64",
-    "image_backward": "T[:, ::1], {views}T[:, :, ::1], int64, int64, T, T[:, :, :], int64, T[::1], int64, int64",
+    "backward": _LOOKUP + "T, T[:, :, :], T[:, :, :], T[::1], float64[:, ::1], int64, int64",
+    "image_backward": "T[::1], int64, {views}T[:, :, ::1], int64, int64, T, T[:, :, :], int64, T[::1], int64, int64",
     "carve": "T[:, :, ::1], T[:, :, ::1], int32[:, :, ::1], T[::1], T, T, T, uint8[:, :, ::1], int64, int64",
 }
 _MODULES = {

@@ -3,6 +3,10 @@
 Every function takes a range of points (or planes) so that threads can share the work; each releases the interpreter
 lock. The kernels are compiled on first use, a second or two each, and kept on disk by numba.
 
+Points are rows of x, y and z, and results are planar in memory, (view, channel, point), so that a block is read and
+written as whole vectors. All rows are `pitch` long, a multiple of BLOCK. One plane after the other is looked at for a
+whole chunk of points: its pixels then stay in the cache.
+
 Where a point's planes are chosen, the lookups of a chunk of points are first grouped by plane (a counting sort), so
 that blocks share a plane there too and only the chosen planes cost anything.
 """
@@ -17,9 +21,7 @@ from hyperplanes.geometry.blocks import (
     BLOCK,
     CHANNELS,
     COLUMN,
-    FIRST_RECORD,
     INSIDE,
-    PITCH,
     ROW,
     X,
     Y,
@@ -59,85 +61,51 @@ def grouped(views, start, stop, planes, first, order):
 
 @inner
 @no_type_check
-def scratch(dtype, channels, records):
-    """Zeros for the rows of a block and for some records, as laid out in `blocks`."""
-    return np.zeros(FIRST_RECORD + PITCH * (3 + channels) * records, dtype)
+def scratch(dtype, channels):
+    """Zeros for the rows of a block, as laid out in `blocks`."""
+    return np.zeros(CHANNELS + BLOCK * channels, dtype)
 
 
 @inlined
 @no_type_check
-def take(s, i, points, p):
+def take(s, i, points, pitch, p):
     """Point p -> lane i."""
-    s[X + i] = points[p, 0]
-    s[Y + i] = points[p, 1]
-    s[Z + i] = points[p, 2]
-
-
-@inner
-@no_type_check
-def _look(s, record, view, matrices, images, packed, bits, height, width, background, nearest):
-    project(s, matrices, view, nearest)
-    place(s, record, height, width)
-    size, channels = height * width, images.shape[1]
-    if bits:
-        fetch_packed(s, record, packed, view * size, height, width, bits, background)
-    else:
-        for c in range(channels):
-            fetch_plane(s, record, images, (view * channels + c) * size, height, width, c, background)
-
-
-@inlined
-@no_type_check
-def _write(s, first, count, planes, channels, colours, coordinates, valid):
-    """All records of a block -> the flat outputs from point `first` on, one output at a time: streams of writes."""
-    step = (3 + channels) * PITCH
-    for i in range(count):
-        k = (first + i) * planes * channels
-        for view in range(planes):
-            row = FIRST_RECORD + view * step + CHANNELS + i
-            if channels == 3:
-                store(colours, k, load(s, row))
-                store(colours, k + 1, load(s, row + PITCH))
-                store(colours, k + 2, load(s, row + 2 * PITCH))
-            else:
-                for c in range(channels):
-                    store(colours, k + c, load(s, row + c * PITCH))
-            k += channels
-    for i in range(count):
-        k = (first + i) * planes
-        for view in range(planes):
-            row = FIRST_RECORD + view * step + i
-            store(coordinates, 2 * (k + view), load(s, row + COLUMN))
-            store(coordinates, 2 * (k + view) + 1, load(s, row + ROW))
-    for i in range(count):
-        k = (first + i) * planes
-        for view in range(planes):
-            store(valid, k + view, np.uint8(load(s, FIRST_RECORD + view * step + INSIDE + i)))
+    s[X + i] = points[p]
+    s[Y + i] = points[pitch + p]
+    s[Z + i] = points[2 * pitch + p]
 
 
 @no_type_check
-def forward(points, matrices, images, packed, bits, height, width, background, nearest,
+def forward(points, pitch, matrices, images, packed, bits, height, width, background, nearest,
             colours, coordinates, valid, start, stop):  # fmt: skip
     """Looks points start..stop up in all planes."""
     planes, channels = images.shape[0], images.shape[1]
-    s = scratch(points.dtype, channels, planes)
-    step = (3 + channels) * PITCH
-    for p in range(start, stop, BLOCK):
-        count = min(BLOCK, stop - p)
-        for i in range(count):
-            take(s, i, points, p + i)
-        for view in range(planes):
-            record = FIRST_RECORD + view * step
-            _look(s, record, view, matrices, images, packed, bits, height, width, background, nearest)
-        _write(s, p, count, planes, channels, colours, coordinates, valid)
+    s = scratch(points.dtype, 0)
+    size = height * width
+    for view in range(planes):
+        for p in range(start, stop, BLOCK):
+            project(s, points, p, pitch, matrices, view, nearest)
+            k = 2 * view * pitch + p
+            place(s, coordinates, k, k + pitch, height, width)
+            k = view * pitch + p
+            for i in range(BLOCK):
+                store(valid, k + i, np.uint8(load(s, INSIDE + i)))
+            if bits:
+                k = 3 * view * pitch + p
+                fetch_packed(s, colours, k, pitch, packed, view * size, height, width, bits, background)
+            else:
+                for c in range(channels):
+                    plane = view * channels + c
+                    fetch_plane(s, colours, plane * pitch + p, images, plane * size, height, width, background)
 
 
 @no_type_check
-def forward_chosen(points, views, matrices, images, packed, bits, height, width, background, nearest,
+def forward_chosen(points, pitch, views, matrices, images, packed, bits, height, width, background, nearest,
                    colours, coordinates, valid, start, stop):  # fmt: skip
     """Looks points start..stop up in the planes chosen for each."""
     planes, channels, m = images.shape[0], images.shape[1], views.shape[1]
-    s = scratch(points.dtype, channels, 1)
+    s = scratch(points.dtype, channels)
+    size = height * width
     first = np.empty(planes + 1, np.int64)
     order = np.empty((stop - start) * m, np.int64)
     grouped(views, start, stop, planes, first, order)
@@ -145,12 +113,19 @@ def forward_chosen(points, views, matrices, images, packed, bits, height, width,
         for begin in range(first[view], first[view + 1], BLOCK):
             count = min(BLOCK, first[view + 1] - begin)
             for i in range(count):
-                take(s, i, points, order[begin + i] // m)
-            _look(s, FIRST_RECORD, view, matrices, images, packed, bits, height, width, background, nearest)
-            for i in range(count):
-                k, row = order[begin + i], FIRST_RECORD + i
-                store(coordinates, 2 * k, load(s, row + COLUMN))
-                store(coordinates, 2 * k + 1, load(s, row + ROW))
-                store(valid, k, np.uint8(load(s, row + INSIDE)))
+                take(s, i, points, pitch, order[begin + i] // m)
+            project(s, s, X, BLOCK, matrices, view, nearest)
+            place(s, s, COLUMN, ROW, height, width)
+            if bits:
+                fetch_packed(s, s, CHANNELS, BLOCK, packed, view * size, height, width, bits, background)
+            else:
                 for c in range(channels):
-                    store(colours, k * channels + c, load(s, row + CHANNELS + c * PITCH))
+                    offset = (view * channels + c) * size
+                    fetch_plane(s, s, CHANNELS + c * BLOCK, images, offset, height, width, background)
+            for i in range(count):
+                p, j = order[begin + i] // m, order[begin + i] % m
+                store(coordinates, 2 * j * pitch + p, load(s, COLUMN + i))
+                store(coordinates, (2 * j + 1) * pitch + p, load(s, ROW + i))
+                store(valid, j * pitch + p, np.uint8(load(s, INSIDE + i)))
+                for c in range(channels):
+                    store(colours, (j * channels + c) * pitch + p, load(s, CHANNELS + c * BLOCK + i))

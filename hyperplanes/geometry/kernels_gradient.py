@@ -10,15 +10,14 @@ from hyperplanes.geometry.blocks import (
     BLOCK,
     CHANNELS,
     COLUMN,
-    FIRST_RECORD,
     GRAD_X,
     GRAD_Y,
     GRAD_Z,
     INSIDE,
-    PITCH,
     ROW,
     U,
     V,
+    X,
     back_project,
     inlined,
     inner,
@@ -36,79 +35,59 @@ __all__ = ["backward", "backward_chosen", "image_backward", "image_backward_chos
 
 @inlined
 @no_type_check
-def _read_gradients(s, first, count, grad_colours, grad_coordinates):
-    """The gradients of all lookups of a block's points -> its records; zeros where the block is not full."""
-    planes, channels = grad_colours.shape[1], grad_colours.shape[2]
-    step = (3 + channels) * PITCH
-    for i in range(count):
-        for view in range(planes):
-            row = FIRST_RECORD + view * step + CHANNELS + i
-            for c in range(channels):
-                s[row + c * PITCH] = grad_colours[first + i, view, c]
-    for i in range(count):
-        for view in range(planes):
-            row = FIRST_RECORD + view * step + i
-            s[row + COLUMN] = grad_coordinates[first + i, view, 0]
-            s[row + ROW] = grad_coordinates[first + i, view, 1]
-    for view in range(planes):
-        _clear(s, FIRST_RECORD + view * step, count, channels)
-
-
-@inlined
-@no_type_check
-def _clear(s, record, count, channels):
+def _clear(s, count, channels):
     """Zero gradients in the lanes from `count` on, which hold no lookup."""
     for i in range(count, BLOCK):
-        s[record + COLUMN + i] = 0
-        s[record + ROW + i] = 0
+        s[COLUMN + i] = 0
+        s[ROW + i] = 0
         for c in range(channels):
-            s[record + CHANNELS + c * PITCH + i] = 0
+            s[CHANNELS + c * BLOCK + i] = 0
 
 
 @inner
 @no_type_check
-def _pull(s, record, view, matrices, images, packed, bits, height, width, nearest, sums):
-    """A record's gradients -> GRAD_X, GRAD_Y, GRAD_Z and the matrix sums."""
-    project(s, matrices, view, nearest)
-    start_pull(s, record, height, width)
-    place(s, record, height, width)
+def _pull(s, points, at, pitch, view, matrices, images, packed, bits, height, width, nearest, gradients, into, sums):
+    """The gradients in COLUMN, ROW and the channels' rows -> the points' gradients and the matrix sums."""
+    project(s, points, at, pitch, matrices, view, nearest)
+    start_pull(s, height, width)
+    place(s, s, COLUMN, ROW, height, width)
     size, channels = height * width, images.shape[1]
     if bits:
-        pull_packed(s, record, packed, view * size, height, width, bits)
+        pull_packed(s, packed, view * size, height, width, bits)
     else:
         for c in range(channels):
-            pull_plane(s, record, images, (view * channels + c) * size, height, width, c)
-    back_project(s, matrices, view, sums)
+            pull_plane(s, images, (view * channels + c) * size, height, width, c)
+    back_project(s, points, at, pitch, matrices, view, gradients, into, sums)
 
 
 @no_type_check
-def backward(points, matrices, images, packed, bits, height, width, nearest, grad_colours, grad_coordinates,
+def backward(points, pitch, matrices, images, packed, bits, height, width, nearest, grad_colours, grad_coordinates,
              grad_points, sums, start, stop):  # fmt: skip
     """Gradients with respect to points start..stop, and their share of the matrices' gradient, added to `sums`."""
-    planes, channels = images.shape[0], images.shape[1]
-    s = scratch(points.dtype, channels, planes)
-    step = (3 + channels) * PITCH
-    for p in range(start, stop, BLOCK):
-        count = min(BLOCK, stop - p)
-        s[GRAD_X : GRAD_Z + BLOCK] = 0
-        for i in range(count):
-            take(s, i, points, p + i)
-        _read_gradients(s, p, count, grad_colours, grad_coordinates)
-        for view in range(planes):
-            record = FIRST_RECORD + view * step
-            _pull(s, record, view, matrices, images, packed, bits, height, width, nearest, sums)
-        for i in range(count):
-            grad_points[p + i, 0] = s[GRAD_X + i]
-            grad_points[p + i, 1] = s[GRAD_Y + i]
-            grad_points[p + i, 2] = s[GRAD_Z + i]
+    planes, channels, total = images.shape[0], images.shape[1], grad_colours.shape[0]
+    s = scratch(points.dtype, channels)
+    for view in range(planes):
+        for p in range(start, stop, BLOCK):
+            count = min(BLOCK, total - p)
+            for i in range(count):
+                s[COLUMN + i] = grad_coordinates[p + i, view, 0]
+            for i in range(count):
+                s[ROW + i] = grad_coordinates[p + i, view, 1]
+            for c in range(channels):
+                for i in range(count):
+                    s[CHANNELS + c * BLOCK + i] = grad_colours[p + i, view, c]
+            _clear(s, count, channels)
+            _pull(
+                s, points, p, pitch, view, matrices, images, packed, bits, height, width, nearest, grad_points, p, sums
+            )
 
 
 @no_type_check
-def backward_chosen(points, views, matrices, images, packed, bits, height, width, nearest, grad_colours,
+def backward_chosen(points, pitch, views, matrices, images, packed, bits, height, width, nearest, grad_colours,
                     grad_coordinates, grad_points, sums, start, stop):  # fmt: skip
     """As `backward`, for chosen planes; `grad_points` starts at zero."""
     planes, channels, m = images.shape[0], images.shape[1], views.shape[1]
-    s = scratch(points.dtype, channels, 1)
+    s = scratch(points.dtype, channels)
     first = np.empty(planes + 1, np.int64)
     order = np.empty((stop - start) * m, np.int64)
     grouped(views, start, stop, planes, first, order)
@@ -117,19 +96,19 @@ def backward_chosen(points, views, matrices, images, packed, bits, height, width
             count = min(BLOCK, first[view + 1] - begin)
             s[GRAD_X : GRAD_Z + BLOCK] = 0
             for i in range(count):
-                p, j, row = order[begin + i] // m, order[begin + i] % m, FIRST_RECORD + i
-                take(s, i, points, p)
-                s[row + COLUMN] = grad_coordinates[p, j, 0]
-                s[row + ROW] = grad_coordinates[p, j, 1]
+                p, j = order[begin + i] // m, order[begin + i] % m
+                take(s, i, points, pitch, p)
+                s[COLUMN + i] = grad_coordinates[p, j, 0]
+                s[ROW + i] = grad_coordinates[p, j, 1]
                 for c in range(channels):
-                    s[row + CHANNELS + c * PITCH] = grad_colours[p, j, c]
-            _clear(s, FIRST_RECORD, count, channels)
-            _pull(s, FIRST_RECORD, view, matrices, images, packed, bits, height, width, nearest, sums)
+                    s[CHANNELS + c * BLOCK + i] = grad_colours[p, j, c]
+            _clear(s, count, channels)
+            _pull(s, s, X, BLOCK, view, matrices, images, packed, bits, height, width, nearest, s, GRAD_X, sums)
             for i in range(count):
                 p = order[begin + i] // m
-                grad_points[p, 0] += s[GRAD_X + i]
-                grad_points[p, 1] += s[GRAD_Y + i]
-                grad_points[p, 2] += s[GRAD_Z + i]
+                grad_points[p] += s[GRAD_X + i]
+                grad_points[pitch + p] += s[GRAD_Y + i]
+                grad_points[2 * pitch + p] += s[GRAD_Z + i]
 
 
 @inlined
@@ -158,36 +137,33 @@ def _splat(s, i, p, j, grad_colours, height, width, channels, pitch, start, plan
 
 
 @no_type_check
-def image_backward(points, matrices, height, width, nearest, grad_colours, pitch, grad_images, start, stop):
+def image_backward(points, pitch, matrices, height, width, nearest, grad_colours, pixel, grad_images, start, stop):
     """The gradient with respect to planes start..stop.
 
-    `grad_images` is flat (view, pixel, pitch) with one spare pixel at the end, since an image one pixel wide has zero
-    weight on a neighbour that it lacks.
+    `grad_images` is flat (view, row, column, channel), `pixel` numbers a pixel, with one spare pixel at the end, since
+    an image one pixel wide has zero weight on a neighbour that it lacks.
     """
-    s = scratch(points.dtype, 0, 1)
-    channels = grad_colours.shape[2]
-    for p in range(0, points.shape[0], BLOCK):
-        count = min(BLOCK, points.shape[0] - p)
-        for i in range(count):
-            take(s, i, points, p + i)
-        for view in range(start, stop):
-            project(s, matrices, view, nearest)
-            place(s, FIRST_RECORD, height, width)
-            plane = view * height * width * pitch
-            for i in range(count):
-                if load(s, FIRST_RECORD + INSIDE + i) > 0:
-                    _splat(s, i, p + i, view, grad_colours, height, width, channels, pitch, plane, grad_images)
+    s = scratch(points.dtype, 0)
+    total, channels = grad_colours.shape[0], grad_colours.shape[2]
+    for view in range(start, stop):
+        plane = view * height * width * pixel
+        for p in range(0, total, BLOCK):
+            project(s, points, p, pitch, matrices, view, nearest)
+            place(s, s, COLUMN, ROW, height, width)
+            for i in range(min(BLOCK, total - p)):
+                if load(s, INSIDE + i) > 0:
+                    _splat(s, i, p + i, view, grad_colours, height, width, channels, pixel, plane, grad_images)
 
 
 @no_type_check
-def image_backward_chosen(points, views, matrices, height, width, nearest, grad_colours, pitch, grad_images,
+def image_backward_chosen(points, pitch, views, matrices, height, width, nearest, grad_colours, pixel, grad_images,
                           start, stop):  # fmt: skip
     """As `image_backward`, for chosen planes: only lookups in planes start..stop are followed."""
-    s = scratch(points.dtype, 0, 1)
+    s = scratch(points.dtype, 0)
     m, planes, channels = views.shape[1], matrices.shape[0], grad_colours.shape[2]
     order = np.empty((planes, BLOCK), np.int64)
     filled = np.zeros(planes, np.int64)
-    total = points.shape[0] * m
+    total = views.shape[0] * m
     for k in range(total + planes):  # the last rounds empty the half-full blocks
         view = views[k // m, k % m] if k < total else k - total
         if view < start or view >= stop:
@@ -198,12 +174,12 @@ def image_backward_chosen(points, views, matrices, height, width, nearest, grad_
         if filled[view] < BLOCK and k < total:
             continue
         for i in range(filled[view]):
-            take(s, i, points, order[view, i] // m)
-        project(s, matrices, view, nearest)
-        place(s, FIRST_RECORD, height, width)
-        plane = view * height * width * pitch
+            take(s, i, points, pitch, order[view, i] // m)
+        project(s, s, X, BLOCK, matrices, view, nearest)
+        place(s, s, COLUMN, ROW, height, width)
+        plane = view * height * width * pixel
         for i in range(filled[view]):
-            if load(s, FIRST_RECORD + INSIDE + i) > 0:
+            if load(s, INSIDE + i) > 0:
                 p, j = order[view, i] // m, order[view, i] % m
-                _splat(s, i, p, j, grad_colours, height, width, channels, pitch, plane, grad_images)
+                _splat(s, i, p, j, grad_colours, height, width, channels, pixel, plane, grad_images)
         filled[view] = 0

@@ -7,6 +7,7 @@ need the plain torch backend.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from hyperplanes.geometry.threads import share
 
 __all__ = ["lookup", "lookup_backward"]
 
-_CHUNK = 4096  # points a call of a kernel
+_BLOCK = 128  # points that the kernels take at once; `blocks.BLOCK`, which needs numba to import
+_CHUNK = 64 * _BLOCK  # points a call of a kernel
 _PLANES = "Tensor points, Tensor matrices, Tensor images, Tensor? packed, int bits, Tensor? views"
 _SCHEMA = f"({_PLANES}, float background) -> (Tensor, Tensor, Tensor)"
 _BACKWARD_SCHEMA = (
@@ -32,14 +34,14 @@ def lookup(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
     background: float,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Colours (point, view, channel), coordinates (point, view, 2) and validity (point, view)."""
-    colours, coordinates, valid = _empty(points, images, views)
+    """Colours (point, view, channel), coordinates (point, view, 2) and validity (point, view), planar in memory."""
+    colours, coordinates, valid = _empty(points, images, views, _large)
     if valid.numel():
         kernel = _kernel("forward", points.dtype, views is not None)
-        number = _array(points).dtype.type
+        number = _number(points)
         fixed = (*_geometry(points, matrices, views), *_store(images, packed, bits), number(background))
-        fixed += (number(NEAREST_DEPTH), colours.numpy().reshape(-1), coordinates.numpy().reshape(-1))
-        fixed += (valid.view(torch.uint8).numpy().reshape(-1),)
+        flat = [_flat(value) for value in (colours, coordinates, valid.view(torch.uint8))]
+        fixed += (number(NEAREST_DEPTH), *flat)
         share(lambda start, stop: kernel(*fixed, start, stop), len(points), _CHUNK)
     return colours, coordinates, valid
 
@@ -64,10 +66,30 @@ def lookup_backward(
     return grad_points, grad_matrices, grad_images
 
 
-def _empty(points: Tensor, images: Tensor, views: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    rows = (points.shape[0], images.shape[0] if views is None else views.shape[1])
-    valid = points.new_empty(rows, dtype=torch.bool)
-    return points.new_empty(*rows, images.shape[1]), points.new_empty(*rows, 2), valid
+def _pitch(points: Tensor) -> int:
+    """How long a row of one number a point is: on the CPU whole blocks of the kernels."""
+    return -(-len(points) // _BLOCK) * _BLOCK if points.device.type == "cpu" else len(points)
+
+
+def _empty(
+    points: Tensor, images: Tensor, views: Tensor | None, new: Callable[..., Tensor] | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Outputs of a lookup: (view, channel, point) in memory, seen as (point, view, channel)."""
+    count, slots, room = len(points), images.shape[0] if views is None else views.shape[1], _pitch(points)
+    new = new or points.new_empty
+    colours = new((slots, images.shape[1], room), dtype=points.dtype).permute(2, 0, 1)[:count]
+    coordinates = new((slots, 2, room), dtype=points.dtype).permute(2, 0, 1)[:count]
+    return colours, coordinates, new((slots, room), dtype=torch.bool).T[:count]
+
+
+def _large(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """Uninitialised memory from NumPy, which asks Linux for large pages: three times faster to touch first."""
+    return torch.from_numpy(np.empty(shape, str(dtype).removeprefix("torch.")))
+
+
+def _flat(value: Tensor) -> np.ndarray:
+    """The memory that a tensor lies in, room to spare included."""
+    return value.new_empty(0).set_(value.untyped_storage()).numpy()
 
 
 def _kernel(name: str, dtype: torch.dtype, chosen: bool) -> Any:
@@ -80,8 +102,16 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _geometry(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[np.ndarray, ...]:
-    return (_array(points), *(() if views is None else (_array(views),)), _array(matrices))
+def _number(points: Tensor) -> Callable[[float], np.generic]:
+    """The scalar type that goes with the points."""
+    return np.float64 if points.dtype == torch.float64 else np.float32
+
+
+def _geometry(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[Any, ...]:
+    """Points as rows of x, y and z, the rows' length, the chosen views where there are any, and the matrices."""
+    rows = points.detach().new_zeros(3, _pitch(points))
+    rows[:, : len(points)] = points.detach().T
+    return (rows.numpy().reshape(-1), rows.shape[1], *(() if views is None else (_array(views),)), _array(matrices))
 
 
 def _store(images: Tensor, packed: Tensor | None, bits: int) -> tuple[Any, ...]:
@@ -93,13 +123,13 @@ def _geometry_gradient(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
     grad_colours: Tensor, grad_coordinates: Tensor,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    grad_points = torch.zeros(points.shape, dtype=points.dtype)
+    rows = torch.zeros(3, _pitch(points), dtype=points.dtype)
     if not grad_coordinates.numel():
-        return grad_points, torch.zeros_like(matrices)
+        return torch.zeros_like(points), torch.zeros_like(matrices)
     kernel = _kernel("backward", points.dtype, views is not None)
-    number = _array(points).dtype.type
+    number = _number(points)
     fixed = (*_geometry(points, matrices, views), *_store(images, packed, bits), number(NEAREST_DEPTH))
-    fixed += (grad_colours.detach().numpy(), grad_coordinates.detach().numpy(), grad_points.numpy())
+    fixed += (grad_colours.detach().numpy(), grad_coordinates.detach().numpy(), rows.numpy().reshape(-1))
 
     def work(start: int, stop: int) -> np.ndarray:
         sums = np.zeros((len(matrices), 12))
@@ -107,7 +137,7 @@ def _geometry_gradient(
         return sums
 
     total = sum(share(work, len(points), _CHUNK), np.zeros((len(matrices), 12)))
-    return grad_points, torch.from_numpy(total).to(matrices).reshape(matrices.shape)
+    return rows[:, : len(points)].T.contiguous(), torch.from_numpy(total).to(matrices).reshape(matrices.shape)
 
 
 def _image_gradient(
@@ -115,13 +145,13 @@ def _image_gradient(
 ) -> Tensor:
     count, channels, height, width = images.shape
     pitch = _pixel_pitch(channels)
-    flat = torch.zeros((count * height * width + 1) * pitch, dtype=images.dtype)
+    flat = torch.from_numpy(np.zeros((count * height * width + 1) * pitch, str(images.dtype).removeprefix("torch.")))
     if grad_colours.numel():
         kernel = _kernel("image_backward", points.dtype, views is not None)
-        fixed = (*_geometry(points, matrices, views), height, width, _array(points).dtype.type(NEAREST_DEPTH))
+        fixed = (*_geometry(points, matrices, views), height, width, _number(points)(NEAREST_DEPTH))
         fixed += (grad_colours.detach().numpy(), pitch, flat.numpy())
-        # A few planes at a time: they share the reads of the gradient, and their pixels stay in the cache.
-        step = min(4, -(-count // torch.get_num_threads())) if views is None else -(-count // torch.get_num_threads())
+        # One plane at a time, whose pixels stay in the cache; but every call reads through all chosen views.
+        step = 1 if views is None else -(-count // torch.get_num_threads())
         share(lambda start, stop: kernel(*fixed, start, stop), count, step)
     return flat[:-pitch].reshape(count, height, width, pitch)[..., :channels].permute(0, 3, 1, 2)
 
