@@ -167,7 +167,8 @@ def runs(leaves: Leaves, found: dict[str, Way], gradient: bool) -> dict[str, Cal
         return {name: partial(_forward, way, leaves) for name, way in found.items()}
     live = tuple(leaf.detach().clone().requires_grad_() for leaf in leaves)
     usable = {name: way for name, way in found.items() if name != "cpu_packed"}  # its images need no gradient
-    return {name: partial(_forward_backward, way, live) for name, way in usable.items()}
+    pulls = {name: [torch.ones_like(result) for result in way(*live)] for name, way in usable.items()}
+    return {name: partial(_forward_backward, way, live, pulls[name]) for name, way in usable.items()}
 
 
 def _forward(way: Way, leaves: Leaves) -> tuple[Tensor, ...]:
@@ -175,11 +176,8 @@ def _forward(way: Way, leaves: Leaves) -> tuple[Tensor, ...]:
         return way(*leaves)
 
 
-def _forward_backward(way: Way, leaves: Leaves) -> None:
-    for leaf in leaves:
-        leaf.grad = None
-    results = way(*leaves)
-    torch.autograd.backward(results, [torch.ones_like(result) for result in results])
+def _forward_backward(way: Way, leaves: Leaves, pulls: list[Tensor]) -> tuple[Tensor | None, ...]:
+    return torch.autograd.grad(way(*leaves), leaves, pulls, allow_unused=True)
 
 
 def needed_bytes(scene: Scene, part: str, gradient: bool, way: str) -> int:

@@ -17,10 +17,12 @@ from hyperplanes.geometry import kernels_carving, kernels_cpu, kernels_gradient
 __all__ = ["compiled"]
 
 _LOOKUP = "T[::1], int64, {views}T[:, :, ::1], T[:, :, :, ::1], uint32[::1], int64, int64, int64, "
+_FLAT = "T[::1], UniTuple(int64, 3)"  # a tensor of three dimensions as its memory and strides
 _SIGNATURES = {
     "forward": _LOOKUP + "T, T, T[::1], T[::1], uint8[::1], int64, int64",
-    "backward": _LOOKUP + "T, T[:, :, :], T[:, :, :], T[::1], float64[:, ::1], int64, int64",
-    "image_backward": "T[::1], int64, {views}T[:, :, ::1], int64, int64, T, T[:, :, :], int64, T[::1], int64, int64",
+    "backward": _LOOKUP + "T, {flat}, {flat}, T[::1], float64[:, ::1], int64, int64, int64",
+    "image_backward": "T[::1], int64, {views}T[:, :, ::1], int64, int64, T, {flat}, int64, int64, T[::1], "
+    "int64, int64, int64",
     "carve": "T[:, :, ::1], T[:, :, ::1], int32[:, :, ::1], T[::1], T, T, T, uint8[:, :, ::1], int64, int64",
 }
 _MODULES = {
@@ -60,7 +62,8 @@ def compiled(name: str, dtype: str, chosen: bool = False) -> Callable[..., None]
         chosen: whether each point brings its own planes.
     """
     function = getattr(_MODULES[name], f"{name}_chosen" if chosen else name)
-    signature = _SIGNATURES[name].format(views="int64[:, ::1], " if chosen else "").replace("T", dtype)
+    signature = _SIGNATURES[name].format(views="int64[:, ::1], " if chosen else "", flat=_FLAT)
+    signature = signature.replace("T[", f"{dtype}[").replace("T,", f"{dtype},")
     options = {"fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy", "nogil": True}
     kept = getattr(config, "CACHE_DIR", "")
     setattr(config, "CACHE_DIR", _cache_folder())  # noqa: B010 - the module's attributes are not declared

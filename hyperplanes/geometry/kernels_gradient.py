@@ -1,4 +1,8 @@
-"""The CPU kernels of the fused lookup's gradient; see `kernels_cpu` for how they are arranged."""
+"""The CPU kernels of the fused lookup's gradient; see `kernels_cpu` for how they are arranged.
+
+Incoming gradients have whatever strides autograd gives them. They come flat, with the strides of (point, view, channel)
+as a tuple; where a stride over points is 1, as for gradients laid out like the results, LLVM reads whole vectors.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +32,7 @@ from hyperplanes.geometry.blocks import (
     start_pull,
 )
 from hyperplanes.geometry.kernels_cpu import grouped, scratch, take
-from hyperplanes.geometry.vector_memory import add_pixels, load
+from hyperplanes.geometry.vector_memory import add_pixels, load, read, store
 
 __all__ = ["backward", "backward_chosen", "image_backward", "image_backward_chosen"]
 
@@ -42,6 +46,14 @@ def _clear(s, count, channels):
         s[ROW + i] = 0
         for c in range(channels):
             s[CHANNELS + c * BLOCK + i] = 0
+
+
+@inner
+@no_type_check
+def _copy(s, row, count, values, at, stride):
+    """Every `stride`-th number of `values` -> a row of the scratch."""
+    for i in range(count):
+        store(s, row + i, read(values, at, i * stride))
 
 
 @inner
@@ -61,21 +73,19 @@ def _pull(s, points, at, pitch, view, matrices, images, packed, bits, height, wi
 
 
 @no_type_check
-def backward(points, pitch, matrices, images, packed, bits, height, width, nearest, grad_colours, grad_coordinates,
-             grad_points, sums, start, stop):  # fmt: skip
+def backward(points, pitch, matrices, images, packed, bits, height, width, nearest, grad_colours, per,
+             grad_coordinates, by, grad_points, sums, total, start, stop):  # fmt: skip
     """Gradients with respect to points start..stop, and their share of the matrices' gradient, added to `sums`."""
-    planes, channels, total = images.shape[0], images.shape[1], grad_colours.shape[0]
+    planes, channels = images.shape[0], images.shape[1]
     s = scratch(points.dtype, channels)
     for view in range(planes):
         for p in range(start, stop, BLOCK):
             count = min(BLOCK, total - p)
-            for i in range(count):
-                s[COLUMN + i] = grad_coordinates[p + i, view, 0]
-            for i in range(count):
-                s[ROW + i] = grad_coordinates[p + i, view, 1]
+            _copy(s, COLUMN, count, grad_coordinates, p * by[0] + view * by[1], by[0])
+            _copy(s, ROW, count, grad_coordinates, p * by[0] + view * by[1] + by[2], by[0])
             for c in range(channels):
-                for i in range(count):
-                    s[CHANNELS + c * BLOCK + i] = grad_colours[p + i, view, c]
+                at = p * per[0] + view * per[1] + c * per[2]
+                _copy(s, CHANNELS + c * BLOCK, count, grad_colours, at, per[0])
             _clear(s, count, channels)
             _pull(
                 s, points, p, pitch, view, matrices, images, packed, bits, height, width, nearest, grad_points, p, sums
@@ -84,7 +94,7 @@ def backward(points, pitch, matrices, images, packed, bits, height, width, neare
 
 @no_type_check
 def backward_chosen(points, pitch, views, matrices, images, packed, bits, height, width, nearest, grad_colours,
-                    grad_coordinates, grad_points, sums, start, stop):  # fmt: skip
+                    per, grad_coordinates, by, grad_points, sums, total, start, stop):  # fmt: skip
     """As `backward`, for chosen planes; `grad_points` starts at zero."""
     planes, channels, m = images.shape[0], images.shape[1], views.shape[1]
     s = scratch(points.dtype, channels)
@@ -98,10 +108,11 @@ def backward_chosen(points, pitch, views, matrices, images, packed, bits, height
             for i in range(count):
                 p, j = order[begin + i] // m, order[begin + i] % m
                 take(s, i, points, pitch, p)
-                s[COLUMN + i] = grad_coordinates[p, j, 0]
-                s[ROW + i] = grad_coordinates[p, j, 1]
+                at = p * by[0] + j * by[1]
+                s[COLUMN + i] = grad_coordinates[at]
+                s[ROW + i] = grad_coordinates[at + by[2]]
                 for c in range(channels):
-                    s[CHANNELS + c * BLOCK + i] = grad_colours[p, j, c]
+                    s[CHANNELS + c * BLOCK + i] = grad_colours[p * per[0] + j * per[1] + c * per[2]]
             _clear(s, count, channels)
             _pull(s, s, X, BLOCK, view, matrices, images, packed, bits, height, width, nearest, s, GRAD_X, sums)
             for i in range(count):
@@ -113,7 +124,7 @@ def backward_chosen(points, pitch, views, matrices, images, packed, bits, height
 
 @inlined
 @no_type_check
-def _splat(s, i, p, j, grad_colours, height, width, channels, pitch, start, plane):
+def _splat(s, i, at, step, grad_colours, height, width, channels, pitch, start, plane):
     """Adds one lookup's gradient to the four pixels it was interpolated from; pixels lie `pitch` numbers apart."""
     u, v = load(s, U + i), load(s, V + i)
     x, y = min(np.int64(u), max(width - 2, 0)), min(np.int64(v), max(height - 2, 0))
@@ -124,12 +135,13 @@ def _splat(s, i, p, j, grad_colours, height, width, channels, pitch, start, plan
     top = start + (y * width + x) * pitch
     low = top + (width * pitch if height > 1 else 0)
     if channels == 3:
-        first, second, third = grad_colours[p, j, 0], grad_colours[p, j, 1], grad_colours[p, j, 2]
+        first, second = load(grad_colours, at), load(grad_colours, at + step)
+        third = load(grad_colours, at + 2 * step)
         add_pixels(plane, top, wa, wb, first, second, third)
         add_pixels(plane, low, wc, wd, first, second, third)
     else:
         for c in range(channels):
-            gradient = grad_colours[p, j, c]
+            gradient = grad_colours[at + c * step]
             plane[top + c] += wa * gradient
             plane[top + pitch + c] += wb * gradient
             plane[low + c] += wc * gradient
@@ -137,14 +149,14 @@ def _splat(s, i, p, j, grad_colours, height, width, channels, pitch, start, plan
 
 
 @no_type_check
-def image_backward(points, pitch, matrices, height, width, nearest, grad_colours, pixel, grad_images, start, stop):
+def image_backward(points, pitch, matrices, height, width, nearest, grad_colours, per, channels, pixel, grad_images,
+                   total, start, stop):  # fmt: skip
     """The gradient with respect to planes start..stop.
 
     `grad_images` is flat (view, row, column, channel), `pixel` numbers a pixel, with one spare pixel at the end, since
     an image one pixel wide has zero weight on a neighbour that it lacks.
     """
     s = scratch(points.dtype, 0)
-    total, channels = grad_colours.shape[0], grad_colours.shape[2]
     for view in range(start, stop):
         plane = view * height * width * pixel
         for p in range(0, total, BLOCK):
@@ -152,26 +164,27 @@ def image_backward(points, pitch, matrices, height, width, nearest, grad_colours
             place(s, s, COLUMN, ROW, height, width)
             for i in range(min(BLOCK, total - p)):
                 if load(s, INSIDE + i) > 0:
-                    _splat(s, i, p + i, view, grad_colours, height, width, channels, pixel, plane, grad_images)
+                    at = (p + i) * per[0] + view * per[1]
+                    _splat(s, i, at, per[2], grad_colours, height, width, channels, pixel, plane, grad_images)
 
 
 @no_type_check
-def image_backward_chosen(points, pitch, views, matrices, height, width, nearest, grad_colours, pixel, grad_images,
-                          start, stop):  # fmt: skip
+def image_backward_chosen(points, pitch, views, matrices, height, width, nearest, grad_colours, per, channels, pixel,
+                          grad_images, total, start, stop):  # fmt: skip
     """As `image_backward`, for chosen planes: only lookups in planes start..stop are followed."""
     s = scratch(points.dtype, 0)
-    m, planes, channels = views.shape[1], matrices.shape[0], grad_colours.shape[2]
+    m, planes = views.shape[1], matrices.shape[0]
     order = np.empty((planes, BLOCK), np.int64)
     filled = np.zeros(planes, np.int64)
-    total = views.shape[0] * m
-    for k in range(total + planes):  # the last rounds empty the half-full blocks
-        view = views[k // m, k % m] if k < total else k - total
+    lookups = total * m
+    for k in range(lookups + planes):  # the last rounds empty the half-full blocks
+        view = views[k // m, k % m] if k < lookups else k - lookups
         if view < start or view >= stop:
             continue
-        if k < total:
+        if k < lookups:
             order[view, filled[view]] = k
             filled[view] += 1
-        if filled[view] < BLOCK and k < total:
+        if filled[view] < BLOCK and k < lookups:
             continue
         for i in range(filled[view]):
             take(s, i, points, pitch, order[view, i] // m)
@@ -180,6 +193,6 @@ def image_backward_chosen(points, pitch, views, matrices, height, width, nearest
         plane = view * height * width * pixel
         for i in range(filled[view]):
             if load(s, INSIDE + i) > 0:
-                p, j = order[view, i] // m, order[view, i] % m
-                _splat(s, i, p, j, grad_colours, height, width, channels, pixel, plane, grad_images)
+                at = order[view, i] // m * per[0] + order[view, i] % m * per[1]
+                _splat(s, i, at, per[2], grad_colours, height, width, channels, pixel, plane, grad_images)
         filled[view] = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 from dataclasses import dataclass
 
@@ -50,14 +51,19 @@ class Backend:
     reason: str
 
 
+@functools.cache
+def _installed(module: str) -> bool:
+    return importlib.util.find_spec(module) is not None
+
+
 def backends() -> list[Backend]:
     """Every way to do lookups, the plain reference first."""
     found = [Backend("torch", True, "plain PyTorch, any device; the reference")]
-    if importlib.util.find_spec("numba") is None:
+    if not _installed("numba"):
         found.append(Backend("cpu", False, "needs numba: pip install numba"))
     else:
         found.append(Backend("cpu", True, f"numba kernels, {torch.get_num_threads()} threads; the default on the CPU"))
-    if importlib.util.find_spec("triton") is None:
+    if not _installed("triton"):
         found.append(Backend("triton", False, "needs triton, which comes with PyTorch for CUDA"))
     elif not torch.cuda.is_available():
         found.append(Backend("triton", False, "needs a CUDA device that PyTorch can see"))
@@ -69,11 +75,11 @@ def backends() -> list[Backend]:
 
 def choose(points: Tensor, images: Tensor) -> str:
     """The fastest backend for these tensors: by device, and plain PyTorch for all that the kernels do not take."""
-    height, width = images.shape[2:]
-    known = points.dtype in (torch.float32, torch.float64) and height * width < 2**31
-    wanted = {"cpu": "cpu", "cuda": "triton"}.get(points.device.type)
-    usable = known and any(backend.available and backend.name == wanted for backend in backends())
-    return wanted if wanted is not None and usable else "torch"
+    if points.dtype not in (torch.float32, torch.float64) or images.shape[2] * images.shape[3] >= 2**31:
+        return "torch"
+    if points.device.type == "cpu":
+        return "cpu" if _installed("numba") else "torch"
+    return "triton" if points.device.type == "cuda" and _installed("triton") else "torch"
 
 
 def lookup(
@@ -123,13 +129,20 @@ def lookup(
             )
     if name == "torch":
         return Lookup(*lookup_torch.lookup(points, matrices, images, views, background))
-    known = {each.name: each for each in backends()}
-    if name not in known:
-        raise ValueError(f"backend: expected one of {', '.join(known)}, got {name!r}")
-    if not known[name].available:
-        raise ValueError(f"backend: {name} {known[name].reason}")
+    if backend is not None:
+        _check(backend, points.device)
     from hyperplanes.geometry import lookup_op
 
     fits = packed is not None and points.dtype == torch.float32 and not images.requires_grad
     words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
     return Lookup(*lookup_op.lookup(points, matrices, images, words, bits, views, background))
+
+
+def _check(name: str, device: torch.device) -> None:
+    known = {each.name: each for each in backends()}
+    if name not in known:
+        raise ValueError(f"backend: expected one of {', '.join(known)}, got {name!r}")
+    if not known[name].available:
+        raise ValueError(f"backend: {name} {known[name].reason}")
+    if device.type != {"cpu": "cpu", "triton": "cuda"}[name]:
+        raise ValueError(f"backend: {name} does not take points on {device}")

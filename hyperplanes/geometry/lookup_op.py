@@ -92,6 +92,12 @@ def _flat(value: Tensor) -> np.ndarray:
     return value.new_empty(0).set_(value.untyped_storage()).numpy()
 
 
+def _strided(value: Tensor) -> tuple[np.ndarray, tuple[int, ...]]:
+    """The memory that a tensor spans, from its first element on, and its strides."""
+    span = 1 + sum((size - 1) * stride for size, stride in zip(value.shape, value.stride(), strict=True))
+    return value.detach().as_strided((span if value.numel() else 0,), (1,)).numpy(), value.stride()
+
+
 def _kernel(name: str, dtype: torch.dtype, chosen: bool) -> Any:
     from hyperplanes.geometry.compiling import compiled
 
@@ -102,16 +108,16 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _number(points: Tensor) -> Callable[[float], np.generic]:
+def _number(points: Tensor) -> type[np.floating[Any]]:
     """The scalar type that goes with the points."""
     return np.float64 if points.dtype == torch.float64 else np.float32
 
 
 def _geometry(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[Any, ...]:
     """Points as rows of x, y and z, the rows' length, the chosen views where there are any, and the matrices."""
-    rows = points.detach().new_zeros(3, _pitch(points))
-    rows[:, : len(points)] = points.detach().T
-    return (rows.numpy().reshape(-1), rows.shape[1], *(() if views is None else (_array(views),)), _array(matrices))
+    rows = np.zeros((3, _pitch(points)), _number(points))  # by NumPy: waking PyTorch's threads costs more than the work
+    rows[:, : len(points)] = points.detach().numpy().T
+    return (rows.reshape(-1), rows.shape[1], *(() if views is None else (_array(views),)), _array(matrices))
 
 
 def _store(images: Tensor, packed: Tensor | None, bits: int) -> tuple[Any, ...]:
@@ -123,21 +129,22 @@ def _geometry_gradient(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
     grad_colours: Tensor, grad_coordinates: Tensor,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    rows = torch.zeros(3, _pitch(points), dtype=points.dtype)
+    rows = np.zeros((3, _pitch(points)), _number(points))
     if not grad_coordinates.numel():
         return torch.zeros_like(points), torch.zeros_like(matrices)
     kernel = _kernel("backward", points.dtype, views is not None)
     number = _number(points)
     fixed = (*_geometry(points, matrices, views), *_store(images, packed, bits), number(NEAREST_DEPTH))
-    fixed += (grad_colours.detach().numpy(), grad_coordinates.detach().numpy(), rows.numpy().reshape(-1))
+    fixed += (*_strided(grad_colours), *_strided(grad_coordinates), rows.reshape(-1))
 
     def work(start: int, stop: int) -> np.ndarray:
         sums = np.zeros((len(matrices), 12))
-        kernel(*fixed, sums, start, stop)
+        kernel(*fixed, sums, len(points), start, stop)
         return sums
 
     total = sum(share(work, len(points), _CHUNK), np.zeros((len(matrices), 12)))
-    return rows[:, : len(points)].T.contiguous(), torch.from_numpy(total).to(matrices).reshape(matrices.shape)
+    grad_points = torch.from_numpy(np.ascontiguousarray(rows[:, : len(points)].T))
+    return grad_points, torch.from_numpy(total).to(matrices).reshape(matrices.shape)
 
 
 def _image_gradient(
@@ -149,7 +156,7 @@ def _image_gradient(
     if grad_colours.numel():
         kernel = _kernel("image_backward", points.dtype, views is not None)
         fixed = (*_geometry(points, matrices, views), height, width, _number(points)(NEAREST_DEPTH))
-        fixed += (grad_colours.detach().numpy(), pitch, flat.numpy())
+        fixed += (*_strided(grad_colours), channels, pitch, flat.numpy(), len(points))
         # One plane at a time, whose pixels stay in the cache; but every call reads through all chosen views.
         step = 1 if views is None else -(-count // torch.get_num_threads())
         share(lambda start, stop: kernel(*fixed, start, stop), count, step)

@@ -233,6 +233,6 @@ def test_the_default_follows_device_and_dtype(monkeypatch):
     assert [backend.name for backend in backends()] == ["torch", "cpu", "triton"]
     assert choose(points, images) == "cpu"
     assert choose(points.half(), images) == "torch"
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("hyperplanes.geometry.lookup._installed", lambda module: False)
     assert choose(points, images) == "torch"
     assert not {backend.name: backend for backend in backends()}["cpu"].available
