@@ -1,8 +1,8 @@
 """The fused lookup as a PyTorch operator, `hyperplanes::lookup`, and its gradient, `hyperplanes::lookup_backward`.
 
-Registered with `torch.library`, so that autograd, `torch.compile` and fake tensors know them. Each device type brings
-its own kernel; this file holds what they share (shapes and the gradient's wiring) and the CPU ones. Second derivatives
-need the plain torch backend.
+Registered with `torch.library`, so that autograd, `torch.compile` and fake tensors know them. This file holds what all
+device types share, shapes and the gradient's wiring, and the CPU's way to its kernels; `lookup_triton` has those for
+CUDA. Second derivatives need the plain torch backend.
 """
 
 from __future__ import annotations
@@ -202,12 +202,30 @@ def _(points, matrices, images, packed, bits, views, background):
 @lookup_backward.register_fake
 def _(points, matrices, images, packed, bits, views, grad_colours, grad_coordinates, geometry, pixels):
     count, channels, height, width = images.shape
-    size = (count, height, width, _pixel_pitch(channels))
+    last = points.new_empty(images.shape)
+    if points.device.type == "cpu":
+        last = points.new_empty(count, height, width, _pixel_pitch(channels))[..., :channels].permute(0, 3, 1, 2)
     return (
         points.new_empty(points.shape if geometry else 0),
         points.new_empty(matrices.shape if geometry else 0),
-        points.new_empty(size)[..., :channels].permute(0, 3, 1, 2) if pixels else points.new_empty(0),
+        last if pixels else points.new_empty(0),
     )
 
 
 lookup.register_autograd(_gradients, setup_context=_setup)
+
+
+@lookup.register_kernel("cuda")
+def _(points, matrices, images, packed, bits, views, background):
+    from hyperplanes.geometry import lookup_triton
+
+    return lookup_triton.lookup(points, matrices, images, views, background)
+
+
+@lookup_backward.register_kernel("cuda")
+def _(points, matrices, images, packed, bits, views, grad_colours, grad_coordinates, geometry, pixels):
+    from hyperplanes.geometry import lookup_triton
+
+    return lookup_triton.lookup_backward(
+        points, matrices, images, views, grad_colours, grad_coordinates, geometry, pixels
+    )
