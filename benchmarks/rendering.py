@@ -62,7 +62,7 @@ def main(arguments: list[str]) -> int:
         return large_view(model)
     rows: list[Row] = []
     for size in (64,) if options.quick else (64, 128, 200, 400):
-        tasks = held_out(1 if options.quick or size > 128 else 3, size)
+        tasks = held_out(3 if size == 64 and not options.quick else 1, size)
         rows += compare(model, tasks, repeats=3 if size == 64 else 1)
         rows += parts(model, tasks[0])
         rows += baked(model, tasks[0])
@@ -104,7 +104,7 @@ def paper_view(adapted: AdaptedField, query: Views, view: int) -> tuple[float, f
     """
     height, width = query.size
     total = height * width
-    chosen = torch.arange(0, total, max(1, total // RAYS_OF_A_LARGE_VIEW) if total > 200 * 200 else 1)
+    chosen = torch.arange(0, total, max(1, total // RAYS_OF_A_LARGE_VIEW) if total > 128 * 128 else 1)
     pixels = pixel_grid(height, width)[chosen]
     rays = cast(query.cameras, torch.full_like(chosen, view), pixels, query.bounds, span="depth")
     seconds, seen = timed(lambda: render_in_chunks(adapted.field, rays, PAPER, proposal=adapted.proposal))
