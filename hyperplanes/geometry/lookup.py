@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 from dataclasses import dataclass
 
@@ -14,6 +13,8 @@ from hyperplanes.geometry import lookup_torch
 from hyperplanes.geometry.storage import Packed
 
 __all__ = ["Backend", "Lookup", "backends", "choose", "lookup"]
+
+_INSTALLED = {module: importlib.util.find_spec(module) is not None for module in ("numba", "triton")}
 
 
 @dataclass(frozen=True)
@@ -51,19 +52,14 @@ class Backend:
     reason: str
 
 
-@functools.cache
-def _installed(module: str) -> bool:
-    return importlib.util.find_spec(module) is not None
-
-
 def backends() -> list[Backend]:
     """Every way to do lookups, the plain reference first."""
     found = [Backend("torch", True, "plain PyTorch, any device; the reference")]
-    if not _installed("numba"):
+    if not _INSTALLED["numba"]:
         found.append(Backend("cpu", False, "needs numba: pip install numba"))
     else:
         found.append(Backend("cpu", True, f"numba kernels, {torch.get_num_threads()} threads; the default on the CPU"))
-    if not _installed("triton"):
+    if not _INSTALLED["triton"]:
         found.append(Backend("triton", False, "needs triton, which comes with PyTorch for CUDA"))
     elif not torch.cuda.is_available():
         found.append(Backend("triton", False, "needs a CUDA device that PyTorch can see"))
@@ -78,8 +74,8 @@ def choose(points: Tensor, images: Tensor) -> str:
     if points.dtype not in (torch.float32, torch.float64) or images.shape[2] * images.shape[3] >= 2**31:
         return "torch"
     if points.device.type == "cpu":
-        return "cpu" if _installed("numba") else "torch"
-    return "triton" if points.device.type == "cuda" and _installed("triton") else "torch"
+        return "cpu" if _INSTALLED["numba"] else "torch"
+    return "triton" if points.device.type == "cuda" and _INSTALLED["triton"] else "torch"
 
 
 def lookup(

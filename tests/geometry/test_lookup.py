@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hyperplanes.geometry import ImagePlanes, cameras
-from hyperplanes.geometry.lookup import backends, choose, lookup
+from hyperplanes.geometry.lookup import _INSTALLED, backends, choose, lookup
 from hyperplanes.geometry.storage import pack, unpack
 from tests import reference
 
@@ -216,6 +216,24 @@ def test_the_operator_passes_torchs_own_checks():
         torch.library.opcheck(lookup_op.lookup, (*leaves, None, 0, views, 1.0), test_utils=tests)
 
 
+def test_compiled_code_gives_the_same():
+    """Another implementation: eager mode. One graph, gradients included; the operator, as checked shapes do not trace."""
+    from hyperplanes.geometry import lookup_op
+
+    points, ours, images = scene(points=50)
+    matrices = cameras.projection_matrices(ours)
+
+    def loss(points, images):
+        colours, coordinates, _ = lookup_op.lookup(2 * points, matrices, images, None, 0, None, 1.0)
+        return colours.square().sum() + coordinates.sin().sum()
+
+    values = []
+    for function in (loss, torch.compile(loss, backend="aot_eager", fullgraph=True)):
+        leaves = [value.clone().requires_grad_() for value in (points, images)]
+        values.append(torch.autograd.grad(function(*leaves), leaves))
+    torch.testing.assert_close(values[0], values[1])
+
+
 def test_wrong_arguments_are_named():
     points, ours, images = scene(points=4)
     with pytest.raises(ValueError, match="views: expected indices of 5 planes, got 0 to 5"):
@@ -233,6 +251,6 @@ def test_the_default_follows_device_and_dtype(monkeypatch):
     assert [backend.name for backend in backends()] == ["torch", "cpu", "triton"]
     assert choose(points, images) == "cpu"
     assert choose(points.half(), images) == "torch"
-    monkeypatch.setattr("hyperplanes.geometry.lookup._installed", lambda module: False)
+    monkeypatch.setitem(_INSTALLED, "numba", False)
     assert choose(points, images) == "torch"
     assert not {backend.name: backend for backend in backends()}["cpu"].available
