@@ -217,7 +217,7 @@ def test_the_operator_passes_torchs_own_checks():
 
 
 def test_compiled_code_gives_the_same():
-    """Another implementation: eager mode. One graph, gradients included; the operator, as checked shapes do not trace."""
+    """Another implementation: eager mode. One graph with gradients; shape checks would not trace."""
     from hyperplanes.geometry import lookup_op
 
     points, ours, images = scene(points=50)
