@@ -217,7 +217,8 @@ def test_the_operator_passes_torchs_own_checks():
 
 
 def test_compiled_code_gives_the_same():
-    """Another implementation: eager mode. One graph with gradients; shape checks would not trace."""
+    """Another implementation: eager mode. One graph with gradients; shape checks would not
+    trace."""
     from hyperplanes.geometry import lookup_op
 
     points, ours, images = scene(points=50)
