@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from data_gen.lighting import Lighting
 from data_gen.ray_casting import Caster, Hits, pixel_rays
-from data_gen.rigs import Rig
+from data_gen.rig import Rig
 from data_gen.shading import facing, shade
 from data_gen.surfaces import Surface, linear
 from data_gen.textures import MipTexture

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from data_gen.rigs import DEFAULT_DISTANCE, OBJECT_RADIUS, Rig
+from data_gen.rig import DEFAULT_DISTANCE, OBJECT_RADIUS, Rig
 from data_gen.sources import Item
 from hyperplanes.data.files import encode_json, encode_npz, encode_png
 from hyperplanes.data.transforms_document import transforms_document

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.layouts import LAYOUTS, RenderedObject
+from data_gen.rig import Rig
 from data_gen.rig_presets import RIG_PRESETS
-from data_gen.rigs import Rig
 from data_gen.sources import Item, seed_of
 from hyperplanes.data.files import encode_json, sha256, write_whole
 
@@ -45,8 +45,8 @@ def make_rig(settings: dict[str, Any], name: str) -> Rig:
         return rigs.orbit(views, resolution, **common)
     if kind not in RIGS:
         raise ValueError(f"rig: expected one of {', '.join(RIGS)}, got {kind!r}")
-    make = rigs.random_sphere if kind == "random" else rigs.random_hemisphere
-    return make(views, resolution, seed=seed_of(settings["seed"], "rig", name) % 2**32, **common)
+    lowest = -90.0 if kind == "random" else 0.0
+    return rigs.random(views, resolution, seed=seed_of(settings["seed"], "rig", name) % 2**32, lowest=lowest, **common)
 
 
 @contextmanager

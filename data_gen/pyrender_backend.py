@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from data_gen.backends import RendererError
 from data_gen.lighting import Lighting
-from data_gen.rigs import Rig
+from data_gen.rig import Rig
 from data_gen.surfaces import Surface
 
 __all__ = ["PyrenderBackend"]

@@ -19,7 +19,7 @@ import trimesh
 from data_gen import SUPERSAMPLE
 from data_gen.backends import BACKENDS, Backend, RendererError, find_backend, remedy
 from data_gen.lighting import Lighting, resolve_lighting
-from data_gen.rigs import Rig
+from data_gen.rig import Rig
 from data_gen.surfaces import RasteriseError, Surface, surfaces_of
 
 __all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "Part", "RasteriseError", "Rasteriser", "Rendering"]

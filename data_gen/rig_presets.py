@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from data_gen.rigs import DEFAULT_DISTANCE, Rig, fixed, random_sphere
+from data_gen.rig import DEFAULT_DISTANCE, Rig
+from data_gen.rigs import fixed, random
 
 __all__ = ["RIG_PRESETS", "RigPreset", "preset"]
 
@@ -63,4 +64,4 @@ def preset(name: str, *, seed: int = 0) -> Rig:
     lens = {"distance": chosen.distance, "field_of_view": chosen.field_of_view}
     if chosen.kind == "fixed":
         return fixed(chosen.views, chosen.resolution, **lens)
-    return random_sphere(chosen.views, chosen.resolution, seed=seed, **lens)
+    return random(chosen.views, chosen.resolution, seed=seed, **lens)

@@ -1,167 +1,24 @@
-"""Camera rigs: where the cameras of a generated object stand.
+"""Where the cameras of a generated object stand: `fixed`, at `random`, or in an `orbit`. Conventions: `data_gen.rig`.
 
-Conventions: OpenCV camera axes (x right, y down, z forward), a world with y up, ``world_from_camera`` poses, intrinsics
-in pixels with INTEGER pixel centres, so a centred principal point is ``((W - 1) / 2, (H - 1) / 2)``. Objects are
-expected inside the sphere of radius 1 around the origin, at which every camera looks.
+Numbers that make no sense are a ValueError that names them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = [
-    "DEFAULT_DISTANCE",
-    "OBJECT_RADIUS",
-    "Rig",
-    "fitting_field_of_view",
-    "fixed",
-    "look_at_origin",
-    "orbit",
-    "random_hemisphere",
-    "random_sphere",
-]
+from data_gen.rig import DEFAULT_DISTANCE, OBJECT_RADIUS, Rig, fitting_field_of_view, look_at_origin
+
+__all__ = ["fixed", "orbit", "random"]
 
 Array = npt.NDArray[np.float64]
 
-OBJECT_RADIUS = 1.0
-"""Radius of the sphere around the origin that holds every normalised object, in world units."""
-
-DEFAULT_DISTANCE = 3.0
-"""Distance of the cameras from the origin, in world units."""
-
-_MARGIN = 1.04
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
-
-
-@dataclass(frozen=True)
-class Rig:
-    """Posed cameras of one size.
-
-    Attributes:
-        world_from_camera: Camera poses ``(view, 4, 4)``, OpenCV axes, in world units.
-        intrinsics: Pinhole matrices ``(view, 3, 3)`` in pixels, integer pixel centres. One ``(3, 3)`` is accepted and
-            repeated for every view.
-        width: Image width in pixels.
-        height: Image height in pixels.
-        near: Distance along a ray before which there is no object, in world units.
-        far: Distance along a ray after which there is no object, in world units.
-
-    Raises:
-        ValueError: If a shape is wrong, a number is not finite, a pose is not a rigid motion, or near and far are out
-            of order.
-    """
-
-    world_from_camera: Array
-    intrinsics: Array
-    width: int
-    height: int
-    near: float
-    far: float
-
-    def __post_init__(self) -> None:
-        poses = np.ascontiguousarray(self.world_from_camera, dtype=np.float64)
-        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
-            raise ValueError(f"world_from_camera: expected shape (view, 4, 4) with view >= 1, received {poses.shape}")
-        intrinsics = np.asarray(self.intrinsics, dtype=np.float64)
-        if intrinsics.shape not in {(3, 3), (len(poses), 3, 3)}:
-            raise ValueError(f"intrinsics: expected shape (3, 3) or ({len(poses)}, 3, 3), received {intrinsics.shape}")
-        intrinsics = np.array(np.broadcast_to(intrinsics, (len(poses), 3, 3)))
-        if not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
-            raise ValueError("world_from_camera, intrinsics: expected finite numbers, received NaN or infinity")
-        rotations = poses[:, :3, :3]
-        error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
-        if error > 1e-6 or np.linalg.det(rotations).min() < 0:
-            raise ValueError(
-                "world_from_camera: expected rotations without scale or mirroring, received "
-                f"|R R^T - 1| up to {error:.2g} and determinants from {np.linalg.det(rotations).min():.3g}"
-            )
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"width, height: expected at least 1 pixel, received {self.width} x {self.height}")
-        if not 0 < self.near < self.far:
-            raise ValueError(f"near, far: expected 0 < near < far, received {self.near} and {self.far}")
-        poses.flags.writeable = False
-        intrinsics.flags.writeable = False
-        object.__setattr__(self, "world_from_camera", poses)
-        object.__setattr__(self, "intrinsics", intrinsics)
-
-    def __len__(self) -> int:
-        """Return the number of views."""
-        return len(self.world_from_camera)
-
-    @property
-    def camera_from_world(self) -> Array:
-        """Extrinsics ``(view, 4, 4)`` as Kornia's PinholeCamera takes them."""
-        return np.asarray(np.linalg.inv(self.world_from_camera), dtype=np.float64)
-
-    @property
-    def camera_centres(self) -> Array:
-        """Camera positions ``(view, 3)`` in world units."""
-        return self.world_from_camera[:, :3, 3]
-
-    def select(self, views: Sequence[int]) -> Rig:
-        """Return the rig of some of the views, in the order given.
-
-        Args:
-            views: Indices of the views to keep.
-
-        Returns:
-            A rig of ``len(views)`` cameras with the same size, near and far.
-        """
-        index = np.asarray(views, dtype=np.int64)
-        return Rig(self.world_from_camera[index], self.intrinsics[index], self.width, self.height, self.near, self.far)
-
-
-def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:
-    """Field of view at which the unit sphere just fits, with a margin of 4 %.
-
-    Args:
-        distance: Distance of the camera from the centre of the sphere, more than 1.04.
-
-    Returns:
-        The full angle in degrees, ``2 asin(1.04 / distance)``.
-
-    Raises:
-        ValueError: If the camera is too near for any angle to do.
-
-    >>> round(fitting_field_of_view(3.0), 3)
-    40.567
-    """
-    if not distance > _MARGIN * OBJECT_RADIUS:
-        raise ValueError(f"distance: expected more than {_MARGIN} (the object's radius is 1), received {distance}")
-    return math.degrees(2.0 * math.asin(_MARGIN * OBJECT_RADIUS / distance))
-
-
-def look_at_origin(centres: npt.ArrayLike) -> Array:
-    """Poses of cameras that look at the origin with the world's y axis up in the picture.
-
-    Args:
-        centres: Camera positions ``(view, 3)``, none of them the origin.
-
-    Returns:
-        ``world_from_camera`` ``(view, 4, 4)``, OpenCV axes. Right above or below the origin, where no direction is up,
-        the world's -z axis is up in the picture.
-
-    >>> look_at_origin([[0.0, 0.0, 3.0]])[0].round().astype(int).tolist()
-    [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]]
-    """
-    positions = np.asarray(centres, dtype=np.float64)
-    forward = -positions / np.linalg.norm(positions, axis=-1, keepdims=True)
-    up = np.where(np.abs(forward[:, 1:2]) < 1.0 - 1e-9, [[0.0, 1.0, 0.0]], [[0.0, 0.0, -1.0]])
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    poses = np.zeros((len(positions), 4, 4))
-    poses[:, :3, 0] = right
-    poses[:, :3, 1] = np.cross(forward, right)
-    poses[:, :3, 2] = forward
-    poses[:, :3, 3] = positions
-    poses[:, 3, 3] = 1.0
-    return poses + 0.0  # no negative zeros in what is written to disk
+_HALF_TURN = _GOLDEN_ANGLE / 2.0
 
 
 def fixed(
@@ -190,31 +47,29 @@ def fixed(
 
     Returns:
         A rig of ``views`` cameras.
-
-    Raises:
-        ValueError: If the number of views, the elevations, the distance or the resolution make no sense.
     """
     _check_views(views)
-    if not -90.0 <= lowest < highest <= 90.0:
-        raise ValueError(f"lowest, highest: expected -90 <= lowest < highest <= 90, received {lowest} and {highest}")
+    band = _height_band(lowest, highest)
     directions = np.empty((views, 3))
     for first in (0, 1):
         count = len(range(first, views, 2))
         if count:
-            spread = _fibonacci_band(count, lowest, highest, level=0.25 + 0.5 * first, turn=first * _HALF_TURN)
+            spread = _fibonacci_band(count, *band, level=0.25 + 0.5 * first, turn=first * _HALF_TURN)
             directions[first::2] = spread[_farthest_first(spread)]
     return _rig(directions, resolution, distance, field_of_view)
 
 
-def random_sphere(
+def random(
     views: int = 50,
     resolution: int | tuple[int, int] = 128,
     *,
     seed: int,
     distance: float = DEFAULT_DISTANCE,
     field_of_view: float | None = None,
+    lowest: float = -90.0,
+    highest: float = 90.0,
 ) -> Rig:
-    """Cameras at random, uniformly over the whole sphere.
+    """Cameras at random, uniformly in area over a band of elevations: the whole sphere, or the upper half of it.
 
     Args:
         views: Number of views.
@@ -222,34 +77,17 @@ def random_sphere(
         seed: Seed of the random numbers; the same seed gives the same poses.
         distance: Distance of the cameras from the origin in world units.
         field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
+        lowest: Lowest elevation in degrees; 0 for the upper hemisphere.
+        highest: Highest elevation in degrees.
 
     Returns:
         A rig of ``views`` cameras.
     """
-    return _random(views, resolution, seed, distance, field_of_view, lowest=-1.0)
-
-
-def random_hemisphere(
-    views: int = 50,
-    resolution: int | tuple[int, int] = 128,
-    *,
-    seed: int,
-    distance: float = DEFAULT_DISTANCE,
-    field_of_view: float | None = None,
-) -> Rig:
-    """Cameras at random, uniformly over the upper half of the sphere (y >= 0).
-
-    Args:
-        views: Number of views.
-        resolution: Pixels, one number for a square image or (width, height).
-        seed: Seed of the random numbers; the same seed gives the same poses.
-        distance: Distance of the cameras from the origin in world units.
-        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
-
-    Returns:
-        A rig of ``views`` cameras.
-    """
-    return _random(views, resolution, seed, distance, field_of_view, lowest=0.0)
+    _check_views(views)
+    generator = np.random.default_rng(seed)
+    heights = generator.uniform(*_height_band(lowest, highest), views)
+    azimuths = generator.uniform(0.0, 2.0 * math.pi, views)
+    return _rig(_directions(heights, azimuths), resolution, distance, field_of_view)
 
 
 def orbit(
@@ -283,9 +121,6 @@ def orbit(
     return _rig(_directions(heights, azimuths), resolution, distance, field_of_view)
 
 
-_HALF_TURN = _GOLDEN_ANGLE / 2.0
-
-
 def _check_views(views: int) -> None:
     if views < 1:
         raise ValueError(f"views: expected at least 1, received {views}")
@@ -297,9 +132,15 @@ def _directions(heights: Array, azimuths: Array) -> Array:
     return np.stack((across * np.sin(azimuths), heights, across * np.cos(azimuths)), axis=-1)
 
 
-def _fibonacci_band(count: int, lowest: float, highest: float, *, level: float, turn: float) -> Array:
-    """Directions (count, 3) on a golden spiral, uniform in area between two elevations in degrees."""
-    bottom, top = math.sin(math.radians(lowest)), math.sin(math.radians(highest))
+def _height_band(lowest: float, highest: float) -> tuple[float, float]:
+    """The y coordinates on the unit sphere of two elevations in degrees."""
+    if not -90.0 <= lowest < highest <= 90.0:
+        raise ValueError(f"lowest, highest: expected -90 <= lowest < highest <= 90, received {lowest} and {highest}")
+    return math.sin(math.radians(lowest)), math.sin(math.radians(highest))
+
+
+def _fibonacci_band(count: int, bottom: float, top: float, *, level: float, turn: float) -> Array:
+    """Directions (count, 3) on a golden spiral, uniform in area between two heights."""
     heights = bottom + (top - bottom) * (np.arange(count) + level) / count
     return _directions(heights, turn + _GOLDEN_ANGLE * np.arange(count, dtype=np.float64))
 
@@ -313,22 +154,6 @@ def _farthest_first(directions: Array) -> list[int]:
         order.append(following)
         nearness = np.maximum(nearness, directions @ directions[following])
     return order
-
-
-def _random(
-    views: int,
-    resolution: int | tuple[int, int],
-    seed: int,
-    distance: float,
-    field_of_view: float | None,
-    *,
-    lowest: float,
-) -> Rig:
-    _check_views(views)
-    generator = np.random.default_rng(seed)
-    heights = generator.uniform(lowest, 1.0, views)
-    azimuths = generator.uniform(0.0, 2.0 * math.pi, views)
-    return _rig(_directions(heights, azimuths), resolution, distance, field_of_view)
 
 
 def _rig(directions: Array, resolution: int | tuple[int, int], distance: float, field_of_view: float | None) -> Rig:

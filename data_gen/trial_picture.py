@@ -13,7 +13,7 @@ from trimesh.visual import ColorVisuals
 
 from data_gen.backends import RendererError
 from data_gen.rasterise import Rasteriser
-from data_gen.rigs import Rig, look_at_origin
+from data_gen.rig import Rig, look_at_origin
 
 __all__ = ["draw_trial_picture"]
 

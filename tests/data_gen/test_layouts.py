@@ -7,8 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
+from data_gen import rigs
 from data_gen.layouts import LAYOUTS, RenderedObject, over_white
-from data_gen.rigs import fixed, random_sphere
+from data_gen.rigs import fixed
 from data_gen.sources import Item
 from hyperplanes.data import mesh_path, open_dataset, read_channel, read_task, read_views
 from hyperplanes.data.npz import catalogue
@@ -26,7 +27,7 @@ ITEMS = [
 def rendered(layout, item, **more):
     style = LAYOUTS[layout]
     size = style.resolution or 20
-    rig = random_sphere(VIEWS, size, seed=item.seed, distance=style.distance, field_of_view=style.field_of_view)
+    rig = rigs.random(VIEWS, size, seed=item.seed, distance=style.distance, field_of_view=style.field_of_view)
     rgba = np.random.default_rng(item.seed).integers(0, 256, (VIEWS, size, size, 4), dtype=np.uint8)
     rgba[..., 3] = np.where(rgba[..., 3] < 128, 0, rgba[..., 3])
     rgba[:, [0, -1]] = rgba[:, :, [0, -1]] = 0

@@ -6,6 +6,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from data_gen import rigs
+from data_gen.rig import Rig
 from data_gen.rig_presets import RIG_PRESETS, preset
 
 
@@ -32,8 +33,8 @@ def _kornia_project(rig, points):
     "rig",
     [
         rigs.fixed(7, 64),
-        rigs.random_sphere(7, 64, seed=1),
-        rigs.random_hemisphere(7, 64, seed=1),
+        rigs.random(7, 64, seed=1),
+        rigs.random(7, 64, seed=1, lowest=0.0),
         rigs.orbit(7, 64),
         rigs.orbit(3, 64, elevation=90.0),
         rigs.orbit(3, 64, elevation=-90.0),
@@ -81,12 +82,12 @@ def test_fixed_any_number_of_views(views):
 
 
 def test_random_rigs_follow_their_seed_and_cover_their_part_of_the_sphere():
-    one = rigs.random_sphere(400, 8, seed=3).camera_centres
-    assert np.array_equal(one, rigs.random_sphere(400, 8, seed=3).camera_centres)
-    assert not np.array_equal(one, rigs.random_sphere(400, 8, seed=4).camera_centres)
+    one = rigs.random(400, 8, seed=3).camera_centres
+    assert np.array_equal(one, rigs.random(400, 8, seed=3).camera_centres)
+    assert not np.array_equal(one, rigs.random(400, 8, seed=4).camera_centres)
     # Uniform on the sphere: each coordinate of the mean of 400 has standard deviation sqrt(1 / 3 / 400) = 0.029.
     assert np.abs((one / 3.0).mean(axis=0)).max() < 0.12
-    upper = rigs.random_hemisphere(400, 8, seed=3).camera_centres / 3.0
+    upper = rigs.random(400, 8, seed=3, lowest=0.0).camera_centres / 3.0
     assert upper[:, 1].min() >= 0.0
     assert abs(upper[:, 1].mean() - 0.5) < 0.05
 
@@ -111,7 +112,7 @@ def test_select_keeps_views_and_bounds():
 
 def test_one_intrinsic_matrix_serves_all_views():
     rig = rigs.fixed(4, 16)
-    same = rigs.Rig(rig.world_from_camera, rig.intrinsics[0], 16, 16, 2.0, 4.0)
+    same = Rig(rig.world_from_camera, rig.intrinsics[0], 16, 16, 2.0, 4.0)
     assert np.array_equal(same.intrinsics, rig.intrinsics)
 
 
@@ -122,15 +123,16 @@ def test_one_intrinsic_matrix_serves_all_views():
         (lambda: rigs.fixed(4, 0), "at least 1 pixel, received 0"),
         (lambda: rigs.fixed(4, 16, distance=1.0), "more than 1.04 .* received 1.0"),
         (lambda: rigs.fixed(4, 16, lowest=50.0, highest=20.0), "received 50.0 and 20.0"),
+        (lambda: rigs.random(4, 16, seed=0, lowest=-91.0), "received -91.0 and 90.0"),
         (lambda: rigs.fixed(4, 16, field_of_view=180.0), "received 180.0"),
         (lambda: rigs.orbit(4, 16, elevation=91.0), "received 91.0"),
-        (lambda: rigs.Rig(np.eye(4), np.eye(3), 4, 4, 1, 2), r"received \(4, 4\)"),
-        (lambda: rigs.Rig(np.eye(4)[None], np.eye(4), 4, 4, 1, 2), r"received \(4, 4\)"),
-        (lambda: rigs.Rig(2 * np.eye(4)[None], np.eye(3), 4, 4, 1, 2), "without scale or mirroring"),
-        (lambda: rigs.Rig(np.diag([1.0, 1, -1, 1])[None], np.eye(3), 4, 4, 1, 2), "determinants from -1"),
-        (lambda: rigs.Rig(np.eye(4)[None] * np.nan, np.eye(3), 4, 4, 1, 2), "NaN"),
-        (lambda: rigs.Rig(np.eye(4)[None], np.eye(3), 4, 0, 1, 2), "received 4 x 0"),
-        (lambda: rigs.Rig(np.eye(4)[None], np.eye(3), 4, 4, 2, 2), "received 2 and 2"),
+        (lambda: Rig(np.eye(4), np.eye(3), 4, 4, 1, 2), r"received \(4, 4\)"),
+        (lambda: Rig(np.eye(4)[None], np.eye(4), 4, 4, 1, 2), r"received \(4, 4\)"),
+        (lambda: Rig(2 * np.eye(4)[None], np.eye(3), 4, 4, 1, 2), "without scale or mirroring"),
+        (lambda: Rig(np.diag([1.0, 1, -1, 1])[None], np.eye(3), 4, 4, 1, 2), "determinants from -1"),
+        (lambda: Rig(np.eye(4)[None] * np.nan, np.eye(3), 4, 4, 1, 2), "NaN"),
+        (lambda: Rig(np.eye(4)[None], np.eye(3), 4, 0, 1, 2), "received 4 x 0"),
+        (lambda: Rig(np.eye(4)[None], np.eye(3), 4, 4, 2, 2), "received 2 and 2"),
     ],
 )
 def test_wrong_input_says_what_was_received(call, message):
