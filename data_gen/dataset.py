@@ -15,8 +15,8 @@ from data_gen import SUPERSAMPLE
 from data_gen.layouts import LAYOUTS
 from data_gen.manifest import Progress, build_manifest
 from data_gen.objects import RIGS, make_rig
+from data_gen.rig import OBJECT_RADIUS
 from data_gen.rig_presets import RIG_PRESETS
-from data_gen.rigs import OBJECT_RADIUS
 from data_gen.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.workers import Outcome, WorkerError, run_isolated
 from hyperplanes.data.errors import DataError
@@ -44,6 +44,7 @@ class Report:
         images_per_second: that this call wrote.
         reused: objects that an earlier call had written.
         splits: how many objects are in each split.
+        unlisted: objects that the split file does not name, and that are trained on.
     """
 
     written: int
@@ -52,6 +53,7 @@ class Report:
     images_per_second: float
     reused: int = 0
     splits: dict[str, int] = field(default_factory=dict)
+    unlisted: list[str] = field(default_factory=list)
 
 
 def generate(
@@ -149,7 +151,8 @@ def generate(
         state.finish(manifest, LAYOUTS[layout].splits(kept))
     seconds = time.monotonic() - begun
     splits = {split: len(names) for split, names in manifest["splits"].items()}
-    return Report(len(kept), sorted(skipped), seconds, images / seconds, reused, splits)
+    unlisted = manifest["not_in_split_file"]["names"]
+    return Report(len(kept), sorted(skipped), seconds, images / seconds, reused, splits, unlisted)
 
 
 def _check(rig: str, channels: Sequence[str], engine: str, layout: str) -> None:

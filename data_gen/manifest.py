@@ -74,6 +74,7 @@ def build_manifest(
     """
     by_name = {entry["name"]: entry for entry in entries}
     done = [item for item in items if item.name in by_name]
+    unlisted = [item.name for item in done if item.unlisted]
     splits = {split: [item.name for item in done if item.split == split] for split in ("train", "val", "test")}
     return {
         "format": FORMAT,
@@ -81,6 +82,7 @@ def build_manifest(
         **facts,
         "configuration": configuration,
         "splits": splits,
+        "not_in_split_file": {"count": len(unlisted), "split": "train", "names": unlisted},
         "objects": {item.name: {**by_name[item.name]["record"], "files": by_name[item.name]["files"]} for item in done},
         "skipped": [{"name": name, "reason": reason} for name, reason in sorted(skipped)],
     }

@@ -37,7 +37,8 @@ class MeshFolder:
     Attributes:
         path: the folder.
         up: which axis is up in the files, y or z.
-        split_file: ShapeNet's official all.csv; models that it does not list are trained on.
+        split_file: ShapeNet's official all.csv; models that it does not list are trained on, and the manifest names
+            them.
     """
 
     path: str | Path
@@ -58,6 +59,7 @@ class Item:
         split: "train", "val" or "test".
         seed: of the procedural shape, or None for a file.
         path: of the mesh file, or None for a procedural shape.
+        unlisted: whether a split file decides and does not name it, so that it is trained on.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Item:
     split: str
     seed: int | None = None
     path: str | None = None
+    unlisted: bool = False
 
 
 def list_items(source: Source, held_out: float | int | None) -> list[Item]:
@@ -124,18 +127,19 @@ def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
     found = find_meshes(source.path, split_file=source.split_file)
     if source.split_file is not None and not any(mesh.split for mesh in found):
         raise ValueError(f"{source.split_file}: expected models of {source.path}, found none of them; check both")
+    stated = held_out is None and any(mesh.split for mesh in found)
     classes: dict[str | None, list[Any]] = defaultdict(list)
     for mesh in sorted(found, key=lambda mesh: mesh.name):
         classes[mesh.class_name].append(mesh)
     items = []
     for class_name, meshes in classes.items():
-        stated = held_out is None and any(mesh.split for mesh in meshes)
         kept = _held_out(len(meshes), 0.2 if held_out is None else held_out)
         for index, mesh in enumerate(meshes):
             split = "test" if index >= len(meshes) - kept else "train"
             if stated:
                 split = mesh.split or "train"
-            items.append(Item(mesh.name, class_name, split, path=str(mesh.path)))
+            unlisted = stated and mesh.split is None
+            items.append(Item(mesh.name, class_name, split, path=str(mesh.path), unlisted=unlisted))
     return items
 
 

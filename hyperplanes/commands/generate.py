@@ -110,6 +110,12 @@ def summary(report: Report, out: Path) -> str:
     return f"{out}: {report.written} objects ({splits}{reused}){speed}"
 
 
+def unlisted(names: list[str]) -> str:
+    """One line about objects that the split file does not name."""
+    shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    return f"not in the split file, so trained on: {len(names)} objects ({shown}), listed in the manifest"
+
+
 def run(arguments: Arguments) -> int:
     """Generate the data set and say what was skipped."""
     from data_gen.backends import find_backend
@@ -145,6 +151,8 @@ def run(arguments: Arguments) -> int:
         )
     for name, reason in report.skipped:
         console.warn(f"skipped {name}: {reason}")
+    if report.unlisted:
+        console.warn(unlisted(report.unlisted))
     console.say(summary(report, arguments.out))
     if not arguments.verify:
         return 0

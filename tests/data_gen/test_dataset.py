@@ -267,6 +267,22 @@ def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
         generate(car, tmp_path / "64", rig="paper-64")
 
 
+def test_a_class_that_the_split_file_leaves_out_whole_is_trained_on_and_named(tmp_path):
+    for synset, name in (("02958343", "a"), ("03001627", "x"), ("03001627", "y")):
+        path = tmp_path / "tree" / synset / name / "model.obj"
+        path.parent.mkdir(parents=True)
+        trimesh.creation.box().export(path)
+    official = tmp_path / "tree" / "all.csv"
+    official.write_text("id,synsetId,subSynsetId,modelId,split\n0,02958343,02958343,a,test")
+    items = list_items(MeshFolder(tmp_path / "tree"), None)
+    assert [(item.name, item.split, item.unlisted) for item in items] == [
+        ("chair_x", "train", True),
+        ("chair_y", "train", True),
+        ("car_a", "test", False),
+    ]
+    assert not any(item.unlisted for item in list_items(MeshFolder(tmp_path / "tree"), 1))
+
+
 def test_an_official_split_file_decides(tmp_path):
     tree_of_cars = tmp_path / "ShapeNetCore.v1"
     for name in "abcd":
@@ -283,6 +299,13 @@ def test_an_official_split_file_decides(tmp_path):
         ("car_c", "val"),
         ("car_a", "test"),
     ]
+    assert [item.name for item in items if item.unlisted] == ["car_d"]
+    out = tmp_path / "out"
+    report = generate(MeshFolder(tree_of_cars, split_file=official), out, **SMALL)
+    assert report.unlisted == ["car_d"]
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["not_in_split_file"] == {"count": 1, "split": "train", "names": ["car_d"]}
+    assert manifest["splits"]["train"] == ["car_b", "car_d"]
     with pytest.raises(ValueError, match="held_out: expected none, for .*all.csv decides, got 0.5"):
         list_items(MeshFolder(tree_of_cars, split_file=official), 0.5)
     official.write_text("id,synsetId,subSynsetId,modelId,split\n0,03001627,03001627,a,test")
