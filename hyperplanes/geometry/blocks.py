@@ -1,40 +1,43 @@
-"""The fused lookup on one block of points and one plane, as numba functions that LLVM vectorises over the block.
+"""Where one block of points falls on one plane, and back, as numba functions that LLVM vectorises over the block.
 
 A block is BLOCK lookups that share a view. Its numbers live in one scratch array, one row of BLOCK values a quantity
-(the constants below), small enough for the first-level cache. All functions work in the dtype of the scratch.
+(the constants below), small enough for the first-level cache. All functions work in the dtype of the scratch. What is
+read from the plane there is in `interpolation`.
 """
 
 from __future__ import annotations
 
 from typing import no_type_check
 
-import numpy as np
 from numba import njit
 
-from hyperplanes.geometry.vector_memory import bits_of, load, read, store
+from hyperplanes.geometry.vector_memory import load, read, store
 
 __all__ = [
     "BLOCK",
     "CHANNELS",
     "back_project",
-    "fetch_packed",
-    "fetch_plane",
+    "copy",
+    "copy_pairs",
     "inlined",
     "inner",
+    "locate",
     "place",
     "project",
-    "pull_packed",
-    "pull_plane",
     "start_pull",
 ]  # fmt: skip
 
 BLOCK = 128
 # Rows of the scratch: a point, where points do not come as rows; its pixel before and after clamping; 1 / depth,
 # zero behind the camera; whether it is inside the image; the gradients with respect to the pixel and to the point;
-# coordinates in [-1, 1], or going back the gradients with respect to them; the same for the channels, one row each.
-X, Y, Z, RAW_U, RAW_V, RECIPROCAL, U, V, INSIDE, GRAD_U, GRAD_V, GRAD_X, GRAD_Y, GRAD_Z, COLUMN, ROW, CHANNELS = (
-    BLOCK * row for row in range(17)
+# coordinates in [-1, 1], or going back the gradients with respect to them; the upper left one of the four pixels to
+# interpolate, and the fractions of a pixel beyond it.
+X, Y, Z, RAW_U, RAW_V, RECIPROCAL, U, V, INSIDE, GRAD_U, GRAD_V, GRAD_X, GRAD_Y, GRAD_Z, COLUMN, ROW = (
+    BLOCK * row for row in range(16)
 )
+CORNER, ACROSS, DOWN = (BLOCK * row for row in range(16, 19))
+# Two rows of four numbers a lookup; three channels' slopes across and down; the channels, one row each.
+TILE, SLOPES, CHANNELS = BLOCK * 19, BLOCK * 27, BLOCK * 33
 
 # Everything of fast maths but the assumption that there are no NaN and no infinities. What runs once a lookup is
 # forced inline; LLVM calls it otherwise, which costs more than its work.
@@ -91,117 +94,49 @@ def place(s, out, column, row, height, width):
 
 @inner
 @no_type_check
-def fetch_plane(s, out, first, images, offset, height, width, background):
-    """U, V, INSIDE -> bilinear values of the float plane that starts at `offset`, into `out` from `first` on."""
-    last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
-    right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
-    stride, diagonal, zero = np.int32(width), np.int32(right + below), s.dtype.type(0)
-    for i in range(BLOCK):
-        u, v = load(s, U + i), load(s, V + i)
-        x, y = min(np.int32(u), last_x), min(np.int32(v), last_y)
-        fx, fy = u - s.dtype.type(x), v - s.dtype.type(y)
-        k = np.int32(y * stride + x)
-        a, b = read(images, offset, k), read(images, offset, np.int32(k + right))
-        c, d = read(images, offset, np.int32(k + below)), read(images, offset, np.int32(k + diagonal))
-        top = a + fx * (b - a)
-        value = top + fy * (c + fx * (d - c) - top)
-        store(out, first + i, value if load(s, INSIDE + i) > zero else background)
+def copy(s, row, count, values, at, stride):
+    """Every `stride`-th number of `values` -> a row of the scratch; where they lie side by side as whole vectors."""
+    if stride == 1 and count == BLOCK:
+        for i in range(BLOCK):
+            store(s, row + i, read(values, at, i))
+    else:
+        for i in range(count):
+            store(s, row + i, read(values, at, i * stride))
 
 
 @inner
 @no_type_check
-def _format(bits):
-    """(shifts of the channels, mask, mask of the last channel) of three channels in 32 bits."""
-    narrow = bits if bits == 8 else bits - 1
-    return np.uint32(0), np.uint32(bits), np.uint32(2 * bits), np.uint32((1 << bits) - 1), np.uint32((1 << narrow) - 1)
+def copy_pairs(s, count, values, at, by):
+    """Columns and rows from `at` on, `by` (point, view, column and row) apart -> COLUMN, ROW; as whole vectors too."""
+    if by[0] == 2 and by[2] == 1 and count == BLOCK:
+        for i in range(BLOCK):
+            store(s, COLUMN + i, read(values, at, 2 * i))
+            store(s, ROW + i, read(values, at, 2 * i + 1))
+    else:
+        copy(s, COLUMN, count, values, at, by[0])
+        copy(s, ROW, count, values, at + by[2], by[0])
 
 
 @inner
 @no_type_check
-def fetch_packed(s, out, first, pitch, packed, offset, height, width, bits, background):
-    """As `fetch_plane`, for three channels packed into 32 bits: (8, 8, 8) or (11, 11, 10), first channel lowest.
+def locate(s, height, width):
+    """Coordinates in COLUMN, ROW -> clamped U, V; INSIDE.
 
-    The channels' values go `pitch` apart.
+    Comparisons are written so that NaN falls to 0.
     """
-    last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
-    right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
-    stride, diagonal, zero, one = np.int32(width), np.int32(right + below), s.dtype.type(0), s.dtype.type(1)
-    low, shift, twice, mask, mask_last = _format(bits)
-    unit, unit_last = one / s.dtype.type(mask), one / s.dtype.type(mask_last)
+    one, zero = s.dtype.type(1), s.dtype.type(0)
+    right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
+    per_column, per_row = s.dtype.type(0.5) * right, s.dtype.type(0.5) * bottom
     for i in range(BLOCK):
-        u, v = load(s, U + i), load(s, V + i)
-        x, y = min(np.int32(u), last_x), min(np.int32(v), last_y)
-        fx, fy = u - s.dtype.type(x), v - s.dtype.type(y)
-        k = np.int32(y * stride + x)
-        a, b = read(packed, offset, k), read(packed, offset, np.int32(k + right))
-        c, d = read(packed, offset, np.int32(k + below)), read(packed, offset, np.int32(k + diagonal))
-        wd = fx * fy
-        wb, wc = fx - wd, fy - wd
-        wa = one - fx - wc
-        inside = load(s, INSIDE + i) > zero
-        red = wa * bits_of(a, low, mask) + wb * bits_of(b, low, mask)
-        red += wc * bits_of(c, low, mask) + wd * bits_of(d, low, mask)
-        green = wa * bits_of(a, shift, mask) + wb * bits_of(b, shift, mask)
-        green += wc * bits_of(c, shift, mask) + wd * bits_of(d, shift, mask)
-        blue = wa * bits_of(a, twice, mask_last) + wb * bits_of(b, twice, mask_last)
-        blue += wc * bits_of(c, twice, mask_last) + wd * bits_of(d, twice, mask_last)
-        store(out, first + i, red * unit if inside else background)
-        store(out, first + pitch + i, green * unit if inside else background)
-        store(out, first + 2 * pitch + i, blue * unit_last if inside else background)
-
-
-@inner
-@no_type_check
-def pull_plane(s, images, offset, height, width, channel):
-    """Adds one channel's part to GRAD_U, GRAD_V: its gradient times the slope of its plane."""
-    last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
-    right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
-    stride, diagonal = np.int32(width), np.int32(right + below)
-    for i in range(BLOCK):
-        u, v = load(s, U + i), load(s, V + i)
-        x, y = min(np.int32(u), last_x), min(np.int32(v), last_y)
-        fx, fy = u - s.dtype.type(x), v - s.dtype.type(y)
-        k = np.int32(y * stride + x)
-        a, b = read(images, offset, k), read(images, offset, np.int32(k + right))
-        c, d = read(images, offset, np.int32(k + below)), read(images, offset, np.int32(k + diagonal))
-        gradient = load(s, CHANNELS + channel * BLOCK + i) * load(s, INSIDE + i)
-        twist = (d - c) - (b - a)
-        store(s, GRAD_U + i, load(s, GRAD_U + i) + gradient * ((b - a) + fy * twist))
-        store(s, GRAD_V + i, load(s, GRAD_V + i) + gradient * ((c - a) + fx * twist))
-
-
-@inner
-@no_type_check
-def pull_packed(s, packed, offset, height, width, bits):
-    """As `pull_plane`, for all three channels of packed images."""
-    last_x, last_y = np.int32(max(width - 2, 0)), np.int32(max(height - 2, 0))
-    right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
-    stride, diagonal, one = np.int32(width), np.int32(right + below), s.dtype.type(1)
-    low, shift, twice, mask, mask_last = _format(bits)
-    unit, unit_last = one / s.dtype.type(mask), one / s.dtype.type(mask_last)
-    for i in range(BLOCK):
-        u, v = load(s, U + i), load(s, V + i)
-        x, y = min(np.int32(u), last_x), min(np.int32(v), last_y)
-        fx, fy = u - s.dtype.type(x), v - s.dtype.type(y)
-        k = np.int32(y * stride + x)
-        a, b = read(packed, offset, k), read(packed, offset, np.int32(k + right))
-        c, d = read(packed, offset, np.int32(k + below)), read(packed, offset, np.int32(k + diagonal))
-        inside = load(s, INSIDE + i)
-        first = load(s, CHANNELS + i) * inside * unit
-        second = load(s, CHANNELS + BLOCK + i) * inside * unit
-        third = load(s, CHANNELS + 2 * BLOCK + i) * inside * unit_last
-        # The gradient with respect to a tap is the same sum for each: contract channels first, then interpolate.
-        ga = first * bits_of(a, low, mask) + second * bits_of(a, shift, mask)
-        ga += third * bits_of(a, twice, mask_last)
-        gb = first * bits_of(b, low, mask) + second * bits_of(b, shift, mask)
-        gb += third * bits_of(b, twice, mask_last)
-        gc = first * bits_of(c, low, mask) + second * bits_of(c, shift, mask)
-        gc += third * bits_of(c, twice, mask_last)
-        gd = first * bits_of(d, low, mask) + second * bits_of(d, shift, mask)
-        gd += third * bits_of(d, twice, mask_last)
-        twist = (gd - gc) - (gb - ga)
-        store(s, GRAD_U + i, load(s, GRAD_U + i) + (gb - ga) + fy * twist)
-        store(s, GRAD_V + i, load(s, GRAD_V + i) + (gc - ga) + fx * twist)
+        u, v = (load(s, COLUMN + i) + one) * per_column, (load(s, ROW + i) + one) * per_row
+        inside = (u >= zero) & (u <= right) & (v >= zero) & (v <= bottom)
+        u = u if u > zero else zero
+        u = u if u < right else right
+        v = v if v > zero else zero
+        v = v if v < bottom else bottom
+        store(s, U + i, u)
+        store(s, V + i, v)
+        store(s, INSIDE + i, one if inside else zero)
 
 
 @inner

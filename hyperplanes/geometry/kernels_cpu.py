@@ -26,13 +26,12 @@ from hyperplanes.geometry.blocks import (
     X,
     Y,
     Z,
-    fetch_packed,
-    fetch_plane,
     inlined,
     inner,
     place,
     project,
 )
+from hyperplanes.geometry.interpolation import fetch_packed, fetch_plane
 from hyperplanes.geometry.vector_memory import load, store
 
 __all__ = ["forward", "forward_chosen", "grouped", "scratch", "take"]

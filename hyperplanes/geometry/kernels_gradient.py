@@ -23,37 +23,30 @@ from hyperplanes.geometry.blocks import (
     V,
     X,
     back_project,
+    copy,
+    copy_pairs,
     inlined,
     inner,
     place,
     project,
-    pull_packed,
-    pull_plane,
     start_pull,
 )
+from hyperplanes.geometry.interpolation import pull_packed, pull_plane
 from hyperplanes.geometry.kernels_cpu import grouped, scratch, take
-from hyperplanes.geometry.vector_memory import add_pixels, load, read, store
+from hyperplanes.geometry.vector_memory import add_pixels, load
 
-__all__ = ["backward", "backward_chosen", "image_backward", "image_backward_chosen"]
+__all__ = ["backward", "backward_chosen", "clear", "image_backward", "image_backward_chosen", "splat"]
 
 
 @inlined
 @no_type_check
-def _clear(s, count, channels):
+def clear(s, count, channels):
     """Zero gradients in the lanes from `count` on, which hold no lookup."""
     for i in range(count, BLOCK):
         s[COLUMN + i] = 0
         s[ROW + i] = 0
         for c in range(channels):
             s[CHANNELS + c * BLOCK + i] = 0
-
-
-@inner
-@no_type_check
-def _copy(s, row, count, values, at, stride):
-    """Every `stride`-th number of `values` -> a row of the scratch."""
-    for i in range(count):
-        store(s, row + i, read(values, at, i * stride))
 
 
 @inner
@@ -81,12 +74,11 @@ def backward(points, pitch, matrices, images, packed, bits, height, width, neare
     for view in range(planes):
         for p in range(start, stop, BLOCK):
             count = min(BLOCK, total - p)
-            _copy(s, COLUMN, count, grad_coordinates, p * by[0] + view * by[1], by[0])
-            _copy(s, ROW, count, grad_coordinates, p * by[0] + view * by[1] + by[2], by[0])
+            copy_pairs(s, count, grad_coordinates, p * by[0] + view * by[1], by)
             for c in range(channels):
                 at = p * per[0] + view * per[1] + c * per[2]
-                _copy(s, CHANNELS + c * BLOCK, count, grad_colours, at, per[0])
-            _clear(s, count, channels)
+                copy(s, CHANNELS + c * BLOCK, count, grad_colours, at, per[0])
+            clear(s, count, channels)
             _pull(
                 s, points, p, pitch, view, matrices, images, packed, bits, height, width, nearest, grad_points, p, sums
             )
@@ -113,7 +105,7 @@ def backward_chosen(points, pitch, views, matrices, images, packed, bits, height
                 s[ROW + i] = grad_coordinates[at + by[2]]
                 for c in range(channels):
                     s[CHANNELS + c * BLOCK + i] = grad_colours[p * per[0] + j * per[1] + c * per[2]]
-            _clear(s, count, channels)
+            clear(s, count, channels)
             _pull(s, s, X, BLOCK, view, matrices, images, packed, bits, height, width, nearest, s, GRAD_X, sums)
             for i in range(count):
                 p = order[begin + i] // m
@@ -124,7 +116,7 @@ def backward_chosen(points, pitch, views, matrices, images, packed, bits, height
 
 @inlined
 @no_type_check
-def _splat(s, i, at, step, grad_colours, height, width, channels, pitch, start, plane):
+def splat(s, i, at, step, grad_colours, height, width, channels, pitch, start, plane):
     """Adds one lookup's gradient to the four pixels it was interpolated from; pixels lie `pitch` numbers apart."""
     u, v = load(s, U + i), load(s, V + i)
     x, y = min(np.int64(u), max(width - 2, 0)), min(np.int64(v), max(height - 2, 0))
@@ -165,7 +157,7 @@ def image_backward(points, pitch, matrices, height, width, nearest, grad_colours
             for i in range(min(BLOCK, total - p)):
                 if load(s, INSIDE + i) > 0:
                     at = (p + i) * per[0] + view * per[1]
-                    _splat(s, i, at, per[2], grad_colours, height, width, channels, pixel, plane, grad_images)
+                    splat(s, i, at, per[2], grad_colours, height, width, channels, pixel, plane, grad_images)
 
 
 @no_type_check
@@ -194,5 +186,5 @@ def image_backward_chosen(points, pitch, views, matrices, height, width, nearest
         for i in range(filled[view]):
             if load(s, INSIDE + i) > 0:
                 at = order[view, i] // m * per[0] + order[view, i] % m * per[1]
-                _splat(s, i, at, per[2], grad_colours, height, width, channels, pixel, plane, grad_images)
+                splat(s, i, at, per[2], grad_colours, height, width, channels, pixel, plane, grad_images)
         filled[view] = 0

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-__all__ = ["NEAREST_DEPTH", "interpolate", "lookup", "place", "project"]
+__all__ = ["NEAREST_DEPTH", "interpolate", "lookup", "place", "project", "sample"]
 
 NEAREST_DEPTH = 1e-4  # world units in front of a camera; nearer points count as behind
 
@@ -50,6 +50,18 @@ def interpolate(images: Tensor, coordinates: Tensor, views: Tensor | None) -> Te
     top = torch.lerp(top_left, top_right, fraction[..., 0].expand_as(top_left))
     low = torch.lerp(low_left, low_right, fraction[..., 0].expand_as(top_left))
     return torch.lerp(top, low, fraction[..., 1].expand_as(top))
+
+
+def sample(images: Tensor, coordinates: Tensor, background: float) -> Tensor:
+    """Colours (point, view, channel) at coordinates (point, view, 2); the background outside the images."""
+    if not coordinates.numel() or not images.shape[1]:
+        return coordinates.new_empty(*coordinates.shape[:2], images.shape[1])
+    grid = coordinates.transpose(0, 1)
+    (u, v), (height, width) = (0.5 * (grid + 1)).unbind(-1), images.shape[2:]
+    u, v = u * (width - 1), v * (height - 1)
+    inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    found = interpolate(images, torch.where(inside[..., None], grid, 0.0).transpose(0, 1), None)
+    return torch.where(inside[:, None], found.permute(1, 2, 0), background).permute(2, 0, 1)
 
 
 def lookup(

@@ -4,6 +4,9 @@ A loop that reads pixels at computed places and writes results cannot be vectori
 writes never touch the pixels. `read`, `load` and `store` carry that promise as LLVM `alias.scope` and `noalias`
 metadata (LLVM language reference, "noalias and alias.scope metadata"). None of them checks bounds or wraps negative
 indices. `bits_of` exists because numba widens 32-bit integer arithmetic to 64 bits, which halves the lanes.
+
+Where pixels keep their channels together as numbers, `blend` and `slopes` read two neighbours at once, with vectors
+across the channels rather than across the points: a sixth of the memory accesses, and none of them a gather.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-__all__ = ["add_pixels", "bits_of", "load", "read", "store"]
+__all__ = ["add_pixels", "bits_of", "blend", "load", "load_int", "read", "slopes", "spread", "store", "store_int"]
 
 
 def _scope(module: ir.Module) -> ir.Value:
@@ -57,6 +60,132 @@ def store(typing_context, array, index, value):
         instruction.set_metadata("noalias", _scope(builder.module))
 
     return types.void(array, index, array.dtype), generate
+
+
+@intrinsic
+def store_int(typing_context, array, row, index, value):
+    """Keeps a 32-bit integer in the row of scratch memory that starts at `row`."""
+
+    def generate(context, builder, signature, arguments):
+        instruction = builder.store(arguments[3], _integers(context, builder, signature, arguments))
+        instruction.set_metadata("noalias", _scope(builder.module))
+
+    return types.void(array, row, index, types.int32), generate
+
+
+@intrinsic
+def load_int(typing_context, array, row, index):
+    """What `store_int` kept."""
+
+    def generate(context, builder, signature, arguments):
+        value = builder.load(_integers(context, builder, signature, arguments))
+        value.set_metadata("noalias", _scope(builder.module))
+        return value
+
+    return types.int32(array, row, index), generate
+
+
+def _integers(context, builder, signature, arguments):
+    data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+    row = builder.bitcast(builder.gep(data, [arguments[1]]), ir.IntType(32).as_pointer())
+    return builder.gep(row, [arguments[2]])
+
+
+def _pair(context, builder, pixels, at):
+    """The pixel of four numbers at `at` and the next one."""
+    data = context.make_array(pixels[0])(context, builder, pixels[1]).data
+    wide = ir.VectorType(data.type.pointee, 8).as_pointer()
+    value = builder.load(builder.bitcast(builder.gep(data, [at]), wide), align=4)
+    value.set_metadata("alias.scope", _scope(builder.module))
+    return value
+
+
+def _four_taps(context, builder, signature, arguments):
+    """Upper and lower pair of pixels, the fractions as vectors, and the function that halves vectors."""
+    pixels, at, below, across, down = arguments[:5]
+    kind, typed = across.type, (signature.args[0], pixels)
+    top = _pair(context, builder, typed, at)
+    low = _pair(context, builder, typed, builder.add(at, below))
+
+    def filled(value, lanes):
+        vector = builder.insert_element(ir.Constant(ir.VectorType(kind, lanes), ir.Undefined), value, ir.IntType(32)(0))
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+        return builder.shuffle_vector(vector, vector, zeros)
+
+    def halves(value):
+        for first in (0, 4):
+            lanes = ir.Constant(ir.VectorType(ir.IntType(32), 4), list(range(first, first + 4)))
+            yield builder.shuffle_vector(value, value, lanes)
+
+    return top, low, filled(across, 4), filled(down, 8), halves
+
+
+_FUSED = {"flags": ("contract",)}
+
+
+@intrinsic
+def blend(typing_context, pixels, at, below, across, down, tile, to):
+    """Four pixels -> their bilinear mean, as four numbers in `tile` from `to` on, three of them channels.
+
+    `pixels` holds four numbers a pixel; the upper left one starts at `at`, the one below it `below` further; `across`
+    and `down` are the fractions.
+    """
+
+    def generate(context, builder, signature, arguments):
+        top, low, across, down, halves = _four_taps(context, builder, signature, arguments)
+        column = builder.fadd(top, builder.fmul(down, builder.fsub(low, top), **_FUSED), **_FUSED)
+        left, right = halves(column)
+        value = builder.fadd(left, builder.fmul(across, builder.fsub(right, left), **_FUSED), **_FUSED)
+        _keep(context, builder, signature.args[5], arguments[5], arguments[6], value)
+
+    number = tile.dtype
+    return types.void(pixels, types.int64, types.int64, number, number, tile, types.int64), generate
+
+
+@intrinsic
+def slopes(typing_context, pixels, at, below, across, down, tile, to, apart):
+    """As `blend`, the derivatives of what lies between the pixels: across, and `apart` further in `tile`, down."""
+
+    def generate(context, builder, signature, arguments):
+        top, low, across, down, halves = _four_taps(context, builder, signature, arguments)
+        change = builder.fsub(low, top)
+        left, right = halves(builder.fadd(top, builder.fmul(down, change, **_FUSED), **_FUSED))
+        _keep(context, builder, signature.args[5], arguments[5], arguments[6], builder.fsub(right, left))
+        left, right = halves(change)
+        value = builder.fadd(left, builder.fmul(across, builder.fsub(right, left), **_FUSED), **_FUSED)
+        further = builder.add(arguments[6], arguments[7])
+        _keep(context, builder, signature.args[5], arguments[5], further, value)
+
+    number = tile.dtype
+    return types.void(pixels, types.int64, types.int64, number, number, tile, types.int64, types.int64), generate
+
+
+def _keep(context, builder, kind, array, at, value):
+    data = context.make_array(kind)(context, builder, array).data
+    pointer = builder.bitcast(builder.gep(data, [at]), value.type.as_pointer())
+    builder.store(value, pointer, align=4).set_metadata("noalias", _scope(builder.module))
+
+
+@intrinsic
+def spread(typing_context, tile, at, out, to, pitch):
+    """Eight times four numbers in `tile` from `at` on -> `out`: the first of each from `to` on, the second and third
+    `pitch` and 2 `pitch` further.
+    """  # noqa: D205
+
+    def generate(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        kind = data.type.pointee
+        wide = ir.VectorType(kind, 32)
+        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), wide.as_pointer())
+        value = builder.load(pointer, align=4)
+        value.set_metadata("noalias", _scope(builder.module))
+        for channel in range(3):
+            lanes = ir.Constant(ir.VectorType(ir.IntType(32), 8), [4 * lane + channel for lane in range(8)])
+            row = builder.shuffle_vector(value, value, lanes)
+            place = builder.add(arguments[3], builder.mul(arguments[4], arguments[4].type(channel)))
+            _keep(context, builder, signature.args[2], arguments[2], place, row)
+
+    return types.void(tile, types.int64, out, types.int64, types.int64), generate
 
 
 @intrinsic

@@ -1,0 +1,86 @@
+"""Tensors as the CPU kernels take and give them: NumPy arrays, flat memory, rows of whole blocks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = [
+    "BLOCK",
+    "array",
+    "flat",
+    "kernel",
+    "number",
+    "pitch",
+    "pixel_gradient",
+    "pixel_pitch",
+    "planes",
+    "strided",
+    "uninitialised",
+]
+
+BLOCK = 128  # points that the kernels take at once; `blocks.BLOCK`, which needs numba to import
+
+
+def pitch(points: Tensor) -> int:
+    """How long a row of one number a point is: on the CPU whole blocks of the kernels."""
+    return -(-len(points) // BLOCK) * BLOCK if points.device.type == "cpu" else len(points)
+
+
+def pixel_pitch(channels: int) -> int:
+    """Numbers a pixel's gradient takes in memory: three channels are padded to a vector of four."""
+    return 4 if channels == 3 else channels
+
+
+def uninitialised(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """Uninitialised memory from NumPy, which asks Linux for large pages: three times faster to touch first."""
+    return torch.from_numpy(np.empty(shape, str(dtype).removeprefix("torch.")))
+
+
+def flat(value: Tensor) -> np.ndarray:
+    """The memory that a tensor lies in, room to spare included."""
+    return value.new_empty(0).set_(value.untyped_storage()).numpy()
+
+
+def strided(value: Tensor) -> tuple[np.ndarray, tuple[int, ...]]:
+    """The memory that a tensor spans, from its first element on, and its strides."""
+    span = 1 + sum((size - 1) * stride for size, stride in zip(value.shape, value.stride(), strict=True))
+    return value.detach().as_strided((span if value.numel() else 0,), (1,)).numpy(), value.stride()
+
+
+def kernel(name: str, dtype: torch.dtype, chosen: bool = False) -> Any:
+    """The compiled kernel, as `compiling.compiled` has it."""
+    from hyperplanes.geometry.compiling import compiled
+
+    return compiled(name, str(dtype).removeprefix("torch."), chosen)
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    """A tensor's numbers, without gaps."""
+    return tensor.detach().contiguous().numpy()
+
+
+def number(like: Tensor) -> type[np.floating[Any]]:
+    """The scalar type that goes with a tensor."""
+    return np.float64 if like.dtype == torch.float64 else np.float32
+
+
+def planes(images: Tensor, packed: Tensor | None, bits: int) -> tuple[Any, ...]:
+    """Images, the same packed or nothing, bits a channel or 0, height and width."""
+    words = np.zeros(0, np.uint32) if packed is None else array(packed).reshape(-1).view(np.uint32)
+    return array(images), words, bits if packed is not None else 0, images.shape[2], images.shape[3]
+
+
+def pixel_gradient(images: Tensor) -> tuple[np.ndarray, Tensor]:
+    """Zeros for the gradient of images as the kernels fill it, and the same memory as (view, channel, row, column).
+
+    Pixels lie side by side in memory, their channels padded to `pixel_pitch`, with one spare pixel at the end.
+    """
+    count, channels, height, width = images.shape
+    room = pixel_pitch(channels)
+    memory = np.zeros((count * height * width + 1) * room, str(images.dtype).removeprefix("torch."))
+    pixels = torch.from_numpy(memory)[: memory.size - room].reshape(count, height, width, room)
+    return memory, pixels[..., :channels].permute(0, 3, 1, 2)
