@@ -4,12 +4,13 @@ import pytest
 import torch
 from torch.autograd import gradcheck, gradgradcheck
 
-from hyperplanes.geometry import ImagePlanes, cameras, cast
+from hyperplanes.geometry import ImagePlanes, Rays, Sphere, cameras, cast
 from hyperplanes.geometry.distortion import distorted
 from hyperplanes.geometry.lookup import lookup
 from hyperplanes.geometry.lookup_torch import interpolate, project
+from hyperplanes.geometry.occupancy import full
 from hyperplanes.rendering.compositing import composite
-from hyperplanes.rendering.renderer import Hierarchical, render
+from hyperplanes.rendering.renderer import Hierarchical, Marched, render
 
 
 def small_scene(dtype=torch.float64):
@@ -111,21 +112,33 @@ def test_compositing():
     assert gradcheck(run, (colour, density, edges))
 
 
-def test_the_whole_renderer():
-    """A field that looks colours up and has parameters: pixels with respect to cameras, images and parameters."""
+@pytest.mark.parametrize("backend", ["torch", "cpu"])
+@pytest.mark.parametrize("sampling", [Hierarchical(5, 0), Marched(6)])
+def test_the_whole_renderer(sampling, backend):
+    """A field that looks colours up and has parameters: pixels with respect to cameras, images and parameters.
+
+    Marched places samples at fixed distances: its step is the occupancy's, and where a ray meets the sphere decides
+    without a gradient where the first one is. So rays keep their near and far there, while origins and directions move
+    with the cameras.
+    """
     _, matrix, pose, images = small_scene()
     view, pixels = torch.tensor([0, 1]), torch.tensor([[3.0, 2.0], [2.5, 3.1]], dtype=torch.float64)
+    still = cast(cameras.pinhole(matrix, pose, 6, 7), view, pixels, Sphere())
 
     def run(images, change, shift, parameters):
         ours = cameras.pinhole(grown(matrix, change), moved(pose, shift), 6, 7)
-        planes = ImagePlanes(images, ours)
+        planes = ImagePlanes(images, ours, backend=backend)
+        rays = cast(ours, view, pixels)
+        if isinstance(sampling, Marched):
+            rays = Rays(rays.origins, rays.directions, still.near, still.far)
 
         def field(points, directions):
             seen = planes.lookup(points).colours.mean(1)
             colour = torch.cat([seen, directions[:, :1].sigmoid()], -1)
             return colour * parameters[0], parameters[1] * torch.exp(-points.square().sum(-1) / parameters[2])
 
-        rendered = render(field, cast(ours, view, pixels), Hierarchical(5, 0))
+        rendered = render(field, rays, sampling, occupancy=full(Sphere(), 4))
+        assert rendered.samples >= 6  # rays meet the sphere, and stay with their samples
         return rendered.colour, rendered.opacity, rendered.depth
 
     parameters = torch.tensor([0.9, 2.0, 0.3], dtype=torch.float64)
