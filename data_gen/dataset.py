@@ -27,6 +27,9 @@ __all__ = ["ENGINES", "MeshFolder", "Procedural", "Report", "generate"]
 ENGINES = ("local", "ray")
 """Where objects are rendered: worker processes of this machine, or a Ray cluster."""
 
+PICTURES = 2
+"""Raised whenever the same arguments come to give other bytes, so that no data set is made half of each."""
+
 VIEWS, RESOLUTION = 50, 64
 MOST_VIEWS, MOST_SAMPLES, MOST_BYTES = 10_000, 16_384, 4 * 2**30  # an object; along a side; of all its pictures
 TARGET = "data_gen.objects:open_renderer"
@@ -234,7 +237,7 @@ def _configuration(
             "meshes": len(items),
             "names": sha256(repr(names).encode()),
         }
-    generator = f"hyperplanes {version('hyperplanes')}"
+    generator = f"hyperplanes {version('hyperplanes')}, pictures {PICTURES}"
     return configuration | {"generator": generator, "source": described, "held_out": held_out}
 
 

@@ -57,7 +57,7 @@ class EmbreeBackend:
 
     def draw(
         self, surfaces: Sequence[Surface], rig: Rig, lighting: Lighting, supersample: int
-    ) -> Iterator[npt.NDArray[np.float32]]:
+    ) -> Iterator[npt.NDArray[np.uint8]]:
         """Draw all views, one after the other.
 
         Args:
@@ -67,7 +67,7 @@ class EmbreeBackend:
             supersample: Rays along a side of a pixel.
 
         Yields:
-            Premultiplied sRGB with alpha ``(height, width, 4)``, from 0 to 255.
+            sRGB with straight alpha ``(height, width, 4)``.
         """
         scene = _Scene(surfaces)
         for pose, intrinsics in zip(rig.world_from_camera, rig.intrinsics, strict=True):
@@ -80,7 +80,7 @@ class EmbreeBackend:
                 samples = scene.look(pose, intrinsics, columns, rows, lighting, supersample)
                 blocks = samples.reshape(bottom - top, supersample, right - left, supersample, 4)
                 picture[top:bottom, left:right] = 255.0 * blocks.mean(axis=(1, 3))
-            yield picture
+            yield _straight(picture)
 
 
 def cast_geometry(surfaces: Sequence[Surface], rig: Rig) -> Iterator[Geometry]:
@@ -251,6 +251,13 @@ class _Scene:
         if id(texels) not in self._textures:
             self._textures[id(texels)] = MipTexture(texels)
         return self._textures[id(texels)]
+
+
+def _straight(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """Straight uint8 of premultiplied RGBA, both from 0 to 255."""
+    alpha = picture[..., 3:]
+    colour = np.divide(picture[..., :3] * 255.0, alpha, out=np.zeros_like(picture[..., :3]), where=alpha > 0)
+    return np.clip(np.rint(np.concatenate((colour, alpha), axis=-1)), 0, 255).astype(np.uint8)
 
 
 def _mixed(values: Floats, faces: npt.NDArray[np.int64], corners: Floats) -> Floats:

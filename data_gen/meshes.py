@@ -123,6 +123,7 @@ def prepare_scene(
     colours: ColourSpace = "scene",
     warnings: tuple[str, ...] = (),
     source: str | None = None,
+    closed: bool = False,
 ) -> Mesh:
     """Check a scene and bring it into world coordinates; the scene itself is not changed.
 
@@ -136,6 +137,8 @@ def prepare_scene(
             ``srgb``: all are sRGB. Textures are always sRGB.
         warnings: What is already known to be lost.
         source: What messages begin with; the name by default.
+        closed: Whether all of it is known to be watertight solids wound outwards, so that inner sides, which nobody
+            sees, are not drawn.
 
     Returns:
         The mesh.
@@ -163,7 +166,7 @@ def prepare_scene(
                 f"{source}: expected at most {max_faces} triangles, found {faces}, whose texture or face colours would "
                 "not survive decimation; simplify the mesh or raise the limit"
             )
-        parts = smaller
+        parts, closed = smaller, False
         found.append(f"decimated from {faces} to {sum(len(part.faces) for part in parts)} triangles")
     world_from_file = _normalising(parts, up, fit, source, found)
     ready = trimesh.Scene()
@@ -171,7 +174,7 @@ def prepare_scene(
         key = f"part_{number:04d}"
         smooth = shades_smoothly(part)
         moved = _moved(part, world_from_file)
-        moved.metadata = {"smooth": smooth}
+        moved.metadata = {"smooth": smooth, "closed": closed}
         ready.add_geometry(moved, geom_name=key, node_name=key)
     return Mesh(
         name=name,

@@ -74,7 +74,7 @@ def _draw(rasteriser: Any, item: Item, settings: dict[str, Any]) -> RenderedObje
     else:
         from data_gen.shapes import make
 
-        mesh = prepare_scene(make(str(item.class_name), int(item.seed or 0)), item.name)
+        mesh = prepare_scene(make(str(item.class_name), int(item.seed or 0)), item.name, closed=True)
     rig = make_rig(settings, item.name)
     channels = [channel for channel in settings["channels"] if channel != "mesh"]
     rendering = rasteriser.render(

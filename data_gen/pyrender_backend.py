@@ -46,42 +46,30 @@ class PyrenderBackend:
 
     def draw(
         self, surfaces: Sequence[Surface], rig: Rig, lighting: Lighting, supersample: int
-    ) -> Iterator[npt.NDArray[np.float32]]:
+    ) -> Iterator[npt.NDArray[np.uint8]]:
         """Draw all views, one after the other.
 
         Args:
             surfaces: What to draw.
             rig: The cameras.
             lighting: The lights.
-            supersample: Viewport pixels along a side of a pixel, each with four samples.
+            supersample: Samples along a side of a pixel.
 
         Yields:
-            Premultiplied sRGB with alpha ``(height, width, 4)``, from 0 to 255.
+            sRGB with straight alpha ``(height, width, 4)``.
         """
         _check_owner()
         renderer = self._renderer
         drawables = renderer.load(surfaces)
-        renderer.viewport_width = rig.width * supersample
-        renderer.viewport_height = rig.height * supersample
+        size = (rig.width, rig.height, supersample)
         radius = max(float(np.linalg.norm(surface.positions, axis=1).max()) for surface in surfaces)
         try:
             for pose, intrinsics in zip(rig.world_from_camera, rig.intrinsics, strict=True):
                 clip_from_world = _projection(intrinsics, rig, pose, radius) @ np.linalg.inv(pose @ _OPENGL_FROM_OPENCV)
-                picture = renderer.draw(drawables, clip_from_world, pose[:3, 3], lighting, lighting.directions(pose))
-                yield _averaged(picture, supersample)
+                lamps = lighting.directions(pose)
+                yield renderer.draw(drawables, size, clip_from_world, pose[:3, 3], lighting, lamps)
         finally:
             renderer.load([])
-
-
-def _averaged(picture: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.float32]:
-    """Means of blocks of pixels, each side x side."""
-    rows = picture[::side].astype(np.uint16)
-    for row in range(1, side):
-        rows += picture[row::side]
-    total = rows[:, ::side].copy()
-    for column in range(1, side):
-        total += rows[:, column::side]
-    return total.astype(np.float32) / np.float32(side * side)
 
 
 def _projection(

@@ -59,7 +59,7 @@ class _Engine(Protocol):
 
     def draw(
         self, surfaces: Sequence[Surface], rig: Rig, lighting: Lighting, supersample: int
-    ) -> Iterator[npt.NDArray[np.float32]]: ...
+    ) -> Iterator[npt.NDArray[np.uint8]]: ...
 
 
 class Rasteriser:
@@ -142,8 +142,7 @@ class Rasteriser:
         surfaces = surfaces_of(parts, name)
         pictures: dict[str, npt.NDArray] = {}
         if "rgba" in channels:
-            drawn = self._engine.draw(surfaces, rig, lights, self.supersample)
-            pictures["rgba"] = np.stack([_straight(picture) for picture in drawn])
+            pictures["rgba"] = np.stack(list(self._engine.draw(surfaces, rig, lights, self.supersample)))
             visible = pictures["rgba"][..., 3].any()
         if set(channels) - {"rgba"}:
             from data_gen.embree_backend import cast_geometry
@@ -179,10 +178,3 @@ def _make_engine(name: str) -> _Engine:
         raise RendererError(
             f"renderer {name!r}: expected it to start, found {reason}. Remedy: {remedy(name)}"
         ) from error
-
-
-def _straight(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """Straight uint8 of premultiplied RGBA, both from 0 to 255."""
-    alpha = picture[..., 3:]
-    colour = np.divide(picture[..., :3] * 255.0, alpha, out=np.zeros_like(picture[..., :3]), where=alpha > 0)
-    return np.clip(np.rint(np.concatenate((colour, alpha), axis=-1)), 0, 255).astype(np.uint8)

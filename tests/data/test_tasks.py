@@ -1,12 +1,15 @@
 """Source of truth: the pictures of conftest; counts of what is read from disk."""
 
+import io
 import json
 import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from hyperplanes.data import Dataset
 from hyperplanes.data.catalogue import FORMAT
@@ -75,6 +78,10 @@ def test_files_are_written_whole_or_not_at_all(tmp_path):
 
 def test_encoding_is_deterministic(scene):
     assert encode_png(scene.pictures[0]) == encode_png(scene.pictures[0].copy())
+    generator = np.random.default_rng(0)
+    for shape, kind in (((3, 5), np.uint8), ((3, 5, 3), np.uint8), ((3, 5, 4), np.uint8), ((3, 5), np.uint16)):
+        pixels = generator.integers(0, np.iinfo(kind).max, shape, dtype=kind, endpoint=True)
+        assert np.array_equal(np.asarray(Image.open(io.BytesIO(encode_png(pixels)))), pixels)
     arrays = {"depth": scene.matrix}
     assert encode_npz(arrays) == encode_npz(arrays)
 

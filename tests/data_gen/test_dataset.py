@@ -15,7 +15,7 @@ import torch
 import trimesh
 
 from data_gen import SUPERSAMPLE, dataset
-from data_gen.dataset import MeshFolder, Procedural, generate
+from data_gen.dataset import PICTURES, MeshFolder, Procedural, generate
 from data_gen.inspect import inspect
 from data_gen.manifest import verify
 from data_gen.rig_presets import preset
@@ -231,7 +231,7 @@ def test_progress_is_told(tmp_path):
 
 def test_the_manifest_names_the_version_that_made_it(whole):
     manifest = json.loads((whole[0] / "manifest.json").read_text())
-    assert manifest["configuration"]["generator"] == f"hyperplanes {version('hyperplanes')}"
+    assert manifest["configuration"]["generator"] == f"hyperplanes {version('hyperplanes')}, pictures {PICTURES}"
     assert manifest["configuration"]["supersample"] == SUPERSAMPLE
 
 
