@@ -2,7 +2,8 @@
 
 Conventions of the whole package: OpenCV axes (x right, y down, z forward), extrinsics are camera_from_world, pixel
 (0, 0) is centred at (0, 0), so that a centred principal point is ((W - 1) / 2, (H - 1) / 2). Every function returns a
-new `PinholeCamera` with storage (view, 4, 4); none changes its argument.
+new `PinholeCamera` with storage (view, 4, 4); none changes its argument. Where cameras may stand, `poses` says; its
+functions are names of this module too.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.poses import fibonacci_sphere, look_at, opencv_from_opengl, opengl_from_opencv, orbit
 
 __all__ = [
     "camera_from_world",
@@ -233,78 +235,3 @@ def resized(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
         matrix, cameras.extrinsics, torch.full_like(cameras.height, height), torch.full_like(cameras.width, width)
     )
     return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
-
-
-def opencv_from_opengl(world_from_camera: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
-    """camera_from_world in OpenCV axes of poses stored as OpenGL camera-to-world (Blender, nerfstudio).
-
-    OpenGL cameras look along -z with y up, so y and z of the camera axes change sign.
-    """
-    return torch.linalg.inv(world_from_camera * world_from_camera.new_tensor([1.0, -1.0, -1.0, 1.0]))
-
-
-def opengl_from_opencv(camera_from_world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
-    """OpenGL camera-to-world of poses in our convention: the inverse of `opencv_from_opengl`."""
-    return torch.linalg.inv(camera_from_world) * camera_from_world.new_tensor([1.0, -1.0, -1.0, 1.0])
-
-
-def look_at(
-    eyes: Float[Tensor, "view 3"],
-    target: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    up: tuple[float, float, float] = (0.0, 1.0, 0.0),
-) -> Float[Tensor, "view 4 4"]:
-    """camera_from_world of cameras at `eyes` that look at `target`, image top towards `up`.
-
-    Looking straight along `up` leaves the roll open; the world's next axis decides it then.
-
-    Raises:
-        ValueError: an eye at the target.
-    """
-    forward = eyes.new_tensor(target) - eyes
-    distance = forward.norm(dim=-1, keepdim=True)
-    if (distance < 1e-9).any():
-        raise ValueError(f"eyes: expected every eye away from the target {target}, got one at it")
-    forward = forward / distance
-    upward = eyes.new_tensor(up).expand_as(eyes)
-    other = upward.roll(1, dims=-1)
-    vertical = torch.linalg.cross(forward, upward).norm(dim=-1, keepdim=True) < 1e-6
-    right = torch.linalg.cross(forward, torch.where(vertical, other, upward))
-    right = right / right.norm(dim=-1, keepdim=True)
-    down = torch.linalg.cross(forward, right)
-    rotation = torch.stack([right, down, forward], dim=1)
-    translation = -(rotation @ eyes[..., None])
-    last = eyes.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(eyes), 1, 4)
-    return torch.cat([torch.cat([rotation, translation], dim=2), last], dim=1)
-
-
-def orbit(views: int, distance: float, elevation: float = math.radians(20.0)) -> Float[Tensor, "view 4 4"]:
-    """camera_from_world of `views` cameras evenly around the y axis, looking at the origin.
-
-    Args:
-        views: how many.
-        distance: from the origin, in world units.
-        elevation: above the xz plane, in radians.
-    """
-    azimuth = torch.arange(views) * (2 * math.pi / max(views, 1))
-    flat = math.cos(elevation)
-    up = torch.full_like(azimuth, math.sin(elevation))
-    return look_at(distance * torch.stack([flat * azimuth.sin(), up, flat * azimuth.cos()], -1))
-
-
-def fibonacci_sphere(views: int, distance: float, lowest: float = -1.0, highest: float = 1.0) -> Tensor:
-    """camera_from_world of cameras spread evenly over a band of the sphere, looking at the origin.
-
-    Args:
-        views: how many.
-        distance: from the origin, in world units.
-        lowest: sine of the lowest elevation.
-        highest: sine of the highest elevation.
-
-    Returns:
-        (view, 4, 4) poses in the order of a golden-angle spiral from `highest` to `lowest`.
-    """
-    fraction = (torch.arange(views) + 0.5) / max(views, 1)
-    height = highest + (lowest - highest) * fraction
-    azimuth = torch.arange(views) * (math.pi * (3 - math.sqrt(5)))
-    flat = (1 - height**2).clamp_min(0).sqrt()
-    return look_at(distance * torch.stack([flat * azimuth.sin(), height, flat * azimuth.cos()], -1))
