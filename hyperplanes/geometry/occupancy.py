@@ -88,27 +88,30 @@ def carve(
     """
     if isinstance(cameras, DistortedCamera):
         raise ValueError("cameras: expected pinholes to carve with, got lens distortion; undistort the masks first")
-    tables = pad((masks[:, 0] > 0).int().cumsum(1).cumsum(2).int(), (1, 0, 1, 0))
     matrices, calibrations = camera.projection_matrices(cameras).float(), camera.intrinsics(cameras).float()
     carver = _carve_compiled if masks.device.type == "cpu" and find_spec("numba") else _carve_plainly
-    return Occupancy(carver(tables.contiguous(), matrices, calibrations, full(bounds, side, masks.device)), bounds)
+    return Occupancy(carver(masks[:, 0] > 0, matrices, calibrations, bounds, side), bounds)
 
 
-def _carve_compiled(tables: Tensor, matrices: Tensor, calibrations: Tensor, grid: Occupancy) -> Tensor:
-    """What is left of the grid, by the compiled kernel."""
+def _carve_compiled(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int) -> Tensor:
+    """What is left of a full grid, by the compiled kernel; by NumPy, since PyTorch wakes its threads slowly."""
     from hyperplanes.geometry.compiling import compiled
 
-    occupied = grid.occupied.to(torch.uint8)
-    corner = np.asarray(grid.bounds.centre, np.float32) - np.float32(grid.bounds.radius)
+    views, height, width = masks.shape
+    tables = np.zeros((views, height + 1, width + 1), np.int32)
+    np.cumsum(masks.numpy().cumsum(1, np.int32), 2, out=tables[:, 1:, 1:])
+    grid = Occupancy(torch.from_numpy(np.ones((side, side, side), np.bool_)), bounds)
+    corner = np.asarray(bounds.centre, np.float32) - np.float32(bounds.radius)
     numbers = [np.float32(value) for value in (grid.voxel, grid.voxel * math.sqrt(3) / 2, _nearest(grid))]
-    arrays = (matrices.contiguous().numpy(), calibrations.contiguous().numpy(), tables.numpy())
-    kernel = compiled("carve", "float32")
-    share(lambda a, b: kernel(*arrays, corner, *numbers, occupied.numpy(), a, b), len(occupied), 2)
-    return occupied.bool()
+    fixed = (matrices.contiguous().numpy(), calibrations.contiguous().numpy(), tables, corner, *numbers)
+    kernel, occupied = compiled("carve", "float32"), grid.occupied.numpy().view(np.uint8)
+    share(lambda start, stop: kernel(*fixed, occupied, start, stop), side, 2)
+    return grid.occupied
 
 
-def _carve_plainly(tables: Tensor, matrices: Tensor, calibrations: Tensor, grid: Occupancy) -> Tensor:
-    """What is left of the grid, in plain PyTorch."""
+def _carve_plainly(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int) -> Tensor:
+    """What is left of a full grid, in plain PyTorch."""
+    grid, tables = full(bounds, side, masks.device), pad(masks.int().cumsum(1).cumsum(2), (1, 0, 1, 0))
     kept, points = torch.arange(grid.occupied.numel(), device=tables.device), grid.centres()
     last = points.new_tensor([tables.shape[2] - 1.5, tables.shape[1] - 1.5])
     for matrix, calibration, table in zip(matrices, calibrations, tables, strict=True):
