@@ -1,8 +1,13 @@
 """How fast data sets are generated, against the obvious loop: one process, a new pyrender renderer for every mesh.
 
 Both make the same procedural cars, draw the same 50 views of each at 128x128, and write RGBA PNGs; both times include
-the start of the processes. The loop draws with what pyrender does by itself, four samples a pixel of which one is
-shaded, in a process of its own; ours is measured with four samples a pixel, all shaded, and with nine, the default.
+the start of their processes, but not the one-time search for a renderer. They take turns, so that both meet the same
+disturbances, and for about as long each. The loop draws with what pyrender does by itself, four samples a pixel of
+which one is shaded; ours shades each of four, or of nine, the default.
+
+Speed is told by the clock, and by processor time, which counts all that the processes computed on any core and is less
+disturbed by others on the machine. A thousand objects are extrapolated, from the time until the first is done and that
+of each further one, unless --full makes them.
 """
 
 from __future__ import annotations
@@ -10,102 +15,217 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from benchmarks._timing import ratio
+from benchmarks.generation_parts import RESOLUTION, VIEWS
 from benchmarks.reporting import Row, finish
 from data_gen import SUPERSAMPLE
 
 __all__ = ["main"]
 
-VIEWS, RESOLUTION = 50, 128
 THOUSAND = 1000
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one generation took.
+
+    Attributes:
+        images: that it wrote.
+        wall: seconds that passed.
+        processor: seconds that all its processes computed.
+        first: seconds until the first object was done.
+        each: seconds for each further object.
+    """
+
+    images: int
+    wall: float
+    processor: float
+    first: float = 0.0
+    each: float = 0.0
 
 
 def main(arguments: list[str]) -> int:
     """Measure, print the rows, and write them as JSON where asked.
 
     Args:
-        arguments: --quick for a rough answer in about a minute, --json FILE, or (inside) --loop COUNT OUT.
+        arguments: --quick for a rough answer in about a minute, --full to make the thousand objects, --json FILE.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks generation", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer objects")
+    parser.add_argument("--quick", action="store_true", help="fewer objects and rounds")
+    parser.add_argument("--full", action="store_true", help="make 1,000 objects x 50 views instead of extrapolating")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
-    parser.add_argument("--loop", nargs=2, metavar=("COUNT", "OUT"), help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
-    if options.loop:
-        print(json.dumps(obvious_loop(int(options.loop[0]), Path(options.loop[1]))))
-        return 0
-    objects = 8 if options.quick else 40
+    from data_gen.backends import find_backend
+
+    renderer = find_backend().name
     with tempfile.TemporaryDirectory() as folder:
-        rows = compare(objects, Path(folder))
-        rows += [extrapolate(rows[-1]), memory(24 if options.quick else THOUSAND, Path(folder))]
+        rows = compare(renderer, Path(folder), rounds=2 if options.quick else 5, objects=24 if options.quick else 60)
+        rows += stages(renderer, 4 if options.quick else 10, Path(folder))
+        if options.full:
+            rows.append(thousand(Path(folder)))
+        rows.append(memory(60 if options.quick else THOUSAND, Path(folder)))
     return finish("generation", rows, options.json)
 
 
-def compare(objects: int, folder: Path) -> list[Row]:
-    """Images a second of `data_gen.dataset.generate` and of the obvious loop.
+def compare(renderer: str, folder: Path, *, rounds: int, objects: int) -> list[Row]:
+    """Images a second of `data_gen.dataset.generate` and of the obvious loop, which needs OpenGL.
 
     Args:
-        objects: how many ours makes; the loop makes a quarter, at least four.
+        renderer: a name in `data_gen.backends.BACKENDS`.
         folder: where they write.
+        rounds: how often each runs.
+        objects: how many ours makes a round; the loop makes a sixth.
 
     Returns:
-        A row for each number of samples; `speedup` is ours over theirs.
+        A row for each number of samples, `speedup` with its quartiles over the rounds, and one for 1,000 objects.
     """
-    from data_gen.backends import find_backend
-    from data_gen.dataset import Procedural, generate
-
-    renderer = find_backend().name
-    workers = len(os.sched_getaffinity(0))
-    reference = loop_rate(max(4, objects // 4), folder, renderer)
+    counts = (2, SUPERSAMPLE)
+    ours: dict[int, list[Run]] = {supersample: [] for supersample in counts}
+    loop: list[Run] = []
+    for _ in range(rounds):
+        if renderer.startswith("pyrender"):
+            loop.append(measured(lambda: loop_images(objects // 6, folder / "loop", renderer), folder / "loop"))
+        for supersample in counts:
+            ours[supersample].append(generated(objects, folder / "ours", supersample))
     rows: list[Row] = []
-    for supersample in (2, SUPERSAMPLE):
-        begun = time.perf_counter()
-        generate(
-            Procedural("car", objects),
-            folder / f"ours{supersample}",
-            views=VIEWS,
-            resolution=RESOLUTION,
-            held_out=0,
-            workers=workers,
-            supersample=supersample,
-        )
-        ours = objects * VIEWS / (time.perf_counter() - begun)
-        row: Row = {"name": f"generate, {supersample**2} samples a pixel", "objects": objects}
-        row |= {"renderer": renderer, "workers": workers, "images_per_second": ours}
-        if reference is not None:
-            row |= {"reference_images_per_second": reference, "speedup": ours / reference}
+    for supersample, runs in ours.items():
+        row: Row = {"name": f"generate, {supersample**2} samples a pixel", "renderer": renderer, "rounds": rounds}
+        row |= {"workers": _cores(), "objects": objects, **_speed(runs)}
+        if loop:
+            row |= {f"reference_{key}": value for key, value in _speed(loop).items()}
+            row |= ratio(*([run.wall / run.images for run in side] for side in (loop, runs)))
+            processor = ratio(*([run.processor / run.images for run in side] for side in (loop, runs)))
+            row["processor_speedup"] = processor["speedup"]
         rows.append(row)
-    return rows
+    seconds = [run.first + (THOUSAND - 1) * run.each for run in ours[SUPERSAMPLE]]
+    last: Row = {"name": "1,000 objects x 50 views at 128x128", "seconds_extrapolated": statistics.median(seconds)}
+    if loop:
+        images = THOUSAND * VIEWS
+        last["reference_seconds_extrapolated"] = statistics.median(images * run.wall / run.images for run in loop)
+    return [*rows, last]
 
 
-def loop_rate(objects: int, folder: Path, renderer: str) -> float | None:
-    """Images a second of the obvious loop; None without OpenGL, which it needs.
+def _speed(runs: list[Run]) -> Row:
+    """Medians over the rounds."""
+    return {
+        "images_per_second": statistics.median(run.images / run.wall for run in runs),
+        "processor_milliseconds_an_image": statistics.median(1e3 * run.processor / run.images for run in runs),
+    }
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def measured(run: Callable[[], int], out: Path) -> Run:
+    """What a generation takes.
 
     Args:
-        objects: how many it makes.
-        folder: where it writes.
-        renderer: a name in `data_gen.backends.BACKENDS`.
+        run: writes into `out` and returns how many images it wrote.
+        out: emptied afterwards.
     """
-    if not renderer.startswith("pyrender"):
-        return None
-    command = [sys.executable, "-m", "benchmarks", "generation", "--loop", str(objects), str(folder / "loop")]
-    environment = os.environ | {"PYOPENGL_PLATFORM": renderer.removeprefix("pyrender-")}
-    done = subprocess.run(command, check=True, capture_output=True, env=environment)
-    loop = json.loads(done.stdout.splitlines()[-1])
-    return loop["images"] / loop["seconds"]
+    begun, computed = time.perf_counter(), _computed()
+    images = run()
+    wall, processor = time.perf_counter() - begun, _computed() - computed
+    shutil.rmtree(out)
+    return Run(images, wall, processor)
 
 
-def extrapolate(row: Row) -> Row:
-    """The time that 1,000 objects of 50 views would take at a measured rate; extrapolated, not measured."""
-    seconds = THOUSAND * VIEWS / float(row["images_per_second"])
-    return {"name": "1,000 objects x 50 views at 128x128", "seconds_extrapolated": seconds}
+def _computed() -> float:
+    """Processor seconds of this process and all its children that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+def generated(objects: int, out: Path, supersample: int = SUPERSAMPLE) -> Run:
+    """What `data_gen.dataset.generate` takes for cars, with a worker a core.
+
+    Args:
+        objects: how many.
+        out: where to; removed afterwards.
+        supersample: samples along a side of a pixel.
+    """
+    from data_gen.dataset import Procedural, generate
+
+    ends: list[float] = []
+
+    def run() -> int:
+        generate(
+            Procedural("car", objects),
+            out,
+            views=VIEWS,
+            resolution=RESOLUTION,
+            supersample=supersample,
+            held_out=0,
+            progress=lambda *_: ends.append(time.perf_counter()),
+        )
+        return objects * VIEWS
+
+    begun = time.perf_counter()
+    whole = measured(run, out)
+    each = (ends[-1] - ends[0]) / max(1, len(ends) - 1)
+    return Run(whole.images, whole.wall, whole.processor, ends[0] - begun, each)
+
+
+def loop_images(objects: int, out: Path, renderer: str) -> int:
+    """Run the obvious loop in a process of its own.
+
+    Args:
+        objects: how many cars.
+        out: where to.
+        renderer: that draws, one of pyrender's.
+
+    Returns:
+        How many images it wrote.
+    """
+    return int(_part("loop", objects, out, PYOPENGL_PLATFORM=renderer.removeprefix("pyrender-"))["images"])
+
+
+def stages(renderer: str, objects: int, folder: Path) -> list[Row]:
+    """Processor time by stage, of one worker without threads.
+
+    Args:
+        renderer: that draws.
+        objects: how many.
+        folder: where to.
+    """
+    spent = _part("stages", objects, folder / "stages", LP_NUM_THREADS="0", OMP_NUM_THREADS="1")
+    start = spent.pop("start")
+    total = sum(spent.values()) - spent["one sample a pixel drawn"]
+    rows: list[Row] = [
+        {"name": f"stage: {stage}", "renderer": renderer, "milliseconds_an_image": value, "share": value / total}
+        for stage, value in spent.items()
+    ]
+    return [*rows, {"name": "stage: start of a worker and its first object", "seconds": start}]
+
+
+def _part(name: str, objects: int, out: Path, **environment: str) -> dict[str, float]:
+    """What a part of `benchmarks.generation_parts` prints."""
+    out.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "benchmarks.generation_parts", name, str(objects), str(out)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=os.environ | environment)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def thousand(folder: Path) -> Row:
+    """The time that 1,000 objects of 50 views take."""
+    run = generated(THOUSAND, folder / "thousand")
+    return {
+        "name": "1,000 objects x 50 views at 128x128, made",
+        "seconds": run.wall,
+        "processor_seconds": run.processor,
+    }
 
 
 def memory(objects: int, folder: Path) -> Row:
@@ -152,43 +272,3 @@ def resident_megabytes() -> float:
         except FileNotFoundError:
             continue  # it has ended meanwhile
     return total * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
-def obvious_loop(objects: int, out: Path) -> dict[str, float]:
-    """What one would write first with pyrender.
-
-    Args:
-        objects: how many cars.
-        out: where the pictures go.
-
-    Returns:
-        The number of images and the seconds they took.
-    """
-    begun = time.perf_counter()
-    import numpy as np
-    import pyrender
-    from PIL import Image
-
-    from data_gen.meshes import prepare_scene
-    from data_gen.rigs import fixed
-    from data_gen.shapes import make
-    from data_gen.sources import Procedural, list_items
-
-    rig = fixed(VIEWS, RESOLUTION)
-    opengl = rig.world_from_camera * [1.0, -1.0, -1.0, 1.0]
-    focal = rig.intrinsics[0, 0, 0]
-    for item in list_items(Procedural("car", objects), 0):
-        mesh = prepare_scene(make("car", int(item.seed or 0)), item.name)
-        scene = pyrender.Scene.from_trimesh_scene(mesh.scene, bg_color=[0.0, 0.0, 0.0, 0.0], ambient_light=[0.3] * 3)
-        camera = scene.add(pyrender.IntrinsicsCamera(focal, focal, RESOLUTION / 2, RESOLUTION / 2))
-        light = scene.add(pyrender.DirectionalLight(intensity=3.0))
-        renderer = pyrender.OffscreenRenderer(RESOLUTION, RESOLUTION)
-        for index, pose in enumerate(opengl):
-            scene.set_pose(camera, pose)
-            scene.set_pose(light, pose)
-            drawn: Any = renderer.render(scene, flags=pyrender.RenderFlags.RGBA)
-            path = out / item.name / f"{index:03d}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(np.array(drawn[0])).save(path)
-        renderer.delete()
-    return {"images": objects * VIEWS, "seconds": time.perf_counter() - begun}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from data_gen.layouts import LAYOUTS, RenderedObject
 from data_gen.rig import Rig
 from data_gen.rig_presets import RIG_PRESETS
 from data_gen.sources import Item, seed_of
-from hyperplanes.data.files import encode_json, sha256, write_whole
+from hyperplanes.data.files import encode_json, sha256, write_folder, write_whole
 
 __all__ = ["RIGS", "make_rig", "open_renderer"]
 
@@ -93,10 +94,14 @@ def _draw(rasteriser: Any, item: Item, settings: dict[str, Any]) -> RenderedObje
 def _write(rendered: RenderedObject, settings: dict[str, Any]) -> dict[str, Any]:
     out = Path(settings["out"])
     scratch = out / ".progress" / "unfinished"
-    checksums = {}
-    for path, data in LAYOUTS[settings["layout"]].files(rendered).items():
-        write_whole(out / path, data, scratch)
-        checksums[path] = sha256(data)
+    files = LAYOUTS[settings["layout"]].files(rendered)
+    checksums = {path: sha256(data) for path, data in files.items()}
+    if len(files) > 1:
+        folder = os.path.commonpath(files)
+        write_folder(out / folder, {os.path.relpath(path, folder): data for path, data in files.items()}, scratch)
+    else:
+        for path, data in files.items():
+            write_whole(out / path, data, scratch)
     item, mesh = rendered.item, rendered.mesh
     record: dict[str, Any] = {
         "class": item.class_name,

@@ -8,6 +8,7 @@ import io
 import itertools
 import json
 import os
+import shutil
 import struct
 import zlib
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 from hyperplanes.data.errors import DataError
 
-__all__ = ["encode_json", "encode_npz", "encode_png", "inside", "read_json", "sha256", "write_whole"]
+__all__ = ["encode_json", "encode_npz", "encode_png", "inside", "read_json", "sha256", "write_folder", "write_whole"]
 
 _COLOUR_TYPES = {1: 0, 3: 2, 4: 6}  # PNG's numbers, by channels
 _unfinished = itertools.count()
@@ -85,9 +86,9 @@ def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None
     path = Path(path)
     temporary = None
     try:
-        name = os.path.join(scratch or path.parent, f".{path.name}.{os.getpid()}-{next(_unfinished)}.part")
         if scratch is None:
             path.parent.mkdir(parents=True, exist_ok=True)
+        name = _unfinished_beside(path, scratch)
         with open(name, "wb") as file:
             temporary = name
             file.write(data)
@@ -97,14 +98,53 @@ def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None
             path.parent.mkdir(parents=True, exist_ok=True)
             os.replace(temporary, path)
     except OSError as error:
-        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
-            found, remedy = "a full disk", "free some and run the same command again"
-        else:
-            found, remedy = error.strerror or str(error), "check the folder and its permissions"
-        raise DataError(path, f"room to write {len(data)} bytes", found, remedy) from error
+        raise DataError(*_no_room(path, len(data), error)) from error
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+def write_folder(folder: str | Path, files: dict[str, bytes], scratch: str | Path) -> None:
+    """Write a folder of files so that nobody ever sees half of it; a rename a file takes twice as long as writing it.
+
+    Args:
+        folder: the folder; where it exists already, its files are replaced one by one.
+        files: content by name inside the folder.
+        scratch: a folder of the same file system, where it lies until it is whole.
+
+    Raises:
+        DataError: no space, no permission, or another trouble of the operating system.
+    """
+    folder = Path(folder)
+    temporary = _unfinished_beside(folder, scratch)
+    try:
+        for parent in {os.path.dirname(name) for name in files}:
+            os.makedirs(os.path.join(temporary, parent), exist_ok=True)
+        for name, data in files.items():
+            with open(os.path.join(temporary, name), "wb") as file:
+                file.write(data)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        os.rename(temporary, folder)
+    except OSError as error:
+        if error.errno not in {errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR}:
+            raise DataError(*_no_room(folder, sum(map(len, files.values())), error)) from error
+        for name, data in files.items():
+            write_whole(folder / name, data, scratch)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _unfinished_beside(path: Path, scratch: str | Path | None) -> str:
+    return os.path.join(scratch or path.parent, f".{path.name}.{os.getpid()}-{next(_unfinished)}.part")
+
+
+def _no_room(path: Path, size: int, error: OSError) -> tuple[Path, str, str, str]:
+    """What a DataError is made of."""
+    if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+        found, remedy = "a full disk", "free some and run the same command again"
+    else:
+        found, remedy = error.strerror or str(error), "check the folder and its permissions"
+    return path, f"room to write {size} bytes", found, remedy
 
 
 def encode_json(value: Any) -> bytes:

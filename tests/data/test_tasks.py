@@ -11,9 +11,9 @@ import pytest
 import torch
 from PIL import Image
 
-from hyperplanes.data import Dataset
+from hyperplanes.data import DataError, Dataset
 from hyperplanes.data.catalogue import FORMAT
-from hyperplanes.data.files import encode_npz, encode_png, read_json, write_whole
+from hyperplanes.data.files import encode_npz, encode_png, read_json, write_folder, write_whole
 
 
 @pytest.fixture
@@ -73,6 +73,12 @@ def test_files_are_written_whole_or_not_at_all(tmp_path):
     assert path.read_bytes() == b"second"
     with pytest.raises(ValueError, match="expected room to write 5 bytes, found .*; check the folder"):
         write_whole(path / "below", b"third")
+    write_folder(tmp_path / "whole", {"a/b": b"1", "c": b"2"}, tmp_path)
+    write_folder(tmp_path / "whole", {"a/b": b"3"}, tmp_path)
+    assert [(tmp_path / "whole" / name).read_bytes() for name in ("a/b", "c")] == [b"3", b"2"]
+    with pytest.raises(DataError, match="room to write 1 bytes"):
+        write_folder(path / "below", {"a": b"1"}, tmp_path)
+    assert not list(tmp_path.rglob("*.part"))
     assert [entry.name for entry in path.parent.iterdir()] == ["file"]
 
 
