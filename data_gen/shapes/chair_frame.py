@@ -86,12 +86,12 @@ def draw_palette(rng: np.random.Generator, kind: str) -> Palette:
         choice = rng.random()
         if choice < 0.3:
             seat = weave(rng, colour)
-        elif choice < 0.7 and kind != "office":
+        elif choice < (0.45 if kind == "office" else 0.7):
             other = shade(colour, 0.5) if rng.random() < 0.5 else (226, 214, 188)
             seat = print_of(rng, colour, other)
         else:
-            dark = kind == "office" and rng.random() < 0.5
-            seat = plain((44, 46, 52) if dark else colour, "leather")
+            dark = kind == "office" and rng.random() < 0.3
+            seat = plain(shade((44, 46, 52), rng.uniform(0.8, 1.8)) if dark else colour, "leather")
     elif wooden:
         seat = wood(rng, timber, int(rng.integers(1, 5)))
     else:

@@ -27,11 +27,11 @@ def draw_livery(rng: np.random.Generator) -> Livery:
     """Two colours that differ clearly, few of them pale."""
     hue = rng.random()
     choice = rng.random()
-    if choice < 0.35:
-        level = int(rng.integers(150, 180))
+    if choice < 0.2:
+        level = int(rng.integers(140, 190))
         base: Colour = (level - 6, level, min(255, level + 8))
         accent = tint(rng, hue, 0.8, 0.62, 0.08)
-    elif choice < 0.75:
+    elif choice < 0.7:
         base = tint(rng, hue, rng.uniform(0.5, 0.75), rng.uniform(0.5, 0.75), 0.04)
         accent = (222, 198, 142) if rng.random() < 0.5 else tint(rng, hue + rng.uniform(0.3, 0.6), 0.8, 0.45, 0.05)
     else:
