@@ -57,6 +57,7 @@ class Description:
         objects: the objects that were looked at.
         skipped: what the generator left out: names and reasons.
         broken: objects that cannot be read: names and messages.
+        unlisted: how many training objects the official split file did not name.
     """
 
     layout: str
@@ -64,6 +65,7 @@ class Description:
     objects: tuple[ObjectDescription, ...]
     skipped: tuple[tuple[str, str], ...]
     broken: tuple[tuple[str, str], ...]
+    unlisted: int = 0
 
     def lines(self) -> list[str]:
         """The description for people, a line a fact."""
@@ -84,6 +86,8 @@ class Description:
             lines.append((wrong or self.objects)[0].conventions.line())
             if wrong:
                 lines.append(f"conventions: wrong in {len(wrong)} of {len(self.objects)} objects looked at")
+        if self.unlisted:
+            lines.append(f"not in the split file, so trained on: {self.unlisted}, named in the manifest")
         lines += [f"skipped by the generator: {name}: {reason}" for name, reason in self.skipped]
         return lines + [f"cannot be read: {name}: {message}" for name, message in self.broken]
 
@@ -109,7 +113,8 @@ def describe(path: str | Path | Dataset, objects: int = 8) -> Description:
             broken.append((name, str(error)))
     splits = {split: len(data.names(split)) for split in ("train", "val", "test")}
     skipped = tuple((str(one.get("name")), str(one.get("reason"))) for one in data.manifest.get("skipped", []))
-    return Description(data.layout, splits, tuple(found), skipped, tuple(broken))
+    unlisted = int(data.manifest.get("not_in_split_file", {}).get("count", 0))
+    return Description(data.layout, splits, tuple(found), skipped, tuple(broken), unlisted)
 
 
 def _object(data: Dataset, name: str) -> ObjectDescription:

@@ -22,6 +22,7 @@ from data_gen.rig_presets import preset
 from data_gen.rigs import fixed
 from data_gen.sources import list_items
 from hyperplanes.data import DataError, Dataset
+from hyperplanes.data.describe import describe
 from hyperplanes.geometry import cameras as camera
 
 SMALL = {"views": 4, "resolution": 16, "workers": 1}
@@ -306,6 +307,7 @@ def test_an_official_split_file_decides(tmp_path):
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["not_in_split_file"] == {"count": 1, "split": "train", "names": ["car_d"]}
     assert manifest["splits"]["train"] == ["car_b", "car_d"]
+    assert "not in the split file, so trained on: 1, named in the manifest" in describe(out, 1).lines()
     with pytest.raises(ValueError, match="held_out: expected none, for .*all.csv decides, got 0.5"):
         list_items(MeshFolder(tree_of_cars, split_file=official), 0.5)
     official.write_text("id,synsetId,subSynsetId,modelId,split\n0,03001627,03001627,a,test")
