@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -18,12 +19,14 @@ from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.marching import march
 from hyperplanes.rendering.renderer import Marched
-from hyperplanes.rendering.voxels import cast_through_voxels, compiled_caster
+from hyperplanes.rendering.voxels import cast_through_voxels, compiled_caster, empty_around
 
 __all__ = ["BakedScene", "bake"]
 
 CHUNK = 1 << 12
-FAINT = 0.01  # what adds less than this to a pixel is left out
+LIGHT = 64  # voxels an axis of the grid in which light is followed
+UNSEEN = 0.02  # where less than this of any light arrives, nobody looks
+THIN = 0.005  # what hides less than this of what is behind it, over 1/128 of the scene's diameter, is left out
 
 
 @dataclass(frozen=True)
@@ -48,13 +51,25 @@ class BakedScene:
 
         def see(rays: Rays) -> Rendered:
             basis = spherical_harmonics(rays.directions)
-            return cast_through_voxels(self.field.index, self.field.values, bounds, rays, basis, step=step)
+            return cast_through_voxels(
+                self.field.index, self.field.values, bounds, rays, basis, step=step, empty=self._empty
+            )
 
-        return photograph(cameras, bounds, see, seen=self.field.occupancy)
+        return photograph(cameras, bounds, see, seen=self._outline)
+
+    @cached_property
+    def _empty(self) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
+        """What rays leap over."""
+        return empty_around(self.field.index)
+
+    @cached_property
+    def _outline(self) -> Occupancy:
+        """Few large voxels that hold all the others: finding the pixels that look there takes less time than rays."""
+        return _resampled(self.field.occupancy, max(8, self.field.side // 4))
 
 
 @torch.no_grad()
-def bake(adapted: AdaptedField, *, side: int = 128, directions: int = 24) -> BakedField:
+def bake(adapted: AdaptedField, *, side: int = 256, directions: int = 24) -> BakedField:
     """Density and view-dependent colour of a field, at the voxels that can be seen from outside.
 
     Colour is fitted by least squares over a sphere of viewing directions, each weighted by how much of a ray from
@@ -62,7 +77,7 @@ def bake(adapted: AdaptedField, *, side: int = 128, directions: int = 24) -> Bak
 
     Args:
         adapted: the field of one object.
-        side: voxels an axis.
+        side: voxels an axis; two for every pixel that the object is wide lose little.
         directions: viewing directions asked of every voxel.
 
     Returns:
@@ -73,31 +88,45 @@ def bake(adapted: AdaptedField, *, side: int = 128, directions: int = 24) -> Bak
     """
     if directions < HARMONICS:
         raise ValueError(f"directions: expected at least {HARMONICS}, one a harmonic, got {directions}")
-    if side % 2 or not 8 <= side <= LARGEST_SIDE:
-        raise ValueError(f"side: expected an even number from 8 to {LARGEST_SIDE}, got {side}")
+    coarser = max(2, side // LIGHT)
+    if side % coarser or not 8 <= side <= LARGEST_SIDE:
+        raise ValueError(f"side: expected a multiple of {coarser} from 8 to {LARGEST_SIDE}, got {side}")
     view = camera.fibonacci_sphere(directions, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
-    coarse = _resampled(adapted.filled, side // 2)
+    coarse = _resampled(adapted.filled, side // coarser)
     arriving = _visibility(coarse, _density_at(adapted, coarse.centres()), view)
-    visible = torch.zeros_like(coarse.occupied)
-    visible[coarse.occupied] = arriving.amax(1) > FAINT
-    fine = Occupancy(_resampled(Occupancy(visible, coarse.bounds), side).occupied, coarse.bounds)
-    points = fine.centres()
-    density = _density_at(adapted, points)
-    some = 1 - torch.exp(-density * fine.voxel) > FAINT
-    if not some.any():
+    seen = torch.zeros_like(coarse.occupied)
+    seen[coarse.occupied] = arriving.amax(1) > UNSEEN
+    row = torch.zeros(coarse.occupied.numel(), dtype=torch.long, device=view.device)
+    row[coarse.occupied.flatten()] = torch.arange(len(arriving), device=view.device)
+    fine = _resampled(Occupancy(seen, coarse.bounds), side)
+    kept, values = [], []
+    for points in fine.centres().split(CHUNK):
+        cell = fine.index(points)
+        found = _voxels(adapted, points, view, arriving[row[coarse.index(points)]])
+        kept.append(cell[found[0]])
+        values.append(found[1])
+    if not sum(len(part) for part in kept):
         raise ValueError("bake: expected a field with something in it, got one that is empty everywhere")
-    points, density = points[some], density[some]
-    row = torch.zeros(coarse.occupied.numel(), dtype=torch.long, device=points.device)
-    row[coarse.occupied.flatten()] = torch.arange(len(arriving), device=points.device)
-    arriving = arriving[row[coarse.index(points)]]
-    harmonics = [
-        _harmonics(adapted, points[part], view, arriving[part])
-        for part in torch.arange(len(points), device=points.device).split(CHUNK)
-    ]
-    index = torch.full((side**3,), -1, dtype=torch.int32, device=points.device)
-    index[fine.index(points)] = torch.arange(len(points), dtype=torch.int32, device=points.device)
-    values = torch.cat([density[:, None], torch.cat(harmonics)], 1)
-    return BakedField(index.reshape(side, side, side).cpu(), values.cpu(), fine.bounds)
+    cells, rows = torch.cat(kept), torch.cat(values)
+    index = torch.full((side**3,), -1, dtype=torch.int32, device=view.device)
+    index[cells] = torch.arange(len(cells), dtype=torch.int32, device=view.device)
+    return BakedField(index.reshape(side, side, side).cpu(), rows.cpu(), fine.bounds)
+
+
+def _voxels(
+    adapted: AdaptedField, points: Tensor, view: Tensor, arriving: Tensor
+) -> tuple[Bool[Tensor, " point"], Float[Tensor, "kept 28"]]:
+    """Which points hide something, and their density and coefficients."""
+    field, length = adapted.field, adapted.occupancy.bounds.radius / 64
+    hidden = field.hidden(points) if isinstance(field, Field) else points
+    density = field.density_of(hidden) if isinstance(field, Field) else adapted.density(points)
+    some = 1 - torch.exp(-density * length) > THIN
+    hidden, density, arriving = hidden[some], density[some], arriving[some]
+    if isinstance(field, Field):
+        colours = field.colours_along(hidden, view)
+    else:
+        colours = torch.stack([field(hidden, each.expand(len(hidden), 3))[0] for each in view], 1)
+    return some, torch.cat([density[:, None], _harmonics(colours, view, arriving)], 1)
 
 
 def _resampled(occupancy: Occupancy, side: int) -> Occupancy:
@@ -138,19 +167,13 @@ def _visibility(
 
 
 def _harmonics(
-    adapted: AdaptedField, points: Float[Tensor, "point 3"], view: Float[Tensor, "direction 3"], arriving: Tensor
+    colours: Float[Tensor, "point direction 3"], view: Float[Tensor, "direction 3"], arriving: Tensor
 ) -> Float[Tensor, "point 27"]:
     """Coefficients of colour, red first, by weighted least squares with a little ridge on all but the mean."""
-    count = len(view)
-    if isinstance(adapted.field, Field):
-        hidden = adapted.field.hidden(points)
-        colours = [adapted.field.colour_of(hidden, each.expand(len(points), 3)) for each in view]
-    else:
-        colours = [adapted.field(points, each.expand(len(points), 3))[0] for each in view]
     basis = spherical_harmonics(view)
     weights = (arriving + 1e-3)[..., None]
-    ridge = torch.full((HARMONICS,), 1e-2 * count, device=points.device)
+    ridge = torch.full((HARMONICS,), 1e-2 * len(view), device=view.device)
     ridge[0] = 1e-6
     normal = basis.T @ (weights * basis) + torch.diag(ridge) * arriving.mean(1)[:, None, None].clamp_min(1e-3)
-    right = basis.T @ (weights * torch.stack(colours, 1))
-    return torch.linalg.solve(normal, right).mT.reshape(len(points), -1)
+    right = basis.T @ (weights * colours)
+    return torch.linalg.solve(normal, right).mT.flatten(1)

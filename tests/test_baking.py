@@ -15,7 +15,7 @@ from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.metrics import psnr
 from hyperplanes.rendering.renderer import Marched
-from hyperplanes.rendering.voxels import cast_through_voxels, compiled_caster
+from hyperplanes.rendering.voxels import cast_through_voxels, compiled_caster, empty_around
 
 CAMERAS = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(6, 3.0), 48, 48)
 
@@ -105,8 +105,27 @@ def test_a_file_that_is_no_baked_field_is_named(tmp_path):
 def test_wrong_arguments_are_refused(adapted):
     with pytest.raises(ValueError, match="directions: expected at least 9"):
         bake(adapted, side=16, directions=4)
-    with pytest.raises(ValueError, match="side: expected an even number"):
+    with pytest.raises(ValueError, match="side: expected a multiple of 2 from 8 to 512, got 15"):
         bake(adapted, side=15)
     empty = AdaptedField(lambda p, d: (torch.zeros_like(p), p.new_zeros(len(p))), full(Sphere(), 16), Marched())
     with pytest.raises(ValueError, match="empty everywhere"):
         bake(empty, side=16)
+
+
+def test_rays_leap_over_no_voxel():
+    # Source of truth: the cells walked one by one, by the definition of the distance.
+    index = torch.where(torch.rand(6, 6, 6, generator=torch.Generator().manual_seed(0)) < 0.03, 0, -1)
+    away = empty_around(index)
+    cells = [
+        cell
+        for cell in torch.cartesian_prod(*[torch.arange(7)] * 3)
+        if any(
+            (index[tuple(cell - step)] >= 0)
+            for step in torch.cartesian_prod(*[torch.arange(2)] * 3)
+            if ((cell - step >= 0) & (cell - step < 6)).all()
+        )
+    ]
+    assert cells
+    for cell in torch.cartesian_prod(*[torch.arange(7)] * 3):
+        nearest = min(int((cell - filled).abs().max()) for filled in cells)
+        assert int(away[tuple(cell)]) == nearest

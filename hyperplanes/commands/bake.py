@@ -5,7 +5,7 @@ the baked pictures are compared with the field's own and with the true query vie
 
 Example:
     hyperplanes bake --checkpoint runs/demo --views photos/ --out chair.safetensors
-    hyperplanes bake --checkpoint runs/demo --views photos/ --out chair.safetensors --voxels 192 --orbit 96
+    hyperplanes bake --checkpoint runs/demo --views photos/ --out chair.safetensors --voxels 384 --orbit 96
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Arguments:
         checkpoint: What `train`, `adapt` or `demo` wrote.
         views: The posed images of the object.
         out: The file to write.
-        voxels: Along each side of the grid.
+        voxels: Along each side of the grid; two for every pixel that the object is wide lose little.
         steps: Fine-tuning steps on the shown views.
         orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
         size: Pixels along the longer side of the turntable; as the images when not given.
@@ -49,7 +49,7 @@ class Arguments:
     checkpoint: Path
     views: Path
     out: Path
-    voxels: int = 128
+    voxels: int = 256
     steps: int = 0
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None

@@ -17,6 +17,13 @@ __all__ = ["HARMONICS", "LARGEST_SIDE", "BakedField", "spherical_harmonics"]
 
 HARMONICS = 9
 LARGEST_SIDE = 512
+STORED = {  # what a file holds
+    "occupied": torch.uint8,
+    "density": torch.float16,
+    "coefficients": torch.uint8,
+    "range": torch.float32,
+    "sphere": torch.float32,
+}
 
 
 def spherical_harmonics(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
@@ -98,13 +105,20 @@ class BakedField:
         return colour.clamp(0, 1), density
 
     def save(self, path: Path | str) -> None:
-        """Write one compact file: a bit a voxel, half precision a row."""
+        """Write one compact file: a bit a voxel, and a row of half precision density and a byte a coefficient.
+
+        Bytes divide the range of each coefficient, so that pictures change by about a grey level of 255.
+        """
         bits = (self.index >= 0).flatten().reshape(-1, 8).to(torch.uint8)
         packed = (bits * (2 ** torch.arange(8, device=bits.device)).to(torch.uint8)).sum(1, dtype=torch.uint8)
         order = self.index.flatten()
         rows = self.values[order[order >= 0].long()]
-        sphere = torch.tensor([*self.bounds.centre, self.bounds.radius])
-        save_tensors(Path(path), {"occupied": packed, "values": rows.half(), "sphere": sphere})
+        low, high = rows[:, 1:].aminmax(dim=0) if len(rows) else 2 * (rows.new_zeros(3 * HARMONICS),)
+        coefficients = (rows[:, 1:] - low) / (high - low).clamp_min(1e-12) * 255
+        content = {"occupied": packed, "density": rows[:, 0].half(), "coefficients": coefficients.round().byte()}
+        content |= {"range": torch.stack([low, high])}
+        content |= {"sphere": torch.tensor([*self.bounds.centre, self.bounds.radius])}
+        save_tensors(Path(path), content)
 
     @classmethod
     def load(cls, path: Path | str) -> BakedField:
@@ -115,17 +129,20 @@ class BakedField:
         """
         path = Path(path)
         found = load_tensors(path)
-        if set(found) != {"occupied", "values", "sphere"} or found["occupied"].dtype != torch.uint8:
+        if {name: value.dtype for name, value in found.items()} != STORED:
             raise CheckpointError(f"{path}: expected a baked field, found tensors {sorted(found)}; `hyperplanes bake`")
         bits = found["occupied"][:, None].bitwise_and((2 ** torch.arange(8)).to(torch.uint8)).bool().flatten()
-        side = round(len(bits) ** (1 / 3))
-        rows = int(bits.sum())
-        if side**3 != len(bits) or side > LARGEST_SIDE or tuple(found["values"].shape) != (rows, 1 + 3 * HARMONICS):
+        side, rows, numbers = round(len(bits) ** (1 / 3)), int(bits.sum()), 3 * HARMONICS
+        shapes = {"density": (rows,), "coefficients": (rows, numbers), "range": (2, numbers), "sphere": (4,)}
+        if side**3 != len(bits) or side > LARGEST_SIDE or any(found[n].shape != shape for n, shape in shapes.items()):
             raise CheckpointError(
-                f"{path}: expected a cube of voxels and {rows} rows of {1 + 3 * HARMONICS} numbers, found {len(bits)} "
-                f"voxels and {tuple(found['values'].shape)}; bake again"
+                f"{path}: expected a cube of voxels and {rows} rows of 1 + {numbers} numbers, found {len(bits)} voxels "
+                f"and {', '.join(f'{name} {tuple(found[name].shape)}' for name in shapes)}; bake again"
             )
+        low, high = found["range"]
+        coefficients = low + (high - low) / 255 * found["coefficients"].float()
+        values = torch.cat([found["density"].float()[:, None], coefficients], 1)
         index = torch.full((len(bits),), -1, dtype=torch.int32)
         index[bits] = torch.arange(rows, dtype=torch.int32)
         x, y, z, radius = found["sphere"].tolist()
-        return cls(index.reshape(side, side, side), found["values"].float(), Sphere((x, y, z), radius))
+        return cls(index.reshape(side, side, side), values, Sphere((x, y, z), radius))

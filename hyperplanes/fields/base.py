@@ -146,5 +146,15 @@ class Field:
         value = relu(self._linear("view", torch.cat([self._linear("feature", hidden), seen], -1)))
         return torch.sigmoid(self._linear("colour", value))
 
+    def colours_along(
+        self, hidden: Float[Tensor, "point width"], directions: Float[Tensor, "direction 3"]
+    ) -> Float[Tensor, "point direction 3"]:
+        """The colour head for every point in every direction; what does not depend on both is computed once."""
+        width = self.target.config.width
+        weight, bias = self.parameters["view.weight"], self.parameters["view.bias"]
+        here = linear(self._linear("feature", hidden), weight[:, :width], bias)
+        along = linear(encode(directions, self.target.config.direction_octaves), weight[:, width:])
+        return torch.sigmoid(self._linear("colour", relu(here[:, None] + along)))
+
     def _linear(self, name: str, value: Tensor) -> Tensor:
         return linear(value, self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"])

@@ -5,18 +5,21 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from hyperplanes.geometry.rays import Rays, Sphere
+from hyperplanes.geometry.threads import share
 from hyperplanes.rendering.compositing import Rendered
 
-__all__ = ["cast_through_voxels", "compiled_caster"]
+__all__ = ["cast_through_voxels", "compiled_caster", "empty_around"]
+
+FAR = 255  # no voxel is farther from a filled one, as far as it is counted
+RAYS = 1 << 10  # that a thread takes at once
 
 
 @functools.cache
@@ -26,7 +29,31 @@ def compiled_caster() -> Callable[..., int] | None:
         import numba
     except ImportError:
         return None
-    return numba.njit(fastmath=True, nogil=True, cache=True)(_cast)
+    return numba.njit(fastmath=True, error_model="numpy", nogil=True, cache=True)(_cast)
+
+
+def empty_around(index: Int[Tensor, "x y z"]) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
+    """How far every cell between eight voxel centres is from the nearest cell that is not empty.
+
+    Cell (i, j, k) lies between the centres of voxels i - 1 and i, and so on; there is one more of them an axis than
+    voxels. It is empty where none of its eight voxels has a row. The distance is the greatest of the three axes'.
+
+    Args:
+        index: row of every voxel or -1.
+
+    >>> empty_around(torch.tensor([-1, -1, 0, -1, -1]).reshape(1, 1, 5))[0, 0].tolist()
+    [2, 1, 0, 0, 1, 2]
+    """
+    from scipy.ndimage import distance_transform_cdt
+
+    filled = np.pad(index.numpy() >= 0, 1)
+    for axis in range(3):
+        low, high = (np.take(filled, range(n, filled.shape[axis] - 1 + n), axis) for n in (0, 1))
+        filled = low | high
+    if not filled.any():
+        return torch.full(filled.shape, FAR, dtype=torch.uint8)
+    away = np.asarray(distance_transform_cdt(~filled, metric="chessboard"))
+    return torch.from_numpy(away.clip(max=FAR).astype(np.uint8))
 
 
 def cast_through_voxels(
@@ -37,6 +64,7 @@ def cast_through_voxels(
     basis: Float[Tensor, "ray 9"],
     *,
     step: float,
+    empty: UInt8[Tensor, "cell_x cell_y cell_z"] | None = None,
     stop: float = 1e-3,
     background: float = 1.0,
 ) -> Rendered:
@@ -49,6 +77,7 @@ def cast_through_voxels(
         rays: with near and far.
         basis: spherical harmonics of every ray's direction.
         step: distance between samples in world units.
+        empty: what `empty_around` found, over which rays leap; found here where absent.
         stop: transmittance below which a ray is finished.
         background: grey value behind everything.
 
@@ -61,15 +90,14 @@ def cast_through_voxels(
     caster = compiled_caster()
     if caster is None:
         raise RuntimeError("cast_through_voxels: expected numba, found none; pip install numba")
-    side = index.shape[0]
-    scale = side / (2 * bounds.radius)
+    scale = index.shape[0] / (2 * bounds.radius)
     corner = torch.tensor(bounds.centre) - bounds.radius
-    origins = (rays.origins.float() - corner) * scale
     out = np.empty((len(rays), 5), np.float32)
     arguments = (
         index.numpy(),
         values.numpy(),
-        origins.numpy(),
+        (empty_around(index) if empty is None else empty).numpy(),
+        ((rays.origins.float() - corner) * scale + 0.5).contiguous().numpy(),
         (rays.directions.float() * scale).contiguous().numpy(),
         rays.near.float().numpy(),
         rays.far.float().numpy(),
@@ -79,67 +107,78 @@ def cast_through_voxels(
         np.float32(background),
         out,
     )
-    threads = torch.get_num_threads()
-    cuts = [len(rays) * part // threads for part in range(threads + 1)]
-    with ThreadPoolExecutor(threads) as pool:
-        samples = sum(pool.map(lambda start, stop: caster(*arguments, start, stop), cuts, cuts[1:]))
+    samples = sum(share(lambda start, stop: caster(*arguments, start, stop), len(rays), RAYS))
     found = torch.from_numpy(out)
-    return Rendered(found[:, :3], found[:, 3], found[:, 4], int(samples))
+    return Rendered(found[:, :3], found[:, 3], found[:, 4], samples)
 
 
 @no_type_check
-def _cast(index, values, origins, directions, near, far, basis, step, limit, background, out, start, stop):  # noqa: PLR0913
-    """The loop over rays start..stop: (colour, opacity, depth) into `out`; returns the samples that were not empty."""
-    side = index.shape[0]
+def _cast(index, values, empty, origins, directions, near, far, basis, step, limit, background, out, start, stop):  # noqa: PLR0913
+    """The loop over rays start..stop: (colour, opacity, depth) into `out`; returns the samples that were not empty.
+
+    Positions are counted in cells: the whole part names the cell, the rest is the place between its voxel centres.
+    """
+    side, harmonics = empty.shape[0], basis.shape[1]
+    one, zero = np.float32(1.0), np.float32(0.0)
+    mixed = np.empty(values.shape[1], np.float32)
     total = 0
     for ray in range(start, stop):
-        t = near[ray] + np.float32(0.5) * step
-        passed = np.float32(0.0)
-        red, green, blue = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        depth, opacity = np.float32(0.0), np.float32(0.0)
-        asked = 0
-        while t < far[ray] and passed < limit:
-            # voxel coordinates, counted from the centre of voxel 0
-            x = origins[ray, 0] + t * directions[ray, 0] - np.float32(0.5)
-            y = origins[ray, 1] + t * directions[ray, 1] - np.float32(0.5)
-            z = origins[ray, 2] + t * directions[ray, 2] - np.float32(0.5)
-            lowest_x, lowest_y, lowest_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
-            density = np.float32(0.0)
-            r, g, b = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        origin_x, origin_y, origin_z = origins[ray, 0], origins[ray, 1], origins[ray, 2]
+        along_x, along_y, along_z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        first, last = near[ray] + np.float32(0.5) * step, far[ray]
+        a_cell = one / (max(abs(along_x), abs(along_y), abs(along_z)) * step)  # samples to the next cell, at least
+        passed, opacity, depth = zero, zero, zero
+        red, green, blue = zero, zero, zero
+        sample = 0
+        while passed < limit:
+            t = first + np.float32(sample) * step
+            if t >= last:
+                break
+            x, y, z = origin_x + t * along_x, origin_y + t * along_y, origin_z + t * along_z
+            low_x, low_y, low_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+            if min(low_x, low_y, low_z) < 0 or max(low_x, low_y, low_z) >= side:
+                sample += 1
+                continue
+            away = empty[low_x, low_y, low_z]
+            if away > 0:
+                sample += 1 + int(np.float32(away - 1) * a_cell)
+                continue
+            sample += 1
+            x, y, z = x - np.float32(low_x), y - np.float32(low_y), z - np.float32(low_z)
+            density = zero
+            mixed[:] = zero
             for corner in range(8):
-                at_x, at_y, at_z = lowest_x + (corner >> 2), lowest_y + (corner >> 1 & 1), lowest_z + (corner & 1)
-                if min(at_x, at_y, at_z) < 0 or max(at_x, at_y, at_z) >= side:
+                right, up, behind = corner >> 2, corner >> 1 & 1, corner & 1
+                at_x, at_y, at_z = low_x + right - 1, low_y + up - 1, low_z + behind - 1
+                if min(at_x, at_y, at_z) < 0 or max(at_x, at_y, at_z) >= side - 1:
                     continue
                 row = index[at_x, at_y, at_z]
                 if row < 0:
                     continue
-                share = (
-                    (np.float32(1.0) - abs(x - at_x))
-                    * (np.float32(1.0) - abs(y - at_y))
-                    * (np.float32(1.0) - abs(z - at_z))
-                    * values[row, 0]
-                )
+                share = (x if right else one - x) * (y if up else one - y) * (z if behind else one - z)
+                share *= values[row, 0]
                 density += share
-                for harmonic in range(9):
-                    weight = share * basis[ray, harmonic]
-                    r += weight * values[row, 1 + harmonic]
-                    g += weight * values[row, 10 + harmonic]
-                    b += weight * values[row, 19 + harmonic]
-            if density > np.float32(1e-8):
-                asked += 1
-                thickness = density * step
-                weight = math.exp(-passed) * (np.float32(1.0) - math.exp(-thickness))
-                passed += thickness
-                red += weight * min(max(r / density, np.float32(0.0)), np.float32(1.0))
-                green += weight * min(max(g / density, np.float32(0.0)), np.float32(1.0))
-                blue += weight * min(max(b / density, np.float32(0.0)), np.float32(1.0))
-                opacity += weight
-                depth += weight * t
-            t += step
-        out[ray, 0] = red + (1 - opacity) * background
-        out[ray, 1] = green + (1 - opacity) * background
-        out[ray, 2] = blue + (1 - opacity) * background
+                for number in range(mixed.shape[0]):
+                    mixed[number] += share * values[row, number]
+            if density <= np.float32(1e-8):
+                continue
+            total += 1
+            r, g, b = zero, zero, zero
+            for number in range(harmonics):
+                r += basis[ray, number] * mixed[1 + number]
+                g += basis[ray, number] * mixed[1 + harmonics + number]
+                b += basis[ray, number] * mixed[1 + 2 * harmonics + number]
+            thickness = density * step
+            weight = math.exp(-passed) * (one - math.exp(-thickness))
+            passed += thickness
+            red += weight * min(max(r / density, zero), one)
+            green += weight * min(max(g / density, zero), one)
+            blue += weight * min(max(b / density, zero), one)
+            opacity += weight
+            depth += weight * t
+        out[ray, 0] = red + (one - opacity) * background
+        out[ray, 1] = green + (one - opacity) * background
+        out[ray, 2] = blue + (one - opacity) * background
         out[ray, 3] = opacity
         out[ray, 4] = depth / max(opacity, np.float32(1e-10))
-        total += asked
     return total

@@ -92,6 +92,15 @@ def test_density_does_not_depend_on_direction_but_colour_does(target):
 
 
 @torch.no_grad()
+def test_colours_along_many_directions_are_those_along_each(target):
+    # Source of truth: the colour head asked direction by direction.
+    points, directions = queries(7)
+    field = target.bind(Parameters.of(target), None if isinstance(target, NeRF) else planes())
+    hidden = field.hidden(points)
+    expected = torch.stack([field.colour_of(hidden, each.expand(7, 3)) for each in directions], 1)
+    torch.testing.assert_close(field.colours_along(hidden, directions), expected)
+
+
 def test_delta_of_zero_changes_nothing_and_each_head_only_its_own(target):
     theta, images, (points, directions) = Parameters.of(target), planes(), queries()
     colour, density = target.bind(theta, images)(points, directions)
