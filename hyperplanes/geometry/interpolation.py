@@ -38,6 +38,7 @@ __all__ = [
     "pull_packed",
     "pull_pixels",
     "pull_plane",
+    "room",
 ]
 
 
@@ -72,8 +73,8 @@ def fetch_plane(s, out, first, images, offset, height, width, background):
     for i in range(BLOCK):
         k, fx, fy = _corner(s, i, height, width)
         a, b, c, d = _taps(images, offset, k, height, width)
-        top = a + fx * (b - a)
-        value = top + fy * (c + fx * (d - c) - top)
+        left, right = a + fy * (c - a), b + fy * (d - b)  # down before across, as `blend` does
+        value = left + fx * (right - left)
         store(out, first + i, value if load(s, INSIDE + i) > zero else background)
 
 
@@ -153,6 +154,15 @@ def pull_packed(s, packed, offset, height, width, bits):
         twist = (_contracted(d, g, channels) - gc) - (gb - ga)
         store(s, GRAD_U + i, load(s, GRAD_U + i) + ((gb - ga) + fy * twist))
         store(s, GRAD_V + i, load(s, GRAD_V + i) + ((gc - ga) + fx * twist))
+
+
+@inner
+@no_type_check
+def room(images, bits, points):
+    """Memory for an interleaved plane, or none where making it costs more than reading it for so many points saves."""
+    channels, height, width = images.shape[1:]
+    pays = bits == 0 and channels == 3 and 2 * points >= height * width
+    return np.zeros(4 * (height * width + 1) if pays else 0, images.dtype)
 
 
 @inner

@@ -5,7 +5,7 @@ lock. The kernels are compiled on first use, a second or two each, and kept on d
 
 Points are rows of x, y and z, and results are planar in memory, (view, channel, point), so that a block is read and
 written as whole vectors. All rows are `pitch` long, a multiple of BLOCK. One plane after the other is looked at for a
-whole chunk of points: its pixels then stay in the cache.
+whole chunk of points: its pixels then stay in the cache, interleaved first where the chunk is large enough.
 
 Where a point's planes are chosen, the lookups of a chunk of points are first grouped by plane (a counting sort), so
 that blocks share a plane there too and only the chosen planes cost anything.
@@ -31,7 +31,7 @@ from hyperplanes.geometry.blocks import (
     place,
     project,
 )
-from hyperplanes.geometry.interpolation import fetch_packed, fetch_plane
+from hyperplanes.geometry.interpolation import fetch_packed, fetch_pixels, fetch_plane, interleave, room
 from hyperplanes.geometry.vector_memory import load, store
 
 __all__ = ["forward", "forward_chosen", "grouped", "scratch", "take"]
@@ -79,9 +79,11 @@ def forward(points, pitch, matrices, images, packed, bits, height, width, backgr
             colours, coordinates, valid, start, stop):  # fmt: skip
     """Looks points start..stop up in all planes."""
     planes, channels = images.shape[0], images.shape[1]
-    s = scratch(points.dtype, 0)
+    s, pixels = scratch(points.dtype, 0), room(images, bits, stop - start if planes > 1 else 0)
     size = height * width
     for view in range(planes):
+        if len(pixels):
+            interleave(images, view, pixels)
         for p in range(start, stop, BLOCK):
             project(s, points, p, pitch, matrices, view, nearest)
             k = 2 * view * pitch + p
@@ -89,13 +91,15 @@ def forward(points, pitch, matrices, images, packed, bits, height, width, backgr
             k = view * pitch + p
             for i in range(BLOCK):
                 store(valid, k + i, np.uint8(load(s, INSIDE + i)))
+            k = channels * view * pitch + p
             if bits:
-                k = 3 * view * pitch + p
                 fetch_packed(s, colours, k, pitch, packed, view * size, height, width, bits, background)
+            elif len(pixels):
+                fetch_pixels(s, colours, k, pitch, pixels, height, width, background)
             else:
                 for c in range(channels):
-                    plane = view * channels + c
-                    fetch_plane(s, colours, plane * pitch + p, images, plane * size, height, width, background)
+                    offset = (view * channels + c) * size
+                    fetch_plane(s, colours, k + c * pitch, images, offset, height, width, background)
 
 
 @no_type_check

@@ -31,7 +31,7 @@ from hyperplanes.geometry.blocks import (
     project,
     start_pull,
 )
-from hyperplanes.geometry.interpolation import pull_packed, pull_plane
+from hyperplanes.geometry.interpolation import interleave, pull_packed, pull_pixels, pull_plane, room
 from hyperplanes.geometry.kernels_cpu import grouped, scratch, take
 from hyperplanes.geometry.vector_memory import add_pixels, load
 
@@ -51,7 +51,8 @@ def clear(s, count, channels):
 
 @inner
 @no_type_check
-def _pull(s, points, at, pitch, view, matrices, images, packed, bits, height, width, nearest, gradients, into, sums):
+def _pull(s, points, at, pitch, view, matrices, images, packed, bits, pixels, height, width, nearest, gradients, into,
+          sums):  # fmt: skip
     """The gradients in COLUMN, ROW and the channels' rows -> the points' gradients and the matrix sums."""
     project(s, points, at, pitch, matrices, view, nearest)
     start_pull(s, height, width)
@@ -59,6 +60,8 @@ def _pull(s, points, at, pitch, view, matrices, images, packed, bits, height, wi
     size, channels = height * width, images.shape[1]
     if bits:
         pull_packed(s, packed, view * size, height, width, bits)
+    elif len(pixels):
+        pull_pixels(s, pixels, height, width)
     else:
         for c in range(channels):
             pull_plane(s, images, (view * channels + c) * size, height, width, c)
@@ -70,8 +73,10 @@ def backward(points, pitch, matrices, images, packed, bits, height, width, neare
              grad_coordinates, by, grad_points, sums, total, start, stop):  # fmt: skip
     """Gradients with respect to points start..stop, and their share of the matrices' gradient, added to `sums`."""
     planes, channels = images.shape[0], images.shape[1]
-    s = scratch(points.dtype, channels)
+    s, pixels = scratch(points.dtype, channels), room(images, bits, stop - start if planes > 1 else 0)
     for view in range(planes):
+        if len(pixels):
+            interleave(images, view, pixels)
         for p in range(start, stop, BLOCK):
             count = min(BLOCK, total - p)
             copy_pairs(s, count, grad_coordinates, p * by[0] + view * by[1], by)
@@ -79,9 +84,8 @@ def backward(points, pitch, matrices, images, packed, bits, height, width, neare
                 at = p * per[0] + view * per[1] + c * per[2]
                 copy(s, CHANNELS + c * BLOCK, count, grad_colours, at, per[0])
             clear(s, count, channels)
-            _pull(
-                s, points, p, pitch, view, matrices, images, packed, bits, height, width, nearest, grad_points, p, sums
-            )
+            _pull(s, points, p, pitch, view, matrices, images, packed, bits, pixels, height, width, nearest,
+                  grad_points, p, sums)  # fmt: skip
 
 
 @no_type_check
@@ -106,7 +110,7 @@ def backward_chosen(points, pitch, views, matrices, images, packed, bits, height
                 for c in range(channels):
                     s[CHANNELS + c * BLOCK + i] = grad_colours[p * per[0] + j * per[1] + c * per[2]]
             clear(s, count, channels)
-            _pull(s, s, X, BLOCK, view, matrices, images, packed, bits, height, width, nearest, s, GRAD_X, sums)
+            _pull(s, s, X, BLOCK, view, matrices, images, packed, bits, s[:0], height, width, nearest, s, GRAD_X, sums)
             for i in range(count):
                 p = order[begin + i] // m
                 grad_points[p] += s[GRAD_X + i]

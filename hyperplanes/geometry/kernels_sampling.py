@@ -1,15 +1,15 @@
 """The CPU kernels of sampling at given coordinates, and of its gradient; the blocks are those of the lookup.
 
 Work comes in pieces of `chunk` points on one plane, numbered plane after plane, so that threads can share it while a
-plane's pixels stay in the cache. Coordinates and incoming gradients lie as they like, given as their memory with the
-strides of (point, view, column and row or channel); results are planar, (view, channel, point), in rows of `pitch`.
+plane's pixels stay in the cache, interleaved first where a piece has more points than the plane has pixels: what the
+threads take for that is then less than the results. Coordinates and incoming gradients lie as they like, given as
+their memory with the strides of (point, view, column and row or channel); results are planar, (view, channel, point),
+in rows of `pitch`.
 """
 
 from __future__ import annotations
 
 from typing import no_type_check
-
-import numpy as np
 
 from hyperplanes.geometry.blocks import (
     BLOCK,
@@ -30,6 +30,7 @@ from hyperplanes.geometry.interpolation import (
     pull_packed,
     pull_pixels,
     pull_plane,
+    room,
 )
 from hyperplanes.geometry.kernels_cpu import scratch
 from hyperplanes.geometry.kernels_gradient import splat
@@ -46,20 +47,12 @@ def _arrive(s, coordinates, by, view, p, count, height, width):
     locate(s, height, width)
 
 
-@inner
-@no_type_check
-def _room(images, bits, chunk):
-    """Memory for an interleaved plane, where reading it will save more than making it costs; none elsewhere."""
-    size = images.shape[2] * images.shape[3]
-    return np.zeros(4 * (size + 1) if not bits and images.shape[1] == 3 and 2 * chunk >= size else 0, images.dtype)
-
-
 @no_type_check
 def sample(images, packed, bits, height, width, background, coordinates, by, colours, pitch, total, chunk,
            start, stop):  # fmt: skip
     """Colours of pieces start..stop."""
     channels, size, pieces = images.shape[1], height * width, -(-total // chunk)
-    s, pixels = scratch(colours.dtype, 0), _room(images, bits, chunk)
+    s, pixels = scratch(colours.dtype, 0), room(images, bits, chunk // 2)
     for piece in range(start, stop):
         view, begin = piece // pieces, piece % pieces * chunk
         if len(pixels):
@@ -87,7 +80,7 @@ def sample_backward(images, packed, bits, height, width, coordinates, by, grad_c
     """
     channels, size, pieces = images.shape[1], height * width, -(-total // chunk)
     s = scratch(images.dtype, channels)
-    pixels = _room(images, bits, chunk if len(grad_coordinates) else 0)
+    pixels = room(images, bits, chunk // 2 if len(grad_coordinates) else 0)
     zero, half = s.dtype.type(0), s.dtype.type(0.5)
     per_column, per_row = half * s.dtype.type(width - 1), half * s.dtype.type(height - 1)
     for piece in range(start, stop):

@@ -20,7 +20,7 @@ from hyperplanes.geometry.threads import share
 
 __all__ = ["lookup", "lookup_backward"]
 
-_CHUNK = 64 * memory.BLOCK  # points a call of a kernel
+_CHUNK = 64 * memory.BLOCK  # points a call of a kernel at least
 _PLANES = "Tensor points, Tensor matrices, Tensor images, Tensor? packed, int bits, Tensor? views"
 _SCHEMA = f"({_PLANES}, float background) -> (Tensor, Tensor, Tensor)"
 _BACKWARD_SCHEMA = (
@@ -42,7 +42,7 @@ def lookup(
         fixed = (*_geometry(points, matrices, views), *memory.planes(images, packed, bits), number(background))
         flat = [memory.flat(value) for value in (colours, coordinates, valid.view(torch.uint8))]
         fixed += (number(NEAREST_DEPTH), *flat)
-        share(lambda start, stop: kernel(*fixed, start, stop), len(points), _CHUNK)
+        share(lambda start, stop: kernel(*fixed, start, stop), len(points), _chunk(points, packed, views))
     return colours, coordinates, valid
 
 
@@ -77,6 +77,12 @@ def _empty(
     return colours, coordinates, new((slots, room), dtype=torch.bool).T[:count]
 
 
+def _chunk(points: Tensor, packed: Tensor | None, views: Tensor | None) -> int:
+    """Points a call of a kernel: an equal share a thread, to gain from planes interleaved for them; few, elsewhere."""
+    equal = -(-len(points) // (torch.get_num_threads() * memory.BLOCK)) * memory.BLOCK
+    return max(_CHUNK, equal) if packed is None and views is None else _CHUNK
+
+
 def _geometry(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[Any, ...]:
     """Points as rows of x, y and z, the rows' length, the chosen views where there are any, and the matrices."""
     rows = np.zeros(
@@ -103,7 +109,7 @@ def _geometry_gradient(
         kernel(*fixed, sums, len(points), start, stop)
         return sums
 
-    total = sum(share(work, len(points), _CHUNK), np.zeros((len(matrices), 12)))
+    total = sum(share(work, len(points), _chunk(points, packed, views)), np.zeros((len(matrices), 12)))
     grad_points = torch.from_numpy(np.ascontiguousarray(rows[:, : len(points)].T))
     return grad_points, torch.from_numpy(total).to(matrices).reshape(matrices.shape)
 

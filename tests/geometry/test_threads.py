@@ -11,11 +11,11 @@ from hyperplanes.geometry import ImagePlanes, cameras, threads
 from hyperplanes.geometry.threads import share
 
 
-def lookups(count):
-    ours = cameras.pinhole(cameras.symmetric_intrinsics(8, 8, 0.8), cameras.orbit(3, 2.5), 8, 8)
-    images = torch.rand(3, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+def lookups(count, size=8, exact=False):
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(size, size, 0.8), cameras.orbit(3, 2.5), size, size)
+    images = torch.rand(3, 3, size, size, generator=torch.Generator().manual_seed(0))
     points = torch.rand(count, 3, generator=torch.Generator().manual_seed(1)) - 0.5
-    return ImagePlanes(images, ours).lookup(points).colours
+    return ImagePlanes(images, ours, exact=exact).lookup(points).colours
 
 
 def test_share_covers_every_index_once():
@@ -25,13 +25,15 @@ def test_share_covers_every_index_once():
     assert share(lambda start, stop: 1, 0, 5) == []
 
 
-def test_the_result_does_not_depend_on_the_threads():
+@pytest.mark.parametrize(("size", "exact"), [(8, False), (8, True), (150, True)])
+def test_the_result_does_not_depend_on_the_threads(size, exact):
+    """Nor on how planes are read: of 150 x 150 pixels, one thread interleaves them for its points, three do not."""
     before = torch.get_num_threads()
     try:
         results = []
         for count in (1, 2, 3):
             torch.set_num_threads(count)
-            results.append(lookups(20_000))
+            results.append(lookups(20_000, size, exact))
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(results[0], result) for result in results)
