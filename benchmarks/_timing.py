@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-__all__ = ["Times", "copy_bandwidth", "interleaved", "peak_bytes", "ratio", "table"]
+__all__ = ["Times", "copy_bandwidth", "interleaved", "peak_bytes", "ratio", "table", "timed"]
 
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler announces itself on every start otherwise
 
@@ -54,6 +54,13 @@ def interleaved(ways: dict[str, Callable[[], object]], repeats: int, seconds: fl
             times[name].processor.append(time.process_time() - computed)
             times[name].wall.append(time.perf_counter() - begun)
     return times
+
+
+def timed(run: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds of a call, and what it returned."""
+    begun = time.perf_counter()
+    result = run()
+    return time.perf_counter() - begun, result
 
 
 def ratio(reference: list[float], ours: list[float]) -> dict[str, float]:

@@ -16,7 +16,6 @@ import argparse
 import json
 import os
 import resource
-import shutil
 import statistics
 import subprocess
 import sys
@@ -24,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from benchmarks._timing import ratio
@@ -93,11 +93,12 @@ def compare(renderer: str, folder: Path, *, rounds: int, objects: int) -> list[R
     counts = (2, SUPERSAMPLE)
     ours: dict[int, list[Run]] = {supersample: [] for supersample in counts}
     loop: list[Run] = []
-    for _ in range(rounds):
+    # Nothing is deleted between rounds: ext4 looks long for an inode among those that were deleted a moment ago.
+    for turn in range(rounds):
         if renderer.startswith("pyrender"):
-            loop.append(measured(lambda: loop_images(objects // 6, folder / "loop", renderer), folder / "loop"))
+            loop.append(measured(partial(loop_images, objects // 6, folder / f"loop{turn}", renderer)))
         for supersample in counts:
-            ours[supersample].append(generated(objects, folder / "ours", supersample))
+            ours[supersample].append(generated(objects, folder / f"ours{supersample}_{turn}", supersample))
     rows: list[Row] = []
     for supersample, runs in ours.items():
         row: Row = {"name": f"generate, {supersample**2} samples a pixel", "renderer": renderer, "rounds": rounds}
@@ -128,17 +129,11 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def measured(run: Callable[[], int], out: Path) -> Run:
-    """What a generation takes.
-
-    Args:
-        run: writes into `out` and returns how many images it wrote.
-        out: emptied afterwards.
-    """
+def measured(run: Callable[[], int]) -> Run:
+    """What a generation takes, which returns how many images it wrote."""
     begun, computed = time.perf_counter(), _computed()
     images = run()
     wall, processor = time.perf_counter() - begun, _computed() - computed
-    shutil.rmtree(out)
     return Run(images, wall, processor)
 
 
@@ -153,7 +148,7 @@ def generated(objects: int, out: Path, supersample: int = SUPERSAMPLE) -> Run:
 
     Args:
         objects: how many.
-        out: where to; removed afterwards.
+        out: where to.
         supersample: samples along a side of a pixel.
     """
     from data_gen.dataset import Procedural, generate
@@ -173,7 +168,7 @@ def generated(objects: int, out: Path, supersample: int = SUPERSAMPLE) -> Run:
         return objects * VIEWS
 
     begun = time.perf_counter()
-    whole = measured(run, out)
+    whole = measured(run)
     each = (ends[-1] - ends[0]) / max(1, len(ends) - 1)
     return Run(whole.images, whole.wall, whole.processor, ends[0] - begun, each)
 

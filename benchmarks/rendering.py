@@ -12,18 +12,14 @@ import resource
 import statistics
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from benchmarks._timing import timed
+from benchmarks.objects import held_out
+from benchmarks.rendering_growth import growth, plot_growth
 from benchmarks.reporting import Row, finish
-from data_gen.meshes import prepare_scene, render_ready
-from data_gen.rasterise import Rasteriser
-from data_gen.rigs import fixed
-from data_gen.shapes import make
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.baking import BakedScene, bake
@@ -40,7 +36,6 @@ from hyperplanes.views import Task, Views
 __all__ = ["main"]
 
 CHECKPOINT = Path(__file__).parent / "weights" / "paper-network"
-FIRST_SEED = 900_000
 PAPER = Hierarchical(64, 128)
 RAYS_OF_A_LARGE_VIEW = 8192
 
@@ -55,46 +50,26 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--quick", action="store_true", help="64 pixels and one object, about a minute")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="a trained model (default: %(default)s)")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the growth goes (PNG)")
     parser.add_argument("--memory", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     model = HyperPlanes.from_pretrained(options.checkpoint)
     if options.memory:
         return large_view(model)
     rows: list[Row] = []
-    for size in (64,) if options.quick else (64, 128, 200, 400):
-        tasks = held_out(3 if size == 64 and not options.quick else 1, size)
-        rows += compare(model, tasks, repeats=3 if size == 64 else 1)
+    for size, count in ((64, 2),) if options.quick else ((64, 3), (128, 3), (200, 2), (400, 1)):
+        tasks = held_out(count, size)
+        rows += compare(model, tasks)
         rows += parts(model, tasks[0])
-        rows += baked(model, tasks[0])
+        rows += [] if options.quick else baked(model, tasks[0])
     if not options.quick:
         rows.append(fifty_views(model, held_out(1, 200)[0]))
         rows.append(peak_memory(options.checkpoint))
+    if options.plot:
+        grown = growth(model, options.quick)
+        plot_growth(grown, options.plot)
+        rows += grown
     return finish("rendering", rows, options.json)
-
-
-def held_out(count: int, size: int) -> list[Task]:
-    """Procedural cars never trained on, 25 support and 25 query views each, on the training rig."""
-    rig = fixed(50, size)
-    cameras = camera.pinhole(
-        torch.tensor(rig.intrinsics).float(), torch.tensor(rig.camera_from_world).float(), size, size
-    )
-    tasks = []
-    with Rasteriser() as rasteriser:
-        for seed in range(FIRST_SEED, FIRST_SEED + count):
-            mesh = prepare_scene(make("car", seed), f"car-{seed}")
-            pixels = torch.tensor(rasteriser.render(render_ready(mesh), rig).rgba).permute(0, 3, 1, 2).float() / 255
-            masks = pixels[:, 3:]
-            views = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks)
-            even = torch.arange(0, 50, 2)
-            tasks.append(Task(views[even], views[even + 1], mesh.name))
-    return tasks
-
-
-def timed(run: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of a call, and what it returned."""
-    begun = time.perf_counter()
-    result = run()
-    return time.perf_counter() - begun, result
 
 
 def paper_view(adapted: AdaptedField, query: Views, view: int) -> tuple[float, float, float, float]:
@@ -119,11 +94,11 @@ def paper_view(adapted: AdaptedField, query: Views, view: int) -> tuple[float, f
     )
 
 
-def compare(model: HyperPlanes, tasks: list[Task], repeats: int) -> list[Row]:
-    """One view of each object by both protocols, in turn."""
+def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
+    """One view of each object by both protocols: ours, the paper's, ours again."""
     rows, ratios, paper_seconds, our_seconds, adapt_seconds = [], [], [], [], []
     paper_errors, our_errors, samples, paper_samples = [], [], [], []
-    for number, task in enumerate(tasks * repeats):
+    for number, task in enumerate(tasks):
         view = (7 * number + 3) % len(task.query)
         adapt, adapted = timed(lambda task=task: model.adapt(task.support))
         refine, _ = timed(lambda adapted=adapted: adapted.filled)

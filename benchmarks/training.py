@@ -1,20 +1,22 @@
-"""Training by packed rays against the dense path of the paper: rays a second, parts of a step, and the curves.
+"""Training by packed rays against the dense path of the paper: rays a second, parts of a step, memory, and the curves.
 
 Both train the same network from the same start on the same objects with the same number of rays a step. The dense path
 draws its rays from whole query images and asks a coarse and a fine network at 64 + 192 places of each; the packed one
-asks where the visual hull of the support masks leaves something to be seen.
+draws them where the visual hull of the support masks can be seen and asks where it leaves something to be seen. With
+`--curves` both train the paper's networks for so many steps, looked at alike on objects that neither saw.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
+import statistics
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from benchmarks.rendering import held_out
+from benchmarks._timing import interleaved, peak_bytes, ratio, timed
+from benchmarks.objects import held_out
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.metrics import psnr
@@ -26,10 +28,12 @@ from hyperplanes.views import Task
 __all__ = ["main"]
 
 DENSE = Hierarchical(64, 128)
+RAYS = 512
+UNSEEN = 2  # objects that are not trained on
 
 
 class Objects:
-    """Tasks in memory, the last one held out."""
+    """Tasks in memory, the last ones held out."""
 
     def __init__(self, tasks: list[Task]) -> None:
         self.tasks = {task.name: task for task in tasks}
@@ -37,7 +41,7 @@ class Objects:
     def names(self, split: str) -> list[str]:
         """The objects of a split."""
         names = sorted(self.tasks)
-        return names[-1:] if split == "test" else names[:-1]
+        return names[-UNSEEN:] if split == "test" else names[:-UNSEEN]
 
     def task(self, name: str) -> Task:
         """One object."""
@@ -48,71 +52,105 @@ def main(arguments: list[str]) -> int:
     """Measure, print, and write the rows where asked.
 
     Args:
-        arguments: --quick, --json FILE, --steps N.
+        arguments: --quick, --curves STEPS, --json FILE, --plot FILE.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks training", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="the quick preset alone, few steps")
+    parser.add_argument("--curves", type=int, metavar="STEPS", help="train both this far instead, which takes long")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
-    parser.add_argument("--steps", type=int, default=40, help="of the curves (default: %(default)s)")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the curves goes (PNG)")
     options = parser.parse_args(arguments)
     rows: list[Row] = []
+    if options.curves:
+        chosen = preset("paper-128-brief")
+        rows = curves(chosen, Objects(held_out(10, chosen.resolution)), options.curves)
+        if options.plot:
+            plot(rows, options.plot)
+        return finish("training", rows, options.json)
     for name in ("quick",) if options.quick else ("quick", "small", "paper-128"):
         chosen = preset(name)
-        objects = Objects(held_out(4, chosen.resolution))
-        steps = 6 if options.quick else options.steps
-        rows += compare(name, chosen, objects, steps)
+        rows += compare(name, chosen, Objects(held_out(2 + UNSEEN, chosen.resolution)), 3 if options.quick else 8)
     return finish("training", rows, options.json)
 
 
-def trainer(chosen: Preset, objects: Objects, sampling: Hierarchical | Marched) -> Trainer:
-    """A training of the preset by one protocol, always from the same weights."""
-    torch.manual_seed(0)
-    model = HyperPlanes(replace(chosen.model, sampling=sampling))
-    return Trainer(model, objects, replace(chosen.training, rays=512, tasks=1, warmup=0, final=1.0))
+def both(chosen: Preset, objects: Objects) -> dict[str, Trainer]:
+    """A training by each path, always from the same weights, with everything about its objects ready."""
+    trainers = {}
+    for path, sampling in (("packed", chosen.model.sampling), ("dense", DENSE)):
+        model = HyperPlanes(replace(chosen.model, sampling=sampling))
+        trainers[path] = Trainer(model, objects, replace(chosen.training, rays=RAYS, tasks=1, warmup=10, final=1.0))
+        for name in objects.names("train"):
+            trainers[path].warm(name)
+    return trainers
 
 
 def compare(name: str, chosen: Preset, objects: Objects, steps: int) -> list[Row]:
-    """Steps of both paths in turn: two packed ones to each dense one, so that both see the same machine."""
-    dense, packed = trainer(chosen, objects, DENSE), trainer(chosen, objects, chosen.model.sampling)
-    for each in (dense, packed):
-        each.take_step()
-        for task in objects.names("train"):
-            each.warm(task)
-    seconds: dict[str, list[float]] = {"dense": [], "packed": []}
-    for _ in range(steps):
-        for path, each in (("packed", packed), ("dense", dense)):
-            begun = time.perf_counter()
-            each.take_step()
-            seconds[path].append(time.perf_counter() - begun)
-    ratios = torch.tensor(seconds["dense"]) / torch.tensor(seconds["packed"])
-    row: Row = {
-        "name": f"packed training, {name}, 512 rays a step",
-        "rays_per_second": 512 / float(torch.tensor(seconds["packed"]).median()),
-        "reference_rays_per_second": 512 / float(torch.tensor(seconds["dense"]).median()),
-        "speedup": float(ratios.median()),
-        "speedup_lowest": float(ratios.min()),
-        "speedup_highest": float(ratios.max()),
-        "steps": steps,
-    }
-    ours, theirs = held_out_psnr(packed, objects), held_out_psnr(dense, objects)
-    return [row | {"psnr": ours, "reference_psnr": theirs, "psnr_loss": theirs - ours}, *step_parts(name, packed)]
-
-
-def held_out_psnr(trained: Trainer, objects: Objects) -> float:
-    """PSNR of two query views of the held-out object after the steps so far, both by the default protocol."""
-    task = objects.task(objects.names("test")[0])
-    query = task.query[3::12]
-    pictures = trained.model.adapt(task.support).render(query.cameras, Marched())
-    return float(psnr(pictures.images.clamp(0, 1), query.images).mean())
+    """Rays a second, memory and the parts of a step, of both paths in turn."""
+    trainers = both(chosen, objects)
+    times = interleaved({path: each.take_step for path, each in trainers.items()}, steps, seconds=120)
+    row: Row = {"name": f"packed training, {name}, {RAYS} rays a step"}
+    row["rays_per_second"] = RAYS / statistics.median(times["packed"].wall)
+    row["reference_rays_per_second"] = RAYS / statistics.median(times["dense"].wall)
+    row |= ratio(times["dense"].wall, times["packed"].wall)
+    row["speedup_processor"] = ratio(times["dense"].processor, times["packed"].processor)["speedup"]
+    row["steps"] = len(times["packed"].wall)
+    row["peak_megabytes"] = peak_bytes(trainers["packed"].take_step) / 1e6
+    row["reference_peak_megabytes"] = peak_bytes(trainers["dense"].take_step) / 1e6
+    return [row, *(part for path, each in trainers.items() for part in step_parts(f"{name}, {path}", each))]
 
 
 def step_parts(name: str, trained: Trainer) -> list[Row]:
-    """Seconds of the parts of one packed step."""
+    """Seconds of the parts of one step."""
     with torch.profiler.profile(record_shapes=False) as profiler:
         trained.take_step()
-    found: list[Row] = []
-    for event in profiler.key_averages():
-        if event.key.startswith("step:"):
-            part = event.key.removeprefix("step:")
-            found.append({"name": f"part of a step, {name}: {part}", "seconds": event.cpu_time_total / 1e6})
-    return found
+    return [
+        {
+            "name": f"part of a step, {name}: {event.key.removeprefix('step:')}",
+            "seconds": event.cpu_time_total / 1e6,
+        }
+        for event in profiler.key_averages()
+        if event.key.startswith("step:")
+    ]
+
+
+def curves(chosen: Preset, objects: Objects, steps: int) -> list[Row]:
+    """PSNR on unseen objects after equal steps of both paths, and the seconds that the steps took."""
+    trainers = both(chosen, objects)
+    spent = dict.fromkeys(trainers, 0.0)
+    rows: list[Row] = []
+    for step in range(1, steps + 1):
+        for path, each in trainers.items():
+            spent[path] += timed(each.take_step)[0]
+            if step % max(1, steps // 10) == 0:
+                row: Row = {"name": f"curve, {path}", "path": path, "step": step, "seconds": spent[path]}
+                rows.append(row | {"psnr": unseen_psnr(each, objects)})
+    return rows
+
+
+def unseen_psnr(trained: Trainer, objects: Objects) -> float:
+    """PSNR of query views of the held-out objects after the steps so far, by the default protocol for both paths."""
+    found = []
+    for name in objects.names("test"):
+        task = objects.task(name)
+        query = task.query[3::8]
+        pictures = trained.model.adapt(task.support).render(query.cameras, Marched())
+        found.append(psnr(pictures.images.clamp(0, 1), query.images))
+    return float(torch.cat(found).mean())
+
+
+def plot(rows: list[Row], path: Path) -> None:
+    """The rows of `curves`, over steps and over seconds."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    for axes, axis in zip(figure.subplots(1, 2, sharey=True), ("step", "seconds"), strict=True):
+        for name, colour in (("packed", "#1a73e8"), ("dense", "#9aa0a6")):
+            found = [row for row in rows if row["path"] == name]
+            axes.plot([float(r[axis]) for r in found], [float(r["psnr"]) for r in found], "o-", ms=3, color=colour,
+                      label={"packed": "packed (default)", "dense": "dense, 64 + 192 a ray (paper)"}[name])  # fmt: skip
+        axes.set(xlabel={"step": "steps of 512 rays", "seconds": "seconds"}[axis])
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8, loc="lower right")
+    figure.axes[0].set_ylabel("PSNR of unseen objects, dB")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,71 @@
+"""How the time of one view grows with pixels, samples and planes, by the default protocol."""
+
+from __future__ import annotations
+
+import statistics
+from dataclasses import replace
+from pathlib import Path
+
+from kornia.geometry.camera import PinholeCamera
+
+from benchmarks._timing import timed
+from benchmarks.objects import held_out
+from benchmarks.reporting import Row
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.rendering.renderer import Marched
+
+__all__ = ["growth", "plot_growth"]
+
+
+def growth(model: HyperPlanes, quick: bool) -> list[Row]:
+    """Seconds of one view as pixels, samples a ray and planes grow, each from 128x128, 96 steps, 25 planes.
+
+    Networks of another number of planes than the model's are not trained: their pictures mean nothing, but every
+    sample costs what it costs.
+    """
+    rows: list[Row] = []
+    sizes, steps, counts = (32, 64, 128, 256, 512), (24, 48, 96, 192, 384), (1, 5, 10, 25, 50, 100)
+    task = held_out(1, 128)[0]
+    adapted, one = model.adapt(task.support), camera.select(task.query.cameras, [3])
+    settings: list[tuple[str, int, AdaptedField, PinholeCamera, Marched]] = []
+    settings += [("pixels", n, adapted, camera.resized(one, n, n), Marched()) for n in sizes]
+    settings += [("steps", n, adapted, one, Marched(n)) for n in steps]
+    for count in counts:
+        config = ModelConfig(network=replace(model.config.network, planes=count), hypernetwork=None)
+        untrained = HyperPlanes(config)
+        support = held_out(1, 128, 2 * count)[0].support
+        untrained.set_rig(support)
+        settings.append(("planes", count, replace(untrained.adapt(support), occupancy=adapted.filled), one, Marched()))
+    for axis, value, field, cameras, sampling in settings:
+        _ = field.filled
+        field.render(cameras, sampling)
+        taken = [timed(lambda f=field, c=cameras, s=sampling: f.render(c, s)) for _ in range(1 if quick else 3)]
+        row: Row = {"name": f"growth with {axis}", "growth": axis, "value": value, "samples": taken[0][1].samples}
+        rows.append(row | {"seconds": statistics.median(seconds for seconds, _ in taken)})
+    return rows
+
+
+def plot_growth(rows: list[Row], path: Path) -> None:
+    """Seconds of one view along each axis of `growth`, with a line of the slope that the samples asked for explain."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axes = figure.subplots(1, 3, sharey=True)
+    labels = {"pixels": "pixels a side", "steps": "steps along the diameter", "planes": "ImagePlanes"}
+    for where, (axis, label) in zip(axes, labels.items(), strict=True):
+        found = [row for row in rows if row["growth"] == axis]
+        values = [float(row["value"]) for row in found]
+        seconds = [float(row["seconds"]) for row in found]
+        samples = [float(row["samples"]) for row in found]
+        middle = len(found) // 2
+        where.plot(values, seconds, "o-", ms=4, label="one view")
+        explained = [seconds[middle] * each / samples[middle] for each in samples]
+        where.plot(values, explained, "--", color="0.6", label="in proportion to the samples asked for")
+        where.set(xscale="log", yscale="log", xlabel=label)
+        where.grid(alpha=0.3, which="both")
+    axes[0].set_ylabel("seconds")
+    axes[0].legend(fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
