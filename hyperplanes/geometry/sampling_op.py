@@ -59,7 +59,7 @@ def sample_backward(
 
 def _spread(work: Callable[[int, int], None], pieces: int) -> None:
     """The work in a few calls a thread: each sets memory aside, whose first touch takes a tenth of a plane's time."""
-    share(work, pieces, -(-pieces // (2 * torch.get_num_threads())))
+    share(work, pieces, -(-pieces // (4 * torch.get_num_threads())))
 
 
 def _chunk(total: int, planes: int) -> int:
