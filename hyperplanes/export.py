@@ -239,8 +239,7 @@ def extract_mesh(field: AdaptedField, *, voxels: int = 128, level: float | None 
     live = occupancy.dilated().contains(points).nonzero()[:, 0]
     density = torch.zeros(len(points), device=device)
     for part in live.split(1 << 16):
-        straight_down = torch.tensor([0.0, -1.0, 0.0], device=device).expand(len(part), 3)
-        density[part] = field(points[part], straight_down)[1]
+        density[part] = field.density(points[part])
     if not float(density.max()) > level:
         raise ValueError(
             f"level: expected less than the highest density, {float(density.max()):.3g}, got {level:.3g}; "
