@@ -64,6 +64,8 @@ def plot_growth(rows: list[Row], path: Path) -> None:
         explained = [seconds[middle] * each / samples[middle] for each in samples]
         where.plot(values, explained, "--", color="0.6", label="in proportion to the samples asked for")
         where.set(xscale="log", yscale="log", xlabel=label)
+        where.set_xticks(values, [f"{value:.0f}" for value in values])
+        where.set_xticks([], minor=True)
         where.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("seconds")
     axes[0].legend(fontsize=8)
