@@ -46,6 +46,7 @@ class Lighting:
         sky: Ambient light on a surface that faces up, linear RGB.
         ground: Ambient light on a surface that faces down, linear RGB.
         follows_camera: Whether the lights' directions are in OpenCV camera axes instead of world axes.
+        lasting: Whether so much is lit by it that a renderer may compile it in.
 
     Raises:
         ValueError: If there are too many lights, a direction is not a unit vector or a colour is negative.
@@ -55,6 +56,7 @@ class Lighting:
     sky: Vector
     ground: Vector
     follows_camera: bool = False
+    lasting: bool = False
 
     def __post_init__(self) -> None:
         if len(self.lights) > MAX_LIGHTS:
@@ -146,6 +148,7 @@ _STUDIO = Lighting(
     ),
     sky=_grey(0.40),
     ground=_grey(0.27),
+    lasting=True,
 )
 
 _HEADLIGHT = Lighting(

@@ -18,7 +18,13 @@ from pyrender import Mesh, MetallicRoughnessMaterial, Node, Primitive, Renderer,
 
 from data_gen.lighting import Lighting
 from data_gen.sample_buffers import SampleBuffers
-from data_gen.surface_program import CLEAR_TEXELS, SOLID_TEXELS, SurfaceProgram
+from data_gen.surface_program import (
+    CLEAR_TEXELS,
+    SOLID_TEXELS,
+    SurfaceProgram,
+    constants_of_lighting,
+    constants_of_surface,
+)
 from data_gen.surfaces import Surface
 
 __all__ = ["Drawable", "SurfaceRenderer"]
@@ -41,6 +47,7 @@ class Drawable:
 
     Attributes:
         defines: What its program needs to be compiled with.
+        constants: What of its material may be compiled in.
     """
 
     def __init__(self, surface: Surface, textures: dict[int, Texture]) -> None:
@@ -68,6 +75,7 @@ class Drawable:
             "CLEAR": not surface.opaque or surface.cutoff is not None,
             "ALIGNED": _aligned(surface),
         }
+        self.constants = constants_of_surface(surface)
         self.defines |= {name: 1 for name, needed in needs.items() if needed}
         self.centre = surface.positions[surface.faces].mean(axis=(0, 1))
 
@@ -90,7 +98,7 @@ class SurfaceRenderer(Renderer):
         if drawables:
             scene.add_node(Node(mesh=Mesh([drawable.primitive for drawable in drawables])))
         self._update_context(scene, RenderFlags.NONE)
-        return sorted(drawables, key=lambda drawable: (not drawable.surface.opaque, sorted(drawable.defines.items())))
+        return sorted(drawables, key=lambda drawable: (not drawable.surface.opaque, _program_key(drawable)))
 
     def draw(
         self,
@@ -169,9 +177,10 @@ class SurfaceRenderer(Renderer):
     def _bind(self, drawable: Drawable, bound: SurfaceProgram | None, view: Any) -> SurfaceProgram:
         programs: dict[tuple[Any, ...], SurfaceProgram] = self.__dict__.setdefault("_surface_programs", {})
         defines = drawable.defines | {"LIGHTS": len(view[-1])}
-        key = tuple(sorted(defines.items()))
+        constants = drawable.constants | constants_of_lighting(view[2])
+        key = (*sorted(defines.items()), *sorted(constants.items()))
         if key not in programs:
-            programs[key] = SurfaceProgram(defines)
+            programs[key] = SurfaceProgram(defines, constants)
         program = programs[key]
         if program is not bound:
             GL.glUseProgram(program.handle)
@@ -188,6 +197,10 @@ class SurfaceRenderer(Renderer):
         drawable.primitive._bind()
         GL.glDrawElements(GL.GL_TRIANGLES, drawable.surface.faces.size, GL.GL_UNSIGNED_INT, c_void_p(0))
         drawable.primitive._unbind()
+
+
+def _program_key(drawable: Drawable) -> tuple[Any, ...]:
+    return (*sorted(drawable.defines.items()), *sorted(drawable.constants.items()))
 
 
 def _aligned(surface: Surface) -> bool:

@@ -24,7 +24,16 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from data_gen.visuals import texture_of, visual_of
 
-__all__ = ["MAX_METALLIC", "MAX_TEXTURE_SIDE", "MIN_ROUGHNESS", "RasteriseError", "Surface", "linear", "surfaces_of"]
+__all__ = [
+    "DEFAULT_ROUGHNESS",
+    "MAX_METALLIC",
+    "MAX_TEXTURE_SIDE",
+    "MIN_ROUGHNESS",
+    "RasteriseError",
+    "Surface",
+    "linear",
+    "surfaces_of",
+]
 
 MAX_METALLIC = 0.3
 """Metalness above this is drawn as this."""
