@@ -51,16 +51,25 @@ def interleaved(ways: dict[str, Callable[[], object]], repeats: int, seconds: fl
         for name in names[turn % len(names) :] + names[: turn % len(names)]:
             begun, computed = time.perf_counter(), time.process_time()
             ways[name]()
+            wait()
             times[name].processor.append(time.process_time() - computed)
             times[name].wall.append(time.perf_counter() - begun)
     return times
 
 
 def timed(run: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of a call, and what it returned."""
+    """Seconds of a call, all that it left to a GPU included, and what it returned."""
+    wait()
     begun = time.perf_counter()
     result = run()
+    wait()
     return time.perf_counter() - begun, result
+
+
+def wait() -> None:
+    """Until a GPU, where there is one, has done what it was asked for."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
 
 
 def ratio(reference: list[float], ours: list[float]) -> dict[str, float]:

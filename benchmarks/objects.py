@@ -16,7 +16,7 @@ __all__ = ["held_out"]
 FIRST_SEED = 900_000
 
 
-def held_out(count: int, size: int, views: int = 50) -> list[Task]:
+def held_out(count: int, size: int, views: int = 50, device: torch.device | str = "cpu") -> list[Task]:
     """Procedural cars never trained on, half of the views support and half query, on the training rig."""
     rig = fixed(views, size)
     cameras = camera.pinhole(
@@ -28,7 +28,7 @@ def held_out(count: int, size: int, views: int = 50) -> list[Task]:
             mesh = prepare_scene(make("car", seed), f"car-{seed}")
             pixels = torch.tensor(rasteriser.render(render_ready(mesh), rig).rgba).permute(0, 3, 1, 2).float() / 255
             masks = pixels[:, 3:]
-            seen = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks)
+            seen = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks).to(device)
             even = torch.arange(0, views, 2)
             tasks.append(Task(seen[even], seen[even + 1], mesh.name))
     return tasks

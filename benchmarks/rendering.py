@@ -44,27 +44,28 @@ def main(arguments: list[str]) -> int:
     """Measure, print, and write the rows where asked.
 
     Args:
-        arguments: --quick, --json FILE, --checkpoint FOLDER.
+        arguments: --quick, --json FILE, --plot FILE, --checkpoint FOLDER, --device NAME.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks rendering", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="64 pixels and one object, about a minute")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="a trained model (default: %(default)s)")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the growth goes (PNG)")
+    parser.add_argument("--device", default="cpu", help="what renders (default: %(default)s)")
     parser.add_argument("--memory", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
-    model = HyperPlanes.from_pretrained(options.checkpoint)
+    model = HyperPlanes.from_pretrained(options.checkpoint).to(options.device)
     if options.memory:
         return large_view(model)
     rows: list[Row] = []
     for size, count in ((64, 2),) if options.quick else ((64, 3), (128, 3), (200, 2), (400, 1)):
-        tasks = held_out(count, size)
+        tasks = held_out(count, size, device=options.device)
         rows += compare(model, tasks)
         rows += parts(model, tasks[0])
         rows += [] if options.quick else baked(model, tasks[0])
     if not options.quick:
-        rows.append(fifty_views(model, held_out(1, 200)[0]))
-        rows.append(peak_memory(options.checkpoint))
+        rows.append(fifty_views(model, held_out(1, 200, device=options.device)[0]))
+        rows.append(peak_memory(options.checkpoint, options.device))
     if options.plot:
         grown = growth(model, options.quick)
         plot_growth(grown, options.plot)
@@ -96,8 +97,8 @@ def paper_view(adapted: AdaptedField, query: Views, view: int) -> tuple[float, f
 
 def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
     """One view of each object by both protocols: ours, the paper's, ours again."""
-    rows, ratios, paper_seconds, our_seconds, adapt_seconds = [], [], [], [], []
-    paper_errors, our_errors, samples, paper_samples = [], [], [], []
+    rows, ratios, paper_seconds, our_seconds, adapt_seconds = [], [], [], [], [], []
+    paper_errors, our_errors, samples, paper_samples, refine_seconds = [], [], [], [], []
     for number, task in enumerate(tasks):
         view = (7 * number + 3) % len(task.query)
         adapt, adapted = timed(lambda task=task: model.adapt(task.support))
@@ -110,7 +111,8 @@ def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
         ratios.append(slow / fast)
         paper_seconds.append(slow)
         our_seconds.append(fast)
-        adapt_seconds.append(adapt + refine)
+        adapt_seconds.append(adapt)
+        refine_seconds.append(refine)
         paper_errors.append(paper_error)
         our_errors.append(our_error)
         samples.append(pictures.samples / (task.query.size[0] * task.query.size[1]))
@@ -131,6 +133,7 @@ def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
             "reference_psnr": paper_psnr,
             "psnr_loss": paper_psnr - our_psnr,
             "adapt_seconds": statistics.median(adapt_seconds),
+            "refine_seconds": statistics.median(refine_seconds),
         }
     )
     return rows
@@ -216,9 +219,10 @@ def baked(model: HyperPlanes, task: Task) -> list[Row]:
     ]
 
 
-def peak_memory(checkpoint: Path) -> Row:
+def peak_memory(checkpoint: Path, device: str) -> Row:
     """Peak resident memory of a process that adapts to 25 support views and renders one view of 800x800."""
     command = [sys.executable, "-m", "benchmarks", "rendering", "--memory", "--checkpoint", str(checkpoint)]
+    command += ["--device", device]
     answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     seconds, peak = answer.split()[-2:]
     return {

@@ -27,15 +27,16 @@ def growth(model: HyperPlanes, quick: bool) -> list[Row]:
     """
     rows: list[Row] = []
     sizes, steps, counts = (32, 64, 128, 256, 512), (24, 48, 96, 192, 384), (1, 5, 10, 25, 50, 100)
-    task = held_out(1, 128)[0]
+    device = model.rig.device
+    task = held_out(1, 128, device=device)[0]
     adapted, one = model.adapt(task.support), camera.select(task.query.cameras, [3])
     settings: list[tuple[str, int, AdaptedField, PinholeCamera, Marched]] = []
     settings += [("pixels", n, adapted, camera.resized(one, n, n), Marched()) for n in sizes]
     settings += [("steps", n, adapted, one, Marched(n)) for n in steps]
     for count in counts:
         config = ModelConfig(network=replace(model.config.network, planes=count), hypernetwork=None)
-        untrained = HyperPlanes(config)
-        support = held_out(1, 128, 2 * count)[0].support
+        untrained = HyperPlanes(config).to(device)
+        support = held_out(1, 128, 2 * count, device)[0].support
         untrained.set_rig(support)
         settings.append(("planes", count, replace(untrained.adapt(support), occupancy=adapted.filled), one, Marched()))
     for axis, value, field, cameras, sampling in settings:

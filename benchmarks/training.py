@@ -52,32 +52,34 @@ def main(arguments: list[str]) -> int:
     """Measure, print, and write the rows where asked.
 
     Args:
-        arguments: --quick, --curves STEPS, --json FILE, --plot FILE.
+        arguments: --quick, --curves STEPS, --json FILE, --plot FILE, --device NAME.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks training", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="the quick preset alone, few steps")
     parser.add_argument("--curves", type=int, metavar="STEPS", help="train both this far instead, which takes long")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the curves goes (PNG)")
+    parser.add_argument("--device", default="cpu", help="what trains (default: %(default)s)")
     options = parser.parse_args(arguments)
     rows: list[Row] = []
     if options.curves:
         chosen = preset("paper-128-brief")
-        rows = curves(chosen, Objects(held_out(10, chosen.resolution)), options.curves)
+        rows = curves(chosen, Objects(held_out(10, chosen.resolution, device=options.device)), options.curves)
         if options.plot:
             plot(rows, options.plot)
         return finish("training", rows, options.json)
     for name in ("quick",) if options.quick else ("quick", "small", "paper-128"):
         chosen = preset(name)
-        rows += compare(name, chosen, Objects(held_out(2 + UNSEEN, chosen.resolution)), 3 if options.quick else 8)
+        tasks = held_out(2 + UNSEEN, chosen.resolution, device=options.device)
+        rows += compare(name, chosen, Objects(tasks), 3 if options.quick else 8)
     return finish("training", rows, options.json)
 
 
 def both(chosen: Preset, objects: Objects) -> dict[str, Trainer]:
     """A training by each path, always from the same weights, with everything about its objects ready."""
-    trainers = {}
+    device, trainers = objects.task(objects.names("test")[0]).support.images.device, {}
     for path, sampling in (("packed", chosen.model.sampling), ("dense", DENSE)):
-        model = HyperPlanes(replace(chosen.model, sampling=sampling))
+        model = HyperPlanes(replace(chosen.model, sampling=sampling)).to(device)
         trainers[path] = Trainer(model, objects, replace(chosen.training, rays=RAYS, tasks=1, warmup=10, final=1.0))
         for name in objects.names("train"):
             trainers[path].warm(name)

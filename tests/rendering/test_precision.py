@@ -1,0 +1,38 @@
+"""What a GPU's shorter matrix products do to pictures, seen without one."""
+
+import torch
+from torch.nn.functional import linear
+
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.fields import base
+from hyperplanes.geometry.cameras import select
+from hyperplanes.metrics import psnr
+from hyperplanes.rendering.renderer import shorter_products
+from hyperplanes.views import Views
+from tests.reference_rendering import ring
+
+
+def test_products_of_a_gpu_are_shorter_there_alone_and_for_a_while():
+    before = torch.get_float32_matmul_precision()
+    for name, expected in (("cpu", before), ("cuda", "high")):
+        with shorter_products(torch.device(name)):
+            assert torch.get_float32_matmul_precision() == expected
+        assert torch.get_float32_matmul_precision() == before
+
+
+def test_pictures_bear_the_shorter_products_of_a_gpu(monkeypatch):
+    # Source of truth: operands rounded to 10 bits of fraction by hand, as tensor cores read them.
+    model = HyperPlanes.from_pretrained("cars-64")
+    generator = torch.Generator().manual_seed(0)
+    views = Views(torch.rand(25, 3, 64, 64, generator=generator), ring(25, (64, 64)), torch.ones(25, 1, 64, 64))
+    exact = model.adapt(views).render(select(views.cameras, [0, 9])).images
+
+    def rounded(value):
+        bits = value.contiguous().view(torch.int32)
+        return (bits + (1 << 12) >> 13 << 13).view(torch.float32)
+
+    monkeypatch.setattr(base, "linear", lambda x, weight, bias: linear(rounded(x), rounded(weight), bias))
+    short = model.adapt(views).render(select(views.cameras, [0, 9])).images
+    assert exact.std() > 0.02
+    assert not torch.equal(short, exact)
+    assert psnr(short, exact).min() > 60
