@@ -97,7 +97,7 @@ def paper_view(adapted: AdaptedField, query: Views, view: int) -> tuple[float, f
 
 def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
     """One view of each object by both protocols: ours, the paper's, ours again."""
-    rows, ratios, paper_seconds, our_seconds, adapt_seconds = [], [], [], [], [], []
+    rows, ratios, paper_seconds, our_seconds, adapt_seconds = [], [], [], [], []
     paper_errors, our_errors, samples, paper_samples, refine_seconds = [], [], [], [], []
     for number, task in enumerate(tasks):
         view = (7 * number + 3) % len(task.query)
