@@ -17,14 +17,14 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.rendering.marching import march
+from hyperplanes.rendering.light import compiled_light, light_arriving
 from hyperplanes.rendering.renderer import Marched
 from hyperplanes.rendering.voxels import cast_through_voxels, compiled_caster, empty_around
 
 __all__ = ["BakedScene", "bake"]
 
 CHUNK = 1 << 12
-LIGHT = 64  # voxels an axis of the grid in which light is followed
+LIGHT = 128  # voxels an axis of the grid in which light is followed; half of that where it is not compiled
 UNSEEN = 0.02  # where less than this of any light arrives, nobody looks
 THIN = 0.005  # what hides less than this of what is behind it, over 1/128 of the scene's diameter, is left out
 
@@ -88,12 +88,15 @@ def bake(adapted: AdaptedField, *, side: int = 256, directions: int = 24) -> Bak
     """
     if directions < HARMONICS:
         raise ValueError(f"directions: expected at least {HARMONICS}, one a harmonic, got {directions}")
-    coarser = max(2, side // LIGHT)
+    light = LIGHT if compiled_light() else LIGHT // 2
+    coarser = max(2, side // light)
     if side % coarser or not 8 <= side <= LARGEST_SIDE:
         raise ValueError(f"side: expected a multiple of {coarser} from 8 to {LARGEST_SIDE}, got {side}")
     view = camera.fibonacci_sphere(directions, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
     coarse = _resampled(adapted.filled, side // coarser)
-    arriving = _visibility(coarse, _density_at(adapted, coarse.centres()), view)
+    thickness = torch.zeros_like(coarse.occupied, dtype=view.dtype)
+    thickness[coarse.occupied] = _density_at(adapted, coarse.centres()) * coarse.voxel
+    arriving = light_arriving(thickness, coarse.occupied.nonzero(), view)
     seen = torch.zeros_like(coarse.occupied)
     seen[coarse.occupied] = arriving.amax(1) > UNSEEN
     row = torch.zeros(coarse.occupied.numel(), dtype=torch.long, device=view.device)
@@ -142,28 +145,6 @@ def _resampled(occupancy: Occupancy, side: int) -> Occupancy:
 
 def _density_at(adapted: AdaptedField, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
     return torch.cat([adapted.density(part) for part in points.split(CHUNK)] or [points.new_zeros(0)])
-
-
-def _visibility(
-    occupancy: Occupancy, density: Float[Tensor, " voxel"], view: Float[Tensor, "direction 3"]
-) -> Float[Tensor, "voxel direction"]:
-    """How much of a ray that travels along each direction arrives at each occupied voxel."""
-    grid = torch.zeros(occupancy.occupied.numel(), device=density.device)
-    grid[occupancy.occupied.flatten()] = density
-    result = []
-    for part in occupancy.centres().split(CHUNK):
-        count = len(part) * len(view)
-        origins = part[:, None].expand(-1, len(view), -1).reshape(-1, 3)
-        back = -view[None].expand(len(part), -1, -1).reshape(-1, 3)
-        # out of the object, leaving the voxel itself behind first
-        near = torch.full((count,), occupancy.voxel, device=part.device)
-        rays = Rays(origins, back, near, torch.full_like(near, 2 * occupancy.bounds.radius))
-        samples = march(rays, occupancy, occupancy.voxel)
-        places = origins[samples.ray] + samples.middles[:, None] * back[samples.ray]
-        thickness = grid[occupancy.index(places)] * occupancy.voxel
-        hidden = torch.zeros(count, device=part.device).index_add(0, samples.ray, thickness)
-        result.append(torch.exp(-hidden).reshape(len(part), len(view)))
-    return torch.cat(result) if result else density.new_zeros(0, len(view))
 
 
 def _harmonics(

@@ -14,6 +14,8 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.metrics import psnr
+from hyperplanes.rendering import light
+from hyperplanes.rendering.light import compiled_light, light_arriving
 from hyperplanes.rendering.renderer import Marched
 from hyperplanes.rendering.voxels import cast_through_voxels, compiled_caster, empty_around
 
@@ -129,3 +131,24 @@ def test_rays_leap_over_no_voxel():
     for cell in torch.cartesian_prod(*[torch.arange(7)] * 3):
         nearest = min(int((cell - filled).abs().max()) for filled in cells)
         assert int(away[tuple(cell)]) == nearest
+
+
+def test_light_through_a_slab_is_beer_lambert():
+    # Closed form: exp(-thickness of the voxels between a voxel and the outside).
+    thickness = torch.full((8, 8, 8), 0.3)
+    cells = torch.tensor([[4, 4, 1], [4, 4, 7]])
+    upward, downward = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
+    found = light_arriving(thickness, cells, torch.tensor([upward, downward]))
+    layers = torch.tensor([[1.0, 6.0], [7.0, 0.0]])
+    torch.testing.assert_close(found, torch.exp(-0.3 * layers))
+
+
+@pytest.mark.skipif(compiled_light() is None, reason="numba, which compiles the walk, is not installed")
+def test_compiled_light_is_that_of_plain_torch(monkeypatch):
+    # Source of truth: the same walk with all cells at once, step by step.
+    generator = torch.Generator().manual_seed(0)
+    thickness = torch.rand(12, 12, 12, generator=generator) * (torch.rand(12, 12, 12, generator=generator) < 0.3)
+    cells, directions = torch.randint(0, 12, (50, 3), generator=generator), camera.fibonacci_sphere(9, 1.0)[:, 2, :3]
+    compiled = light_arriving(thickness, cells, directions)
+    monkeypatch.setattr(light, "compiled_light", lambda: None)
+    torch.testing.assert_close(light_arriving(thickness, cells, directions), compiled)
