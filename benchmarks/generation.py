@@ -6,8 +6,8 @@ disturbances, and for about as long each. The loop draws with what pyrender does
 which one is shaded; ours shades each of four, or of nine, the default.
 
 Speed is told by the clock, and by processor time, which counts all that the processes computed on any core and is less
-disturbed by others on the machine. A thousand objects are extrapolated, from the time until the first is done and that
-of each further one, unless --full makes them.
+disturbed by others on the machine; `load` is how many processes wanted a core, ours included. A thousand objects are
+extrapolated, from the time until the first is done and that of each further one, unless --full makes them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks._timing import ratio
@@ -96,24 +95,23 @@ def compare(renderer: str, folder: Path, *, rounds: int, objects: int) -> list[R
     # Nothing is deleted between rounds: ext4 looks long for an inode among those that were deleted a moment ago.
     for turn in range(rounds):
         if renderer.startswith("pyrender"):
-            loop.append(measured(partial(loop_images, objects // 6, folder / f"loop{turn}", renderer)))
+            loop.append(looped(objects // 6, folder / f"loop{turn}", renderer))
         for supersample in counts:
             ours[supersample].append(generated(objects, folder / f"ours{supersample}_{turn}", supersample))
     rows: list[Row] = []
     for supersample, runs in ours.items():
         row: Row = {"name": f"generate, {supersample**2} samples a pixel", "renderer": renderer, "rounds": rounds}
-        row |= {"workers": _cores(), "objects": objects, **_speed(runs)}
+        row |= {"workers": _cores(), "objects": objects, "load": os.getloadavg()[0], **_speed(runs)}
         if loop:
             row |= {f"reference_{key}": value for key, value in _speed(loop).items()}
             row |= ratio(*([run.wall / run.images for run in side] for side in (loop, runs)))
             processor = ratio(*([run.processor / run.images for run in side] for side in (loop, runs)))
             row["processor_speedup"] = processor["speedup"]
         rows.append(row)
-    seconds = [run.first + (THOUSAND - 1) * run.each for run in ours[SUPERSAMPLE]]
+    seconds, theirs = ([run.first + (THOUSAND - 1) * run.each for run in runs] for runs in (ours[SUPERSAMPLE], loop))
     last: Row = {"name": "1,000 objects x 50 views at 128x128", "seconds_extrapolated": statistics.median(seconds)}
-    if loop:
-        images = THOUSAND * VIEWS
-        last["reference_seconds_extrapolated"] = statistics.median(images * run.wall / run.images for run in loop)
+    if theirs:
+        last |= {"reference_seconds_extrapolated": statistics.median(theirs), **ratio(theirs, seconds)}
     return [*rows, last]
 
 
@@ -173,18 +171,22 @@ def generated(objects: int, out: Path, supersample: int = SUPERSAMPLE) -> Run:
     return Run(whole.images, whole.wall, whole.processor, ends[0] - begun, each)
 
 
-def loop_images(objects: int, out: Path, renderer: str) -> int:
-    """Run the obvious loop in a process of its own.
+def looped(objects: int, out: Path, renderer: str) -> Run:
+    """What the obvious loop takes, in a process of its own.
 
     Args:
         objects: how many cars.
         out: where to.
         renderer: that draws, one of pyrender's.
-
-    Returns:
-        How many images it wrote.
     """
-    return int(_part("loop", objects, out, PYOPENGL_PLATFORM=renderer.removeprefix("pyrender-"))["images"])
+    told: dict[str, float] = {}
+
+    def run() -> int:
+        told.update(_part("loop", objects, out, PYOPENGL_PLATFORM=renderer.removeprefix("pyrender-")))
+        return int(told["images"])
+
+    whole = measured(run)
+    return replace(whole, first=told["first"], each=told["each"])
 
 
 def stages(renderer: str, objects: int, folder: Path) -> list[Row]:
