@@ -4,7 +4,8 @@
 `kornia_batched` takes all cameras at once, with the points expanded to every camera. `torch` is our plain reference,
 `cpu` the fused kernel on the images themselves, `cpu_packed` the same on 32 bits a pixel (the default where images
 need no gradient), `triton` the fused kernel on a GPU. A lookup is one point on one plane, colours and coordinates out.
-Points are random in a ball, the worst case for caches. Sampling alone starts from Kornia's coordinates.
+Points are random in a ball, the worst case for caches. Sampling alone starts from Kornia's coordinates. Every way is
+called three times in a row, as work calls it again and again, before the next has its turn.
 
 `speedup` is wall time over `kornia_loop`'s in the same round, with quartiles; `speedup_processor` compares the
 processor time of both, which other work on the machine disturbs less. With `--threads 1` the two are alike.
@@ -27,6 +28,8 @@ from benchmarks.reporting import Row, environment
 
 __all__ = ["main"]
 
+CALLS = 3  # in a row
+
 COLUMNS = ["part", "gradient", "way", "million_lookups_per_second", "speedup", "speedup_low", "speedup_high"]
 COLUMNS += ["speedup_processor", "over_batched", "over_batched_processor", "peak_megabytes", "needed_megabytes"]
 COLUMNS += ["copy_fraction"]
@@ -43,7 +46,7 @@ def measure(scene: Scene, part: str, gradient: bool, repeats: int, bandwidth: fl
         bandwidth: of a copy on this machine, in bytes a second; without it, memory is not looked at.
     """
     calls = runs(*ways(scene, part), gradient)
-    times = interleaved(calls, repeats)
+    times = interleaved(calls, repeats, row=CALLS)
     rows = []
     for name, taken in times.items():
         middle = statistics.median(taken.wall)
