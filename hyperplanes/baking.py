@@ -46,7 +46,8 @@ class BakedScene:
         """The pictures that the cameras see; compiled on a CPU with numba, packed torch elsewhere."""
         bounds = self.field.bounds
         if compiled_caster() is None or self.field.index.device.type != "cpu":
-            return AdaptedField(self.field, self.field.occupancy, Marched(self.steps)).render(cameras)
+            sampling = Marched(self.steps, 1e-3)
+            return AdaptedField(self.field, self.field.occupancy, sampling).render(cameras, sampling)
         step = 2 * bounds.radius / self.steps
 
         def see(rays: Rays) -> Rendered:

@@ -105,7 +105,7 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
         ) from None
     if expected is not None:
         check_tensors(path, found, expected)
-    return found
+    return {name: value.clone() for name, value in found.items()}  # in memory of its own, as aligned as what was saved
 
 
 def check_tensors(path: Path, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:

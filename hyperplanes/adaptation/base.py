@@ -106,12 +106,14 @@ class AdaptedField:
 
         Args:
             cameras: any number, one image size, on any device and in any precision.
-            sampling: another protocol than the field's own.
+            sampling: another protocol than the field's own, whose samples are made twice as dense for pictures where
+                they are marched.
 
         Returns:
             One picture a camera, where the field is.
         """
-        sampling = sampling or self.sampling
+        if sampling is None:
+            sampling = self.sampling.finer if isinstance(self.sampling, Marched) else self.sampling
         cameras = camera.to(cameras, self.occupancy.occupied.device)
         if isinstance(sampling, Hierarchical):
             return photograph(

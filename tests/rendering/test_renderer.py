@@ -302,7 +302,7 @@ def test_a_threshold_of_zero_never_stops():
     whole = render(fog(50.0), rays, Marched(64, 0.0), occupancy=GRID)
     assert whole.samples == len(march(rays, GRID, 2 / 64))
     torch.testing.assert_close(
-        whole.colour, render(fog(50.0), rays, Marched(64), occupancy=GRID).colour, atol=1e-3, rtol=0
+        whole.colour, render(fog(50.0), rays, Marched(64, 1e-3), occupancy=GRID).colour, atol=1e-3, rtol=0
     )
 
 
