@@ -63,7 +63,7 @@ def main(arguments: list[str]) -> int:
         tasks = held_out(count, size, device=options.device)
         rows += compare(model, tasks)
         rows += parts(model, tasks[0])
-        rows += [] if options.quick else baked(model, tasks[0])
+        rows += [] if options.quick or size > 200 else baked(model, tasks[0])
     if not options.quick:
         rows.append(fifty_views(model, held_out(1, 200, device=options.device)[0]))
         rows.append(peak_memory(options.checkpoint, options.device))
@@ -191,14 +191,14 @@ def parts(model: HyperPlanes, task: Task) -> list[Row]:
 def baked(model: HyperPlanes, task: Task) -> list[Row]:
     """The baked form against the field it was made from: speed and what it costs."""
     adapted = model.adapt(task.support)
-    query = task.query[::5]
+    query = task.query[::8]
     _ = adapted.filled
     baking, field = timed(lambda: bake(adapted))
     scene = BakedScene(field)
     scene.render(camera.select(query.cameras, [0]))  # compiles
     slow, fast = [], []
     pictures: list[Pictures] = []
-    for _ in range(3):
+    for _ in range(2):
         seconds, before = timed(lambda: adapted.render(query.cameras))
         slow.append(seconds / len(query))
         seconds, after = timed(lambda: scene.render(query.cameras))

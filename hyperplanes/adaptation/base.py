@@ -106,8 +106,8 @@ class AdaptedField:
 
         Args:
             cameras: any number, one image size, on any device and in any precision.
-            sampling: another protocol than the field's own, whose samples are made twice as dense for pictures where
-                they are marched.
+            sampling: another protocol than the field's own, whose samples are made denser for pictures where they
+                are marched.
 
         Returns:
             One picture a camera, where the field is.
