@@ -47,7 +47,7 @@ def main(arguments: list[str]) -> int:
         arguments: --quick, --json FILE, --plot FILE, --checkpoint FOLDER, --device NAME.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks rendering", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="64 pixels and one object, about a minute")
+    parser.add_argument("--quick", action="store_true", help="64 pixels alone, about a minute")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="a trained model (default: %(default)s)")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the growth goes (PNG)")
