@@ -107,7 +107,7 @@ class BakedField:
     def save(self, path: Path | str) -> None:
         """Write one compact file: a bit a voxel, and a row of half precision density and a byte a coefficient.
 
-        Bytes divide the range of each coefficient, so that pictures change by about a grey level of 255.
+        Bytes divide the range of each coefficient, so that pictures change by less than a grey level of 255.
         """
         bits = (self.index >= 0).flatten().reshape(-1, 8).to(torch.uint8)
         packed = (bits * (2 ** torch.arange(8, device=bits.device)).to(torch.uint8)).sum(1, dtype=torch.uint8)

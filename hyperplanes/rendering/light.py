@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from typing import no_type_check
@@ -12,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from hyperplanes.geometry.threads import share
+from hyperplanes.rendering.machine_code import machine_code
 
 __all__ = ["compiled_light", "light_arriving"]
 
@@ -19,14 +19,9 @@ CELLS = 1 << 12  # that are looked at together
 DARK = 12.0  # thickness behind which nothing is left of single precision
 
 
-@functools.cache
 def compiled_light() -> Callable[..., None] | None:
     """The compiled walk through the voxels, or None where numba is missing."""
-    try:
-        import numba
-    except ImportError:
-        return None
-    return numba.njit(fastmath=True, error_model="numpy", nogil=True, cache=True)(_walk)
+    return machine_code(_walk)
 
 
 def light_arriving(

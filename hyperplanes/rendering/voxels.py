@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from typing import no_type_check
@@ -15,6 +14,7 @@ from torch import Tensor
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.geometry.threads import share
 from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.rendering.machine_code import machine_code
 
 __all__ = ["cast_through_voxels", "compiled_caster", "empty_around"]
 
@@ -22,14 +22,9 @@ FAR = 255  # no voxel is farther from a filled one, as far as it is counted
 RAYS = 1 << 10  # that a thread takes at once
 
 
-@functools.cache
 def compiled_caster() -> Callable[..., int] | None:
     """The compiled ray caster, or None where numba is missing."""
-    try:
-        import numba
-    except ImportError:
-        return None
-    return numba.njit(fastmath=True, error_model="numpy", nogil=True, cache=True)(_cast)
+    return machine_code(_cast)
 
 
 def empty_around(index: Int[Tensor, "x y z"]) -> UInt8[Tensor, "cell_x cell_y cell_z"]:

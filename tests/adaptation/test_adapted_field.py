@@ -42,6 +42,14 @@ def test_a_picture_is_what_its_rays_see(sampling, size):
 
 
 @torch.no_grad()
+def test_pictures_are_marched_with_five_samples_for_three():
+    cameras = ring(2, (12, 12))
+    field = adapted(Marched(48, 0.0))
+    assert torch.equal(field.render(cameras).images, field.render(cameras, Marched(80, 0.0)).images)
+    assert field.render(cameras).samples > 1.5 * field.render(cameras, Marched(48, 0.0)).samples
+
+
+@torch.no_grad()
 def test_one_pixel_against_the_loop():
     cameras = camera_at((0.0, 0.0, 3.0), (5, 5))
     pictures = adapted(Hierarchical(40, 0)).render(cameras)
