@@ -17,7 +17,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hyperplanes.adaptation.fine_tuning import FineTuned
+    from hyperplanes.adaptation.fine_tuned import FineTuned
+    from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
     from hyperplanes.adaptation.nearest_view import NearestView
     from hyperplanes.data import DataError, Dataset, open_dataset, read_task, read_views
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 _HOMES = {
     "DataError": "data",
     "Dataset": "data",
-    "FineTuned": "adaptation.fine_tuning",
+    "FineTuned": "adaptation.fine_tuned",
+    "FineTuning": "adaptation.fine_tuning",
     "HyperPlanes": "adaptation.hyperplanes",
     "ImagePlanes": "geometry",
     "Lookup": "geometry",
@@ -60,6 +62,7 @@ __all__ = [
     "DataError",
     "Dataset",
     "FineTuned",
+    "FineTuning",
     "HyperPlanes",
     "ImagePlanes",
     "Lookup",

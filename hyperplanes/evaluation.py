@@ -3,31 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean
 
 from hyperplanes.adaptation.base import Adapter, Pictures
-from hyperplanes.adaptation.fine_tuning import FineTuned
-from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.episodes import naming
 from hyperplanes.metrics import psnr, ssim
 from hyperplanes.training import Tasks
 from hyperplanes.views import Task
 
-__all__ = ["METHODS", "ObjectScore", "Score", "evaluate", "make_method"]
-
-METHODS: dict[str, str] = {
-    "nearest_view": "the nearest support view, copied",
-    "nerf": "NeRF, one set of weights for all objects",
-    "multiplane": "MultiPlaneNeRF, one set of weights for all objects",
-    "point_multiplane": "PointMultiPlaneNeRF, one set of weights for all objects",
-    "hyperplanes": "HyperPlanes in one step",
-    "hyperplanes_10": "HyperPlanes after 10 fine-tuning steps",
-    "hyperplanes_100": "HyperPlanes after 100 fine-tuning steps",
-}
+__all__ = ["ObjectScore", "Score", "evaluate"]
 
 
 @dataclass(frozen=True)
@@ -67,30 +53,6 @@ class Score:
             **{name: self.mean(name) for name in names},
             "objects": {each.name: {name: getattr(each, name) for name in names} for each in self.objects},
         }
-
-
-def make_method(name: str, checkpoints: Mapping[str, Path]) -> Adapter:
-    """The adapter behind a method's name.
-
-    Args:
-        name: one of METHODS.
-        checkpoints: folders by "hyperplanes", "point_multiplane" and so on.
-
-    Returns:
-        An adapter.
-
-    Raises:
-        ValueError: an unknown name, or a checkpoint that the method needs and that is not given.
-    """
-    if name not in METHODS:
-        raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {name!r}")
-    if name == "nearest_view":
-        return NearestView()
-    family, _, steps = name.rpartition("_") if name[-1].isdigit() else (name, "", "")
-    if family not in checkpoints:
-        raise ValueError(f"method {name}: expected a checkpoint of {family}, got none; `hyperplanes train` makes one")
-    model = HyperPlanes.from_pretrained(checkpoints[family])
-    return FineTuned(model, int(steps)) if steps else model
 
 
 def evaluate(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import torch
 
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Renderable
 from hyperplanes.adaptation.configuration import checkpoint_folder
-from hyperplanes.adaptation.fine_tuning import FineTuned
+from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.data.upright import upright_task
@@ -27,7 +27,6 @@ __all__ = [
     "choose_device",
     "find_checkpoints",
     "load_model",
-    "on_device",
 ]
 
 
@@ -92,15 +91,6 @@ class ByProtocol:
         return replace(made, sampling=self.sampling)
 
 
-def on_device(adapter: Adapter, device: torch.device) -> Adapter:
-    """The method with its weights on a device."""
-    if isinstance(adapter, HyperPlanes):
-        return adapter.to(device)
-    if isinstance(adapter, FineTuned):
-        return FineTuned(adapter.model.to(device), adapter.steps)
-    return adapter
-
-
 def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
     """Checkpoints by the method that trained them.
 
@@ -140,15 +130,15 @@ def load_model(folder: Path) -> HyperPlanes:
     return HyperPlanes.from_pretrained(found.get("hyperplanes") or next(iter(found.values())))
 
 
-def adapt(model: HyperPlanes, support: Views, steps: int = 0) -> AdaptedField:
-    """The field of an object in one step, or after some more.
-
-    Raises:
-        ValueError: a negative number of steps, or fine-tuning a model without a hypernetwork.
-    """
-    if steps < 0:
-        raise ValueError(f"steps: expected 0 or more, got {steps}")
-    return model.fine_tune(support, steps) if steps else model.adapt(support)
+def adapt(
+    model: HyperPlanes,
+    support: Views,
+    steps: Steps = 0,
+    settings: FineTuning | None = None,
+    on_step: Callable[[int], None] | None = None,
+) -> AdaptedField:
+    """The field of an object in one step, or after fine-tuning; as `HyperPlanes.adapt` and `HyperPlanes.fine_tune`."""
+    return model.fine_tune(support, steps, settings, on_step=on_step) if steps else model.adapt(support)
 
 
 @torch.no_grad()

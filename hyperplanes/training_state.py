@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors, write_json
+from hyperplanes.optimisers import Muon
 
 __all__ = ["Curve", "check_model", "load_state", "save_state"]
 
@@ -97,10 +98,11 @@ def load_state(
     weights = {f"model.{name}": value for name, value in model.state_dict().items()}
     moments: dict[str, Tensor] = {}
     for index, optimiser in enumerate(optimisers):
+        names = ("momentum",) if isinstance(optimiser, Muon) else ("step", "exp_avg", "exp_avg_sq")
         for place, parameter in enumerate(value for group in optimiser.param_groups for value in group["params"]):
-            if f"{index}.{place}.step" in found:
-                moments[f"{index}.{place}.step"] = torch.zeros(())
-                moments |= {f"{index}.{place}.{name}": parameter for name in ("exp_avg", "exp_avg_sq")}
+            if f"{index}.{place}.{names[0]}" in found:  # absent where no gradient has reached the parameter yet
+                moments |= {f"{index}.{place}.{name}": parameter for name in names if name != "step"}
+                moments |= {f"{index}.{place}.{name}": torch.zeros(()) for name in names if name == "step"}
     check_tensors(folder / saved["state"], found, {**weights, **moments})
     model.load_state_dict({name: found[f"model.{name}"] for name in model.state_dict()})
     for index, optimiser in enumerate(optimisers):

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import NearestView, Pictures
-from hyperplanes.adaptation.fine_tuning import FineTuned
-from hyperplanes.evaluation import METHODS, ObjectScore, Score, evaluate, make_method
+from hyperplanes.evaluation import ObjectScore, Score, evaluate
 from hyperplanes.metrics import psnr, ssim
 from tests.reference_rendering import Balls, small_model
 
@@ -90,28 +89,6 @@ def test_a_row_in_json():
 def test_nothing_to_evaluate_on_is_refused():
     with pytest.raises(ValueError, match="names: expected at least one object to evaluate on, got none"):
         evaluate("nearest_view", NearestView(), Balls(), [])
-
-
-def test_methods_by_name(tmp_path):
-    full, plain = tmp_path / "full", tmp_path / "plain"
-    small_model().save(full)
-    small_model(hypernetwork=None).save(plain)
-    folders = {"hyperplanes": full} | dict.fromkeys(("nerf", "multiplane", "point_multiplane"), plain)
-    made = {name: make_method(name, folders) for name in METHODS}
-    assert isinstance(made["nearest_view"], NearestView)
-    assert made["point_multiplane"].hypernetwork is None
-    assert made["hyperplanes"].hypernetwork is not None
-    for name, steps in (("hyperplanes_10", 10), ("hyperplanes_100", 100)):
-        assert isinstance(made[name], FineTuned)
-        assert made[name].steps == steps
-
-
-def test_unknown_methods_and_missing_checkpoints_are_refused():
-    with pytest.raises(ValueError, match="method: expected one of nearest_view, .*, got 'magic'"):
-        make_method("magic", {})
-    for name, family in (("hyperplanes_10", "hyperplanes"), ("point_multiplane", "point_multiplane")):
-        with pytest.raises(ValueError, match=f"method {name}: expected a checkpoint of {family}, got none"):
-            make_method(name, {})
 
 
 @pytest.mark.parametrize("broken", ["query", "masks"])

@@ -167,7 +167,7 @@ def test_only_training_objects_are_trained_on():
     for _ in range(6):
         trainer.take_step()
     assert set(asked) <= set(data.names("train"))
-    trainer.held_out_psnr()
+    trainer.look()
     assert asked[-1] in data.names("test")
 
 
@@ -185,7 +185,7 @@ def test_progress_is_reported_with_the_held_out_quality(tmp_path):
 
 
 def test_no_held_out_objects_have_no_quality():
-    assert Trainer(small_model(), Balls(test=0), FAST).held_out_psnr() is None
+    assert Trainer(small_model(), Balls(test=0), FAST).look() == (None, None)
 
 
 def test_no_training_object_is_refused():
@@ -305,7 +305,7 @@ def test_the_papers_protocol_carves_no_hull_unless_empty_space_is_asked_for(monk
     dense = {"coarse_network": True, "sampling": Hierarchical(4, 4)}
     trainer = Trainer(small_model(**dense), Balls(), FAST)
     trainer.take_step()
-    trainer.held_out_psnr()
+    trainer.look()
     assert not carved
     Trainer(small_model(**dense), Balls(), with_(empty_points=8)).take_step()
     assert carved
@@ -318,8 +318,8 @@ def test_held_out_objects_are_of_the_validation_split_where_there_is_one():
     data.splits["val"] = ["test1"]
     trainer = Trainer(small_model(), data, FAST)
     asked.clear()
-    first = trainer.held_out_psnr()
-    assert trainer.held_out_psnr() == first
+    first = trainer.look()
+    assert trainer.look() == first
     assert asked == ["test1"]  # and its planes and hull are kept between looks
 
 
@@ -330,7 +330,7 @@ def test_a_look_at_held_out_objects_is_adapting_and_rendering():
     task = data.task("test0")
     views = task.query[[0, 2]]
     expected = psnr(trainer.model.adapt(task.support).render(views.cameras).images, views.images).mean()
-    assert trainer.held_out_psnr() == pytest.approx(expected.item())
+    assert trainer.look()[0] == pytest.approx(expected.item())
     assert trainer.model.training
 
 

@@ -1,18 +1,27 @@
 """Methods: support views -> a field."""
 
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Renderable
-from hyperplanes.adaptation.fine_tuning import FineTuned
+from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
+from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig, Prepared
 from hyperplanes.adaptation.nearest_view import NearestView
+from hyperplanes.adaptation.swapped import Swapped
 
 __all__ = [
     "AdaptedField",
     "Adapter",
+    "Diagnostics",
     "FineTuned",
+    "FineTuning",
+    "FromScratch",
     "HyperPlanes",
     "ModelConfig",
     "NearestView",
     "Pictures",
     "Prepared",
     "Renderable",
+    "Swapped",
+    "diagnose",
+    "swap_gap",
 ]

@@ -24,6 +24,7 @@ LARGEST = {
     "depth": 256,
     "width": 8192,
     "code": 8192,
+    "rank": 1024,
     "planes": 1024,
     "views": 1024,
     "point_octaves": 32,

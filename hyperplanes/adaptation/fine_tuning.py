@@ -1,28 +1,182 @@
-"""HyperPlanes-10 and HyperPlanes-100: the hypernetwork refined on the support views of each object."""
+"""Fine-tuning: some steps of gradient descent on the support views of one object (HyperPlanes, section 3)."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.optimisers import make_optimisers
+from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Views
 
-__all__ = ["FineTuned"]
+__all__ = ["FineTuning", "Steps", "best_stop", "minimise", "ray_loss", "ray_span"]
+
+Steps: TypeAlias = int | Literal["auto"]
+
+JUDGED = 4096  # rays of left-out views that "auto" compares
+CHECKS = 10  # times that it compares them
+
+RATES: dict[str, tuple[str, float, float]] = {
+    "weights": ("muon", 2e-3, 0.03),
+    "hypernetwork": ("adam", 3e-4, 0.0),
+    "scratch": ("muon", 4e-3, 0.05),
+}
+"""What is optimised: by which optimiser, the learning rate of Adam, that of Muon. Chosen by measurement, see
+docs/adaptation.md."""
 
 
 @dataclass(frozen=True)
-class FineTuned:
-    """A model that takes some steps on every object before it answers.
+class FineTuning:
+    """How a field is fine-tuned.
 
     Attributes:
-        model: never changed.
-        steps: of fine-tuning an object.
+        free: what is optimised: "weights", theta + delta itself; "hypernetwork", a copy of the hypernetwork while theta
+            is frozen, as in the paper; or "scratch", weights that begin at random, the control of both.
+        rays: a step, drawn from all support views.
+        optimiser: "muon" or "adam"; the best for what is free, see RATES, where None.
+        learning_rate: of Adam at the first step; that of RATES where None.
+        muon_learning_rate: of Muon at the first step; that of RATES where None.
+        final: what the rates fall to along half a cosine, as a fraction.
+        longest: the most steps that "auto" may choose.
+        left_out: every so many-th support view is left out of the planes and of the rays while "auto" chooses.
+        seed: of rays and samples, and of random weights.
     """
 
-    model: HyperPlanes
-    steps: int
+    free: Literal["weights", "hypernetwork", "scratch"] = "weights"
+    rays: int = 512
+    optimiser: Literal["adam", "muon"] | None = None
+    learning_rate: float | None = None
+    muon_learning_rate: float | None = None
+    final: float = 0.1
+    longest: int = 300
+    left_out: int = 6
+    seed: int = 0
 
-    def adapt(self, support: Views) -> AdaptedField:
-        """The field after fine-tuning on the support views."""
-        return self.model.fine_tune(support, self.steps)
+    def optimisers(self, variables: Sequence[Tensor]) -> list[torch.optim.Optimizer]:
+        """The optimisers of what is free, at the rates of the first step."""
+        name, adam, muon = RATES[self.free]
+        return make_optimisers(
+            variables,
+            self.optimiser or name,
+            adam if self.learning_rate is None else self.learning_rate,
+            muon if self.muon_learning_rate is None else self.muon_learning_rate,
+            betas=(0.9, 0.99),
+        )
+
+    def schedule(self, step: int, steps: int) -> float:
+        """What the rates are multiplied with at a step, counted from 0."""
+        return self.final + (1 - self.final) * (1 + math.cos(math.pi * step / max(1, steps))) / 2
+
+
+def ray_loss(seen: Rendered, truth: Tensor) -> Tensor:
+    """Mean squared error of the colours of rays, that of the coarse pass added where there was one (Eq. 2)."""
+    loss = (seen.colour - truth).square().mean()
+    return loss if seen.coarse is None else loss + (seen.coarse - truth).square().mean()
+
+
+def minimise(
+    field: Callable[[], AdaptedField],
+    variables: Sequence[Tensor],
+    support: Views,
+    steps: int,
+    settings: FineTuning,
+    *,
+    pixels: Int[Tensor, " pixel"] | None = None,
+    stop: int | None = None,
+    on_step: Callable[[int], None] | None = None,
+) -> None:
+    """Gradient steps on the squared error of rays of the support views.
+
+    Args:
+        field: the field that the variables make.
+        variables: what is optimised, in place.
+        support: where rays and their colours come from.
+        steps: length of the schedule.
+        settings: rays, rates and seed.
+        pixels: flat indices (view, row, column) to draw from; all where absent.
+        stop: end after so many steps of the schedule.
+        on_step: called with the number of steps done, before the first and after each.
+    """
+    optimisers = settings.optimisers(variables)
+    rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
+    generator = torch.Generator().manual_seed(settings.seed)
+    if on_step is not None:
+        on_step(0)
+    with torch.enable_grad():
+        for step in range(steps if stop is None else stop):
+            made = field()
+            rays, truth = support.sample_rays(settings.rays, generator=generator, among=pixels, span=ray_span(made))
+            loss = ray_loss(made.trace(rays, generator), truth)
+            for variable in variables:
+                variable.grad = None
+            loss.backward()
+            for optimiser, rate in zip(optimisers, rates, strict=True):
+                optimiser.param_groups[0]["lr"] = rate * settings.schedule(step, steps)
+                optimiser.step()
+            if on_step is not None:
+                on_step(step + 1)
+
+
+def best_stop(
+    field: Callable[[], AdaptedField],
+    variables: Sequence[Tensor],
+    support: Views,
+    left_out: Views,
+    settings: FineTuning,
+    *,
+    pixels: Int[Tensor, " pixel"] | None = None,
+    judged: Int[Tensor, " judged"] | None = None,
+) -> int:
+    """After how many steps of a schedule of `settings.longest` the field shows left-out views best; 0 for none.
+
+    Judged on the squared error of the same JUDGED rays at 0 steps and at every CHECKS-th part of the schedule; ends
+    early after two checks without improvement.
+
+    Args:
+        field: as in `minimise`.
+        variables: as in `minimise`.
+        support: the views that rays are drawn from.
+        left_out: the views that decide.
+        settings: as in `minimise`.
+        pixels: as in `minimise`.
+        judged: flat indices of the pixels of `left_out` that count.
+
+    Returns:
+        A number of steps.
+    """
+    generator = torch.Generator().manual_seed(settings.seed + 1)
+    with torch.no_grad():
+        made = field()
+        rays, truth = left_out.sample_rays(JUDGED, generator=generator, among=judged, span=ray_span(made))
+    errors: dict[int, float] = {}
+    every = max(1, settings.longest // CHECKS)
+
+    class Finished(Exception):  # noqa: N818 - it ends the loop, nothing is wrong
+        pass
+
+    def check(step: int) -> None:
+        if step not in (0, settings.longest, every // 3) and step % every:
+            return
+        with torch.no_grad():
+            error = float((field().trace(rays).colour - truth).square().mean())
+        errors[step] = error if math.isfinite(error) else math.inf
+        if step - min(errors, key=lambda each: errors[each]) > 2 * every:
+            raise Finished
+
+    with suppress(Finished):
+        minimise(field, variables, support, settings.longest, settings, pixels=pixels, on_step=check)
+    return min(errors, key=lambda each: errors[each])
+
+
+def ray_span(field: AdaptedField) -> str:
+    """Where the rays of a field begin and end, as `geometry.cast` names it."""
+    return "sphere" if isinstance(field.sampling, Marched) else "depth"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
+from hyperplanes.adaptation.fine_tuning import FineTuning, Steps, best_stop, minimise
 from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors, write_json
 from hyperplanes.fields import TARGETS, Target
 from hyperplanes.geometry import cameras as camera
@@ -125,7 +126,7 @@ class HyperPlanes(nn.Module):
         Returns:
             All that depends on the support views and not on weights.
         """
-        support = self._at_home(support)
+        support = self._to_own(support)
         views = self.arrange(support)
         side = self.config.hull_side
         region = hull(support, side) if carved else full(support.bounds, 1, support.images.device)
@@ -154,7 +155,7 @@ class HyperPlanes(nn.Module):
             )
         return rig
 
-    def _at_home(self, support: Views) -> Views:
+    def _to_own(self, support: Views) -> Views:
         """The views where the weights are, in their precision or at least single."""
         return support.to(self.rig.device, torch.promote_types(self.rig.dtype, torch.float32))
 
@@ -168,14 +169,18 @@ class HyperPlanes(nn.Module):
         Returns:
             One tensor a parameter of the updated layers.
         """
+        return self.updates([prepared], hypernetwork)[0]
+
+    def updates(self, prepared: Sequence[Prepared], hypernetwork: HyperNetwork | None = None) -> list[Parameters]:
+        """The updates of several objects, whose HyperPlanes are encoded in one batch; as `update`."""
         theta = self.theta if hypernetwork is None else self.theta.detach()
         hypernetwork = hypernetwork or self.hypernetwork
         if hypernetwork is None:
-            return Parameters()
+            return [Parameters() for _ in prepared]
         chosen = self.hyperplanes()
-        images = prepared.views.images[chosen]
-        directions = camera.viewing_directions(prepared.views.cameras)[chosen]
-        return hypernetwork(images, directions, theta)
+        images = torch.stack([each.views.images[chosen] for each in prepared])
+        directions = torch.stack([camera.viewing_directions(each.views.cameras)[chosen] for each in prepared])
+        return cast("list[Parameters]", hypernetwork(images, directions, theta))
 
     def field(self, prepared: Prepared, parameters: Parameters) -> AdaptedField:
         """The field of given weights on prepared planes (HyperPlanes, Eq. 5)."""
@@ -198,53 +203,83 @@ class HyperPlanes(nn.Module):
     def fine_tune(
         self,
         support: Views,
-        steps: int,
+        steps: Steps,
+        settings: FineTuning | None = None,
         *,
-        rays: int = 1024,
-        learning_rate: float = 3e-4,
-        seed: int = 0,
+        on_step: Callable[[int], None] | None = None,
     ) -> AdaptedField:
-        """The field of one object after some more steps of the hypernetwork on its support views, theta frozen.
+        """The field of one object after gradient steps on its support views; the model itself stays as it is.
 
-        The model itself stays as it is (HyperPlanes, section 3, fine-tuning).
+        It begins at theta + delta, the field of `adapt`. Either these weights themselves are optimised, or, as in the
+        paper, a copy of the hypernetwork while theta is frozen (HyperPlanes, section 3, fine-tuning).
 
         Args:
             support: the views of the object.
-            steps: Adam steps on rays of the support views.
-            rays: a step.
-            learning_rate: of Adam.
-            seed: of the rays and their samples.
+            steps: gradient steps on rays of the support views, or "auto": as many, up to `settings.longest`, as show
+                support views best that were left out for the purpose; 0 where every step made those worse.
+            settings: what is optimised, rates, rays and seed.
+            on_step: called with the number of steps done, before the first and after each.
 
         Returns:
-            The field of theta + delta, delta by the refined hypernetwork.
+            The field.
 
         Raises:
-            ValueError: a model without a hypernetwork.
+            ValueError: the hypernetwork of a model that has none, a negative number of steps, or "auto" with fewer
+                than 3 views.
         """
-        if self.hypernetwork is None:
+        settings = settings or FineTuning()
+        if settings.free == "hypernetwork" and self.hypernetwork is None:
             raise ValueError("fine_tune: expected a model with a hypernetwork, got one without")
-        support = self._at_home(support)
+        if steps != "auto" and steps < 0:
+            raise ValueError(f"steps: expected 0 or more, or 'auto', got {steps}")
+        support = self._to_own(support)
+        schedule, stop = (settings.longest, self._best_stop(support, settings)) if steps == "auto" else (steps, steps)
         prepared = self.prepare(support)
-        tuned = copy.deepcopy(self.hypernetwork).eval()
-        theta = self.theta.detach()
-        optimiser = torch.optim.Adam(tuned.parameters(), learning_rate)
-        generator = torch.Generator().manual_seed(seed)
-        marched = isinstance(self.config.sampling, Marched)
-        live = footprint(prepared.occupancy, support.cameras).flatten().nonzero()[:, 0] if marched else None
-        span = "sphere" if marched else "depth"
-        with torch.enable_grad():
-            for _ in range(steps):
-                field = self.field(prepared, theta + self.update(prepared, tuned))
-                sampled, truth = support.sample_rays(rays, generator=generator, among=live, span=span)
-                seen = field.trace(sampled, generator)
-                loss = (seen.colour - truth).square().mean()
-                if seen.coarse is not None:
-                    loss = loss + (seen.coarse - truth).square().mean()
-                optimiser.zero_grad()
-                loss.backward()
-                optimiser.step()
+        field, variables = self._tunable(prepared, settings)
+        pixels = self._live_pixels(prepared, support)
+        minimise(field, variables, support, schedule, settings, pixels=pixels, stop=stop, on_step=on_step)
         with torch.no_grad():
-            return self.field(prepared, theta + self.update(prepared, tuned))
+            return field()
+
+    def _best_stop(self, support: Views, settings: FineTuning) -> int:
+        """How many steps of fine-tuning show left-out views best; they are neither planes nor give rays meanwhile."""
+        if len(support) < 3:
+            raise ValueError(f"steps: expected at least 3 support views to choose their number by, got {len(support)}")
+        every = min(settings.left_out, len(support))
+        left_out = torch.arange(len(support)) % every == every // 2
+        shown, judged = support[(~left_out).nonzero()[:, 0]], support[left_out.nonzero()[:, 0]]
+        prepared = self.prepare(shown)
+        field, variables = self._tunable(prepared, settings)
+        return best_stop(
+            field,
+            variables,
+            shown,
+            judged,
+            settings,
+            pixels=self._live_pixels(prepared, shown),
+            judged=self._live_pixels(prepared, judged),
+        )
+
+    def _tunable(
+        self, prepared: Prepared, settings: FineTuning
+    ) -> tuple[Callable[[], AdaptedField], list[torch.Tensor]]:
+        """The field as a function of what fine-tuning optimises, and the tensors that it optimises."""
+        if settings.free == "hypernetwork":
+            tuned = copy.deepcopy(self.hypernetwork)
+            assert tuned is not None
+            tuned = tuned.eval().requires_grad_(True)
+            theta = self.theta.detach()
+            return lambda: self.field(prepared, theta + self.update(prepared, tuned)), list(tuned.parameters())
+        with torch.no_grad(), _in_use(self):
+            start = self.theta + self.update(prepared)
+        free = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
+        return lambda: self.field(prepared, free if torch.is_grad_enabled() else free.detach()), list(free.values())
+
+    def _live_pixels(self, prepared: Prepared, views: Views) -> Int[Tensor, " pixel"] | None:
+        """Flat indices of the pixels of views that look into the hull; None where all are drawn from."""
+        if not isinstance(self.config.sampling, Marched):
+            return None
+        return footprint(prepared.occupancy, views.cameras).flatten().nonzero()[:, 0]
 
     def save(self, folder: Path | str) -> None:
         """Write model.json and model.safetensors."""

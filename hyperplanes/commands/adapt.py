@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import Up
-from hyperplanes.commands.render import read_scene
+from hyperplanes.commands.options import Free, Steps, Up
+from hyperplanes.commands.render import after_steps, read_scene
 from hyperplanes.words import duration
 
 __all__ = ["Arguments", "run"]
@@ -30,7 +30,9 @@ class Arguments:
         checkpoint: What `train` or `demo` wrote.
         views: The posed images of the object.
         out: The folder for the weights.
-        steps: Fine-tuning steps on the shown views; none is the paper's single step.
+        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
+            single forward pass.
+        fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         all_views: Show the model every view, not only the support half.
         up: The axis that points up in the world of the views: y as in training data, z as in Blender.
         device: auto, cpu or cuda.
@@ -39,7 +41,8 @@ class Arguments:
     checkpoint: Path
     views: Path
     out: Path
-    steps: int = 0
+    steps: Steps = 0
+    fine_tune: Free = "weights"
     all_views: bool = False
     up: Up = "y"
     device: str = "auto"
@@ -47,16 +50,19 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Adapt and write the weights."""
+    from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.models import adapt, adapted_model, choose_device, load_model
 
     console, device = Console(), choose_device(arguments.device)
     model = load_model(arguments.checkpoint).to(device)
     task = read_scene(arguments.views, arguments.all_views, arguments.up)
     started = time.perf_counter()
-    field = adapt(model, task.support.to(device), arguments.steps)
+    settings, taken = FineTuning(free=arguments.fine_tune), []
+    field = adapt(model, task.support.to(device), arguments.steps, settings, taken.append)
     seconds = time.perf_counter() - started
     adapted_model(model, field).save(arguments.out)
-    console.say(f"{arguments.out}: adapted to {len(task.support)} views of {task.name} in {duration(seconds)}")
+    how = f"in {duration(seconds)}{after_steps(taken)}"
+    console.say(f"{arguments.out}: adapted to {len(task.support)} views of {task.name} {how}")
     up = "" if arguments.up == "y" else f" --up {arguments.up}"
     console.say(f"next: hyperplanes render --checkpoint {arguments.out} --views {arguments.views}{up} --out new-views")
     return 0

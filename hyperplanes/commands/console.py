@@ -42,6 +42,10 @@ class Bar:
             self._printed = time.monotonic()
             self._console.print(f"{self._title} {done}/{total}  {text}", markup=False, highlight=False, soft_wrap=True)
 
+    def warn(self, line: str) -> None:
+        """A line on standard error, above the progress line."""
+        _warn(line)
+
 
 class Console:
     """Standard output for results, standard error for warnings."""
@@ -56,7 +60,7 @@ class Console:
 
     def warn(self, line: str) -> None:
         """A line on standard error."""
-        RichConsole(file=sys.stderr).print(line, markup=False, highlight=False, soft_wrap=True)
+        _warn(line)
 
     def table(self, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """A table; all columns but the first are aligned to the right."""
@@ -92,3 +96,7 @@ class Console:
         )
         with Progress(*columns, console=self._out) as progress:
             yield Bar(self._out, progress, title)
+
+
+def _warn(line: str) -> None:
+    RichConsole(file=sys.stderr).print(line, markup=False, highlight=False, soft_wrap=True)

@@ -3,8 +3,12 @@
 Every method goes through the same code: it is shown the support views of an object and judged by the others. The data
 set may be one that `generate` wrote or a single posed scene, such as a folder with transforms.json.
 
+A method's name may end in a number of fine-tuning steps on the support views of each object, or in _auto. With --steps
+every method that can be fine-tuned is evaluated at each of those numbers, and --curve draws its PSNR over them.
+
 Example:
-    hyperplanes evaluate --data data/cars --checkpoint runs/cars --method nearest_view hyperplanes hyperplanes_10
+    hyperplanes evaluate --data data/cars --checkpoint runs/cars --method nearest_view hyperplanes hyperplanes_swapped
+    hyperplanes evaluate --data data/cars --checkpoint runs/cars --method hyperplanes scratch --steps 10 100
     hyperplanes evaluate --data photos/ --checkpoint runs/demo --method hyperplanes --json photos.json
 """
 
@@ -16,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalInt, Protocol, Up, optional
+from hyperplanes.commands.options import Free, OptionalInt, Protocol, Up, optional
 from hyperplanes.words import duration
 
 if TYPE_CHECKING:
@@ -33,9 +37,14 @@ class Arguments:
 
     Attributes:
         data: A data set or one posed scene.
-        method: nearest_view, point_multiplane, hyperplanes, hyperplanes_10 (after 10 fine-tuning steps) and so on.
+        method: nearest_view, nerf, multiplane, point_multiplane, hyperplanes, hyperplanes_swapped (each object with the
+            update of another) or scratch (random weights); all but the first and hyperplanes_swapped may be followed by
+            _N or _auto for fine-tuning steps.
         checkpoint: Folders that `train` wrote, or folders of them such as runs/demo.
         json: Write the table here too, with every object.
+        steps: Evaluate methods after so many fine-tuning steps, each number a row; 0 is the method itself.
+        curve: Draw PSNR over --steps into this SVG file.
+        fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         split: Which objects.
         objects: Only the first so many.
         up: The axis that points up in the data's world: y as in training data, z as in Blender.
@@ -47,6 +56,9 @@ class Arguments:
     method: tuple[str, ...] = ("nearest_view", "hyperplanes")
     checkpoint: tuple[Path, ...] = ()
     json: Annotated[Path | None, optional("FILE")] = None
+    steps: tuple[int, ...] = ()
+    curve: Annotated[Path | None, optional("FILE")] = None
+    fine_tune: Free = "weights"
     split: Literal["test", "val", "train", "all"] = "test"
     objects: OptionalInt = None
     up: Up = "y"
@@ -70,27 +82,52 @@ def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
 
 def run(arguments: Arguments) -> int:
     """Evaluate all methods and print the table."""
+    from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.checkpoints import write_json
     from hyperplanes.data import open_dataset
-    from hyperplanes.evaluation import make_method
-    from hyperplanes.models import ByProtocol, OnDevice, choose_device, find_checkpoints, on_device
+    from hyperplanes.methods import at_steps, make_method
+    from hyperplanes.models import ByProtocol, OnDevice, choose_device, find_checkpoints
     from hyperplanes.presets import PROTOCOLS
     from hyperplanes.recipes import score_all
 
+    if arguments.curve is not None and len(arguments.steps) < 2:
+        raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
     console, device = Console(), choose_device(arguments.device)
     checkpoints = find_checkpoints(arguments.checkpoint)
-    data = open_dataset(arguments.data)
+    data = OnDevice(open_dataset(arguments.data), device, arguments.up)
     names = data.names(arguments.split)[: arguments.objects]
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
-    sampling = PROTOCOLS[arguments.protocol]
-    methods = {
-        name: ByProtocol(on_device(make_method(name, checkpoints), device), sampling) for name in arguments.method
-    }
+    sampling, settings = PROTOCOLS[arguments.protocol], FineTuning(free=arguments.fine_tune)
+
+    def make(name: str) -> ByProtocol:
+        objects = (data.task(each).support for each in names)
+        return ByProtocol(make_method(name, checkpoints, device=device, settings=settings, objects=objects), sampling)
+
+    chosen = [each for name in arguments.method for each in at_steps(name, arguments.steps)]
+    methods = {name: make(name) for name in dict.fromkeys(chosen)}
     with console.bar("evaluating") as bar:
-        scores = score_all(methods, OnDevice(data, device, arguments.up), names, bar.show)
+        scores = score_all(methods, data, names, bar.show)
     if arguments.json is not None:
         write_json(arguments.json, {score.method: score.as_json() for score in scores})
+    if arguments.curve is not None:
+        _draw(scores, arguments.method, arguments.steps, arguments.curve)
+        console.say(f"{arguments.curve}: PSNR over fine-tuning steps")
     console.table(HEADINGS, rows(scores))
     console.say(f"{len(names)} objects of {arguments.data}")
     return 0
+
+
+def _draw(scores: Sequence[Score], methods: Sequence[str], steps: Sequence[int], path: Path) -> None:
+    """PSNR over fine-tuning steps of every method that was evaluated at several."""
+    from hyperplanes.checkpoints import write_whole
+    from hyperplanes.methods import at_steps
+    from hyperplanes.report.charts import line_chart, standalone
+
+    quality = {score.method: score.mean("psnr") for score in scores}
+    curves = {}
+    for method in methods:
+        named = [(count, name) for count in steps for name in at_steps(method, [count])]
+        curves[method] = [(float(count), quality[name]) for count, name in named]
+    chart = line_chart(curves, "PSNR over fine-tuning steps", "dB", horizontal="fine-tuning steps", steps=True)
+    write_whole(path, standalone(chart).encode())

@@ -14,13 +14,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalFolder
 
-__all__ = ["Arguments", "checkpoint_lines", "run"]
+if TYPE_CHECKING:
+    from hyperplanes.adaptation.diagnostics import Diagnostics
+
+__all__ = ["Arguments", "checkpoint_lines", "recorded_diagnostics", "run"]
 
 
 @dataclass(frozen=True)
@@ -42,9 +46,11 @@ class Arguments:
 
 def checkpoint_lines(folder: Path) -> list[str]:
     """What a checkpoint holds, a line a fact."""
+    from hyperplanes.adaptation.configuration import checkpoint_folder
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.checkpoints import read_json
 
+    folder = checkpoint_folder(folder)
     model = HyperPlanes.from_pretrained(folder)
     config = model.config
     lines = [
@@ -55,9 +61,10 @@ def checkpoint_lines(folder: Path) -> list[str]:
     if config.hypernetwork is not None and model.hypernetwork is not None:
         hyper = config.hypernetwork
         lines.append(
-            f"hypernetwork: {hyper.encoder} reads {hyper.views} views and updates {', '.join(hyper.layers)}, "
-            f"{sum(p.numel() for p in model.hypernetwork.parameters()):,} weights"
+            f"hypernetwork: {hyper.encoder} reads {hyper.views} views, {hyper.update} update of "
+            f"{', '.join(hyper.layers)}, {sum(p.numel() for p in model.hypernetwork.parameters()):,} weights"
         )
+        lines.append(f"diagnostics: {recorded_diagnostics(folder) or 'not recorded; `hyperplanes train` does'}")
     else:
         lines.append("hypernetwork: none, the same weights for every object")
     if (folder / "training.json").exists():
@@ -68,10 +75,21 @@ def checkpoint_lines(folder: Path) -> list[str]:
     return lines
 
 
+def recorded_diagnostics(folder: Path) -> Diagnostics | None:
+    """The diagnostics that the training of a checkpoint recorded last, beside its weights."""
+    from hyperplanes.adaptation.diagnostics import Diagnostics
+    from hyperplanes.checkpoints import read_json
+
+    if not (folder / "diagnostics.json").exists():
+        return None
+    return Diagnostics.of_json(read_json(folder / "diagnostics.json"), folder / "diagnostics.json")
+
+
 def run(arguments: Arguments) -> int:
     """Describe it; 1 when a data set is not as it should be."""
     console = Console()
-    if (arguments.path / "model.json").exists():
+    packaged = len(arguments.path.parts) == 1 and not arguments.path.exists()
+    if packaged or (arguments.path / "model.json").exists():
         for line in checkpoint_lines(arguments.path):
             console.say(line)
         return 0

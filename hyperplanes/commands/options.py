@@ -7,7 +7,17 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-__all__ = ["OptionalFolder", "OptionalInt", "OptionalName", "OptionalNumber", "Protocol", "Up", "optional"]
+__all__ = [
+    "Free",
+    "OptionalFolder",
+    "OptionalInt",
+    "OptionalName",
+    "OptionalNumber",
+    "Protocol",
+    "Steps",
+    "Up",
+    "optional",
+]
 
 
 def optional(metavar: str, **options: Any) -> Any:
@@ -22,6 +32,12 @@ OptionalNumber = Annotated[int | float | None, optional("NUMBER")]
 
 Protocol = Literal["default", "paper"]
 """A name in `hyperplanes.presets.PROTOCOLS`."""
+
+Steps = int | Literal["auto"]
+"""Fine-tuning steps, or as many as show left-out views best."""
+
+Free = Literal["weights", "hypernetwork"]
+"""What fine-tuning optimises."""
 
 Up = Literal["y", "z"]
 """The axis that points up in the world of posed images."""

@@ -12,18 +12,19 @@ Example:
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalInt, Protocol, Up, optional
+from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, Up, optional
 from hyperplanes.words import duration
 
 if TYPE_CHECKING:
     from hyperplanes.views import Task
 
-__all__ = ["Arguments", "read_scene", "run"]
+__all__ = ["Arguments", "after_steps", "read_scene", "run"]
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,9 @@ class Arguments:
         checkpoint: What `train`, `adapt` or `demo` wrote.
         views: The posed images of the object.
         out: The folder for the pictures.
-        steps: Fine-tuning steps on the shown views; none is the paper's single step.
+        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
+            single forward pass.
+        fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         orbit: So many pictures evenly around the object, and a turntable, instead of the query poses.
         size: Pixels along the longer side of an orbit's pictures; as the images when not given.
         turntable: The format of the turntable.
@@ -47,7 +50,8 @@ class Arguments:
     checkpoint: Path
     views: Path
     out: Path
-    steps: int = 0
+    steps: Steps = 0
+    fine_tune: Free = "weights"
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"
@@ -78,8 +82,14 @@ def read_scene(path: Path, all_views: bool, up: str = "y") -> Task:
     return Task(views, views, path.resolve().name)
 
 
+def after_steps(taken: Sequence[int]) -> str:
+    """How many fine-tuning steps were taken, as the end of a sentence; nothing where there were none to take."""
+    return f", {taken[-1]} fine-tuning steps" if taken else ""
+
+
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
+    from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.checkpoints import write_whole
     from hyperplanes.export import encode_animation, orbit_cameras, save_images, to_pixels
     from hyperplanes.metrics import psnr, ssim
@@ -91,8 +101,10 @@ def run(arguments: Arguments) -> int:
     task = read_scene(arguments.views, arguments.all_views, arguments.up)
     shown, asked = task.support.to(device), task.query.to(device)
     started = time.perf_counter()
-    field = adapt(model, shown, arguments.steps)
-    console.say(f"adapted to {len(shown)} views of {task.name} in {duration(time.perf_counter() - started)}")
+    settings, taken = FineTuning(free=arguments.fine_tune), []
+    field = adapt(model, shown, arguments.steps, settings, taken.append)
+    seconds = time.perf_counter() - started
+    console.say(f"adapted to {len(shown)} views of {task.name} in {duration(seconds)}{after_steps(taken)}")
     cameras = asked.cameras
     if arguments.orbit is not None:
         cameras = orbit_cameras(shown, arguments.orbit, size=arguments.size)

@@ -90,11 +90,23 @@ def follow(trainer: Trainer, bar: Bar) -> None:
     Raises:
         KeyboardInterrupt: after Ctrl-C, with a checkpoint written and advice as its text.
     """
+    from hyperplanes.adaptation.diagnostics import SMALLEST_SPREAD
+
     quality = None
     with _polite_interrupt() as interrupted:
+        warned = False
         for progress in trainer.run():
             quality = progress.psnr if progress.psnr is not None else quality
             line = progress_line(progress, quality)
+            if progress.diagnostics is not None:
+                line += f"\n  {progress.diagnostics}"
+                if progress.diagnostics.constant and not warned:
+                    warned = True
+                    bar.warn(
+                        f"warning: at step {progress.step} the updates of different objects differ by less than "
+                        f"{SMALLEST_SPREAD:.0%} of their norm: the hypernetwork writes the same update for every "
+                        "object; see docs/hypernetwork.md for options that prevent it"
+                    )
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
             if interrupted and progress.step < progress.steps:
                 trainer.save()

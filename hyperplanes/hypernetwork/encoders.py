@@ -33,7 +33,7 @@ class ConvNet(nn.Module):
 
     def forward(self, images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view code"]:
         """One code an image; images in [0, 1] of any size."""
-        value = 1 - images  # a white background is silence
+        value = 1 - images  # so that the white background is zero
         for convolution, normalisation in zip(self.convolutions, self.normalisations, strict=True):
             value = relu(normalisation(convolution(value)))
         return self.code(self.pool(value).flatten(1))
@@ -42,7 +42,7 @@ class ConvNet(nn.Module):
 class _Bottleneck(nn.Module):
     """1x1, 3x3, 1x1 convolutions beside a shortcut (He et al. 2016, Fig. 5).
 
-    The stride is that of the 3x3 convolution, as everybody has it since; the publication strides the first 1x1.
+    The stride is that of the 3x3 convolution, as in torchvision (ResNet v1.5); the publication strides the first 1x1.
     """
 
     def __init__(self, before: int, narrow: int, stride: int, normalisation: str) -> None:

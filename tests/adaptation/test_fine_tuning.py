@@ -1,10 +1,17 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
-from hyperplanes.adaptation.fine_tuning import FineTuned
+from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.fine_tuning import FineTuning
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.metrics import psnr
 from hyperplanes.rendering import Hierarchical
 from tests.reference_rendering import awaken, ball_views, ring, small_model
+
+PAPER = FineTuning(free="hypernetwork", rays=64, learning_rate=1e-2)
+WEIGHTS = FineTuning(free="weights", rays=64, learning_rate=1e-2, muon_learning_rate=0.05)
 
 
 @pytest.fixture
@@ -17,21 +24,24 @@ def support():
     return ball_views(ring(4))
 
 
-def test_the_model_stays_as_it_is_bit_for_bit(model, support):
+def moved(model, field):
+    """Names of the parameters that differ from theta."""
+    theta = model.theta.under("fine")
+    return {name for name, value in field.parameters.items() if not torch.equal(value, theta[name])}
+
+
+@pytest.mark.parametrize("settings", [PAPER, WEIGHTS])
+def test_the_model_stays_as_it_is_bit_for_bit(model, support, settings):
     before = {name: value.clone() for name, value in model.state_dict().items()}
-    model.fine_tune(support, 3, rays=64)
+    model.fine_tune(support, 3, settings)
     after = model.state_dict()
     assert set(after) == set(before)
     assert all(torch.equal(value, after[name]) for name, value in before.items())
-
-
-def test_no_gradient_is_left_in_the_model(model, support):
-    model.fine_tune(support, 1, rays=64)
     assert all(value.grad is None for value in model.parameters())
 
 
-def test_theta_is_frozen_and_only_the_updated_layers_move(model, support):
-    fields = [model.fine_tune(support, steps, rays=64, learning_rate=1e-2).field for steps in (0, 4)]
+def test_theta_is_frozen_and_only_the_updated_layers_move_in_the_papers_way(model, support):
+    fields = [model.fine_tune(support, steps, PAPER).field for steps in (0, 4)]
     for name, value in model.theta.under("fine").items():
         first, last = fields[0].parameters[name], fields[1].parameters[name]
         if name.split(".")[0] in ("colour", "density"):
@@ -42,22 +52,31 @@ def test_theta_is_frozen_and_only_the_updated_layers_move(model, support):
         assert not last.requires_grad
 
 
-def test_no_steps_are_adapting(model, support):
+def test_all_weights_move_when_they_are_free(model, support):
+    field = model.fine_tune(support, 3, WEIGHTS).field
+    assert moved(model, field) == set(model.theta.under("fine"))
+    assert not any(value.requires_grad for value in field.parameters.values())
+
+
+@pytest.mark.parametrize("settings", [PAPER, WEIGHTS])
+def test_no_steps_are_adapting(model, support, settings):
     cameras = ring(1, shift=1)
-    assert torch.equal(model.fine_tune(support, 0).render(cameras).images, model.adapt(support).render(cameras).images)
+    tuned = model.fine_tune(support, 0, settings).render(cameras).images
+    assert torch.equal(tuned, model.adapt(support).render(cameras).images)
 
 
-def test_more_steps_fit_the_support_views_better(model, support):
+@pytest.mark.parametrize("settings", [PAPER, WEIGHTS, replace(WEIGHTS, optimiser="adam")])
+def test_more_steps_fit_the_support_views_better(model, support, settings):
     quality = [
-        psnr(tuned.render(support.cameras).images, support.images).mean()
-        for tuned in (model.fine_tune(support, steps, rays=128, learning_rate=1e-2) for steps in (0, 15))
+        psnr(model.fine_tune(support, steps, settings).render(support.cameras).images, support.images).mean()
+        for steps in (0, 15)
     ]
     assert quality[1] > quality[0] + 1
 
 
 def test_the_seed_decides(model, support):
     def picture(seed):
-        return model.fine_tune(support, 3, rays=32, seed=seed, learning_rate=1e-2).render(ring(1)).images
+        return model.fine_tune(support, 3, replace(WEIGHTS, seed=seed)).render(ring(1)).images
 
     before = torch.random.get_rng_state()
     assert torch.equal(picture(1), picture(1))
@@ -67,26 +86,85 @@ def test_the_seed_decides(model, support):
 
 def test_it_works_where_gradients_are_switched_off(model, support):
     with torch.no_grad():
-        tuned = model.fine_tune(support, 2, rays=32, learning_rate=1e-2)
+        tuned = model.fine_tune(support, 2, WEIGHTS)
     assert not torch.equal(tuned.render(ring(1)).images, model.adapt(support).render(ring(1)).images)
 
 
 def test_the_coarse_network_is_fine_tuned_beside_the_fine_one(support):
     # the outputs of this hypernetwork are zero: only a loss of the coarse picture can move the coarse weights
     both = small_model(coarse_network=True, sampling=Hierarchical(6, 6))
-    tuned = both.fine_tune(support, 1, rays=64, learning_rate=1e-2)
+    tuned = both.fine_tune(support, 1, PAPER)
     for part, field in (("fine", tuned.field), ("coarse", tuned.proposal)):
         theta = both.theta.under(part)
-        moved = {name for name, value in field.parameters.items() if not torch.equal(value, theta[name])}
-        assert moved == {"colour.weight", "colour.bias", "density.weight", "density.bias"}
+        changed = {name for name, value in field.parameters.items() if not torch.equal(value, theta[name])}
+        assert changed == {"colour.weight", "density.weight", "colour.bias", "density.bias"}
 
 
-def test_a_model_without_a_hypernetwork_has_nothing_to_tune(support):
+def test_a_model_without_a_hypernetwork_has_weights_to_tune_and_no_hypernetwork(support):
+    plain = small_model(hypernetwork=None)
+    assert moved(plain, plain.fine_tune(support, 1, WEIGHTS).field)
     with pytest.raises(ValueError, match="fine_tune: expected a model with a hypernetwork, got one without"):
-        small_model(hypernetwork=None).fine_tune(support, 1)
+        plain.fine_tune(support, 1, PAPER)
+
+
+def test_wrong_settings_are_refused(model, support):
+    with pytest.raises(ValueError, match="steps: expected 0 or more, or 'auto', got -1"):
+        model.fine_tune(support, -1)
+    with pytest.raises(ValueError, match="steps: expected at least 3 support views .*, got 2"):
+        model.fine_tune(support[:2], "auto")
+
+
+def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, support):
+    taken = []
+    ruinous = replace(WEIGHTS, learning_rate=1e30, muon_learning_rate=1e30, longest=12)  # NaN after the first step
+    field = model.fine_tune(support, "auto", ruinous, on_step=taken.append)
+    assert taken == [0]
+    cameras = ring(1, shift=1)
+    assert torch.equal(field.render(cameras).images, model.adapt(support).render(cameras).images)
+
+
+def test_auto_goes_on_where_steps_show_left_out_views_better():
+    model, support, taken = awaken(small_model()), ball_views(ring(9)), []
+    field = model.fine_tune(support, "auto", replace(WEIGHTS, longest=40, left_out=3), on_step=taken.append)
+    assert taken[-1] >= 12
+    query = ball_views(ring(4, shift=1))
+    quality = [psnr(each.render(query.cameras).images, query.images).mean() for each in (model.adapt(support), field)]
+    assert quality[1] > quality[0] + 3
+
+
+def test_left_out_views_are_neither_planes_nor_rays_while_the_number_of_steps_is_chosen(model, monkeypatch):
+    support, prepared, drawn = ball_views(ring(9)), [], []
+    prepare, sample = HyperPlanes.prepare, type(support).sample_rays
+    monkeypatch.setattr(HyperPlanes, "prepare", lambda self, views: prepared.append(views) or prepare(self, views))
+
+    def sampled(self, count, **given):
+        drawn.append((len(self), count))
+        return sample(self, count, **given)
+
+    monkeypatch.setattr(type(support), "sample_rays", sampled)
+    model.fine_tune(support, "auto", replace(WEIGHTS, longest=10, left_out=3))
+    assert [len(views) for views in prepared] == [6, 9]
+    assert drawn[0] == (3, 4096)  # the rays that judge
+    assert {count for views, count in drawn[1:]} == {64}
+    assert {views for views, _ in drawn[1:]} <= {6, 9}
 
 
 def test_as_a_method_it_takes_its_steps_on_every_object(model, support):
     cameras = ring(1, shift=1)
-    tuned = FineTuned(model, 2).adapt(support).render(cameras).images
-    assert torch.equal(tuned, model.fine_tune(support, 2).render(cameras).images)
+    tuned = FineTuned(model, 2, WEIGHTS).adapt(support).render(cameras).images
+    assert torch.equal(tuned, model.fine_tune(support, 2, WEIGHTS).render(cameras).images)
+
+
+def test_from_scratch_nothing_that_was_trained_is_used(support):
+    cameras = ring(1, shift=1)
+    pictures = []
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        model = small_model()
+        for value in model.parameters():
+            torch.nn.init.normal_(value, std=0.1 + seed)
+        pictures.append(FromScratch(model, 2, WEIGHTS).adapt(support).render(cameras).images)
+    assert torch.equal(*pictures)
+    other = FromScratch(small_model(), 2, replace(WEIGHTS, seed=1)).adapt(support).render(cameras).images
+    assert not torch.equal(pictures[0], other)
+

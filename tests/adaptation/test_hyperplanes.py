@@ -4,6 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation import HyperPlanes, ModelConfig, configuration
 from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.fields import TargetConfig
@@ -58,7 +59,7 @@ def test_what_the_hypernetwork_reads(model, support):
     seen = []
     model.hypernetwork.register_forward_pre_hook(lambda module, given: seen.append(given))
     model.adapt(support)
-    images, directions, theta = seen[0]
+    (images,), (directions,), theta = seen[0]
     assert images.shape == (2, 3, 16, 16)
     assert set(theta) == set(model.theta)
     for image, direction in zip(images, directions, strict=True):
@@ -329,7 +330,7 @@ def test_adapting_and_fine_tuning_leave_the_model_in_its_mode(support):
     before = {name: part.training for name, part in batch.named_modules()}
     statistics = {name: value.clone() for name, value in batch.named_buffers()}
     batch.adapt(support)
-    batch.fine_tune(support, 1, rays=8)
+    batch.fine_tune(support, 1, FineTuning(rays=8))
     assert {name: part.training for name, part in batch.named_modules()} == before
     assert all(torch.equal(value, statistics[name]) for name, value in batch.named_buffers())
     assert torch.equal(picture(batch, support), picture(batch.eval(), support))
@@ -338,7 +339,7 @@ def test_adapting_and_fine_tuning_leave_the_model_in_its_mode(support):
 def test_views_in_double_precision_are_taken_to_where_the_weights_are(model, support):
     double = support.to(dtype=torch.float64)
     torch.testing.assert_close(picture(model, double), picture(model, support), atol=1e-4, rtol=0)
-    model.fine_tune(double, 1, rays=8)
+    model.fine_tune(double, 1, FineTuning(rays=8))
 
 
 def test_without_a_hull_one_voxel_holds_everything(model, support):

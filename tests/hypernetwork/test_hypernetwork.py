@@ -105,7 +105,7 @@ def test_the_head_has_the_depth_and_width_of_its_configuration(depth):
 
 
 def test_gradients_reach_the_hypernetwork_the_images_and_theta():
-    network, (images, directions, theta) = make().train(), inputs()
+    network, (images, directions, theta) = make(), inputs()
     theta = {name: value.requires_grad_() for name, value in theta.items()}
     update = network(images.requires_grad_(), directions.requires_grad_(), theta)
     sum(change.square().sum() for change in update.values()).backward()
@@ -115,13 +115,68 @@ def test_gradients_reach_the_hypernetwork_the_images_and_theta():
     assert all((theta[name].grad is not None) == (name in update) for name in theta)
 
 
+def test_objects_in_one_batch_are_those_one_by_one():
+    network = make()
+    several = [inputs(seed) for seed in range(3)]
+    theta = several[0][2]
+    batch = network(torch.stack([each[0] for each in several]), torch.stack([each[1] for each in several]), theta)
+    for (images, directions, _), update in zip(several, batch, strict=True):
+        for name, value in network(images, directions, theta).items():
+            torch.testing.assert_close(value, update[name])
+
+
+@pytest.mark.parametrize("update", ["full", "scaling", "low_rank"])
+@torch.no_grad()
+def test_updates_against_their_formulas(update):
+    # Closed form: the outputs o of the row r of W become o W (full: o itself), plus U V for a low rank.
+    network = make(replace(CONFIG, update=update, layers=("all",), rank=2))
+    images, directions, theta = inputs()
+    caught = []
+    for form in network.updates:
+        form.register_forward_pre_hook(lambda module, given: caught.append(given))
+    found = network(images, directions, theta)
+    for (outputs, parameter), form, name in zip(caught, network.updates, SHAPES, strict=True):
+        if parameter.ndim == 1 or update == "full":
+            expected = outputs.reshape(parameter.shape)
+        elif update == "scaling":
+            expected = torch.stack([o * row for o, row in zip(outputs, parameter, strict=True)])
+        else:
+            rows = outputs.reshape(len(parameter), 3)
+            expected = torch.stack([r[0] * w + r[1:] @ form.right for r, w in zip(rows, parameter, strict=True)])
+        torch.testing.assert_close(found[name], expected)
+
+
+@torch.no_grad()
+def test_the_mean_of_codes_knows_no_order_of_the_views():
+    network = make(replace(CONFIG, join="mean"))
+    images, directions, theta = inputs()
+    order = [2, 0, 1]
+    shuffled = network(images[order], directions[order], theta)
+    for name, value in network(images, directions, theta).items():
+        torch.testing.assert_close(value, shuffled[name])
+    assert differs(shuffled, network(images[order], directions, theta))  # but which image has which direction
+
+
+def test_a_centred_update_has_mean_zero_over_the_objects_it_was_trained_on():
+    network = make().train()
+    objects = [inputs(seed)[:2] for seed in range(4)]
+    images, directions = (torch.stack(parts) for parts in zip(*objects, strict=True))
+    theta = inputs()[2]
+    for _ in range(400):  # the running statistics come to those of these objects
+        updates = network(images, directions, theta)
+    updates = [each.detach() for each in updates]
+    mean = {name: torch.stack([each[name] for each in updates]).mean(0) for name in updates[0]}
+    size = max(float(each[name].abs().max()) for each in updates for name in each)
+    assert max(float(value.abs().max()) for value in mean.values()) < 1e-3 * size
+
+
 def test_wrong_shapes_of_the_network_are_refused():
     with pytest.raises(
         ValueError, match=r"layers: expected \('all',\) or some of \['0', 'colour', 'density'\], got \['sigma'\]"
     ):
         make(replace(CONFIG, layers=("sigma",)))
-    with pytest.raises(ValueError, match=r"encoder: expected one of \['convnet', 'resnet101'\], got 'vgg'"):
-        make(replace(CONFIG, encoder="vgg"))
+    with pytest.raises(ValueError, match=r"encoder: expected one of 'convnet', 'resnet101', got 'vgg'"):
+        replace(CONFIG, encoder="vgg")
     images, directions, theta = inputs()
     with pytest.raises(ValueError, match="HyperPlanes: expected 3 images and directions, got 2 and 2"):
         make()(images[:2], directions[:2], theta)
@@ -145,7 +200,7 @@ def test_all_of_theta_or_the_updated_layers_are_read():
     blind = make(replace(CONFIG, weights_seen="all", see_weights=False))
     other = {name: value + 1 for name, value in theta.items()}
     assert not differs(blind(images, directions, theta), blind(images, directions, other))
-    with pytest.raises(ValueError, match="weights_seen: expected 'updated' or 'all', got 'some'"):
+    with pytest.raises(ValueError, match="weights_seen: expected one of 'updated', 'all', got 'some'"):
         make(replace(CONFIG, weights_seen="some"))
 
 

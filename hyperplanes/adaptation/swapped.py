@@ -1,0 +1,51 @@
+"""Every object with the update of another one: the control that shows whether the update depends on the object."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+import torch
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.parameters import Parameters
+from hyperplanes.views import Views
+
+__all__ = ["Swapped"]
+
+
+class Swapped:
+    """HyperPlanes with the update of the next object; planes and hull are the object's own.
+
+    Args:
+        model: with a hypernetwork.
+        objects: the support views of all objects that will be asked for, or of others; read once.
+
+    Raises:
+        ValueError: a model without a hypernetwork, or fewer than two objects.
+    """
+
+    def __init__(self, model: HyperPlanes, objects: Iterable[Views]) -> None:
+        if model.hypernetwork is None:
+            raise ValueError("swapped: expected a model with a hypernetwork, got one without")
+        self.model = model
+        self._updates: dict[str, Parameters] = {}
+        with torch.no_grad():
+            for support in objects:
+                self._updates[_digest(support)] = model.eval().update(model.prepare(support, carved=False))
+        if len(self._updates) < 2:
+            raise ValueError(f"swapped: expected at least 2 objects to swap updates of, got {len(self._updates)}")
+
+    @torch.no_grad()
+    def adapt(self, support: Views) -> AdaptedField:
+        """The field of theta plus the update of the object after this one."""
+        prepared = self.model.prepare(support)
+        known = list(self._updates)
+        own = _digest(support)
+        other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]
+        return self.model.field(prepared, self.model.theta + self._updates[other])
+
+
+def _digest(support: Views) -> str:
+    return hashlib.sha256(support.images.detach().cpu().contiguous().numpy().tobytes()).hexdigest()

@@ -1,0 +1,49 @@
+import pytest
+import torch
+
+from hyperplanes.hypernetwork.standardisation import RunningStandardisation
+
+
+def test_the_statistics_become_those_of_what_it_is_shown():
+    # Statistics: codes of known mean and variance, 4 objects a step.
+    generator = torch.Generator().manual_seed(0)
+    mean, deviation = torch.tensor([5.0, -3.0]), torch.tensor([0.1, 4.0])
+    layer = RunningStandardisation((2,), momentum=0.01)
+    for _ in range(2000):
+        layer(mean + deviation * torch.randn(4, 2, generator=generator))
+    torch.testing.assert_close(layer.mean, mean, atol=0.3, rtol=0.05)
+    torch.testing.assert_close(layer.variance.sqrt(), deviation, rtol=0.1, atol=0)
+    layer.eval()
+    codes = layer(mean + deviation * torch.randn(10_000, 2, generator=generator))
+    assert codes.mean(0).abs().max() < 0.15
+    assert (codes.std(0) - 1).abs().max() < 0.1
+
+
+def test_the_first_steps_are_averaged_evenly():
+    layer = RunningStandardisation((1,), momentum=0.1)
+    for value in (1.0, 2.0, 6.0):
+        layer(torch.tensor([[value]]))
+    assert layer.mean.item() == pytest.approx(3.0)
+
+
+def test_one_object_a_step_is_enough():
+    layer = RunningStandardisation((3,))
+    assert layer(torch.ones(1, 3)).isfinite().all()
+    assert layer(2 * torch.ones(1, 3)).isfinite().all()
+
+
+def test_evaluation_changes_nothing():
+    layer = RunningStandardisation((3,))
+    layer(torch.randn(4, 3))
+    layer.eval()
+    before = {name: value.clone() for name, value in layer.state_dict().items()}
+    layer(torch.randn(4, 3) + 7)
+    assert all(torch.equal(value, layer.state_dict()[name]) for name, value in before.items())
+
+
+def test_no_gradient_flows_through_the_statistics():
+    # Closed form: d/dx of (x - mean) / sqrt(variance + epsilon) with constant statistics.
+    layer = RunningStandardisation((2,))
+    codes = torch.randn(4, 2, requires_grad=True)
+    layer(codes).sum().backward()
+    torch.testing.assert_close(codes.grad, torch.rsqrt(layer.variance + layer.epsilon).expand(4, 2))

@@ -1,0 +1,105 @@
+import pytest
+import torch
+
+from hyperplanes.adaptation import FineTuned, FineTuning, FromScratch, NearestView, Swapped
+from hyperplanes.evaluation import evaluate
+from hyperplanes.methods import METHODS, at_steps, describe_method, make_method
+from tests.reference_rendering import Balls, awaken, small_model
+
+
+@pytest.fixture
+def folders(tmp_path):
+    full, plain = tmp_path / "full", tmp_path / "plain"
+    awaken(small_model()).save(full)
+    small_model(hypernetwork=None).save(plain)
+    return {"hyperplanes": full} | dict.fromkeys(("nerf", "multiplane", "point_multiplane"), plain)
+
+
+def test_methods_by_name(folders):
+    data = Balls(test=2)
+    objects = [data.task(name).support for name in data.names("test")]
+    made = {name: make_method(name, folders, objects=objects) for name in METHODS if name != "scratch"}
+    assert isinstance(made["nearest_view"], NearestView)
+    assert isinstance(made["hyperplanes_swapped"], Swapped)
+    assert made["point_multiplane"].hypernetwork is None
+    assert made["hyperplanes"].hypernetwork is not None
+
+
+@pytest.mark.parametrize("name", ["hyperplanes", "point_multiplane", "nerf", "scratch"])
+@pytest.mark.parametrize("steps", [1, 37, "auto"])
+def test_any_number_of_fine_tuning_steps(folders, name, steps):
+    settings = FineTuning(rays=7)
+    made = make_method(f"{name}_{steps}", folders, settings=settings)
+    assert isinstance(made, FromScratch if name == "scratch" else FineTuned)
+    assert (made.steps, made.settings) == (steps, settings)
+
+
+@pytest.mark.parametrize("name", ["magic", "scratch", "nearest_view_10", "hyperplanes_swapped_3", "hyperplanes_", ""])
+def test_unknown_methods_are_refused(name):
+    with pytest.raises(ValueError, match=f"method: expected one of nearest_view, .*, got '{name}'"):
+        make_method(name, {})
+
+
+@pytest.mark.parametrize(
+    ("name", "family"),
+    [("hyperplanes_10", "hyperplanes"), ("point_multiplane", "point_multiplane"), ("scratch_1", "hyperplanes")],
+)
+def test_missing_checkpoints_are_named(name, family):
+    with pytest.raises(ValueError, match=f"method {name}: expected a checkpoint of {family}, got none"):
+        make_method(name, {})
+
+
+def test_every_method_in_words():
+    names = [*METHODS, "scratch_100", "hyperplanes_100", "hyperplanes_auto", "point_multiplane_10"]
+    words = {name: describe_method(name) for name in names if name != "scratch"}
+    assert len(set(words.values())) == len(words)
+    assert words["scratch_100"] == "the same field from random weights, 100 steps"
+    assert words["hyperplanes_auto"] == "HyperPlanes after as many fine-tuning steps as left-out views ask for"
+
+
+def test_a_row_for_each_number_of_steps():
+    assert at_steps("scratch", [0, 10, 100]) == ["scratch_10", "scratch_100"]
+    assert at_steps("nearest_view", [0, 10]) == ["nearest_view"]
+    assert at_steps("hyperplanes_5", [0, 10]) == ["hyperplanes_5"]
+    assert at_steps("hyperplanes", []) == ["hyperplanes"]
+
+
+def test_swapped_objects_have_the_update_of_the_next_one_and_everything_else_of_their_own():
+    data, model = Balls(test=3), awaken(small_model()).eval()
+    supports = [data.task(name).support for name in data.names("test")]
+    swapped = Swapped(model, supports)
+    with torch.no_grad():
+        for own, other in zip(supports, [*supports[1:], supports[0]], strict=True):
+            prepared = model.prepare(own)
+            expected = model.field(prepared, model.theta + model.update(model.prepare(other)))
+            cameras = own.cameras
+            assert torch.equal(swapped.adapt(own).render(cameras).images, expected.render(cameras).images)
+            assert not torch.equal(swapped.adapt(own).render(cameras).images, model.adapt(own).render(cameras).images)
+
+
+def test_swapping_takes_two_objects_and_a_hypernetwork():
+    support = Balls().task("test0").support
+    with pytest.raises(ValueError, match="swapped: expected at least 2 objects to swap updates of, got 1"):
+        Swapped(small_model(), [support])
+    with pytest.raises(ValueError, match="swapped: expected a model with a hypernetwork, got one without"):
+        Swapped(small_model(hypernetwork=None), [support])
+
+
+def test_no_method_reads_a_pixel_of_the_query_views(folders):
+    # Source of truth: NaN in the query images would reach the picture of whatever reads them.
+    clean, data = Balls(test=2), Balls(test=2)
+    original, read = data.task, []
+
+    def poisoned(name):
+        task = original(name)
+        task.query.images.fill_(float("nan"))
+        return task
+
+    data.task = poisoned
+    objects = [data.task(name).support for name in data.names("test")]
+    for name in ("hyperplanes", "hyperplanes_swapped", "hyperplanes_2", "point_multiplane_2", "scratch_2"):
+        adapter = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))
+        evaluate(name, adapter, data, ["test0"], lambda score, task, pictures: read.append(pictures.images))
+        again = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))
+        shown = again.adapt(clean.task("test0").support).render(clean.task("test0").query.cameras).images
+        assert torch.equal(read[-1], shown), name
