@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -26,7 +25,7 @@ JUDGED = 4096  # rays of left-out views that "auto" compares
 CHECKS = 10  # times that it compares them
 
 RATES: dict[str, tuple[str, float, float]] = {
-    "weights": ("muon", 2e-3, 0.03),
+    "weights": ("muon", 2e-3, 0.04),
     "hypernetwork": ("adam", 3e-4, 0.0),
     "scratch": ("muon", 4e-3, 0.05),
 }
@@ -52,7 +51,7 @@ class FineTuning:
     """
 
     free: Literal["weights", "hypernetwork", "scratch"] = "weights"
-    rays: int = 512
+    rays: int = 1024
     optimiser: Literal["adam", "muon"] | None = None
     learning_rate: float | None = None
     muon_learning_rate: float | None = None
@@ -91,9 +90,7 @@ def minimise(
     settings: FineTuning,
     *,
     pixels: Int[Tensor, " pixel"] | None = None,
-    stop: int | None = None,
-    on_step: Callable[[int], None] | None = None,
-) -> None:
+) -> Iterator[int]:
     """Gradient steps on the squared error of rays of the support views.
 
     Args:
@@ -103,16 +100,16 @@ def minimise(
         steps: length of the schedule.
         settings: rays, rates and seed.
         pixels: flat indices (view, row, column) to draw from; all where absent.
-        stop: end after so many steps of the schedule.
-        on_step: called with the number of steps done, before the first and after each.
+
+    Yields:
+        The number of steps done: 0, and after each step of the schedule one more.
     """
     optimisers = settings.optimisers(variables)
     rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
     generator = torch.Generator().manual_seed(settings.seed)
-    if on_step is not None:
-        on_step(0)
-    with torch.enable_grad():
-        for step in range(steps if stop is None else stop):
+    yield 0
+    for step in range(steps):
+        with torch.enable_grad():
             made = field()
             rays, truth = support.sample_rays(settings.rays, generator=generator, among=pixels, span=ray_span(made))
             loss = ray_loss(made.trace(rays, generator), truth)
@@ -122,8 +119,7 @@ def minimise(
             for optimiser, rate in zip(optimisers, rates, strict=True):
                 optimiser.param_groups[0]["lr"] = rate * settings.schedule(step, steps)
                 optimiser.step()
-            if on_step is not None:
-                on_step(step + 1)
+        yield step + 1
 
 
 def best_stop(
@@ -160,21 +156,17 @@ def best_stop(
     errors: dict[int, float] = {}
     every = max(1, settings.longest // CHECKS)
 
-    class Finished(Exception):  # noqa: N818 - it ends the loop, nothing is wrong
-        pass
-
-    def check(step: int) -> None:
-        if step not in (0, settings.longest, every // 3) and step % every:
-            return
+    best = 0
+    for step in minimise(field, variables, support, settings.longest, settings, pixels=pixels):
+        if step not in (0, every // 3, settings.longest) and step % every:
+            continue
         with torch.no_grad():
             error = float((field().trace(rays).colour - truth).square().mean())
         errors[step] = error if math.isfinite(error) else math.inf
-        if step - min(errors, key=lambda each: errors[each]) > 2 * every:
-            raise Finished
-
-    with suppress(Finished):
-        minimise(field, variables, support, settings.longest, settings, pixels=pixels, on_step=check)
-    return min(errors, key=lambda each: errors[each])
+        best = min(errors, key=lambda each: errors[each])
+        if step - best > 2 * every:
+            break
+    return best
 
 
 def ray_span(field: AdaptedField) -> str:

@@ -237,7 +237,11 @@ class HyperPlanes(nn.Module):
         prepared = self.prepare(support)
         field, variables = self._tunable(prepared, settings)
         pixels = self._live_pixels(prepared, support)
-        minimise(field, variables, support, schedule, settings, pixels=pixels, stop=stop, on_step=on_step)
+        for done in minimise(field, variables, support, schedule, settings, pixels=pixels):
+            if on_step is not None:
+                on_step(done)
+            if done == stop:
+                break
         with torch.no_grad():
             return field()
 

@@ -159,7 +159,8 @@ class HyperNetwork(nn.Module):
         activation = ACTIVATIONS[config.activation]
         for layer in self.head:
             hidden = activation(layer(hidden))
-        hidden = self.standardise(hidden)
+        if config.centre:  # of unit length on average, as what Adam moves an output by grows with it
+            hidden = self.standardise(hidden) / config.width**0.5
         outputs = [output(hidden) * config.gain for output in self.outputs]
         results = [
             Parameters(

@@ -167,4 +167,3 @@ def test_from_scratch_nothing_that_was_trained_is_used(support):
     assert torch.equal(*pictures)
     other = FromScratch(small_model(), 2, replace(WEIGHTS, seed=1)).adapt(support).render(cameras).images
     assert not torch.equal(pictures[0], other)
-
