@@ -3,7 +3,7 @@
 import sys
 from importlib import import_module
 
-NAMES = ("generation", "lookup", "rendering", "training")
+NAMES = ("generation", "hypernetwork", "lookup", "rendering", "training")
 
 
 def main(arguments: list[str]) -> int:

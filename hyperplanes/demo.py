@@ -8,11 +8,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from hyperplanes.adaptation.base import Pictures
+import torch
+
+from hyperplanes.adaptation.base import Adapter, Pictures
 from hyperplanes.checkpoints import read_json, write_json
-from hyperplanes.evaluation import ObjectScore, evaluate, make_method
+from hyperplanes.evaluation import ObjectScore, evaluate
 from hyperplanes.export import save_images
-from hyperplanes.models import OnDevice, choose_device, on_device
+from hyperplanes.methods import at_steps, describe_method, make_method
+from hyperplanes.models import OnDevice, choose_device
 from hyperplanes.presets import Preset
 from hyperplanes.recipes import recipe
 from hyperplanes.rendering.renderer import Marched
@@ -20,10 +23,37 @@ from hyperplanes.stages import Stage
 from hyperplanes.training import Tasks
 from hyperplanes.views import Task
 
-__all__ = ["METHODS", "MODELS", "DemoSettings", "recipes", "score_method", "stages", "write_metrics"]
+__all__ = [
+    "METHODS",
+    "MODELS",
+    "TUNED",
+    "UNSEEN_METHODS",
+    "DemoSettings",
+    "describe_row",
+    "file_name",
+    "measure_tuning",
+    "recipes",
+    "score_method",
+    "stages",
+    "write_metrics",
+]
 
-METHODS = ("nearest_view", "point_multiplane", "hyperplanes", "hyperplanes_10")
+METHODS = (
+    "nearest_view",
+    "point_multiplane",
+    "hyperplanes_swapped",
+    "hyperplanes",
+    "hyperplanes_10",
+    "hyperplanes_100",
+    "scratch_100",
+)
 """The rows of the demonstration's table."""
+
+UNSEEN_METHODS = ("nearest_view", "hyperplanes", "hyperplanes_100", "scratch_100")
+"""The rows on objects of a class that was never trained on, called METHOD:CLASS."""
+
+TUNED = ("hyperplanes", "scratch")
+"""Methods whose PSNR over fine-tuning steps is drawn."""
 
 MODELS = ("hyperplanes", "point_multiplane")
 """What is trained, each into a folder of its name."""
@@ -44,11 +74,14 @@ class DemoSettings:
         seed: of everything.
         exhibits: objects shown in the report.
         frames: of each turntable.
+        unseen_objects: of another class, which no model is trained on.
+        tuning: numbers of fine-tuning steps in the chart of fine-tuning.
+        tuned_objects: held-out objects that it is drawn of.
         tiny: networks so small that nothing is learnt: to see that everything runs.
     """
 
     class_name: str = "car"
-    objects: int = 70
+    objects: int = 210
     held_out: int = 10
     resolution: int = 64
     views: int = 50
@@ -57,12 +90,26 @@ class DemoSettings:
     seed: int = 0
     exhibits: int = 6
     frames: int = 36
+    unseen_objects: int = 3
+    tuning: tuple[int, ...] = (0, 1, 3, 10, 30, 100, 300)
+    tuned_objects: int = 2
     tiny: bool = False
+
+    @property
+    def unseen_class(self) -> str:
+        """The class of the objects that no model is trained on."""
+        return "car" if self.class_name == "chair" else "chair"
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """The rows of the table: methods, and METHOD:CLASS for those on the other class."""
+        return (*METHODS, *(f"{method}:{self.unseen_class}" for method in UNSEEN_METHODS))
 
     @classmethod
     def quick_check(cls, seed: int = 0) -> DemoSettings:
         """A demonstration of seconds that shows nothing but that it runs."""
-        return cls(objects=3, held_out=1, resolution=24, views=12, steps=20, seed=seed, exhibits=1, frames=6, tiny=True)
+        sizes = {"objects": 4, "held_out": 2, "resolution": 24, "views": 12, "steps": 20, "exhibits": 1, "frames": 6}
+        return cls(**sizes, unseen_objects=1, tuning=(0, 2, 5), tuned_objects=1, seed=seed, tiny=True)
 
 
 def recipes(settings: DemoSettings) -> dict[str, Preset]:
@@ -90,50 +137,99 @@ def _tiny(chosen: Preset, views: int) -> Preset:
 def stages(settings: DemoSettings) -> list[Stage]:
     """The stages in their order, each with all that decides its result."""
     described = json.loads(json.dumps(asdict(settings)))
-    data = {key: described[key] for key in ("class_name", "objects", "held_out", "resolution", "views", "seed")}
-    result = [Stage("data", data, ["data"])]
+    deciding = ("class_name", "objects", "held_out", "unseen_objects", "resolution", "views", "seed")
+    data = {key: described[key] for key in deciding}
+    result = [Stage("data", data, ["data", "unseen"])]
     models: dict[str, Any] = {}
     for name, chosen in recipes(settings).items():
         models[name] = {"model": chosen.model.as_json(), "training": asdict(chosen.training)}
         own = json.loads(json.dumps({"data": data, **models[name]}))
         result.append(Stage(name, own, [name]))
     everything = json.loads(json.dumps({"data": data, "models": models}))
-    for name in METHODS:
-        result.append(Stage(f"evaluate {name}", everything, [f"scores/{name}.json", f"pictures/{name}"]))
+    for name in settings.rows:
+        file = file_name(name)
+        result.append(Stage(f"evaluate {name}", everything, [f"scores/{file}.json", f"pictures/{file}"]))
+    tuning = {key: described[key] for key in ("tuning", "tuned_objects")}
+    result.append(Stage("fine-tuning", {**everything, **tuning}, ["tuning.json"]))
     shown = {"exhibits": settings.exhibits, "frames": settings.frames}
-    result.append(Stage("report", {**everything, **shown}, ["metrics.json", "report.html", "overview.png"]))
+    result.append(Stage("report", {**everything, **tuning, **shown}, ["metrics.json", "report.html", "overview.png"]))
     return result
 
 
+def describe_row(row: str) -> str:
+    """A row of the table in words."""
+    method, _, class_name = row.partition(":")
+    return describe_method(method) + (f", on {class_name}s: a class never trained on" if class_name else "")
+
+
+def file_name(row: str) -> str:
+    """The name of a row in file names."""
+    return row.replace(":", "-on-")
+
+
 def score_method(
-    method: str, data: Tasks, folder: Path, report: Callable[[ObjectScore], None], device: str = "cpu"
+    row: str, data: Tasks, folder: Path, report: Callable[[ObjectScore], None], device: str = "cpu"
 ) -> None:
     """Evaluate one method on all held-out objects; its score goes to scores/, its pictures to pictures/.
 
     Args:
-        method: one of METHODS.
+        row: one of `DemoSettings.rows`.
         data: with the held-out objects in its "test" split.
         folder: of the demonstration, with the checkpoints.
         report: called after each object.
         device: where to compute.
     """
     where = choose_device(device)
-    adapter = on_device(make_method(method, {name: folder / name for name in MODELS}), where)
+    tasks, names, file = OnDevice(data, where), data.names("test"), file_name(row)
+    adapter = _adapter(row.partition(":")[0], tasks, folder, where)
 
     def keep(score: ObjectScore, task: Task, pictures: Pictures) -> None:
-        save_images(pictures.images, folder / "pictures" / method / score.name, task.query.names)
+        save_images(pictures.images, folder / "pictures" / file / score.name, task.query.names)
         report(score)
 
-    score = evaluate(method, adapter, OnDevice(data, where), data.names("test"), keep)
-    write_json(folder / "scores" / f"{method}.json", score.as_json())
+    score = evaluate(row, adapter, tasks, names, keep)
+    write_json(folder / "scores" / f"{file}.json", score.as_json())
 
 
-def write_metrics(folder: Path) -> dict[str, dict[str, Any]]:
-    """Put the scores of all methods into metrics.json.
+def _adapter(method: str, tasks: Tasks, folder: Path, device: torch.device) -> Adapter:
+    objects = (tasks.task(name).support for name in tasks.names("test"))
+    return make_method(method, {name: folder / name for name in MODELS}, device=device, objects=objects)
+
+
+def measure_tuning(
+    settings: DemoSettings, data: Tasks, folder: Path, report: Callable[[str, float], None], device: str = "cpu"
+) -> None:
+    """PSNR after several numbers of fine-tuning steps, of TUNED; written to tuning.json by method and steps.
+
+    Args:
+        settings: steps and objects.
+        data: with the held-out objects in its "test" split.
+        folder: of the demonstration, with the checkpoints.
+        report: called with every row's name and its PSNR in dB.
+        device: where to compute.
+    """
+    where = choose_device(device)
+    tasks, names = OnDevice(data, where), data.names("test")[: settings.tuned_objects]
+    found: dict[str, dict[str, float]] = {method: {} for method in TUNED}
+    for method in TUNED:
+        for steps in settings.tuning:
+            for name in at_steps(method, [steps]):
+                quality = evaluate(name, _adapter(name, tasks, folder, where), tasks, names).mean("psnr")
+                found[method][str(steps)] = quality
+                report(name, quality)
+    write_json(folder / "tuning.json", found)
+
+
+def write_metrics(folder: Path, settings: DemoSettings) -> dict[str, dict[str, Any]]:
+    """Put the scores of all rows into metrics.json.
+
+    Args:
+        folder: of the demonstration.
+        settings: of the demonstration.
 
     Returns:
         What was written: psnr, ssim, seconds and the single objects by method.
     """
-    metrics = {method: read_json(folder / "scores" / f"{method}.json") for method in METHODS}
+    metrics = {row: read_json(folder / "scores" / f"{file_name(row)}.json") for row in settings.rows}
     write_json(folder / "metrics.json", metrics)
     return metrics

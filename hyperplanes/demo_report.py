@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ import numpy as np
 import torch
 from PIL import Image
 
+from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.checkpoints import read_json, write_whole
-from hyperplanes.demo import METHODS, MODELS, DemoSettings
-from hyperplanes.evaluation import METHODS as ABOUT
+from hyperplanes.demo import METHODS, MODELS, DemoSettings, describe_row
 from hyperplanes.export import encode_animation, encode_png, orbit_cameras, to_pixels
 from hyperplanes.models import load_model
 from hyperplanes.report import Exhibit, Look, Report, Row, render_page
@@ -92,15 +93,22 @@ def describe(
     one_step = metrics["hyperplanes"]
     table = [
         Row(
-            method,
-            ABOUT[method],
-            metrics[method]["psnr"],
-            metrics[method]["ssim"],
-            duration(metrics[method]["adapt_seconds"]),
-            duration(metrics[method]["render_seconds"]),
+            row,
+            describe_row(row),
+            found["psnr"],
+            statistics.pstdev(each["psnr"] for each in found["objects"].values()),
+            found["ssim"],
+            duration(found["adapt_seconds"]),
+            duration(found["render_seconds"]),
         )
-        for method in METHODS
+        for row, found in metrics.items()
     ]
+    tuning = {
+        method: sorted((float(steps), quality) for steps, quality in found.items())
+        for method, found in read_json(folder / "tuning.json").items()
+    }
+    diagnostics = Diagnostics.of_json(read_json(folder / "hyperplanes" / "diagnostics.json"))
+    gap = one_step["psnr"] - metrics["hyperplanes_swapped"]["psnr"]
     shown = len(exhibits[0].support)
     return Report(
         title="New views of objects it has never seen",
@@ -116,6 +124,9 @@ def describe(
         exhibits=exhibits,
         table=table,
         curves=curves,
+        tuning=tuning,
+        diagnostics=f"Over held-out objects, {diagnostics}. In the table, an object's own update is worth {gap:.2f} dB "
+        "more than that of another object.",
         facts=facts,
         commands=[
             ("this page again, or what is left of it after an interruption", f"hyperplanes demo --out {folder}"),

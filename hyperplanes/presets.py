@@ -49,16 +49,31 @@ class Preset:
         return replace(self, model=replace(self.model, hypernetwork=None))
 
 
+ALL_LAYERS = HyperNetworkConfig(
+    normalisation="group", activation="silu", layers=("all",), update="low_rank", weights_seen="all"
+)
+"""What served best in docs/hypernetwork.md: a low-rank update of every layer, and no batch statistics."""
+
+PAPER_TRAINING = TrainingConfig(steps=100_000, tasks=1, rays=512)
+"""One object and 512 rays a step, Adam at 1e-4 for theta and the hypernetwork (Appendix B)."""
+
 PRESETS: dict[str, Preset] = {
     "quick": Preset(
         ModelConfig(
             network=TargetConfig(depth=4, width=128, point_octaves=5, direction_octaves=2),
-            hypernetwork=HyperNetworkConfig(normalisation="group"),
+            hypernetwork=ALL_LAYERS,
             sampling=Marched(steps=64),
             hull_side=64,
         ),
         TrainingConfig(
-            steps=1200, rays=768, learning_rate=3e-3, hypernetwork_learning_rate=1.5e-3, warmup=100, final=0.03
+            steps=1200,
+            tasks=4,
+            rays=192,
+            optimiser="muon",
+            learning_rate=3e-3,
+            hypernetwork_learning_rate=1.5e-3,
+            warmup=100,
+            final=0.03,
         ),
         64,
         "64x64, minutes on two cores: what `make demo` trains",
@@ -66,19 +81,26 @@ PRESETS: dict[str, Preset] = {
     "small": Preset(
         ModelConfig(
             network=TargetConfig(depth=6, width=192, point_octaves=6),
-            hypernetwork=HyperNetworkConfig(normalisation="group"),
+            hypernetwork=ALL_LAYERS,
             sampling=Marched(steps=96),
             hull_side=96,
         ),
         TrainingConfig(
-            steps=30_000, rays=1024, learning_rate=2e-3, hypernetwork_learning_rate=1e-3, warmup=500, final=0.02
+            steps=30_000,
+            tasks=4,
+            rays=256,
+            optimiser="muon",
+            learning_rate=2e-3,
+            hypernetwork_learning_rate=1e-3,
+            warmup=500,
+            final=0.02,
         ),
         128,
         "128x128, hours on a few cores",
     ),
     "paper-128": Preset(
         ModelConfig(coarse_network=True),
-        TrainingConfig(steps=100_000),
+        PAPER_TRAINING,
         128,
         "the paper's ShapeNet 128x128 setting (Appendix B): ConvNet, 5 HyperPlanes",
     ),
@@ -86,11 +108,14 @@ PRESETS: dict[str, Preset] = {
         ModelConfig(coarse_network=True),
         TrainingConfig(
             steps=1200,
+            tasks=4,
+            rays=128,
+            optimiser="muon",
             learning_rate=5e-4,
             hypernetwork_learning_rate=3e-4,
             warmup=100,
             final=0.02,
-            empty_points=256,
+            empty_points=64,
             evaluate_every=200,
         ),
         128,
@@ -101,7 +126,7 @@ PRESETS: dict[str, Preset] = {
             hypernetwork=HyperNetworkConfig(views=25, encoder="resnet101", depth=10),
             coarse_network=True,
         ),
-        TrainingConfig(steps=100_000),
+        PAPER_TRAINING,
         200,
         "the paper's ShapeNet 200x200 setting (Appendix B): ResNet101, 25 HyperPlanes",
     ),

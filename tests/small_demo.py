@@ -18,7 +18,6 @@ def demo_folder():
     return folder
 
 
-def only_object(folder):
-    """The folder of the held-out object."""
-    (name,) = (path for path in (folder / "data").iterdir() if "test" in path.name)
-    return name
+def first_object(folder):
+    """The folder of the first held-out object."""
+    return min(path for path in (folder / "data").iterdir() if "test" in path.name)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_demo import demo_folder, only_object
+from small_demo import demo_folder, first_object
 
 from data_gen.backends import RendererError
 from hyperplanes.baking import BakedScene
@@ -202,7 +202,7 @@ def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
 
 def test_render_writes_the_query_views_under_their_names(tmp_path):
     demo = demo_folder()
-    scene = only_object(demo)
+    scene = first_object(demo)
     assert main(["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path)]) == 0
     document = json.loads((scene / "transforms.json").read_text())
     assert {path.name for path in tmp_path.iterdir()} == {Path(name).name for name in document["test_filenames"]}
@@ -213,7 +213,7 @@ def test_render_writes_the_query_views_under_their_names(tmp_path):
 
 def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
     demo = demo_folder()
-    scene = str(only_object(demo))
+    scene = str(first_object(demo))
     weights, out, reference = (str(tmp_path / name) for name in ("weights", "out", "reference"))
     assert main(["adapt", "--checkpoint", str(demo), "--views", scene, "--out", weights]) == 0
     assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out]) == 0
@@ -225,7 +225,7 @@ def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
 
 def test_an_orbit_is_pictures_and_a_turntable(tmp_path):
     demo = demo_folder()
-    views = ["--views", str(only_object(demo)), "--out", str(tmp_path), "--all-views"]
+    views = ["--views", str(first_object(demo)), "--out", str(tmp_path), "--all-views"]
     assert main(["render", "--checkpoint", str(demo), *views, "--orbit", "3", "--turntable", "gif"]) == 0
     with Image.open(tmp_path / "turntable.gif") as animation:
         assert animation.n_frames == 3
@@ -234,20 +234,20 @@ def test_an_orbit_is_pictures_and_a_turntable(tmp_path):
 
 def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     out = tmp_path / "voxels.safetensors"
-    views = ["--views", str(only_object(demo_folder())), "--out", str(out)]
+    views = ["--views", str(first_object(demo_folder())), "--out", str(out)]
     command = ["bake", "--checkpoint", str(demo_folder()), *views, "--voxels", "32"]
     assert main([*command, "--orbit", "2", "--size", "16", "--turntable", "gif"]) == 0
     assert "dB, the field" in capsys.readouterr().out
     with Image.open(tmp_path / "voxels.gif") as animation:
         assert animation.n_frames == 2
-    pictures = BakedScene(BakedField.load(out)).render(read_task(only_object(demo_folder())).query.cameras)
+    pictures = BakedScene(BakedField.load(out)).render(read_task(first_object(demo_folder())).query.cameras)
     assert 0 < float(pictures.opacity.mean()) < 1
     assert main([*command, "--voxels", "7"]) == 2
     assert "7" in complaint(capsys)
 
 
 def test_the_paper_protocol_is_rendered_and_evaluated_when_asked_for(tmp_path, capsys):
-    demo, scene = demo_folder(), only_object(demo_folder())
+    demo, scene = demo_folder(), first_object(demo_folder())
     command = ["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path)]
     assert main([*command, "--protocol", "paper"]) == 0
     task = read_task(scene)
@@ -278,7 +278,7 @@ def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tm
 def test_views_of_a_world_with_z_up_are_adapted_to_as_if_y_were(tmp_path):
     """Source of truth: the same scene, its cameras turned by hand as Blender would have written them."""
     demo = demo_folder()
-    scene, turned = only_object(demo), tmp_path / only_object(demo).name
+    scene, turned = first_object(demo), tmp_path / first_object(demo).name
     shutil.copytree(scene, turned)
     document = json.loads((turned / "transforms.json").read_text())
     for frame in document["frames"]:

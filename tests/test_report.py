@@ -42,9 +42,21 @@ def report(title="A <title> & more"):
     generator = np.random.default_rng(0)
     look = Look(*(generator.integers(0, 256, (8, 8, 3), np.uint8),), {"hyperplanes": np.zeros((8, 8, 3), np.uint8)})
     exhibit = Exhibit("car", generator.integers(0, 256, (4, 8, 8, 3), np.uint8), [2, 0], [look], {"hyperplanes": 20.0})
-    row = Row("hyperplanes", "one step", 20.0, 0.5, "1 s", "2 s")
+    row = Row("hyperplanes", "one step", 20.0, 1.5, 0.5, "1 s", "2 s")
     curve = [{"step": 25, "loss": 0.1}, {"step": 50, "loss": 0.01, "psnr": 20.0}]
-    return Report(title, "lead", [("1", "thing")], "hyperplanes", [exhibit], [row], {"hyperplanes": curve}, [], [])
+    return Report(
+        title,
+        "lead",
+        [("1", "thing")],
+        "hyperplanes",
+        [exhibit],
+        [row],
+        {"hyperplanes": curve},
+        {"scratch": [(1.0, 15.0), (10.0, 18.0)]},
+        "they differ",
+        [],
+        [],
+    )
 
 
 def checked(page):

@@ -47,7 +47,7 @@ class Arguments:
 
     out: Path = Path("runs/demo")
     class_name: Annotated[Literal["car", "chair", "plane", "lamp"], tyro.conf.arg(name="class")] = "car"
-    objects: int = 70
+    objects: int = 210
     held_out: int = 10
     resolution: int = 64
     preset: str = "quick"
@@ -67,9 +67,10 @@ def settings_of(arguments: Arguments) -> DemoSettings:
 
     if arguments.quick_check:
         return DemoSettings.quick_check(arguments.seed)
-    if not 0 < arguments.held_out < arguments.objects:
+    if not 1 < arguments.held_out < arguments.objects:
         raise ValueError(
-            f"expected --held-out above 0 and below --objects, got {arguments.held_out} and {arguments.objects}"
+            "expected --held-out above 1, so that updates can be swapped, and below --objects, "
+            f"got {arguments.held_out} and {arguments.objects}"
         )
     if arguments.resolution < 16:
         raise ValueError(f"resolution: expected at least 16 pixels, got {arguments.resolution}")
@@ -109,9 +110,9 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
 
     out = arguments.out
     if stage.name == "data":
-        _generate(settings, out / "data", console)
+        _generate(settings, out, console)
         return
-    data = open_dataset(out / "data")
+    data = open_dataset(out / ("unseen" if ":" in stage.name else "data"))
     if stage.name in MODELS:
         _train(stage.name, recipes(settings)[stage.name], arguments, console)
     elif stage.name == "report":
@@ -119,7 +120,11 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
         from hyperplanes.demo_report import how_it_was_made, write_report
 
         facts = how_it_was_made(settings, out, data.manifest)
-        write_report(out, data, settings, write_metrics(out), facts)
+        write_report(out, data, settings, write_metrics(out, settings), facts)
+    elif stage.name == "fine-tuning":
+        from hyperplanes.demo import measure_tuning
+
+        measure_tuning(settings, data, out, lambda name, psnr: console.say(f"{name}: {psnr:.2f} dB"), arguments.device)
     else:
         from hyperplanes.demo import score_method
 
@@ -135,7 +140,7 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
             score_method(method, data, out, show, arguments.device)
 
 
-def _generate(settings: DemoSettings, folder: Path, console: Console) -> None:
+def _generate(settings: DemoSettings, out: Path, console: Console) -> None:
     from data_gen.backends import find_backend
     from data_gen.dataset import Procedural, generate
     from hyperplanes.commands.generate import summary
@@ -144,19 +149,24 @@ def _generate(settings: DemoSettings, folder: Path, console: Console) -> None:
     console.say(f"renderer: {backend.name} ({backend.detail})")
     for line in backend.advice:
         console.say(f"a faster one: {line}")
-    with console.bar("rendering") as bar:
-        report = generate(
-            Procedural(settings.class_name, settings.objects, settings.seed),
-            folder,
-            views=settings.views,
-            resolution=settings.resolution,
-            held_out=settings.held_out,
-            seed=settings.seed,
-            progress=lambda done, total, name: bar.show(done, total, name),
-        )
-    for name, reason in report.skipped:
-        console.warn(f"skipped {name}: {reason}")
-    console.say(summary(report, folder))
+    unseen = settings.unseen_objects
+    for folder, class_name, objects, held_out in (
+        (out / "data", settings.class_name, settings.objects, settings.held_out),
+        (out / "unseen", settings.unseen_class, unseen, unseen),
+    ):
+        with console.bar("rendering") as bar:
+            report = generate(
+                Procedural(class_name, objects, settings.seed),
+                folder,
+                views=settings.views,
+                resolution=settings.resolution,
+                held_out=held_out,
+                seed=settings.seed,
+                progress=lambda done, total, name, bar=bar: bar.show(done, total, name),
+            )
+        for name, reason in report.skipped:
+            console.warn(f"skipped {name}: {reason}")
+        console.say(summary(report, folder))
 
 
 def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:
@@ -175,11 +185,11 @@ def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:
 
 def _finish(out: Path, console: Console) -> None:
     from hyperplanes.checkpoints import read_json
-    from hyperplanes.evaluation import METHODS
+    from hyperplanes.demo import describe_row
 
     metrics = read_json(out / "metrics.json")
     rows = [
-        (METHODS[name], f"{each['psnr']:.2f} dB", f"{each['ssim']:.3f}", duration(each["adapt_seconds"]))
+        (describe_row(name), f"{each['psnr']:.2f} dB", f"{each['ssim']:.3f}", duration(each["adapt_seconds"]))
         for name, each in sorted(metrics.items(), key=lambda pair: pair[1]["psnr"])
     ]
     console.table(("held-out objects, new views", "PSNR", "SSIM", "to adapt"), rows)

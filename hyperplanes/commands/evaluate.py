@@ -129,5 +129,5 @@ def _draw(scores: Sequence[Score], methods: Sequence[str], steps: Sequence[int],
     for method in methods:
         named = [(count, name) for count in steps for name in at_steps(method, [count])]
         curves[method] = [(float(count), quality[name]) for count, name in named]
-    chart = line_chart(curves, "PSNR over fine-tuning steps", "dB", horizontal="fine-tuning steps", steps=True)
+    chart = line_chart(curves, "PSNR over fine-tuning steps", "dB", horizontal="fine-tuning steps", dense=True)
     write_whole(path, standalone(chart).encode())

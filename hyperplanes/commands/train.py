@@ -32,7 +32,7 @@ class Arguments:
     """What to train, and on what.
 
     Attributes:
-        data: The data set.
+        data: The data set, or several whose objects are drawn alike.
         out: The folder for checkpoints; a training that was interrupted there goes on.
         preset: One of `hyperplanes presets`: how large the model is and how long it is trained.
         method: HyperPlanes, or a target network alone with one set of weights for all objects.
@@ -42,7 +42,7 @@ class Arguments:
         device: auto, cpu or cuda.
     """
 
-    data: Path
+    data: tuple[Path, ...]
     out: Path
     preset: str = "quick"
     method: Literal["hyperplanes", "point_multiplane", "multiplane", "nerf"] = "hyperplanes"
@@ -115,7 +115,7 @@ def follow(trainer: Trainer, bar: Bar) -> None:
 
 def run(arguments: Arguments) -> int:
     """Train, from the start or from where it was interrupted."""
-    from hyperplanes.data import open_dataset
+    from hyperplanes.data.dataset import open_datasets
     from hyperplanes.models import choose_device
     from hyperplanes.recipes import recipe, start_training
 
@@ -123,10 +123,10 @@ def run(arguments: Arguments) -> int:
     chosen = recipe(
         arguments.preset, arguments.method, steps=arguments.steps, seed=arguments.seed, protocol=arguments.protocol
     )
-    data = open_dataset(arguments.data)
+    data, shown = open_datasets(arguments.data), " ".join(map(str, arguments.data))
     if not data.names("train"):
         raise ValueError(
-            f"{arguments.data}: expected objects to train on, found none in its train split; "
+            f"{shown}: expected objects to train on, found none in its train split; "
             "a single scene can only be rendered or evaluated"
         )
     trainer = start_training(chosen, data, arguments.out, choose_device(arguments.device))
@@ -143,6 +143,6 @@ def run(arguments: Arguments) -> int:
     if held_out:
         method = arguments.method
         console.say(
-            f"next: hyperplanes evaluate --data {arguments.data} --checkpoint {arguments.out} --method {method}"
+            f"next: hyperplanes evaluate --data {arguments.data[0]} --checkpoint {arguments.out} --method {method}"
         )
     return 0

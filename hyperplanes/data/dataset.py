@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from hyperplanes.data.recognise import find_catalogue, posed_folder, read_posed_
 from hyperplanes.data.transforms_json import find_transforms, read_transforms
 from hyperplanes.views import Task, Views
 
-__all__ = ["Dataset", "open_dataset", "read_task", "read_views"]
+__all__ = ["Dataset", "Datasets", "open_dataset", "open_datasets", "read_task", "read_views"]
 
 DEFAULT_BUDGET = 2 * 2**30
 
@@ -127,6 +128,53 @@ def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET) -> Dataset:
         The data set; objects are read when asked for.
     """
     return Dataset(path, budget)
+
+
+class Datasets:
+    """Several data sets as one; the name of an object is that of its data set's folder, a slash, and its own.
+
+    Args:
+        parts: data sets by the name that their objects get.
+    """
+
+    def __init__(self, parts: Mapping[str, Dataset]) -> None:
+        self.parts = dict(parts)
+
+    def names(self, split: str = "all") -> list[str]:
+        """The names of the objects of a split of all data sets, one after the other."""
+        return [f"{part}/{name}" for part, data in self.parts.items() for name in data.names(split)]
+
+    def task(self, name: str) -> Task:
+        """One object; as `Dataset.task`.
+
+        Raises:
+            DataError: no such data set or object, or anything wrong with its files.
+        """
+        part, _, own = name.partition("/")
+        if part not in self.parts:
+            known = ", ".join(self.parts)
+            raise DataError(Path(part), f"one of the data sets {known}", repr(name), "check the name")
+        return replace(self.parts[part].task(own), name=name)
+
+
+def open_datasets(paths: Sequence[str | Path]) -> Dataset | Datasets:
+    """One data set, or several as one.
+
+    Args:
+        paths: as in `open_dataset`.
+
+    Returns:
+        The data set, or `Datasets` of several.
+
+    Raises:
+        ValueError: two folders of the same name.
+    """
+    if len(paths) == 1:
+        return open_dataset(paths[0])
+    names = [Path(path).resolve().name for path in paths]
+    if len(set(names)) < len(names):
+        raise ValueError(f"data: expected folders of different names, got {', '.join(names)}; rename one")
+    return Datasets({name: open_dataset(path) for name, path in zip(names, paths, strict=True)})
 
 
 def read_views(path: str | Path) -> Views:

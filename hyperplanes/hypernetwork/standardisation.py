@@ -10,11 +10,14 @@ __all__ = ["RunningStandardisation"]
 
 
 class RunningStandardisation(nn.Module):
-    """Subtracts a running mean over objects and divides by a running standard deviation.
+    """Batch renormalisation (Ioffe 2017) over objects, without an affine part.
 
-    Batch normalisation without an affine part that uses its running statistics in training too, so that a step of a
-    single object is possible and training and evaluation compute the same function. No gradient flows through the
-    statistics. Without it, codes of different objects of one class differ by about 2 % of what they have in common.
+    The value is (code - running mean) / running standard deviation, in training as in evaluation; the gradient is that
+    of normalising by the statistics of the objects of the step, so that nothing is learned of what is the same for all
+    of them. A step of a single object has no such statistics; there, the running ones are constants.
+
+    Without it, codes of different objects of one class differ by about 2 % of what they have in common, and what they
+    have in common is what the layers after it learn to use: docs/hypernetwork.md.
 
     Args:
         shape: of the codes of one object.
@@ -26,7 +29,7 @@ class RunningStandardisation(nn.Module):
     variance: Tensor
     steps: Tensor
 
-    def __init__(self, shape: tuple[int, ...], momentum: float = 0.02, epsilon: float = 1e-5) -> None:
+    def __init__(self, shape: tuple[int, ...], momentum: float = 0.05, epsilon: float = 1e-5) -> None:
         super().__init__()
         self.momentum = momentum
         self.epsilon = epsilon
@@ -34,10 +37,21 @@ class RunningStandardisation(nn.Module):
         self.register_buffer("variance", torch.ones(shape))
         self.register_buffer("steps", torch.zeros(()))
 
-    def forward(self, codes: Float[Tensor, object * shape]) -> Float[Tensor, object * shape]:
+    def forward(self, codes: Float[Tensor, "object *shape"]) -> Float[Tensor, "object *shape"]:
         """Codes of mean 0 and variance 1 over the objects of the training; updates the statistics in training."""
-        if self.training:
-            self._update(codes.detach())
+        if not self.training:
+            return self._standardised(codes)
+        self._update(codes.detach())
+        if len(codes) == 1:
+            return self._standardised(codes)
+        deviation = (codes.var(0, unbiased=False) + self.epsilon).sqrt()
+        normalised = (codes - codes.mean(0)) / deviation
+        running = (self.variance + self.epsilon).sqrt()
+        scale = (deviation / running).detach()
+        shift = ((codes.mean(0) - self.mean) / running).detach()
+        return normalised * scale + shift
+
+    def _standardised(self, codes: Tensor) -> Tensor:
         return (codes - self.mean) * torch.rsqrt(self.variance + self.epsilon)
 
     @torch.no_grad()

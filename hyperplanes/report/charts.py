@@ -48,7 +48,7 @@ def line_chart(
     *,
     logarithmic: bool = False,
     horizontal: str = "steps",
-    steps: bool = False,
+    dense: bool = False,
 ) -> str:
     """A chart of several lines, each named at its end.
 
@@ -58,7 +58,7 @@ def line_chart(
         unit: at the vertical axis.
         logarithmic: the vertical axis.
         horizontal: the name of the horizontal axis.
-        steps: the horizontal axis shows log(1 + x), with a tick and a dot at every point: for few, growing numbers.
+        dense: the horizontal axis shows log(1 + x), with a tick and a dot at every point: for few, growing numbers.
 
     Returns:
         An SVG element, or a remark where there is nothing to draw.
@@ -69,13 +69,13 @@ def line_chart(
     form = math.log10 if logarithmic else float
     values = [form(max(y, 1e-9)) for points in shown.values() for _, y in points]
     last = max(x for points in shown.values() for x, _ in points)
-    places = sorted({x for points in shown.values() for x, _ in points}) if steps else ticks(0, last)
+    places = sorted({x for points in shown.values() for x, _ in points}) if dense else ticks(0, last)
     low, high = min(values), max(values)
     margin = 0.06 * (high - low) or 0.5
     low, high = low - margin, high + margin
 
     def across(x: float) -> float:
-        fraction = math.log1p(x) / math.log1p(last) if steps and last else x / max(last, 1)
+        fraction = math.log1p(x) / math.log1p(last) if dense and last else x / max(last, 1)
         return LEFT + (WIDTH - LEFT - RIGHT) * fraction
 
     def down(value: float) -> float:
@@ -97,7 +97,7 @@ def line_chart(
     for index, (name, points) in enumerate(shown.items()):
         path = " ".join(f"{across(x):.1f},{down(form(max(y, 1e-9))):.1f}" for x, y in points)
         x, y = across(points[-1][0]), down(form(max(points[-1][1], 1e-9)))
-        for dot in points if steps else points[-1:]:
+        for dot in points if dense else points[-1:]:
             place = f'cx="{across(dot[0]):.1f}" cy="{down(form(max(dot[1], 1e-9))):.1f}"'
             parts.append(f'<circle class="dot-{index % 4}" {place} r="3.5"/>')
         parts.append(f'<polyline class="line line-{index % 4}" points="{path}"/>')

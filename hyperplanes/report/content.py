@@ -55,6 +55,7 @@ class Row:
         method: its name.
         about: what it is, in a few words.
         psnr: dB, mean over objects.
+        deviation: dB, standard deviation over objects.
         ssim: mean over objects.
         adapt: how long it took from images to a field, as text.
         render: how long a view took, as text.
@@ -63,6 +64,7 @@ class Row:
     method: str
     about: str
     psnr: float
+    deviation: float
     ssim: float
     adapt: str
     render: str
@@ -80,6 +82,8 @@ class Report:
         exhibits: held-out objects.
         table: one row a method.
         curves: by method, training entries with "step", "loss" and at times "psnr".
+        tuning: by method, PSNR in dB after numbers of fine-tuning steps.
+        diagnostics: what the updates of the hypernetwork have and have not in common, in words.
         facts: how it was made, label and value.
         commands: how to make it again, and what to try next.
     """
@@ -91,5 +95,7 @@ class Report:
     exhibits: Sequence[Exhibit]
     table: Sequence[Row]
     curves: Mapping[str, Sequence[Mapping[str, float]]]
+    tuning: Mapping[str, Sequence[tuple[float, float]]]
+    diagnostics: str
     facts: Sequence[tuple[str, str]]
     commands: Sequence[tuple[str, str]]

@@ -29,8 +29,8 @@ def render_page(report: Report) -> str:
         f"<title>{escape(report.title)}</title>\n<style>\n{style}{_choices(methods)}</style>\n</head>\n<body>\n<main>\n"
         f"<header>\n<h1>{escape(report.title)}</h1>\n"
         f'<p class="lead">{escape(report.lead)}</p>\n{_figures(report.figures)}</header>\n'
-        f"{_story(report.exhibits[0])}{_gallery(report, methods)}{_table(report.table)}{_curves(report.curves)}"
-        f"{_making(report)}</main>\n</body>\n</html>\n"
+        f"{_story(report.exhibits[0])}{_gallery(report, methods)}{_table(report.table)}{_tuning(report)}"
+        f"{_curves(report.curves)}{_making(report)}</main>\n</body>\n</html>\n"
     )
 
 
@@ -129,7 +129,8 @@ def _table(table: Sequence[Row]) -> str:
     best = max(row.psnr for row in table)
     rows = "".join(
         f'<tr class="{"best" if row.psnr == best else "other"}"><td>{escape(row.about)}'
-        f'<small>{escape(row.method)}</small></td><td class="psnr">{row.psnr:.2f} dB</td><td>{row.ssim:.3f}</td>'
+        f'<small>{escape(row.method)}</small></td><td class="psnr">{row.psnr:.2f} &plusmn; {row.deviation:.2f} dB</td>'
+        f"<td>{row.ssim:.3f}</td>"
         f"<td>{escape(row.adapt)}</td><td>{escape(row.render)}</td></tr>"
         for row in table
     )
@@ -137,6 +138,22 @@ def _table(table: Sequence[Row]) -> str:
         "<section>\n<h2>The table</h2>\n<p>Means over the query views of all held-out objects, every row through the "
         'same code.</p>\n<div class="card scroll"><table><thead><tr><th>method</th><th>PSNR</th><th>SSIM</th>'
         f"<th>to adapt</th><th>to render a view</th></tr></thead><tbody>{rows}</tbody></table></div>\n</section>\n"
+    )
+
+
+def _tuning(report: Report) -> str:
+    chart = line_chart(
+        report.tuning,
+        "PSNR over fine-tuning steps",
+        "dB",
+        horizontal="fine-tuning steps on the support views",
+        dense=True,
+    )
+    return (
+        "<section>\n<h2>What adapting is worth</h2>\n"
+        f"<p>{escape(report.diagnostics)}</p>\n<p>Gradient steps on the support views, from the update of the "
+        "hypernetwork and from random weights; PSNR on the query views.</p>\n"
+        f'<div class="charts"><figure class="card">{chart}</figure></div>\n</section>\n'
     )
 
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation import HyperPlanes, ModelConfig, configuration
+from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import camera_from_world, centres, look_at, pinhole, viewing_directions

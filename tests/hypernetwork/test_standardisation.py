@@ -41,9 +41,25 @@ def test_evaluation_changes_nothing():
     assert all(torch.equal(value, layer.state_dict()[name]) for name, value in before.items())
 
 
-def test_no_gradient_flows_through_the_statistics():
-    # Closed form: d/dx of (x - mean) / sqrt(variance + epsilon) with constant statistics.
+def test_training_computes_what_evaluation_does():
+    layer = RunningStandardisation((3,))
+    for _ in range(5):
+        layer(torch.randn(4, 3) + 2)
+    codes = torch.randn(4, 3)
+    training = layer(codes)  # by the statistics that this step is part of
+    torch.testing.assert_close(training, layer.eval()(codes))
+
+
+def test_the_gradient_is_that_of_batch_normalisation_scaled_to_the_running_deviation():
+    # Another implementation: torch's batch norm, whose gradient knows nothing of what all objects have in common.
     layer = RunningStandardisation((2,))
-    codes = torch.randn(4, 2, requires_grad=True)
-    layer(codes).sum().backward()
-    torch.testing.assert_close(codes.grad, torch.rsqrt(layer.variance + layer.epsilon).expand(4, 2))
+    for _ in range(5):
+        layer(3 * torch.randn(4, 2))
+    codes, weight = torch.randn(4, 2, requires_grad=True), torch.randn(4, 2)
+    (layer(codes) * weight).sum().backward()
+    other = codes.detach().clone().requires_grad_()
+    normalised = torch.nn.functional.batch_norm(other, None, None, training=True, eps=layer.epsilon)
+    ratio = ((codes.var(0, unbiased=False) + layer.epsilon) / (layer.variance + layer.epsilon)).sqrt().detach()
+    (normalised * ratio * weight).sum().backward()
+    torch.testing.assert_close(codes.grad, other.grad)
+    assert codes.grad.sum(0).abs().max() < 1e-5

@@ -1,0 +1,157 @@
+"""What each choice in the hypernetwork is worth: variants trained alike, judged on objects that none of them saw.
+
+Every variant trains the preset "quick" with the same objects, rays and steps, and differs in what its name says. Its
+PSNR on held-out objects is compared with the same field without a hypernetwork, and with the update of another object.
+The data sets come first, for example
+
+    hyperplanes generate --class car --count 210 --held-out 10 --resolution 64 --seed 0 --out data/car
+    python -m benchmarks hypernetwork --data data/car --planes 5 --variant none low_rank --json table.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.reporting import Row, finish
+from hyperplanes.adaptation.diagnostics import diagnose
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.data.dataset import open_datasets
+from hyperplanes.episodes import prepare_episode
+from hyperplanes.metrics import psnr
+from hyperplanes.presets import Preset, preset
+from hyperplanes.training import Tasks, Trainer
+
+__all__ = ["VARIANTS", "main", "measure", "recipe"]
+
+NONE: dict[str, Any] = {"none": True}
+PAPER_UPDATE = {"layers": ("colour", "density"), "update": "full", "activation": "relu", "weights_seen": "updated"}
+UNSTANDARDISED = {"code_activation": "relu", "code_normalisation": "none", "centre": False}
+
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "none": ("no hypernetwork", NONE),
+    "low_rank": ("the preset: low-rank update of every layer, codes and outputs standardised over objects", {}),
+    "scaling": ("rows scaled and biases shifted, without the low-rank product", {"update": "scaling"}),
+    "uncentred": ("outputs not standardised: the update may have a part that all objects share", {"centre": False}),
+    "mean": ("codes of the views averaged, not concatenated", {"join": "mean"}),
+    "relu": ("ReLU, not SiLU, in the head", {"activation": "relu"}),
+    "blind": ("theta is no input", {"see_weights": False}),
+    "undirected": ("viewing directions are no input", {"see_directions": False}),
+    "last_layers": ("full update of the colour and density layers, as in the paper; codes, outputs standardised",
+                    PAPER_UPDATE),
+    "published": ("the same with ReLU on the codes and nothing standardised", {**PAPER_UPDATE, **UNSTANDARDISED}),
+    "gain_4": ("outputs multiplied with 4", {"gain": 4.0}),
+}  # fmt: skip
+"""Names, what they change, and the entries of HyperNetworkConfig that differ from the preset's."""
+
+
+def main(arguments: list[str]) -> int:
+    """Train, print, and write the rows where asked.
+
+    Args:
+        arguments: see --help.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks hypernetwork", description=__doc__)
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets, a class each")
+    parser.add_argument("--variant", nargs="+", choices=VARIANTS, default=["none", "low_rank"])
+    parser.add_argument("--planes", type=int, default=25, help="ImagePlanes of the field")
+    parser.add_argument("--optimiser", choices=("adam", "muon"), default="muon", help="of theta")
+    parser.add_argument("--tasks", type=int, default=4, help="objects a step; 768 rays are shared among them")
+    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--quick", action="store_true", help="20 steps: to see that it runs")
+    parser.add_argument("--out", type=Path, help="folder for checkpoints; interrupted trainings go on")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    chosen = parser.parse_args(arguments)
+    data = open_datasets(chosen.data)
+    steps = 20 if chosen.quick else chosen.steps
+    rows = []
+    for name in chosen.variant:
+        for seed in chosen.seeds:
+            made = recipe(name, planes=chosen.planes, optimiser=chosen.optimiser, tasks=chosen.tasks, steps=steps)
+            made = replace(made, training=replace(made.training, seed=seed))
+            folder = chosen.out and chosen.out / f"{name}-{chosen.planes}-{chosen.optimiser}-{seed}"
+            rows.append({"name": name, "planes": chosen.planes, "seed": seed, **measure(made, data, folder)})
+            print(rows[-1], flush=True)
+    return finish("hypernetwork", rows, chosen.json)
+
+
+def recipe(name: str, *, planes: int = 25, optimiser: str = "muon", tasks: int = 4, steps: int = 1200) -> Preset:
+    """The preset "quick" with a variant of its hypernetwork.
+
+    Args:
+        name: one of VARIANTS.
+        planes: of the field; the hypernetwork reads as many views, at most 5.
+        optimiser: of theta.
+        tasks: objects a step.
+        steps: of training.
+    """
+    made, changes = preset("quick"), VARIANTS[name][1]
+    hyper = made.model.hypernetwork
+    assert hyper is not None
+    hyper = None if changes is NONE else replace(hyper, views=min(hyper.views, planes), **changes)
+    return replace(
+        made,
+        model=replace(made.model, hypernetwork=hyper, network=replace(made.model.network, planes=planes)),
+        training=replace(made.training, optimiser=optimiser, tasks=tasks, rays=768 // tasks, steps=steps, held_out=0),
+    )
+
+
+def measure(made: Preset, data: Tasks, folder: Path | None = None, views: int = 4) -> Row:
+    """Train and judge on the held-out objects.
+
+    Args:
+        made: model and training.
+        data: tasks; names begin with the name of their class where there are several.
+        folder: for checkpoints.
+        views: query views of each object that are compared.
+
+    Returns:
+        PSNR in dB with an object's own update and with that of the next object of its class, spread and norm of the
+        updates, seconds of training.
+    """
+    model = HyperPlanes(made.model, made.training.seed)
+    trainer = Trainer(model, data, made.training, folder)
+    begun = time.perf_counter()
+    while trainer.step < made.training.steps:
+        trainer.take_step()
+        if trainer.step % made.training.checkpoint_every == 0:
+            trainer.save()
+    seconds = time.perf_counter() - begun
+    trainer.save()
+    return {**judge(model.eval(), data, views), "seconds": seconds}
+
+
+@torch.no_grad()
+def judge(model: HyperPlanes, data: Tasks, views: int) -> Row:
+    """The figures of a trained model; as `measure`."""
+    names = list(data.names("test"))
+    episodes = []
+    for name in names:
+        task = data.task(name)
+        few = task.query[:: max(1, len(task.query) // views)][:views]
+        episodes.append(prepare_episode(model, replace(task, query=few)))
+    updates = model.updates([each.prepared for each in episodes])
+    classes = [name.rpartition("/")[0] for name in names]
+
+    def quality(shift: int) -> float:
+        total = 0.0
+        for index, each in enumerate(episodes):
+            same = [i for i, label in enumerate(classes) if label == classes[index]]
+            donor = same[(same.index(index) + shift) % len(same)]
+            field = model.field(each.prepared, model.theta + updates[donor])
+            total += float(psnr(field.render(each.query.cameras).images, each.query.images).mean())
+        return total / len(episodes)
+
+    own: Row = {"psnr": quality(0)}
+    if model.hypernetwork is None:
+        return own
+    found = diagnose(model, [each.prepared for each in episodes])
+    swapped = quality(1)
+    gap = {"swapped": swapped, "swap_gap": float(own["psnr"]) - swapped}
+    return {**own, **gap, "spread": found.spread, "norm": found.norm, "active": found.active}

@@ -1,0 +1,122 @@
+"""Trained models, not fresh ones: the update depends on the pictures, or these fail.
+
+Source of truth: taking away. Another object's update, white noise in place of the HyperPlanes and an encoder that is
+switched off must each move the figure.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+
+from benchmarks.objects import held_out
+from hyperplanes.adaptation import HyperPlanes, diagnose, swap_gap
+from hyperplanes.fields import TargetConfig
+from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.training import Trainer, TrainingConfig
+from tests.reference_rendering import Balls, small_model
+
+SMALL = {"views": 1, "normalisation": "group", "code": 16, "depth": 2, "width": 32}
+ALL_LAYERS = HyperNetworkConfig(
+    **SMALL, layers=("all",), update="low_rank", weights_seen="all", activation="silu", rank=2
+)
+LAST_LAYERS = HyperNetworkConfig(**{**SMALL, "normalisation": "batch"})
+
+
+class ManyBalls(Balls):
+    """Eight balls to train on; the held-out ones have colours and sizes between theirs."""
+
+    def __init__(self):
+        super().__init__(train=8, test=3, views=4)
+
+
+@cache
+def trained(shape):
+    """A field that sees a single plane, and must be told the rest; some seconds of training."""
+    model = small_model(
+        network=TargetConfig(depth=2, width=24, planes=1, point_octaves=2, direction_octaves=1), hypernetwork=shape
+    )
+    config = TrainingConfig(steps=250, tasks=4, rays=48, learning_rate=3e-3, hypernetwork_learning_rate=3e-3)
+    trainer = Trainer(model, ManyBalls(), replace(config, held_out=0))
+    while trainer.step < config.steps:
+        trainer.take_step()
+    return trainer
+
+
+def figures(model, data=None, names=("test0", "test1", "test2")):
+    """Spread of the updates, and what swapping them costs in dB."""
+    tasks = [(data or ManyBalls()).task(name) for name in names]
+    model.eval()
+    prepared = [model.prepare(task.support) for task in tasks]
+    return diagnose(model, prepared).spread, swap_gap(model, prepared, [task.query for task in tasks])[1]
+
+
+@pytest.mark.parametrize("shape", [ALL_LAYERS, LAST_LAYERS])
+def test_the_update_depends_on_the_object_and_swapping_it_costs_decibels(shape):
+    spread, gap = figures(trained(shape).model)
+    assert spread > 0.1
+    assert gap > 0.5
+
+
+@pytest.mark.parametrize("shape", [ALL_LAYERS, LAST_LAYERS])
+def test_the_encoder_has_a_gradient_at_the_end_of_training(shape):
+    trainer = trained(shape)
+    trainer.take_step()
+    gradients = [value.grad for value in trainer.model.hypernetwork.encoder.parameters()]
+    assert all(gradient is not None and gradient.abs().sum() > 0 for gradient in gradients)
+
+
+@pytest.mark.parametrize("shape", [ALL_LAYERS, LAST_LAYERS])
+def test_a_hypernetwork_whose_encoder_is_switched_off_is_found_out(shape):
+    model = trained(shape).model
+    hook = model.hypernetwork.encoder.register_forward_hook(lambda module, given, codes: torch.zeros_like(codes))
+    try:
+        spread, gap = figures(model)
+    finally:
+        hook.remove()
+    assert spread < 0.01  # as measured, and as training warns of
+    assert abs(gap) < 0.01
+
+
+def test_the_published_form_is_found_out_when_its_codes_are_dead():
+    # ReLU on codes that are all negative: the update is the same for every object, whatever the pictures show.
+    shape = replace(LAST_LAYERS, code_activation="relu", code_normalisation="none", centre=False)
+    model = small_model(hypernetwork=replace(shape, views=2))
+    torch.nn.init.constant_(model.hypernetwork.encoder.code.bias, -100.0)
+    for output in model.hypernetwork.outputs:
+        torch.nn.init.normal_(output.weight)
+    data = Balls(test=2)
+    prepared = [model.prepare(data.task(name).support) for name in data.names("test")]
+    found = diagnose(model, prepared)
+    assert found.spread < 1e-6
+    assert found.constant
+
+
+@cache
+def cars():
+    return held_out(3, 64)
+
+
+@pytest.fixture(params=["cars-64"])
+def packaged(request):
+    return HyperPlanes.from_pretrained(request.param)
+
+
+def test_packaged_models_read_the_pictures(packaged):
+    prepared = [packaged.prepare(task.support) for task in cars()]
+    found = diagnose(packaged, prepared)
+    assert found.spread > 0.1
+    assert not found.constant
+    first = prepared[0]
+    noise = torch.rand(first.views.images.shape, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        own = packaged.update(first)
+        other = packaged.update(replace(first, views=replace(first.views, images=noise)))
+    moved = sum(float((own[name] - other[name]).square().sum()) for name in own) ** 0.5
+    assert moved > 0.1 * found.norm
+
+
+def test_swapping_updates_of_packaged_models_costs_decibels(packaged):
+    prepared = [packaged.prepare(task.support) for task in cars()]
+    assert swap_gap(packaged, prepared, [task.query[::8] for task in cars()])[1] > 0.1
