@@ -107,7 +107,7 @@ PRESETS: dict[str, Preset] = {
     "paper-128-brief": Preset(
         ModelConfig(coarse_network=True),
         TrainingConfig(
-            steps=1200,
+            steps=800,
             tasks=4,
             rays=128,
             optimiser="muon",
