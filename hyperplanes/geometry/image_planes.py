@@ -14,7 +14,7 @@ from hyperplanes.geometry import lookup_torch
 from hyperplanes.geometry.distortion import DistortedCamera, distorted_pixels
 from hyperplanes.geometry.lookup import Lookup, lookup
 from hyperplanes.geometry.lookup_torch import NEAREST_DEPTH
-from hyperplanes.geometry.storage import Packed, pack
+from hyperplanes.geometry.packed_images import PackedImages, pack
 
 __all__ = ["NEAREST_DEPTH", "ImagePlanes", "Lookup"]
 
@@ -60,7 +60,7 @@ class ImagePlanes:
         self.background = background
         self.backend = backend
         self.exact = exact
-        self._packed: tuple[int, Packed | None] | None = None
+        self._packed: tuple[int, PackedImages | None] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -112,7 +112,7 @@ class ImagePlanes:
         colours = lookup_torch.interpolate(self.images.to(points), coordinates, views)
         return Lookup(torch.where(valid[..., None], colours, self.background), coordinates, valid)
 
-    def _words(self, points: Tensor) -> Packed | None:
+    def _words(self, points: Tensor) -> PackedImages | None:
         """The packed images, made at the first lookup that can use them and again after the images were changed."""
         if self.exact or self.images.requires_grad or self.images.device.type != "cpu" or points.dtype != torch.float32:
             return None

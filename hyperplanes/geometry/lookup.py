@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hyperplanes.geometry import lookup_torch
-from hyperplanes.geometry.storage import Packed
+from hyperplanes.geometry.packed_images import PackedImages
 
 __all__ = ["Backend", "Lookup", "backends", "choose", "lookup"]
 
@@ -85,7 +85,7 @@ def lookup(
     views: Int[Tensor, "point chosen"] | None = None,
     *,
     background: float = 1.0,
-    packed: Packed | None = None,
+    packed: PackedImages | None = None,
     backend: str | None = None,
 ) -> Lookup:
     """Projects every point onto planes and interpolates the colours there.
@@ -127,11 +127,11 @@ def lookup(
         return Lookup(*lookup_torch.lookup(points, matrices, images, views, background))
     if backend is not None:
         _check(backend, points.device)
-    from hyperplanes.geometry import lookup_op
+    from hyperplanes.geometry.kernels import lookup_operator
 
     fits = packed is not None and points.dtype == torch.float32 and not images.requires_grad
     words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
-    return Lookup(*lookup_op.lookup(points, matrices, images, words, bits, views, background))
+    return Lookup(*lookup_operator.lookup(points, matrices, images, words, bits, views, background))
 
 
 def _check(name: str, device: torch.device) -> None:

@@ -16,8 +16,9 @@ from torch.nn.functional import max_pool3d, pad
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.image_planes import NEAREST_DEPTH
+from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.threads import share
 
 __all__ = ["Occupancy", "ball_reach", "carve", "full"]
 
@@ -95,8 +96,6 @@ def carve(
 
 def _carve_compiled(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int) -> Tensor:
     """What is left of a full grid, by the compiled kernel; by NumPy, since PyTorch wakes its threads slowly."""
-    from hyperplanes.geometry.compiling import compiled
-
     views, height, width = masks.shape
     tables = np.zeros((views, height + 1, width + 1), np.int32)
     np.cumsum(masks.numpy().cumsum(1, np.int32), 2, out=tables[:, 1:, 1:])
@@ -104,8 +103,8 @@ def _carve_compiled(masks: Tensor, matrices: Tensor, calibrations: Tensor, bound
     corner = np.asarray(bounds.centre, np.float32) - np.float32(bounds.radius)
     numbers = [np.float32(value) for value in (grid.voxel, grid.voxel * math.sqrt(3) / 2, _nearest(grid))]
     fixed = (matrices.contiguous().numpy(), calibrations.contiguous().numpy(), tables, corner, *numbers)
-    kernel, occupied = compiled("carve", "float32"), grid.occupied.numpy().view(np.uint8)
-    share(lambda start, stop: kernel(*fixed, occupied, start, stop), side, 2)
+    kernel, occupied = compile_kernel("carving.carve", torch.float32), grid.occupied.numpy().view(np.uint8)
+    parallel_for(lambda start, stop: kernel(*fixed, occupied, start, stop), side, 2)
     return grid.occupied
 
 

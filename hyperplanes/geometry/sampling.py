@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hyperplanes.geometry import lookup_torch
 from hyperplanes.geometry.lookup import choose
-from hyperplanes.geometry.storage import Packed
+from hyperplanes.geometry.packed_images import PackedImages
 
 __all__ = ["sample"]
 
@@ -17,7 +17,7 @@ def sample(
     coordinates: Float[Tensor, "point view 2"],
     *,
     background: float = 1.0,
-    packed: Packed | None = None,
+    packed: PackedImages | None = None,
     backend: str | None = None,
 ) -> Float[Tensor, "point view channel"]:
     """Bilinear colours of every image at its own coordinates, as the lookup interpolates them.
@@ -63,8 +63,8 @@ def sample(
         raise ValueError(
             f"backend: expected {'torch' if fastest != 'cpu' else 'torch or cpu'} for {taken}, got {name!r}"
         )
-    from hyperplanes.geometry import sampling_op
+    from hyperplanes.geometry.kernels import sample_operator
 
     fits = packed is not None and coordinates.element_size() == 4 and not images.requires_grad
     words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
-    return sampling_op.sample(images, coordinates, words, bits, background)
+    return sample_operator.sample(images, coordinates, words, bits, background)

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hyperplanes.geometry.threads import share
-from hyperplanes.rendering.machine_code import machine_code
+from hyperplanes.geometry.kernels.compiling import compile_function
+from hyperplanes.geometry.kernels.threads import parallel_for
 
 __all__ = ["compiled_light", "light_arriving"]
 
@@ -21,7 +21,7 @@ DARK = 12.0  # thickness behind which nothing is left of single precision
 
 def compiled_light() -> Callable[..., None] | None:
     """The compiled walk through the voxels, or None where numba is missing."""
-    return machine_code(_walk)
+    return compile_function(_walk)
 
 
 def light_arriving(
@@ -44,7 +44,7 @@ def light_arriving(
     walk = compiled_light()
     if walk is not None and thickness.device.type == "cpu":
         arrays = (thickness.contiguous().numpy(), cells.contiguous().numpy(), directions.contiguous().numpy())
-        share(lambda start, stop: walk(*arrays, found.numpy(), start, stop), len(cells), CELLS)
+        parallel_for(lambda start, stop: walk(*arrays, found.numpy(), start, stop), len(cells), CELLS)
         return found
     side, flat = thickness.shape[0], thickness.flatten()
     for start in range(0, len(cells), CELLS):

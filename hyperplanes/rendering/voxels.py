@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from hyperplanes.geometry.kernels.compiling import compile_function
+from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Rays, Sphere
-from hyperplanes.geometry.threads import share
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.rendering.machine_code import machine_code
 
 __all__ = ["cast_through_voxels", "compiled_caster", "empty_around"]
 
@@ -24,7 +24,7 @@ RAYS = 1 << 10  # that a thread takes at once
 
 def compiled_caster() -> Callable[..., int] | None:
     """The compiled ray caster, or None where numba is missing."""
-    return machine_code(_cast)
+    return compile_function(_cast)
 
 
 def empty_around(index: Int[Tensor, "x y z"]) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
@@ -102,7 +102,7 @@ def cast_through_voxels(
         np.float32(background),
         out,
     )
-    samples = sum(share(lambda start, stop: caster(*arguments, start, stop), len(rays), RAYS))
+    samples = sum(parallel_for(lambda start, stop: caster(*arguments, start, stop), len(rays), RAYS))
     found = torch.from_numpy(out)
     return Rendered(found[:, :3], found[:, 3], found[:, 4], samples)
 

@@ -8,7 +8,7 @@ import torch
 
 from hyperplanes.geometry import ImagePlanes, cameras
 from hyperplanes.geometry.lookup import _INSTALLED, backends, choose, lookup
-from hyperplanes.geometry.storage import pack, unpack
+from hyperplanes.geometry.packed_images import pack, unpack
 from tests import reference
 
 BACKENDS = ["torch", "cpu"]
@@ -206,26 +206,26 @@ def test_bearings_match_centres():
 
 def test_the_operator_passes_torchs_own_checks():
     """Schema, fake tensor and autograd registration, by torch.library.opcheck."""
-    from hyperplanes.geometry import lookup_op
+    from hyperplanes.geometry.kernels import lookup_operator
 
     points, ours, images = scene(points=7)
     matrices = cameras.projection_matrices(ours)
     leaves = (points.requires_grad_(), matrices.requires_grad_(), images.requires_grad_())
     tests = ("test_schema", "test_autograd_registration", "test_faketensor")
     for views in (None, torch.zeros(7, 2, dtype=torch.long)):
-        torch.library.opcheck(lookup_op.lookup, (*leaves, None, 0, views, 1.0), test_utils=tests)
+        torch.library.opcheck(lookup_operator.lookup, (*leaves, None, 0, views, 1.0), test_utils=tests)
 
 
 def test_compiled_code_gives_the_same():
     """Another implementation: eager mode. One graph with gradients; shape checks would not
     trace."""
-    from hyperplanes.geometry import lookup_op
+    from hyperplanes.geometry.kernels import lookup_operator
 
     points, ours, images = scene(points=50)
     matrices = cameras.projection_matrices(ours)
 
     def loss(points, images):
-        colours, coordinates, _ = lookup_op.lookup(2 * points, matrices, images, None, 0, None, 1.0)
+        colours, coordinates, _ = lookup_operator.lookup(2 * points, matrices, images, None, 0, None, 1.0)
         return colours.square().sum() + coordinates.sin().sum()
 
     values = []

@@ -9,8 +9,8 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.blocks import inner
-from hyperplanes.geometry.vector_memory import load, read, store
+from hyperplanes.geometry.kernels.blocks import inner
+from hyperplanes.geometry.kernels.llvm import load, read, store
 
 __all__ = ["carve"]
 
