@@ -1,4 +1,4 @@
-"""Bilinear sampling of images: at projected points (`lookup`) or at given coordinates (`sample`), by several backends."""
+"""Bilinear sampling of images at projected points (`lookup`) or given coordinates (`sample`), by several backends."""
 
 from __future__ import annotations
 

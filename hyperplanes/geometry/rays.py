@@ -87,8 +87,8 @@ def cast(
         view: which camera each ray starts from.
         pixels: (column, row) in the picture, integer pixel centres; a lens is undone.
         bounds: what near and far are taken from; the unit sphere where absent.
-        span: "sphere" clips each ray to the sphere (a miss gets near == far); "depth" gives every ray of a camera the
-            same near and far, the distance of the sphere's centre minus and plus its radius, as NeRF does.
+        span: "sphere" clips each ray to the sphere (a miss gets near == far); "constant" gives every ray of a camera
+            the same near and far, the distance of the sphere's centre minus and plus its radius, as NeRF does.
 
     Returns:
         Rays with unit directions, differentiable in the cameras.
@@ -107,11 +107,11 @@ def cast(
     directions = torch.nn.functional.normalize((pose[:, :3, :3].mT @ local[..., None]).squeeze(-1), dim=-1)
     origins = camera.centres(cameras)[view]
     to_centre = origins.new_tensor(bounds.centre) - origins
-    if span == "depth":
+    if span == "constant":
         distance = to_centre.norm(dim=-1)
         return Rays(origins, directions, (distance - bounds.radius).clamp_min(0), distance + bounds.radius)
     if span != "sphere":
-        raise ValueError(f"span: expected 'sphere' or 'depth', got {span!r}")
+        raise ValueError(f"span: expected 'sphere' or 'constant', got {span!r}")
     middle = (to_centre * directions).sum(-1)
     square = bounds.radius**2 - to_centre.square().sum(-1) + middle.square()
     hit = square > 0

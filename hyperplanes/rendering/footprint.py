@@ -1,4 +1,4 @@
-"""Which pixels an occupied region can be seen in."""
+"""The pixels whose rays may cross an occupied region."""
 
 from __future__ import annotations
 
