@@ -17,7 +17,6 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.episodes import Episode, Kept, naming, prepare_episode
 from hyperplanes.metrics import psnr
-from hyperplanes.rendering.renderer import Marched
 from hyperplanes.training_state import Curve, check_model, load_state, save_state
 from hyperplanes.views import Task
 
@@ -176,7 +175,7 @@ class Trainer:
                 episode = self._episode(name)
             with record_function("step:update"):
                 field = self.model.field(episode.prepared, self.model.theta + self.model.update(episode.prepared))
-            span = "sphere" if isinstance(field.sampling, Marched) else "depth"
+            span = field.sampling.span
             with record_function("step:rays"), naming(name):
                 rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
             with record_function("step:rendering"):
@@ -246,7 +245,7 @@ class Trainer:
     @property
     def _reads_hull(self) -> bool:
         """Whether any sample depends on the hull; the paper's protocol samples without one."""
-        return isinstance(self.model.config.sampling, Marched) or self.config.empty_points > 0
+        return self.model.config.sampling.needs_occupancy or self.config.empty_points > 0
 
     def _episode(self, name: str) -> Episode:
         episode = self._kept.get(name)

@@ -24,7 +24,6 @@ from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.hypernetwork.hypernetwork import HyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.footprint import footprint
-from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanes", "ModelConfig", "Prepared"]
@@ -229,9 +228,9 @@ class HyperPlanes(nn.Module):
         theta = self.theta.detach()
         optimiser = torch.optim.Adam(tuned.parameters(), learning_rate)
         generator = torch.Generator().manual_seed(seed)
-        marched = isinstance(self.config.sampling, Marched)
+        marched = self.config.sampling.needs_occupancy
         live = footprint(prepared.occupancy, support.cameras).flatten().nonzero()[:, 0] if marched else None
-        span = "sphere" if marched else "depth"
+        span = self.config.sampling.span
         with torch.enable_grad():
             for _ in range(steps):
                 field = self.field(prepared, theta + self.update(prepared, tuned))
