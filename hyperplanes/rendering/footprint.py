@@ -12,7 +12,7 @@ from torch.nn.functional import max_pool2d
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
-from hyperplanes.geometry.occupancy import Occupancy, ball_reach
+from hyperplanes.geometry.occupancy import Occupancy, ball_extent
 
 __all__ = ["footprint"]
 
@@ -38,11 +38,11 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
             result[view] = True
             continue
         pixels = homogeneous[:, :2] / homogeneous[:, 2:]
-        reach = ball_reach(pixels, homogeneous[:, 2], calibration[view], occupancy.voxel * math.sqrt(3) / 2)
-        touching = ((pixels + reach >= 0) & (pixels - reach <= pixels.new_tensor([width - 1, height - 1]))).all(-1)
+        extent = ball_extent(pixels, homogeneous[:, 2], calibration[view], occupancy.voxel * math.sqrt(3) / 2)
+        touching = ((pixels + extent >= 0) & (pixels - extent <= pixels.new_tensor([width - 1, height - 1]))).all(-1)
         if not touching.any():
             continue
-        across, down = (int(value) for value in (reach[touching].amax(0) + 0.51).tolist())
+        across, down = (int(value) for value in (extent[touching].amax(0) + 0.51).tolist())
         if across > width or down > height:
             result[view] = True
             continue

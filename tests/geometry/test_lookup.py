@@ -86,7 +86,7 @@ def test_edge_cases_have_the_stated_values(backend):
         ((1e6, -1e6, 1.0), 9.0, (1.0, -1.0), False),  # far outside
         ((0.0, 0.0, -1.0), 9.0, (0.0, 0.0), False),  # behind
         ((0.3, 0.1, 0.0), 9.0, (0.0, 0.0), False),  # at z = 0
-        ((0.0, 0.0, 5e-5), 9.0, (0.0, 0.0), False),  # nearer than NEAREST_DEPTH
+        ((0.0, 0.0, 5e-5), 9.0, (0.0, 0.0), False),  # nearer than MIN_Z
         ((math.nan, 0.0, 1.0), 9.0, (0.0, 0.0), False),
         ((0.0, math.inf, math.inf), 9.0, (0.0, 0.0), False),
     ]
@@ -193,11 +193,11 @@ def test_images_changed_in_place_are_seen():
     torch.testing.assert_close(planes.lookup(points).colours, before / 2, atol=2e-3, rtol=0)
 
 
-def test_bearings_match_centres():
+def test_directions_and_distances_match_centres():
     """Closed form: centre + distance * direction = point, directions are unit vectors."""
     points, ours, images = scene(points=20)
     views = torch.tensor([[4, 0]]).expand(20, 2)
-    found = ImagePlanes(images, ours).lookup(points, views, bearings=True)
+    found = ImagePlanes(images, ours).lookup(points, views, return_directions=True)
     back = cameras.centres(ours)[views] + found.distances[..., None] * found.directions
     torch.testing.assert_close(back, points[:, None].expand_as(back))
     torch.testing.assert_close(found.directions.norm(dim=-1), torch.ones(20, 2))

@@ -1,6 +1,6 @@
 """The CPU kernel of the visual hull: a few voxels in a row at once, view after view, until masks have ruled them out.
 
-The arithmetic is that of `occupancy._carve_plainly` on LANES voxels along z, as loops that LLVM vectorises.
+The arithmetic is that of `occupancy._carve_torch` on LANES voxels along z, as loops that LLVM vectorises.
 """
 
 from __future__ import annotations

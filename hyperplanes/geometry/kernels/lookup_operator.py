@@ -17,7 +17,7 @@ from torch import Tensor
 from hyperplanes.geometry.kernels import memory
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
-from hyperplanes.geometry.lookup_torch import NEAREST_DEPTH
+from hyperplanes.geometry.lookup_torch import MIN_Z
 
 __all__ = ["lookup", "lookup_backward"]
 
@@ -42,7 +42,7 @@ def lookup(
         number = memory.number(points)
         fixed = (*_geometry(points, matrices, views), *memory.planes(images, packed, bits), number(background))
         flat = [memory.flat(value) for value in (colours, coordinates, valid.view(torch.uint8))]
-        fixed += (number(NEAREST_DEPTH), *flat)
+        fixed += (number(MIN_Z), *flat)
         parallel_for(lambda start, stop: kernel(*fixed, start, stop), len(points), _chunk(points, packed, views))
     return colours, coordinates, valid
 
@@ -102,7 +102,7 @@ def _geometry_gradient(
         return torch.zeros_like(points), torch.zeros_like(matrices)
     kernel = compile_kernel("lookup_backward.backward", points.dtype, views is not None)
     number = memory.number(points)
-    fixed = (*_geometry(points, matrices, views), *memory.planes(images, packed, bits), number(NEAREST_DEPTH))
+    fixed = (*_geometry(points, matrices, views), *memory.planes(images, packed, bits), number(MIN_Z))
     fixed += (*memory.strided(grad_colours), *memory.strided(grad_coordinates), rows.reshape(-1))
 
     def work(start: int, stop: int) -> np.ndarray:
@@ -121,7 +121,7 @@ def _image_gradient(
     filled, gradient = memory.pixel_gradient(images)
     if grad_colours.numel():
         kernel = compile_kernel("lookup_backward.image_backward", points.dtype, views is not None)
-        fixed = (*_geometry(points, matrices, views), *images.shape[2:], memory.number(points)(NEAREST_DEPTH))
+        fixed = (*_geometry(points, matrices, views), *images.shape[2:], memory.number(points)(MIN_Z))
         channels = images.shape[1]
         fixed += (*memory.strided(grad_colours), channels, memory.pixel_pitch(channels), filled, len(points))
         # One plane at a time, whose pixels stay in the cache; but every call reads through all chosen views.
