@@ -16,7 +16,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry import sample
 from hyperplanes.geometry.lookup import backends, lookup
 from hyperplanes.geometry.lookup_torch import place, project
-from hyperplanes.geometry.storage import Packed, pack
+from hyperplanes.geometry.packed_images import PackedImages, pack
 
 __all__ = ["STANDARD", "Scene", "needed_bytes", "runs", "ways"]
 
@@ -30,7 +30,7 @@ class Scene:
     cameras: PinholeCamera
     images: Tensor
     points: Tensor
-    packed: Packed | None
+    packed: PackedImages | None
 
     @classmethod
     def make(cls, planes: int, points: int, size: int, device: str = "cpu") -> Scene:
@@ -128,7 +128,7 @@ def _kornia_batched(points: Tensor, images: Tensor, ours: PinholeCamera, coordin
     return _bilinear(images, grid), grid
 
 
-def _both(points: Tensor, images: Tensor, matrices: Tensor, backend: str, packed: Packed | None = None):
+def _both(points: Tensor, images: Tensor, matrices: Tensor, backend: str, packed: PackedImages | None = None):
     found = lookup(points, matrices, images, backend=backend, packed=packed)
     return found.colours, found.coordinates
 
@@ -137,7 +137,7 @@ def _coordinates_alone(points: Tensor, _: Tensor, matrices: Tensor, images: Tens
     return (lookup(points, matrices, images, backend=backend).coordinates,)
 
 
-def _sampling_alone(grid: Tensor, images: Tensor, backend: str, packed: Packed | None = None):
+def _sampling_alone(grid: Tensor, images: Tensor, backend: str, packed: PackedImages | None = None):
     return (sample(images, grid.transpose(0, 1), backend=backend, packed=packed),)
 
 

@@ -30,7 +30,7 @@ from hyperplanes.metrics import psnr
 from hyperplanes.rendering.compositing import composite_packed, packed_weights
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.marching import march
-from hyperplanes.rendering.renderer import Hierarchical, Marched, render_in_chunks
+from hyperplanes.rendering.renderer import Hierarchical, Marched, render
 from hyperplanes.views import Task, Views
 
 __all__ = ["main"]
@@ -83,8 +83,8 @@ def paper_view(adapted: AdaptedField, query: Views, view: int) -> tuple[float, f
     total = height * width
     chosen = torch.arange(0, total, max(1, total // RAYS_OF_A_LARGE_VIEW) if total > 128 * 128 else 1)
     pixels = pixel_grid(height, width)[chosen]
-    rays = cast(query.cameras, torch.full_like(chosen, view), pixels, query.bounds, span="depth")
-    seconds, seen = timed(lambda: render_in_chunks(adapted.field, rays, PAPER, proposal=adapted.proposal))
+    rays = cast(query.cameras, torch.full_like(chosen, view), pixels, query.bounds, span=PAPER.span)
+    seconds, seen = timed(lambda: render(adapted.field, rays, PAPER, proposal=adapted.proposal, differentiable=False))
     truth = query.images[view].flatten(1).T[chosen]
     ours = adapted.render(camera.select(query.cameras, [view])).images[0].flatten(1).T[chosen]
     error = (seen.colour - truth).square().mean()
@@ -103,7 +103,7 @@ def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
     for number, task in enumerate(tasks):
         view = (7 * number + 3) % len(task.query)
         adapt, adapted = timed(lambda task=task: model.adapt(task.support))
-        refine, _ = timed(lambda adapted=adapted: adapted.filled)
+        refine, _ = timed(lambda adapted=adapted: adapted.refined_occupancy)
         one = camera.select(task.query.cameras, [view])
         seconds, pictures = timed(lambda adapted=adapted, one=one: adapted.render(one))
         slow, asked, paper_error, our_error = paper_view(adapted, task.query, view)
@@ -155,7 +155,7 @@ def fifty_views(model: HyperPlanes, task: Task) -> Row:
 def parts(model: HyperPlanes, task: Task) -> list[Row]:
     """Where the time of the default protocol goes, each part on the samples that one view asks for."""
     adapted = model.adapt(task.support)
-    occupancy, query = adapted.filled, task.query
+    occupancy, query = adapted.refined_occupancy, task.query
     field, sampling = adapted.field, adapted.sampling
     if not isinstance(field, Field) or not isinstance(sampling, Marched):
         return []
@@ -167,7 +167,7 @@ def parts(model: HyperPlanes, task: Task) -> list[Row]:
         asked = min(len(samples), adapted.render(one).samples)
         part = samples[torch.arange(asked)]
         directions = rays.directions[part.ray]
-        points = rays.origins[part.ray] + part.middles[:, None] * directions
+        points = rays.origins[part.ray] + part.distances[:, None] * directions
         look = sum(timed(lambda p=p: field.target.inputs(p, field.planes, field.bounds))[0] for p in points.split(8192))
         both = [
             timed(lambda p=p, d=d: field(p, d)) for p, d in zip(points.split(8192), directions.split(8192), strict=True)
@@ -175,8 +175,8 @@ def parts(model: HyperPlanes, task: Task) -> list[Row]:
         colour, density = (torch.cat(values) for values in zip(*(answer for _, answer in both), strict=True))
 
         def assemble() -> None:
-            weights = packed_weights(density * part.width, part.ray, len(rays))
-            composite_packed(colour, weights, part.middles, part.ray, len(rays))
+            weights = packed_weights(density * part.step, part.ray, len(rays))
+            composite_packed(colour, weights, part.distances, part.ray, len(rays))
 
         compose, _ = timed(assemble)
     ask = sum(seconds for seconds, _ in both)
@@ -192,7 +192,7 @@ def baked(model: HyperPlanes, task: Task) -> list[Row]:
     """The baked form against the field it was made from: speed and what it costs."""
     adapted = model.adapt(task.support)
     query = task.query[::8]
-    _ = adapted.filled
+    _ = adapted.refined_occupancy
     baking, field = timed(lambda: bake(adapted))
     scene = BakedScene(field)
     scene.render(camera.select(query.cameras, [0]))  # compiles

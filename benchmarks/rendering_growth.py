@@ -38,9 +38,11 @@ def growth(model: HyperPlanes, quick: bool) -> list[Row]:
         untrained = HyperPlanes(config).to(device)
         support = held_out(1, 128, 2 * count, device)[0].support
         untrained.set_rig(support)
-        settings.append(("planes", count, replace(untrained.adapt(support), occupancy=adapted.filled), one, Marched()))
+        settings.append(
+            ("planes", count, replace(untrained.adapt(support), occupancy=adapted.refined_occupancy), one, Marched())
+        )
     for axis, value, field, cameras, sampling in settings:
-        _ = field.filled
+        _ = field.refined_occupancy
         field.render(cameras, sampling)
         taken = [timed(lambda f=field, c=cameras, s=sampling: f.render(c, s)) for _ in range(1 if quick else 3)]
         row: Row = {"name": f"growth with {axis}", "growth": axis, "value": value, "samples": taken[0][1].samples}

@@ -1,4 +1,4 @@
-"""From an adapted field to a sparse voxel grid that renders at once: `hyperplanes bake`."""
+"""From an adapted field to a sparse voxel grid that renders in real time: `hyperplanes bake`."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from jaxtyping import Bool, Float, UInt8
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.adaptation.base import AdaptedField, Pictures, photograph
+from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.fields.baked import HARMONICS, LARGEST_SIDE, BakedField, spherical_harmonics
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.rendering.light import compiled_light, light_arriving
+from hyperplanes.rendering.images import render_images
 from hyperplanes.rendering.renderer import Marched
-from hyperplanes.rendering.voxels import cast_through_voxels, compiled_caster, empty_around
+from hyperplanes.rendering.transmittance import compiled_transmittance, transmittance
+from hyperplanes.rendering.voxels import compiled_caster, distance_to_filled, render_voxels
 
 __all__ = ["BakedScene", "bake"]
 
 CHUNK = 1 << 12
-LIGHT = 128  # voxels an axis of the grid in which light is followed; half of that where it is not compiled
-UNSEEN = 0.02  # where less than this of any light arrives, nobody looks
-THIN = 0.005  # what hides less than this of what is behind it, over 1/128 of the scene's diameter, is left out
+SIDE = 128  # voxels an axis of the grid of transmittances; half of that where they are not computed by numba
+MIN_TRANSMITTANCE = 0.02  # a voxel is left out where no viewing direction reaches it with more than this
+MIN_OPACITY = 0.005  # over 1/128 of the scene's diameter; voxels below it are left out
 
 
 @dataclass(frozen=True)
 class BakedScene:
-    """A baked field that can be looked at.
+    """A baked field that renders new views.
 
     Attributes:
         field: the voxels.
@@ -43,43 +44,41 @@ class BakedScene:
 
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Pictures:
-        """The pictures that the cameras see; compiled on a CPU with numba, packed torch elsewhere."""
+        """The pictures of the cameras, by a kernel on a CPU with numba and by `Marched` elsewhere."""
         bounds = self.field.bounds
         if compiled_caster() is None or self.field.index.device.type != "cpu":
             sampling = Marched(self.steps, 1e-3)
             return AdaptedField(self.field, self.field.occupancy, sampling).render(cameras, sampling)
         step = 2 * bounds.radius / self.steps
 
-        def see(rays: Rays) -> Rendered:
+        def render_rays(rays: Rays) -> Rendered:
             basis = spherical_harmonics(rays.directions)
-            return cast_through_voxels(
-                self.field.index, self.field.values, bounds, rays, basis, step=step, empty=self._empty
-            )
+            return render_voxels(self.field.index, self.field.values, bounds, rays, basis, step=step, empty=self._empty)
 
-        return photograph(cameras, bounds, see, seen=self._outline)
+        return render_images(cameras, bounds, render_rays, occupancy=self._coarse_occupancy)
 
     @cached_property
     def _empty(self) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
-        """What rays leap over."""
-        return empty_around(self.field.index)
+        """Distances for empty-space skipping."""
+        return distance_to_filled(self.field.index)
 
     @cached_property
-    def _outline(self) -> Occupancy:
-        """Few large voxels that hold all the others: finding the pixels that look there takes less time than rays."""
+    def _coarse_occupancy(self) -> Occupancy:
+        """The occupancy in few large voxels: their footprint takes less time to compute than it saves."""
         return _resampled(self.field.occupancy, max(8, self.field.side // 4))
 
 
 @torch.no_grad()
 def bake(adapted: AdaptedField, *, side: int = 256, directions: int = 24) -> BakedField:
-    """Density and view-dependent colour of a field, at the voxels that can be seen from outside.
+    """Density and view-dependent colour of a field, at the voxels that are visible from outside.
 
-    Colour is fitted by least squares over a sphere of viewing directions, each weighted by how much of a ray from
-    outside arrives at the voxel along it: what nobody can see does not disturb what everybody does.
+    Colour is fitted by least squares over a sphere of viewing directions, each weighted by the transmittance from
+    outside to the voxel along it, so that directions from which the voxel is hidden do not count.
 
     Args:
         adapted: the field of one object.
         side: voxels an axis; two for every pixel that the object is wide lose little.
-        directions: viewing directions asked of every voxel.
+        directions: viewing directions at which colour is evaluated.
 
     Returns:
         The voxels, on the CPU.
@@ -89,42 +88,41 @@ def bake(adapted: AdaptedField, *, side: int = 256, directions: int = 24) -> Bak
     """
     if directions < HARMONICS:
         raise ValueError(f"directions: expected at least {HARMONICS}, one a harmonic, got {directions}")
-    light = LIGHT if compiled_light() else LIGHT // 2
-    coarser = max(2, side // light)
+    coarser = max(2, side // (SIDE if compiled_transmittance() else SIDE // 2))
     if side % coarser or not 8 <= side <= LARGEST_SIDE:
         raise ValueError(f"side: expected a multiple of {coarser} from 8 to {LARGEST_SIDE}, got {side}")
     view = camera.fibonacci_sphere(directions, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
-    coarse = _resampled(adapted.filled, side // coarser)
-    thickness = torch.zeros_like(coarse.occupied, dtype=view.dtype)
-    thickness[coarse.occupied] = _density_at(adapted, coarse.centres()) * coarse.voxel
-    arriving = light_arriving(thickness, coarse.occupied.nonzero(), view)
-    seen = torch.zeros_like(coarse.occupied)
-    seen[coarse.occupied] = arriving.amax(1) > UNSEEN
+    coarse = _resampled(adapted.refined_occupancy, side // coarser)
+    optical_depth = torch.zeros_like(coarse.occupied, dtype=view.dtype)
+    optical_depth[coarse.occupied] = _density_at(adapted, coarse.centres()) * coarse.voxel
+    arriving = transmittance(optical_depth, coarse.occupied.nonzero(), view)
+    visible = torch.zeros_like(coarse.occupied)
+    visible[coarse.occupied] = arriving.amax(1) > MIN_TRANSMITTANCE
     row = torch.zeros(coarse.occupied.numel(), dtype=torch.long, device=view.device)
     row[coarse.occupied.flatten()] = torch.arange(len(arriving), device=view.device)
-    fine = _resampled(Occupancy(seen, coarse.bounds), side)
-    kept, values = [], []
+    fine = _resampled(Occupancy(visible, coarse.bounds), side)
+    cells, rows = [], []
     for points in fine.centres().split(CHUNK):
         cell = fine.index(points)
         found = _voxels(adapted, points, view, arriving[row[coarse.index(points)]])
-        kept.append(cell[found[0]])
-        values.append(found[1])
-    if not sum(len(part) for part in kept):
+        cells.append(cell[found[0]])
+        rows.append(found[1])
+    if not sum(len(part) for part in cells):
         raise ValueError("bake: expected a field with something in it, got one that is empty everywhere")
-    cells, rows = torch.cat(kept), torch.cat(values)
+    filled, values = torch.cat(cells), torch.cat(rows)
     index = torch.full((side**3,), -1, dtype=torch.int32, device=view.device)
-    index[cells] = torch.arange(len(cells), dtype=torch.int32, device=view.device)
-    return BakedField(index.reshape(side, side, side).cpu(), rows.cpu(), fine.bounds)
+    index[filled] = torch.arange(len(filled), dtype=torch.int32, device=view.device)
+    return BakedField(index.reshape(side, side, side).cpu(), values.cpu(), fine.bounds)
 
 
 def _voxels(
     adapted: AdaptedField, points: Tensor, view: Tensor, arriving: Tensor
-) -> tuple[Bool[Tensor, " point"], Float[Tensor, "kept 28"]]:
-    """Which points hide something, and their density and coefficients."""
+) -> tuple[Bool[Tensor, " point"], Float[Tensor, "filled 28"]]:
+    """Which points have density, and the density and coefficients of those."""
     field, length = adapted.field, adapted.occupancy.bounds.radius / 64
     hidden = field.hidden(points) if isinstance(field, Field) else points
     density = field.density_of(hidden) if isinstance(field, Field) else adapted.density(points)
-    some = 1 - torch.exp(-density * length) > THIN
+    some = 1 - torch.exp(-density * length) > MIN_OPACITY
     hidden, density, arriving = hidden[some], density[some], arriving[some]
     if isinstance(field, Field):
         colours = field.colours_along(hidden, view)

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
 from hyperplanes.rendering.footprint import footprint
-from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Task, Views
 
 __all__ = ["Episode", "Kept", "naming", "prepare_episode"]
@@ -55,7 +54,7 @@ def prepare_episode(model: HyperPlanes, task: Task, *, carved: bool = True) -> E
         prepared = model.prepare(task.support, carved=carved)
         query = task.query.to(model.rig.device)
         live = None
-        if isinstance(model.config.sampling, Marched):
+        if model.config.sampling.needs_occupancy:
             live = footprint(prepared.occupancy, query.cameras).flatten().nonzero()[:, 0]
     return Episode(prepared, query, live)
 

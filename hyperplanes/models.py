@@ -15,7 +15,7 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.data.upright import upright_task
 from hyperplanes.fields.base import Field
-from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.rendering.renderer import Sampler
 from hyperplanes.training import Tasks
 from hyperplanes.views import Task, Views
 
@@ -81,7 +81,7 @@ class ByProtocol:
     """
 
     adapter: Adapter
-    sampling: Hierarchical | Marched | None
+    sampling: Sampler | None
 
     def adapt(self, support: Views) -> Renderable:
         """What the method makes of one object."""

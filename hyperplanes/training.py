@@ -21,7 +21,6 @@ from hyperplanes.checkpoints import write_json
 from hyperplanes.episodes import Episode, Kept, naming, prepare_episode
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
-from hyperplanes.rendering.renderer import Marched
 from hyperplanes.training_state import Curve, check_model, load_state, save_state
 from hyperplanes.views import Task
 
@@ -194,7 +193,7 @@ class Trainer:
             updates = self.model.updates([episode.prepared for episode in episodes])
         for name, episode, update in zip(drawn, episodes, updates, strict=True):
             field = self.model.field(episode.prepared, self.model.theta + update)
-            span = "sphere" if isinstance(field.sampling, Marched) else "depth"
+            span = field.sampling.span
             with record_function("step:rays"), naming(name):
                 rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
             with record_function("step:rendering"):
@@ -283,7 +282,7 @@ class Trainer:
     @property
     def _reads_hull(self) -> bool:
         """Whether any sample depends on the hull; the paper's protocol samples without one."""
-        return isinstance(self.model.config.sampling, Marched) or self.config.empty_points > 0
+        return self.model.config.sampling.needs_occupancy or self.config.empty_points > 0
 
     def _episode(self, name: str) -> Episode:
         episode = self._kept.get(name)

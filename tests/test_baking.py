@@ -14,10 +14,10 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.metrics import psnr
-from hyperplanes.rendering import light
-from hyperplanes.rendering.light import compiled_light, light_arriving
+from hyperplanes.rendering import transmittance as module
 from hyperplanes.rendering.renderer import Marched
-from hyperplanes.rendering.voxels import cast_through_voxels, compiled_caster, empty_around
+from hyperplanes.rendering.transmittance import compiled_transmittance, transmittance
+from hyperplanes.rendering.voxels import compiled_caster, distance_to_filled, render_voxels
 
 CAMERAS = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(6, 3.0), 48, 48)
 
@@ -76,9 +76,7 @@ def test_a_constant_slab_is_beer_lambert():
     rays = Rays(
         torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([2.1]), torch.tensor([3.9])
     )
-    seen = cast_through_voxels(
-        index, values, Sphere(), rays, spherical_harmonics(rays.directions), step=1.8 / 512, stop=1e-9
-    )
+    seen = render_voxels(index, values, Sphere(), rays, spherical_harmonics(rays.directions), step=1.8 / 512, stop=1e-9)
     assert float(seen.opacity) == pytest.approx(1 - math.exp(-2 * 1.8), abs=1e-3)
     assert torch.allclose(seen.colour, (1 - seen.opacity)[:, None].expand(1, 3), atol=1e-5)  # black over white
 
@@ -115,10 +113,10 @@ def test_wrong_arguments_are_refused(adapted):
         bake(empty, side=16)
 
 
-def test_rays_leap_over_no_voxel():
+def test_distances_to_filled_cells():
     # Source of truth: the cells walked one by one, by the definition of the distance.
     index = torch.where(torch.rand(6, 6, 6, generator=torch.Generator().manual_seed(0)) < 0.03, 0, -1)
-    away = empty_around(index)
+    away = distance_to_filled(index)
     cells = [
         cell
         for cell in torch.cartesian_prod(*[torch.arange(7)] * 3)
@@ -134,22 +132,22 @@ def test_rays_leap_over_no_voxel():
         assert int(away[tuple(cell)]) == nearest
 
 
-def test_light_through_a_slab_is_beer_lambert():
-    # Closed form: exp(-thickness of the voxels between a voxel and the outside).
-    thickness = torch.full((8, 8, 8), 0.3)
+def test_transmittance_of_a_slab_is_beer_lambert():
+    # Closed form: exp(-optical_depth of the voxels between a voxel and the outside).
+    optical_depth = torch.full((8, 8, 8), 0.3)
     cells = torch.tensor([[4, 4, 1], [4, 4, 7]])
     upward, downward = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
-    found = light_arriving(thickness, cells, torch.tensor([upward, downward]))
+    found = transmittance(optical_depth, cells, torch.tensor([upward, downward]))
     layers = torch.tensor([[1.0, 6.0], [7.0, 0.0]])
     torch.testing.assert_close(found, torch.exp(-0.3 * layers))
 
 
-@pytest.mark.skipif(compiled_light() is None, reason="numba, which compiles the walk, is not installed")
-def test_compiled_light_is_that_of_plain_torch(monkeypatch):
+@pytest.mark.skipif(compiled_transmittance() is None, reason="numba, which compiles the walk, is not installed")
+def test_compiled_transmittance_is_that_of_plain_torch(monkeypatch):
     # Source of truth: the same walk with all cells at once, step by step.
     generator = torch.Generator().manual_seed(0)
-    thickness = torch.rand(12, 12, 12, generator=generator) * (torch.rand(12, 12, 12, generator=generator) < 0.3)
+    optical_depth = torch.rand(12, 12, 12, generator=generator) * (torch.rand(12, 12, 12, generator=generator) < 0.3)
     cells, directions = torch.randint(0, 12, (50, 3), generator=generator), camera.fibonacci_sphere(9, 1.0)[:, 2, :3]
-    compiled = light_arriving(thickness, cells, directions)
-    monkeypatch.setattr(light, "compiled_light", lambda: None)
-    torch.testing.assert_close(light_arriving(thickness, cells, directions), compiled)
+    compiled = transmittance(optical_depth, cells, directions)
+    monkeypatch.setattr(module, "compiled_transmittance", lambda: None)
+    torch.testing.assert_close(transmittance(optical_depth, cells, directions), compiled)

@@ -60,7 +60,7 @@ def test_rays_go_row_by_row_through_the_pixels_of_one_view():
     torch.testing.assert_close(pixel.flatten(), torch.tensor([7.0, 4.0]), atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("span", ["sphere", "depth"])
+@pytest.mark.parametrize("span", ["sphere", "constant"])
 def test_sampled_rays_come_with_the_colours_that_their_pixels_show(span):
     whole = views()
     rays, truth = whole.sample_rays(200, generator=torch.Generator().manual_seed(1), span=span)

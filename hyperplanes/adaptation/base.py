@@ -1,4 +1,4 @@
-"""What every method is to evaluation: support views in, something that renders new views out."""
+"""The interface of every method: an adapter turns support views into a field that renders new views."""
 
 from __future__ import annotations
 
@@ -14,39 +14,22 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve, full
-from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
+from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.rendering.footprint import footprint
+from hyperplanes.rendering.images import Pictures
 from hyperplanes.rendering.refinement import refine
-from hyperplanes.rendering.renderer import FieldFunction, Hierarchical, Marched, render, render_in_chunks
+from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
 from hyperplanes.views import Views
 
-__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull", "photograph"]
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """Rendered views.
-
-    Attributes:
-        images: RGB over white.
-        opacity: how much of each pixel is covered.
-        depth: distance along the ray in world units, 0 where nothing is.
-        samples: how often the field was asked, over all pixels.
-    """
-
-    images: Float[Tensor, "view 3 height width"]
-    opacity: Float[Tensor, "view 1 height width"]
-    depth: Float[Tensor, "view 1 height width"]
-    samples: int
+__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
 
 
 @runtime_checkable
 class Renderable(Protocol):
-    """Anything that can be looked at from new cameras."""
+    """Anything that renders new views."""
 
     def render(self, cameras: PinholeCamera) -> Pictures:
-        """The pictures that the cameras see."""
+        """The pictures of the cameras."""
         ...
 
 
@@ -55,7 +38,7 @@ class Adapter(Protocol):
     """A method: support views -> a field."""
 
     def adapt(self, support: Views) -> Renderable:
-        """What the method makes of one object."""
+        """The field of one object."""
         ...
 
 
@@ -65,25 +48,25 @@ class AdaptedField:
 
     Attributes:
         field: (points, directions) -> (colour, density).
-        occupancy: where it can be anything but empty, by the masks of the support views.
-        sampling: the protocol to render it by.
+        occupancy: voxels where it can be anything but empty: the visual hull of the support masks.
+        sampling: the sampler that it was trained with.
         proposal: the coarse field of `Hierarchical` sampling, where it is another one.
         densities: points -> density alone, of the field and of its proposal.
     """
 
     field: FieldFunction
     occupancy: Occupancy
-    sampling: Hierarchical | Marched
+    sampling: Sampler
     proposal: FieldFunction | None = None
     densities: tuple[Callable[[Tensor], Tensor], ...] = ()
 
     @cached_property
-    def filled(self) -> Occupancy:
-        """Where it is anything but empty, by its own word: asked once, when the first view is rendered."""
+    def refined_occupancy(self) -> Occupancy:
+        """The voxels of `occupancy` in which the field has density; computed when the first view is rendered."""
         return refine(self.occupancy, self.density)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density alone, as the field gives it."""
+        """Density per world unit, without colour where the field can do that."""
         if self.densities:
             return self.densities[0](points)
         return self.field(points, torch.nn.functional.normalize(points, dim=-1))[1]
@@ -91,83 +74,35 @@ class AdaptedField:
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
-        """Colour and density, as the field gives them."""
+        """Colour and density of the field."""
         return self.field(points, directions)
 
     def trace(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
-        """What rays see by the field's own protocol, with gradients: one step of training."""
+        """The pixels of rays by the field's own sampler, with gradients: the forward pass of training."""
         return render(
             self.field, rays, self.sampling, occupancy=self.occupancy, proposal=self.proposal, generator=generator
         )
 
     @torch.no_grad()
-    def render(self, cameras: PinholeCamera, sampling: Hierarchical | Marched | None = None) -> Pictures:
-        """The pictures that the cameras see.
+    def render(self, cameras: PinholeCamera, sampling: Sampler | None = None) -> Pictures:
+        """The pictures of cameras, without gradients.
 
         Args:
             cameras: any number, one image size, on any device and in any precision.
-            sampling: another protocol than the field's own, whose samples are made denser for pictures where they
-                are marched.
+            sampling: another sampler than that of the field, whose samples are denser for pictures where it marches.
 
         Returns:
-            One picture a camera, where the field is.
+            One picture a camera, on the device of the field.
         """
-        if sampling is None:
-            sampling = self.sampling.finer if isinstance(self.sampling, Marched) else self.sampling
-        cameras = camera.to(cameras, self.occupancy.occupied.device)
-        if isinstance(sampling, Hierarchical):
-            return photograph(
-                cameras,
-                self.occupancy.bounds,
-                lambda rays: render_in_chunks(self.field, rays, sampling, proposal=self.proposal),
-                span="depth",
-            )
-        return photograph(
-            cameras,
-            self.occupancy.bounds,
-            lambda rays: render_in_chunks(self.field, rays, sampling, occupancy=self.filled),
-            seen=self.filled,
+        sampling = sampling or self.sampling.for_rendering
+        return render(
+            self.field,
+            camera.to(cameras, self.occupancy.occupied.device),
+            sampling,
+            bounds=self.occupancy.bounds,
+            occupancy=self.refined_occupancy if sampling.needs_occupancy else None,
+            proposal=self.proposal,
         )
-
-
-def photograph(
-    cameras: PinholeCamera,
-    bounds: Sphere,
-    see: Callable[[Rays], Rendered],
-    *,
-    seen: Occupancy | None = None,
-    span: str = "sphere",
-) -> Pictures:
-    """Pictures from anything that sees along rays.
-
-    Rays are cast in the precision of the cameras and seen in single precision, as pictures are.
-
-    Args:
-        cameras: any number, one image size.
-        bounds: what near and far of the rays are taken from.
-        see: the pixels of rays.
-        seen: where anything can be; pixels that do not look there stay white and are never asked for.
-        span: as in `geometry.cast`.
-
-    Returns:
-        One picture a camera.
-    """
-    height, width = camera.image_size(cameras)
-    pixels = pixel_grid(height, width, cameras.intrinsics.device)
-    live = None if seen is None else footprint(seen, cameras).flatten(1)
-    values = pixels.new_zeros(cameras.batch_size, height * width, 5)
-    values[..., :3] = 1.0
-    samples = 0
-    for view in range(cameras.batch_size):
-        chosen = torch.arange(len(pixels), device=pixels.device) if live is None else live[view].nonzero()[:, 0]
-        if not len(chosen):
-            continue
-        rays = cast(cameras, torch.full_like(chosen, view), pixels[chosen], bounds, span=span)
-        part = see(Rays(rays.origins.float(), rays.directions.float(), rays.near.float(), rays.far.float()))
-        values[view, chosen] = torch.cat([part.colour, part.opacity[:, None], part.depth[:, None]], 1).to(values)
-        samples += part.samples
-    maps = values.reshape(cameras.batch_size, height, width, 5).permute(0, 3, 1, 2)
-    return Pictures(maps[:, :3], maps[:, 3:4], maps[:, 4:], samples)
 
 
 def hull(support: Views, side: int) -> Occupancy:

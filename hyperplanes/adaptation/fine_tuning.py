@@ -14,10 +14,9 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.optimisers import make_optimisers
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Views
 
-__all__ = ["FineTuning", "Steps", "best_stop", "minimise", "ray_loss", "ray_span"]
+__all__ = ["FineTuning", "Steps", "best_stop", "minimise", "ray_loss"]
 
 Steps: TypeAlias = int | Literal["auto"]
 
@@ -111,7 +110,7 @@ def minimise(
     for step in range(steps):
         with torch.enable_grad():
             made = field()
-            rays, truth = support.sample_rays(settings.rays, generator=generator, among=pixels, span=ray_span(made))
+            rays, truth = support.sample_rays(settings.rays, generator=generator, among=pixels, span=made.sampling.span)
             loss = ray_loss(made.trace(rays, generator), truth)
             for variable in variables:
                 variable.grad = None
@@ -152,7 +151,7 @@ def best_stop(
     generator = torch.Generator().manual_seed(settings.seed + 1)
     with torch.no_grad():
         made = field()
-        rays, truth = left_out.sample_rays(JUDGED, generator=generator, among=judged, span=ray_span(made))
+        rays, truth = left_out.sample_rays(JUDGED, generator=generator, among=judged, span=made.sampling.span)
     errors: dict[int, float] = {}
     every = max(1, settings.longest // CHECKS)
 
@@ -168,7 +167,3 @@ def best_stop(
             break
     return best
 
-
-def ray_span(field: AdaptedField) -> str:
-    """Where the rays of a field begin and end, as `geometry.cast` names it."""
-    return "sphere" if isinstance(field.sampling, Marched) else "depth"

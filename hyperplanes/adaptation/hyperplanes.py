@@ -25,7 +25,6 @@ from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.hypernetwork.hypernetwork import HyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.footprint import footprint
-from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanes", "ModelConfig", "Prepared"]
@@ -281,7 +280,7 @@ class HyperPlanes(nn.Module):
 
     def _live_pixels(self, prepared: Prepared, views: Views) -> Int[Tensor, " pixel"] | None:
         """Flat indices of the pixels of views that look into the hull; None where all are drawn from."""
-        if not isinstance(self.config.sampling, Marched):
+        if not self.config.sampling.needs_occupancy:
             return None
         return footprint(prepared.occupancy, views.cameras).flatten().nonzero()[:, 0]
 

@@ -26,20 +26,15 @@ class Arguments:
 
 def row(name: str, preset: Preset) -> tuple[str, ...]:
     """One preset as the cells of the table."""
-    from hyperplanes.rendering.renderer import Hierarchical
-
     model, training = preset.model, preset.training
-    sampling, hyper = model.sampling, model.hypernetwork
-    marched = (
-        f"{sampling.coarse} + {sampling.fine}" if isinstance(sampling, Hierarchical) else f"{sampling.steps} in hull"
-    )
+    hyper = model.hypernetwork
     return (
         name,
         str(preset.resolution),
         f"{model.network.depth} x {model.network.width}",
         hyper.encoder if hyper else "-",
         f"{hyper.views if hyper else 0} of {model.network.planes}",
-        marched,
+        model.sampling.summary,
         f"{training.steps:,}",
         str(training.rays * training.tasks),
     )

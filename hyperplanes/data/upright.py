@@ -56,7 +56,7 @@ def upright(views: Views, up: str) -> Views:
         return views
     pose = camera.camera_from_world(views.cameras)
     turned = pose @ turn.T.to(pose)  # camera from old world, after old world from new
-    cameras = camera.pinhole(camera.intrinsics(views.cameras), turned, *camera.image_size(views.cameras))
+    cameras = camera.with_poses(views.cameras, turned)
     x, y, z = (turn[:3, :3] @ torch.tensor(views.bounds.centre, dtype=torch.float64)).tolist()
     return replace(views, cameras=cameras, bounds=Sphere((x, y, z), views.bounds.radius))
 

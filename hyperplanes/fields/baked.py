@@ -51,7 +51,7 @@ def spherical_harmonics(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, 
 
 @dataclass(frozen=True)
 class BakedField:
-    """Rows of numbers at the centres of the voxels that can be seen.
+    """A sparse voxel grid: one row of numbers at the centre of every visible voxel.
 
     Attributes:
         index: row of every voxel of the cube around the bounds, -1 where there is none; indexed [x, y, z].
@@ -97,9 +97,9 @@ class BakedField:
             row = torch.where(inside, self.index[cell[:, 0], cell[:, 1], cell[:, 2]].long(), -1)
             weight = torch.where(step.bool(), fraction, 1 - fraction).prod(-1)
             found = padded[row]
-            share = weight * found[:, 0]
-            density = density + share
-            coefficients = coefficients + share[:, None] * found[:, 1:]
+            weighted = weight * found[:, 0]
+            density = density + weighted
+            coefficients = coefficients + weighted[:, None] * found[:, 1:]
         coefficients = (coefficients / density.clamp_min(1e-8)[:, None]).reshape(-1, 3, HARMONICS)
         colour = (coefficients * spherical_harmonics(directions)[:, None]).sum(-1)
         return colour.clamp(0, 1), density

@@ -1,9 +1,8 @@
 """Differentiable geometry on Kornia's pinhole cameras: projection, lookup, rays, the visual hull."""
 
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.lookup import Lookup
+from hyperplanes.geometry.lookup import Lookup, sample
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Rays, Sphere, cast
-from hyperplanes.geometry.sampling import sample
 
 __all__ = ["ImagePlanes", "Lookup", "Occupancy", "Rays", "Sphere", "carve", "cast", "sample"]

@@ -1,9 +1,9 @@
-"""Build, pick, move and place batches of Kornia pinhole cameras.
+"""Build, select, move, resize and place batches of Kornia pinhole cameras.
 
 Conventions of the whole package: OpenCV axes (x right, y down, z forward), extrinsics are camera_from_world, pixel
 (0, 0) is centred at (0, 0), so that a centred principal point is ((W - 1) / 2, (H - 1) / 2). Every function returns a
-new `PinholeCamera` with storage (view, 4, 4); none changes its argument. Where cameras may stand, `poses` says; its
-functions are names of this module too.
+new `PinholeCamera` with storage (view, 4, 4); none changes its argument. The functions of `poses` are names of this
+module too.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ __all__ = [
     "symmetric_intrinsics",
     "to",
     "viewing_directions",
+    "with_poses",
 ]
 
 ROTATION_TOLERANCE = 1e-3
@@ -50,7 +51,7 @@ def pinhole(
 ) -> PinholeCamera:
     """A checked batch of pinhole cameras that share one image size.
 
-    Kornia's constructor accepts nearly anything; this is where wrong numbers are stopped.
+    Kornia's constructor validates little; wrong numbers are refused here.
 
     Args:
         intrinsics: calibration in pixels with integer pixel centres, one (3, 3) matrix or one a view.
@@ -187,7 +188,7 @@ def select(cameras: PinholeCamera, index: slice | list[int] | Int[Tensor, " chos
 
 
 def concatenate(batches: list[PinholeCamera]) -> PinholeCamera:
-    """All cameras of several batches in one batch; those without a lens get one that does nothing if any has one.
+    """All cameras of several batches in one batch, with zero distortion for those without a lens if any has one.
 
     Raises:
         ValueError: an empty list.
@@ -216,8 +217,14 @@ def to(
     return _rebuilt(cameras, lambda value: value.to(device=device, dtype=dtype))
 
 
+def with_poses(cameras: PinholeCamera, camera_from_world: Float[Tensor, "view 4 4"]) -> PinholeCamera:
+    """The cameras at other poses, with the same calibration and distortion."""
+    bare = pinhole(intrinsics(cameras), camera_from_world, *image_size(cameras))
+    return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
+
+
 def resized(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
-    """The cameras for the same pictures scaled to another size.
+    """The cameras of the same images scaled to another size.
 
     The image borders, not the pixel centres, stay in place: c' = s (c + 1/2) - 1/2, which is not what
     `PinholeCamera.scale` does.

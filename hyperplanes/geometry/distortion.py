@@ -11,23 +11,60 @@ from torch import Tensor
 
 __all__ = ["DistortedCamera", "distorted", "distorted_pixels", "undistorted_pixels"]
 
-_STEPS = 20  # of Kornia's fixed-point iteration; its default of 5 leaves 0.1 pixels at strong distortion
+_ITERATIONS = 20  # of Kornia's fixed-point iteration; its default of 5 leaves 0.1 pixels at strong distortion
 
 
 class DistortedCamera(PinholeCamera):
-    """Pinhole cameras behind lenses; `distortion` is (view, 5): k1, k2, p1, p2, k3, without unit.
+    """Pinhole cameras with lens distortion; `distortion` is (view, 5): k1, k2, p1, p2, k3, without unit.
 
-    `ImagePlanes` and `cast` honour it, and `cameras.select`, `to`, `resized` and `concatenate` keep it. Kornia's own
-    `project` does not.
+    `project`, `unproject`, `ImagePlanes`, `cast` and `footprint` apply it, `cameras.select`, `to`, `resized`,
+    `concatenate` and `with_poses` keep it, and `carve` refuses it. The matrices, such as `intrinsics`, are those of the
+    pinhole behind the lens.
     """
 
     def __init__(self, cameras: PinholeCamera, distortion: Float[Tensor, "view 5"]) -> None:
         super().__init__(cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
         self.distortion = distortion
 
+    def project(self, point_3d: Tensor) -> Float[Tensor, "view point 2"]:
+        """Pixels of world points (view, point, 3), as `PinholeCamera.project` returns them, through the lens.
+
+        NaN where the lens cannot show the point; as in Kornia, points behind the camera are not flagged.
+        """
+        self._check("point_3d", point_3d, 3)
+        pixels, shown = distorted_pixels(self, super().project(point_3d).transpose(0, 1))
+        return torch.where(shown[..., None], pixels, torch.nan).transpose(0, 1)
+
+    def unproject(self, point_2d: Tensor, depth: Tensor) -> Float[Tensor, "view point 3"]:
+        """World points of pixels (view, point, 2) at z coordinates (view, point, 1): the inverse of `project`."""
+        self._check("point_2d", point_2d, 2)
+        view = torch.arange(self.batch_size, device=point_2d.device).repeat_interleave(point_2d.shape[1])
+        ideal = undistorted_pixels(self, view, point_2d.reshape(-1, 2)).reshape(point_2d.shape)
+        return super().unproject(ideal, depth)
+
+    def clone(self) -> DistortedCamera:
+        """A copy."""
+        return DistortedCamera(self, self.distortion.clone())
+
+    def scale(self, scale_factor: Tensor) -> PinholeCamera:
+        """Refused: Kornia's rule moves the principal point away from the centre of distortion.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError("scale: expected cameras without lens distortion, got a DistortedCamera; use cameras.resized")
+
+    def scale_(self, scale_factor: float | Tensor) -> PinholeCamera:
+        """Refused, as `scale`."""
+        return self.scale(torch.as_tensor(scale_factor))
+
+    def _check(self, name: str, value: Tensor, size: int) -> None:
+        if value.ndim != 3 or (value.shape[0], value.shape[2]) != (self.batch_size, size):
+            raise ValueError(f"{name}: expected shape ({self.batch_size}, point, {size}), got {tuple(value.shape)}")
+
 
 def distorted(cameras: PinholeCamera, distortion: Float[Tensor, "*view 5"]) -> DistortedCamera:
-    """The cameras with a lens in front.
+    """The cameras with lens distortion.
 
     Args:
         cameras: without skew.
@@ -52,36 +89,37 @@ def distorted(cameras: PinholeCamera, distortion: Float[Tensor, "*view 5"]) -> D
 def distorted_pixels(
     cameras: DistortedCamera, pixels: Float[Tensor, "point view 2"], views: Int[Tensor, "point view"] | None = None
 ) -> tuple[Float[Tensor, "point view 2"], Tensor]:
-    """Where the lens puts ideal pixels, and whether it can (OpenCV's distortion model).
+    """Distorted pixels of ideal ones, and whether the distortion is defined there (OpenCV's model).
 
-    Beyond the radius at which the radial polynomial turns back, the model would show points that no lens shows.
+    Beyond the radius at which the radial polynomial turns back, the model would map points into the image that no lens
+    shows there.
 
     Args:
         cameras: all of them.
-        pixels: ideal ones, of the pinhole without its lens.
-        views: which camera each column is of; in order where absent.
+        pixels: of the pinhole without its lens.
+        views: index of the camera of each entry; the columns in order where absent.
 
     Returns:
-        Pixels in the picture, and (point, view) false beyond the turning radius.
+        Pixels in the image, and (point, view) false beyond the turning radius.
     """
     index = torch.arange(cameras.batch_size, device=pixels.device)[None] if views is None else views
     matrix = cameras.intrinsics[:, :3, :3].to(pixels)[index]
     limit = _turning_radius(cameras.distortion).to(pixels)[index]
     focal = torch.stack([matrix[..., 0, 0], matrix[..., 1, 1]], -1)
     square = ((pixels - matrix[..., :2, 2]) / focal).square().sum(-1)
-    seen = square < limit.square()
-    inside = torch.where(seen[..., None], pixels, matrix[..., :2, 2])
+    shown = square < limit.square()
+    inside = torch.where(shown[..., None], pixels, matrix[..., :2, 2])
     moved = distort_points(inside[:, :, None], matrix, cameras.distortion.to(pixels)[index])[:, :, 0]
-    return moved, seen
+    return moved, shown
 
 
 def undistorted_pixels(
     cameras: DistortedCamera, view: Int[Tensor, " ray"], pixels: Float[Tensor, "ray 2"]
 ) -> Float[Tensor, "ray 2"]:
-    """The ideal pixels of pixels in pictures: the inverse of `distorted_pixels`, by fixed-point iteration."""
+    """Pixels of the pinhole without its lens, the inverse of `distorted_pixels`, by fixed-point iteration."""
     matrix = cameras.intrinsics[view, :3, :3].to(pixels)
     coefficients = cameras.distortion[view].to(pixels)
-    return undistort_points(pixels[:, None], matrix, coefficients, num_iters=_STEPS)[:, 0]
+    return undistort_points(pixels[:, None], matrix, coefficients, num_iters=_ITERATIONS)[:, 0]
 
 
 def _turning_radius(distortion: Tensor) -> Tensor:

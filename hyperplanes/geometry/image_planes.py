@@ -1,4 +1,4 @@
-"""ImagePlanes: posed images as a lookup from points in the world to colours (MultiPlaneNeRF; HyperPlanes, Eq. 3)."""
+"""ImagePlanes: posed images as a function from world points to colours (MultiPlaneNeRF; HyperPlanes, Eq. 3)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry import lookup_torch
 from hyperplanes.geometry.distortion import DistortedCamera, distorted_pixels
 from hyperplanes.geometry.lookup import Lookup, lookup
-from hyperplanes.geometry.lookup_torch import NEAREST_DEPTH
-from hyperplanes.geometry.storage import Packed, pack
+from hyperplanes.geometry.lookup_torch import MIN_Z
+from hyperplanes.geometry.packed_images import PackedImages, pack
 
-__all__ = ["NEAREST_DEPTH", "ImagePlanes", "Lookup"]
+__all__ = ["MIN_Z", "ImagePlanes", "Lookup"]
 
 
 class ImagePlanes:
-    """Images with their cameras, seen as one function of points in the world.
+    """Images with their cameras, as one function of world points.
 
-    Several objects go into one batch as one set of planes: `views` then names the planes of each point's object.
+    A batch of several objects is one set of planes; `views` holds the indices of the planes of each point's object.
     """
 
     def __init__(
@@ -34,15 +34,15 @@ class ImagePlanes:
         backend: str | None = None,
         exact: bool = False,
     ) -> None:
-        """Checks that images and cameras belong together.
+        """Planes from images and their cameras.
 
         Args:
-            images: any number of channels. Pictures in [0, 1] that need no gradient may be read from a copy of 32 bits
-                a pixel, exact for 8-bit pictures and within 1/2046 for others.
+            images: any number of channels. Three channels in [0, 1] that need no gradient may be read from a copy
+                packed into 32 bits a pixel, exact for 8-bit images and within 1/2046 for others.
             cameras: one an image, of the images' size.
-            background: colour where a point is not seen.
+            background: colour of points outside an image.
             backend: of the lookup; the fastest available where absent.
-            exact: always read the images themselves.
+            exact: never read a packed copy.
 
         Raises:
             ValueError: images of another number or size than the cameras, or of another number of dimensions.
@@ -60,7 +60,7 @@ class ImagePlanes:
         self.background = background
         self.backend = backend
         self.exact = exact
-        self._packed: tuple[int, Packed | None] | None = None
+        self._packed: tuple[int, PackedImages | None] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -70,21 +70,21 @@ class ImagePlanes:
         points: Float[Tensor, "point 3"],
         views: Int[Tensor, "point chosen"] | None = None,
         *,
-        bearings: bool = False,
+        return_directions: bool = False,
     ) -> Lookup:
         """Projects every point onto the planes and interpolates the colours there.
 
         Args:
             points: in the world.
-            views: planes chosen for each point; all where absent.
-            bearings: also return the direction and distance from each camera.
+            views: indices of the planes of each point; all planes where absent.
+            return_directions: also return the direction and distance from each camera.
 
         Returns:
-            One row a point, one column a plane. Differentiable in points, images and cameras.
+            Colours, coordinates and validity, differentiable in points, images and cameras.
         """
         matrices = camera.projection_matrices(self.cameras)
         if isinstance(self.cameras, DistortedCamera):
-            found = self._lookup_through_lenses(points, matrices, views)
+            found = self._lookup_distorted(points, matrices, views)
         else:
             found = lookup(
                 points,
@@ -92,10 +92,10 @@ class ImagePlanes:
                 self.images,
                 views,
                 background=self.background,
-                packed=self._words(points),
+                packed=self._packed_images(points),
                 backend=self.backend,
             )
-        if not bearings:
+        if not return_directions:
             return found
         centres = camera.centres(self.cameras).to(points)
         offsets = points[:, None] - (centres if views is None else centres[views])
@@ -103,16 +103,16 @@ class ImagePlanes:
         directions = offsets / distances.clamp_min(torch.finfo(points.dtype).tiny)[..., None]
         return replace(found, directions=directions, distances=distances)
 
-    def _lookup_through_lenses(self, points: Tensor, matrices: Tensor, views: Tensor | None) -> Lookup:
-        """The same in plain PyTorch; points that a lens cannot show count as behind the camera."""
+    def _lookup_distorted(self, points: Tensor, matrices: Tensor, views: Tensor | None) -> Lookup:
+        """The lookup in plain PyTorch; points that a lens cannot show count as behind the camera."""
         assert isinstance(self.cameras, DistortedCamera)
         ideal, front = lookup_torch.project(points, matrices.to(points), views)
-        pixels, seen = distorted_pixels(self.cameras, ideal, views)
-        coordinates, valid = lookup_torch.place(pixels, front & seen, *self.images.shape[2:])
+        pixels, shown = distorted_pixels(self.cameras, ideal, views)
+        coordinates, valid = lookup_torch.place(pixels, front & shown, *self.images.shape[2:])
         colours = lookup_torch.interpolate(self.images.to(points), coordinates, views)
         return Lookup(torch.where(valid[..., None], colours, self.background), coordinates, valid)
 
-    def _words(self, points: Tensor) -> Packed | None:
+    def _packed_images(self, points: Tensor) -> PackedImages | None:
         """The packed images, made at the first lookup that can use them and again after the images were changed."""
         if self.exact or self.images.requires_grad or self.images.device.type != "cpu" or points.dtype != torch.float32:
             return None

@@ -1,4 +1,4 @@
-"""One lookup, several backends: project points onto posed images and interpolate the colours there."""
+"""Bilinear sampling of images at projected points (`lookup`) or given coordinates (`sample`), by several backends."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hyperplanes.geometry import lookup_torch
-from hyperplanes.geometry.storage import Packed
+from hyperplanes.geometry.packed_images import PackedImages
 
-__all__ = ["Backend", "Lookup", "backends", "choose", "lookup"]
+__all__ = ["Backend", "Lookup", "backends", "choose", "lookup", "sample"]
 
 _INSTALLED = {module: importlib.util.find_spec(module) is not None for module in ("numba", "triton")}
 
 
 @dataclass(frozen=True)
 class Lookup:
-    """What planes say about each point.
+    """Colours and coordinates of points on planes.
 
     Attributes:
         colours: bilinear colours; the background where `valid` is false.
         coordinates: where the point falls on the plane, (column, row) in [-1, 1] from the first pixel's centre to the
-            last one's. Clamped to that range where the point falls outside the image, zero where it is behind.
+            last one's. Clamped to that range for points outside the image, zero for points behind the camera.
         valid: the point is in front of the camera and inside its image, borders included.
-        directions: unit vectors from each camera's centre to the point, in the world; only on request.
-        distances: from each camera's centre to the point, in world units; only on request.
+        directions: unit vectors from each camera's centre to the point, in the world, or None.
+        distances: from each camera's centre to the point, in world units, or None.
     """
 
     colours: Float[Tensor, "point view channel"]
@@ -39,12 +39,12 @@ class Lookup:
 
 @dataclass(frozen=True)
 class Backend:
-    """A way to do lookups, and whether it can be used here.
+    """An implementation of the lookup.
 
     Attributes:
-        name: what `backend=` takes.
-        available: whether it can run.
-        reason: why, or what would make it run.
+        name: value of `backend=`.
+        available: whether it can run here.
+        reason: why, or what is missing.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Backend:
 
 
 def backends() -> list[Backend]:
-    """Every way to do lookups, the plain reference first."""
+    """All implementations of the lookup, the plain reference first."""
     found = [Backend("torch", True, "plain PyTorch, any device; the reference")]
     if not _INSTALLED["numba"]:
         found.append(Backend("cpu", False, "needs numba: pip install numba"))
@@ -70,7 +70,7 @@ def backends() -> list[Backend]:
 
 
 def choose(points: Tensor, images: Tensor) -> str:
-    """The fastest backend for these tensors: by device, and plain PyTorch for all that the kernels do not take."""
+    """The fastest backend for these tensors: that of their device, or plain PyTorch for dtypes and sizes it lacks."""
     if points.dtype not in (torch.float32, torch.float64) or images.shape[2] * images.shape[3] >= 2**31:
         return "torch"
     if points.device.type == "cpu":
@@ -85,26 +85,26 @@ def lookup(
     views: Int[Tensor, "point chosen"] | None = None,
     *,
     background: float = 1.0,
-    packed: Packed | None = None,
+    packed: PackedImages | None = None,
     backend: str | None = None,
 ) -> Lookup:
     """Projects every point onto planes and interpolates the colours there.
 
-    Differentiable in points, matrices and images; with the torch backend twice. With u = M (x, 1), the pixel is
+    Differentiable in points, matrices and images; twice with the torch backend. With u = M (x, 1), the pixel is
     (u_0 / u_2, u_1 / u_2) in integer pixel centres.
 
     Args:
         points: in the world; float32 or float64 for the fast backends. All computations happen in their dtype.
         matrices: K [R | t] of each plane.
         images: the planes, any number of channels, none included.
-        views: planes chosen for each point, which alone are then looked at and paid for; all planes where absent.
-        background: colour where a point is not seen.
+        views: indices of the planes of each point, the only ones that are computed; all planes where absent.
+        background: colour of points outside an image.
         packed: the same images in 32 bits a pixel, which the CPU backend reads instead for float32 points when no
             gradient with respect to the images is wanted.
         backend: "torch", "cpu" or "triton"; the fastest that takes these tensors where absent.
 
     Returns:
-        Contiguous tensors (point, view, ...), where view counts the chosen ones if `views` is given.
+        Tensors (point, view, ...), where the second dimension is that of `views` if that is given.
 
     Raises:
         ValueError: an unknown backend, one that is not available, or an index in `views` of no plane.
@@ -127,11 +127,69 @@ def lookup(
         return Lookup(*lookup_torch.lookup(points, matrices, images, views, background))
     if backend is not None:
         _check(backend, points.device)
-    from hyperplanes.geometry import lookup_op
+    from hyperplanes.geometry.kernels import lookup_operator
 
     fits = packed is not None and points.dtype == torch.float32 and not images.requires_grad
     words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
-    return Lookup(*lookup_op.lookup(points, matrices, images, words, bits, views, background))
+    return Lookup(*lookup_operator.lookup(points, matrices, images, words, bits, views, background))
+
+
+def sample(
+    images: Float[Tensor, "view channel height width"],
+    coordinates: Float[Tensor, "point view 2"],
+    *,
+    background: float = 1.0,
+    packed: PackedImages | None = None,
+    backend: str | None = None,
+) -> Float[Tensor, "point view channel"]:
+    """Bilinear colours of every image at its own coordinates, interpolated as by the lookup.
+
+    Coordinates are those of `Lookup.coordinates`, Kornia's `normalize_pixel_coordinates` and `grid_sample` with
+    `align_corners=True`: (column, row), -1 in the first pixel's centre, 1 in the last one's; along an axis of one pixel
+    all are that pixel. Outside of [-1, 1], and for NaN, the colour is the background, without gradient; unlike in
+    `grid_sample` nothing is blended with it. Differentiable in images and coordinates; twice with the torch backend.
+
+    Args:
+        images: any number of channels, none included.
+        coordinates: of any strides; fastest where a view's coordinates lie together in memory, in pairs, as the
+            transpose of (view, point, 2), or columns first, as the lookup returns them. All computations happen in
+            their dtype, float32 or float64 for the fast backend.
+        background: colour outside.
+        packed: the same images in 32 bits a pixel, which the CPU backend reads instead for float32 coordinates when no
+            gradient with respect to the images is wanted.
+        backend: "torch" or "cpu"; the fastest that takes these tensors where absent.
+
+    Returns:
+        Colours, planar in memory: (view, channel, point).
+
+    Raises:
+        ValueError: coordinates of another shape or of another number of images, or a backend that does not take them.
+
+    >>> import torch
+    >>> ramp = torch.arange(4.0).expand(1, 1, 4, 4)
+    >>> sample(ramp, torch.tensor([[[0.0, 0.0]], [[1.0, -1.0]], [[1.1, 0.0]]]), background=9.0).flatten().tolist()
+    [1.5, 3.0, 9.0]
+    """
+    if images.ndim != 4:
+        raise ValueError(f"images: expected shape (view, channel, height, width), got {tuple(images.shape)}")
+    if coordinates.ndim != 3 or coordinates.shape[1:] != (len(images), 2):
+        expected = f"(point, {len(images)}, 2), {len(images)} being the number of images"
+        raise ValueError(f"coordinates: expected shape {expected}, got {tuple(coordinates.shape)}")
+    images = images.to(coordinates)
+    fastest = choose(coordinates, images)
+    name = backend or ("cpu" if fastest == "cpu" else "torch")
+    if name == "torch":
+        return lookup_torch.sample(images, coordinates, background)
+    if name != "cpu" or fastest != "cpu":
+        taken = f"{str(coordinates.dtype).removeprefix('torch.')} on {coordinates.device}"
+        raise ValueError(
+            f"backend: expected {'torch' if fastest != 'cpu' else 'torch or cpu'} for {taken}, got {name!r}"
+        )
+    from hyperplanes.geometry.kernels import sample_operator
+
+    fits = packed is not None and coordinates.element_size() == 4 and not images.requires_grad
+    words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
+    return sample_operator.sample(images, coordinates, words, bits, background)
 
 
 def _check(name: str, device: torch.device) -> None:

@@ -1,4 +1,4 @@
-"""The lookup in plain PyTorch: the reference of all other backends, for every device, dtype and order of derivative."""
+"""The lookup in plain PyTorch: the reference of the other backends, for any device, dtype and order of derivative."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-__all__ = ["NEAREST_DEPTH", "interpolate", "lookup", "place", "project", "sample"]
+__all__ = ["MIN_Z", "interpolate", "lookup", "place", "project", "sample"]
 
-NEAREST_DEPTH = 1e-4  # world units in front of a camera; nearer points count as behind
+MIN_Z = 1e-4  # z in the camera's frame, in world units; points below it count as behind the camera
 
 
 def project(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -18,9 +18,9 @@ def project(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[Ten
     else:
         chosen = matrices[views]
         homogeneous = torch.einsum("pvij,pj->pvi", chosen[..., :3], points) + chosen[..., 3]
-    depth = homogeneous[..., 2]
-    front = (depth > NEAREST_DEPTH) & (depth < torch.inf)
-    pixels = homogeneous[..., :2] / torch.where(front, depth, 1.0)[..., None]
+    z = homogeneous[..., 2]
+    front = (z > MIN_Z) & (z < torch.inf)
+    pixels = homogeneous[..., :2] / torch.where(front, z, 1.0)[..., None]
     return torch.where(front[..., None], pixels, 0.0), front
 
 

@@ -1,4 +1,4 @@
-"""Which parts of a scene can matter: a grid of occupied voxels, carved from masks (the visual hull)."""
+"""Occupancy grids, and the visual hull: a grid carved from masks (space carving)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from torch.nn.functional import max_pool3d, pad
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
-from hyperplanes.geometry.image_planes import NEAREST_DEPTH
+from hyperplanes.geometry.image_planes import MIN_Z
+from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.threads import share
 
-__all__ = ["Occupancy", "ball_reach", "carve", "full"]
+__all__ = ["Occupancy", "ball_extent", "carve", "full"]
 
 
 @dataclass(frozen=True)
 class Occupancy:
-    """Voxels of the cube around a sphere that may hold something.
+    """A grid of voxels in the cube around a sphere: true where the scene may not be empty.
 
     Attributes:
         occupied: indexed [x, y, z]; voxel 0 starts at centre - radius on each axis.
@@ -63,7 +64,7 @@ class Occupancy:
 
 
 def full(bounds: Sphere, side: int = 64, device: torch.device | str | None = None) -> Occupancy:
-    """A grid in which everything may matter."""
+    """A grid with every voxel occupied."""
     return Occupancy(torch.ones(side, side, side, dtype=torch.bool, device=device), bounds)
 
 
@@ -73,9 +74,9 @@ def carve(
 ) -> Occupancy:
     """The visual hull: voxels that no mask rules out.
 
-    A voxel goes when a camera whose picture holds all of the ball about the voxel sees only background there: no pixel
-    of the mask is set in the box that the ball reaches. So the hull of the true object is never cut, whatever the
-    resolution and wherever the pictures end, and does not depend on the order of the views.
+    A voxel is cleared where some image contains the whole projection of the voxel's bounding ball and no pixel of the
+    mask is set in the bounding box of that projection. So the hull of the true object is never cut, whatever the
+    resolution and wherever the images end, and does not depend on the order of the views.
 
     Args:
         masks: opacity in [0, 1].
@@ -89,39 +90,37 @@ def carve(
     if isinstance(cameras, DistortedCamera):
         raise ValueError("cameras: expected pinholes to carve with, got lens distortion; undistort the masks first")
     matrices, calibrations = camera.projection_matrices(cameras).float(), camera.intrinsics(cameras).float()
-    carver = _carve_compiled if masks.device.type == "cpu" and find_spec("numba") else _carve_plainly
+    carver = _carve_compiled if masks.device.type == "cpu" and find_spec("numba") else _carve_torch
     return Occupancy(carver(masks[:, 0] > 0, matrices, calibrations, bounds, side), bounds)
 
 
 def _carve_compiled(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int) -> Tensor:
-    """What is left of a full grid, by the compiled kernel; by NumPy, since PyTorch wakes its threads slowly."""
-    from hyperplanes.geometry.compiling import compiled
-
+    """The occupied voxels, by the compiled kernel. NumPy prepares its inputs: PyTorch's threads start slowly."""
     views, height, width = masks.shape
     tables = np.zeros((views, height + 1, width + 1), np.int32)
     np.cumsum(masks.numpy().cumsum(1, np.int32), 2, out=tables[:, 1:, 1:])
     grid = Occupancy(torch.from_numpy(np.ones((side, side, side), np.bool_)), bounds)
     corner = np.asarray(bounds.centre, np.float32) - np.float32(bounds.radius)
-    numbers = [np.float32(value) for value in (grid.voxel, grid.voxel * math.sqrt(3) / 2, _nearest(grid))]
+    numbers = [np.float32(value) for value in (grid.voxel, grid.voxel * math.sqrt(3) / 2, _min_z(grid))]
     fixed = (matrices.contiguous().numpy(), calibrations.contiguous().numpy(), tables, corner, *numbers)
-    kernel, occupied = compiled("carve", "float32"), grid.occupied.numpy().view(np.uint8)
-    share(lambda start, stop: kernel(*fixed, occupied, start, stop), side, 2)
+    kernel, occupied = compile_kernel("carving.carve", torch.float32), grid.occupied.numpy().view(np.uint8)
+    parallel_for(lambda start, stop: kernel(*fixed, occupied, start, stop), side, 2)
     return grid.occupied
 
 
-def _carve_plainly(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int) -> Tensor:
-    """What is left of a full grid, in plain PyTorch."""
+def _carve_torch(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int) -> Tensor:
+    """The occupied voxels, in plain PyTorch."""
     grid, tables = full(bounds, side, masks.device), pad(masks.int().cumsum(1).cumsum(2), (1, 0, 1, 0))
     kept, points = torch.arange(grid.occupied.numel(), device=tables.device), grid.centres()
     last = points.new_tensor([tables.shape[2] - 1.5, tables.shape[1] - 1.5])
     for matrix, calibration, table in zip(matrices, calibrations, tables, strict=True):
         homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
-        depth = homogeneous[:, 2]
-        front = depth > _nearest(grid)
-        pixels = homogeneous[:, :2] / torch.where(front, depth, 1.0)[:, None]
-        reach = ball_reach(pixels, depth, calibration, grid.voxel * math.sqrt(3) / 2) + 0.5
-        inside = front & ((pixels - reach >= -0.5) & (pixels + reach <= last)).all(1)
-        low, high = pixels[inside] - reach[inside], pixels[inside] + reach[inside]
+        z = homogeneous[:, 2]
+        front = z > _min_z(grid)
+        pixels = homogeneous[:, :2] / torch.where(front, z, 1.0)[:, None]
+        extent = ball_extent(pixels, z, calibration, grid.voxel * math.sqrt(3) / 2) + 0.5
+        inside = front & ((pixels - extent >= -0.5) & (pixels + extent <= last)).all(1)
+        low, high = pixels[inside] - extent[inside], pixels[inside] + extent[inside]
         (left, top), (right, bottom) = (low + 0.5).long().unbind(1), ((high + 0.5).long() + 1).unbind(1)
         right, bottom = right.clamp_max(table.shape[1] - 1), bottom.clamp_max(table.shape[0] - 1)
         count = table[bottom, right] - table[bottom, left] - table[top, right] + table[top, left]
@@ -131,27 +130,27 @@ def _carve_plainly(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds
     return torch.zeros_like(grid.occupied).flatten().index_fill_(0, kept, True).reshape(grid.occupied.shape)
 
 
-def _nearest(grid: Occupancy) -> float:
-    """Depth of the nearest voxel centre that a camera can judge: its ball must lie in front."""
-    return max(NEAREST_DEPTH, grid.voxel)
+def _min_z(grid: Occupancy) -> float:
+    """The least z of a voxel centre whose bounding ball lies in front of the camera."""
+    return max(MIN_Z, grid.voxel)
 
 
-def ball_reach(
-    pixels: Float[Tensor, "point 2"], depth: Float[Tensor, " point"], calibration: Float[Tensor, "3 3"], radius: float
+def ball_extent(
+    pixels: Float[Tensor, "point 2"], z: Float[Tensor, " point"], calibration: Float[Tensor, "3 3"], radius: float
 ) -> Float[Tensor, "point 2"]:
-    """How many pixels (across, down) a ball about each point reaches in a picture.
+    """Upper bounds, in pixels (horizontal, vertical), of the radius of a ball's projection about its centre's.
 
     A point within r of one at slope u = x / z has a slope within r sqrt(1 + u^2) / (z - r) of u: more towards the
-    border of a picture than in its middle.
+    border of an image than in its middle.
 
     Args:
         pixels: where the points project.
-        depth: along the optical axis, beyond `radius`.
+        z: in the camera's frame, greater than `radius`.
         calibration: of the camera.
         radius: of the balls, in world units.
     """
     down = (pixels[:, 1] - calibration[1, 2]) / calibration[1, 1]
     across = (pixels[:, 0] - calibration[0, 2] - calibration[0, 1] * down) / calibration[0, 0]
     slopes = torch.stack([across, down], -1)
-    change = radius * (1 + slopes.square()).sqrt() / (depth - radius)[:, None]
+    change = radius * (1 + slopes.square()).sqrt() / (z - radius)[:, None]
     return change @ calibration[:2, :2].abs().T

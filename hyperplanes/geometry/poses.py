@@ -1,6 +1,6 @@
-"""Where cameras stand: camera_from_world matrices of rings, spheres and single eyes, and OpenGL's to ours and back.
+"""Camera poses: look-at, orbits and Fibonacci spheres, and conversion between OpenGL and OpenCV axes.
 
-OpenCV axes (x right, y down, z forward), as in `cameras`, which makes cameras of them.
+OpenCV axes (x right, y down, z forward) unless a name says otherwise.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def look_at(
 ) -> Float[Tensor, "view 4 4"]:
     """camera_from_world of cameras at `eyes` that look at `target`, image top towards `up`.
 
-    Looking straight along `up` leaves the roll open; the world's next axis decides it then.
+    Where the viewing direction is parallel to `up`, the world's next axis takes its place.
 
     Raises:
         ValueError: an eye at the target.

@@ -1,4 +1,4 @@
-"""Rays through pixels, and where they cross the sphere that bounds a scene."""
+"""Rays through pixels, with near and far from the bounding sphere of the scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Rays", "Sphere", "cast", "pixel_grid"]
 
 @dataclass(frozen=True)
 class Sphere:
-    """What bounds a scene: nothing outside it is seen.
+    """The bounding sphere of a scene; nothing outside it is rendered.
 
     Attributes:
         centre: in world units.
@@ -34,13 +34,13 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Rays:
-    """Points origin + t direction with near <= t <= far; a ray with near == far sees nothing.
+    """Points origin + t direction with near <= t <= far; a ray with near == far has no samples.
 
     Attributes:
         origins: in the world.
         directions: unit vectors in the world.
-        near: first distance of interest.
-        far: last distance of interest.
+        near: least distance t along the ray.
+        far: greatest distance t along the ray.
     """
 
     origins: Float[Tensor, "ray 3"]
@@ -84,11 +84,11 @@ def cast(
 
     Args:
         cameras: a batch (view,).
-        view: which camera each ray starts from.
-        pixels: (column, row) in the picture, integer pixel centres; a lens is undone.
+        view: index of the camera of each ray.
+        pixels: (column, row) in the image, integer pixel centres; lens distortion is undone.
         bounds: what near and far are taken from; the unit sphere where absent.
-        span: "sphere" clips each ray to the sphere (a miss gets near == far); "depth" gives every ray of a camera the
-            same near and far, the distance of the sphere's centre minus and plus its radius, as NeRF does.
+        span: "sphere" clips each ray to the sphere (a miss gets near == far); "constant" gives every ray of a camera
+            the same near and far, the distance of the sphere's centre minus and plus its radius, as NeRF does.
 
     Returns:
         Rays with unit directions, differentiable in the cameras.
@@ -107,11 +107,11 @@ def cast(
     directions = torch.nn.functional.normalize((pose[:, :3, :3].mT @ local[..., None]).squeeze(-1), dim=-1)
     origins = camera.centres(cameras)[view]
     to_centre = origins.new_tensor(bounds.centre) - origins
-    if span == "depth":
+    if span == "constant":
         distance = to_centre.norm(dim=-1)
         return Rays(origins, directions, (distance - bounds.radius).clamp_min(0), distance + bounds.radius)
     if span != "sphere":
-        raise ValueError(f"span: expected 'sphere' or 'depth', got {span!r}")
+        raise ValueError(f"span: expected 'sphere' or 'constant', got {span!r}")
     middle = (to_centre * directions).sum(-1)
     square = bounds.radius**2 - to_centre.square().sum(-1) + middle.square()
     hit = square > 0

@@ -37,7 +37,7 @@ class RunningStandardisation(nn.Module):
         self.register_buffer("variance", torch.ones(shape))
         self.register_buffer("steps", torch.zeros(()))
 
-    def forward(self, codes: Float[Tensor, "object *shape"]) -> Float[Tensor, "object *shape"]:
+    def forward(self, codes: Float[Tensor, "object ..."]) -> Float[Tensor, "object ..."]:
         """Codes of mean 0 and variance 1 over the objects of the training; updates the statistics in training."""
         if not self.training:
             return self._standardised(codes)

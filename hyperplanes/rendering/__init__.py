@@ -1,16 +1,20 @@
 """Volume rendering of any field given as a callable (points, directions) -> (colour, density)."""
 
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
-from hyperplanes.rendering.marching import Packed, march
-from hyperplanes.rendering.renderer import FieldFunction, Hierarchical, Marched, render, render_in_chunks
-from hyperplanes.rendering.sampling import importance, intervals, stratified
+from hyperplanes.rendering.hierarchical import Hierarchical, importance, intervals, stratified
+from hyperplanes.rendering.images import Pictures
+from hyperplanes.rendering.marching import Marched, PackedSamples, march
+from hyperplanes.rendering.renderer import render
+from hyperplanes.rendering.samplers import FieldFunction, Sampler
 
 __all__ = [
     "FieldFunction",
     "Hierarchical",
     "Marched",
-    "Packed",
+    "PackedSamples",
+    "Pictures",
     "Rendered",
+    "Sampler",
     "composite",
     "composite_packed",
     "importance",
@@ -18,6 +22,5 @@ __all__ = [
     "march",
     "packed_weights",
     "render",
-    "render_in_chunks",
     "stratified",
 ]

@@ -1,4 +1,4 @@
-"""From densities and colours along rays to pixels: dense, (ray, sample), and packed, one row a live sample."""
+"""Alpha compositing of samples along rays: dense, (ray, sample), and packed, one row a sample of any ray."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from torch import Tensor
 
 __all__ = ["Rendered", "composite", "composite_packed", "packed_weights"]
 
-SOLID = 1e3  # thickness above which nothing more can be hidden: exp(-1000) is 0, and a sum over all rays stays exact
+MAX_OPTICAL_DEPTH = 1e3  # of a sample: exp(-1000) is 0, and the running sum over all rays stays exact
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """What rays see.
+    """The pixels of rays.
 
     Attributes:
         colour: over the background.
         opacity: 1 - the transmittance of the whole ray.
-        depth: expected distance of what was hit, sum of w t / opacity; 0 where nothing was.
-        samples: how often the field was asked, over all rays.
-        coarse: the colour of the coarse pass, where there was one; training asks it to be right too.
+        depth: expected distance along the ray in world units, sum of w t / opacity; 0 where the opacity is 0.
+        samples: number of field evaluations, over all rays.
+        coarse: the colour of the coarse pass, where there was one; training has a loss on it too.
     """
 
     colour: Float[Tensor, "ray 3"]
@@ -38,7 +38,7 @@ def composite(
     edges: Float[Tensor, "ray edge"],
     background: float = 1.0,
     *,
-    at: Float[Tensor, "ray interval"] | None = None,
+    distances: Float[Tensor, "ray interval"] | None = None,
 ) -> tuple[Rendered, Float[Tensor, "ray interval"]]:
     """w_i = T_i (1 - exp(-sigma_i delta_i)), T_i = exp(-sum_{j<i} sigma_j delta_j) (NeRF, Eq. 3).
 
@@ -47,56 +47,56 @@ def composite(
         density: of each sample, per world unit.
         edges: of the intervals that the samples stand for, ascending; delta_i is the length of each.
         background: grey value behind everything.
-        at: the distance of each sample, for the depth; the middles of the intervals where absent.
+        distances: of the samples along their rays, for the depth; the middles of the intervals where absent.
 
     Returns:
         The pixels, and the weights for importance sampling.
     """
-    thickness = density * edges.diff(dim=1)
-    passed = torch.cat([torch.zeros_like(thickness[:, :1]), thickness.cumsum(1)], 1)
-    transmittance = torch.exp(-passed)
+    optical_depth = density * edges.diff(dim=1)
+    before = torch.cat([torch.zeros_like(optical_depth[:, :1]), optical_depth.cumsum(1)], 1)
+    transmittance = torch.exp(-before)
     weights = transmittance[:, :-1] - transmittance[:, 1:]
     opacity = 1 - transmittance[:, -1]
-    distances = (edges[:, 1:] + edges[:, :-1]) / 2 if at is None else at
+    distances = (edges[:, 1:] + edges[:, :-1]) / 2 if distances is None else distances
     depth = (weights * distances).sum(1) / opacity.clamp_min(1e-10)
     pixels = (weights[..., None] * colour).sum(1) + (1 - opacity)[:, None] * background
     return Rendered(pixels, opacity, depth, density.numel()), weights
 
 
 def packed_weights(
-    thickness: Float[Tensor, " sample"], ray: Int[Tensor, " sample"], count: int
+    optical_depth: Float[Tensor, " sample"], ray: Int[Tensor, " sample"], count: int
 ) -> Float[Tensor, " sample"]:
     """Compositing weights of packed samples.
 
     Args:
-        thickness: sigma delta of each sample; the samples of a ray stand together, near ones first.
-        ray: which ray each sample belongs to, ascending.
+        optical_depth: sigma delta of each sample; those of a ray are adjacent, in the order of distance.
+        ray: index of the ray of each sample, ascending.
         count: number of rays.
 
     Returns:
-        w_i as in `composite`. A density that is infinite or not a number is the matter of its own ray alone.
+        w_i as in `composite`. A density that is infinite or not a number affects its own ray only.
     """
-    if not len(thickness):
-        return thickness
+    if not len(optical_depth):
+        return optical_depth
     # One running sum over all rays, in double precision so that a ray late in the batch loses nothing, less its value
     # where the ray begins.
-    finite = thickness.double().nan_to_num(0.0).clamp_max(SOLID)
+    finite = optical_depth.double().nan_to_num(0.0).clamp_max(MAX_OPTICAL_DEPTH)
     before = finite.cumsum(0) - finite
     first = torch.searchsorted(ray, torch.arange(count, device=ray.device)).clamp_max(len(ray) - 1)
-    before = (before - before[first][ray]).to(thickness.dtype)
-    return torch.exp(-before) * -torch.expm1(-thickness)
+    before = (before - before[first][ray]).to(optical_depth.dtype)
+    return torch.exp(-before) * -torch.expm1(-optical_depth)
 
 
 def composite_packed(
     colour: Float[Tensor, "sample 3"],
     weights: Float[Tensor, " sample"],
-    middles: Float[Tensor, " sample"],
+    distances: Float[Tensor, " sample"],
     ray: Int[Tensor, " sample"],
     count: int,
     background: float = 1.0,
 ) -> Rendered:
     """Pixels of `count` rays from weighted samples in any order."""
-    values = torch.cat([colour, middles[:, None], torch.ones_like(middles)[:, None]], 1) * weights[:, None]
+    values = torch.cat([colour, distances[:, None], torch.ones_like(distances)[:, None]], 1) * weights[:, None]
     sums = values.new_zeros(count, 5).index_add(0, ray, values)
     opacity = sums[:, 4]
     pixels = sums[:, :3] + (1 - opacity)[:, None] * background

@@ -1,4 +1,4 @@
-"""Which pixels an occupied region can be seen in."""
+"""The pixels whose rays may cross an occupied region."""
 
 from __future__ import annotations
 
@@ -11,19 +11,22 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.occupancy import Occupancy, ball_reach
+from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.occupancy import Occupancy, ball_extent
 
 __all__ = ["footprint"]
 
 
 @torch.no_grad()
 def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "view height width"]:
-    """The pixels whose rays may meet an occupied voxel; every other pixel is background.
+    """The pixels whose rays may cross an occupied voxel; every other pixel is background.
 
-    Voxel centres are projected and grown by the most that a voxel of that view reaches across and down, so that no
-    pixel that sees one is missed. A voxel beside or behind the camera's plane makes every pixel of that view count.
+    Voxel centres are projected and dilated by the largest extent of a voxel in that view, so that no pixel is missed.
+    All pixels of a view count where a voxel lies beside or behind the camera, or where the camera has lens distortion.
     """
     height, width = camera.image_size(cameras)
+    if isinstance(cameras, DistortedCamera) and occupancy.occupied.any():
+        return torch.ones(cameras.batch_size, height, width, dtype=torch.bool, device=cameras.intrinsics.device)
     matrices, calibration = camera.projection_matrices(cameras), camera.intrinsics(cameras)
     points = occupancy.centres().to(matrices)
     result = torch.zeros(len(matrices), height, width, dtype=torch.bool, device=points.device)
@@ -35,11 +38,11 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
             result[view] = True
             continue
         pixels = homogeneous[:, :2] / homogeneous[:, 2:]
-        reach = ball_reach(pixels, homogeneous[:, 2], calibration[view], occupancy.voxel * math.sqrt(3) / 2)
-        touching = ((pixels + reach >= 0) & (pixels - reach <= pixels.new_tensor([width - 1, height - 1]))).all(-1)
+        extent = ball_extent(pixels, homogeneous[:, 2], calibration[view], occupancy.voxel * math.sqrt(3) / 2)
+        touching = ((pixels + extent >= 0) & (pixels - extent <= pixels.new_tensor([width - 1, height - 1]))).all(-1)
         if not touching.any():
             continue
-        across, down = (int(value) for value in (reach[touching].amax(0) + 0.51).tolist())
+        across, down = (int(value) for value in (extent[touching].amax(0) + 0.51).tolist())
         if across > width or down > height:
             result[view] = True
             continue

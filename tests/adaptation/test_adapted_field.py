@@ -35,7 +35,7 @@ def test_a_picture_is_what_its_rays_see(sampling, size):
     assert pictures.opacity.shape == pictures.depth.shape == (2, 1, *size)
     posed = Views(pictures.images, cameras)
     for view in range(2):
-        seen = field.trace(posed.rays(view, span="sphere" if isinstance(sampling, Marched) else "depth"))
+        seen = field.trace(posed.rays(view, span=sampling.span))
         torch.testing.assert_close(pictures.images[view].flatten(1).T, seen.colour, atol=1e-4, rtol=0)
         torch.testing.assert_close(pictures.opacity[view].flatten(), seen.opacity, atol=1e-4, rtol=0)
         torch.testing.assert_close(pictures.depth[view].flatten(), seen.depth, atol=1e-3, rtol=0)

@@ -159,7 +159,7 @@ def test_a_coarse_network_proposes_and_is_updated_too(support):
     assert {name.split(".")[0] for name in both.theta} == {"fine", "coarse"}
     prepared = both.prepare(support)
     assert {name.split(".")[0] for name in both.update(prepared)} == {"fine", "coarse"}
-    seen = both.adapt(support).trace(support.rays(0, span="depth"))
+    seen = both.adapt(support).trace(support.rays(0, span="constant"))
     assert (seen.coarse - seen.colour).abs().max() > 1e-3
 
 

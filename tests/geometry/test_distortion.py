@@ -5,8 +5,13 @@ import numpy as np
 import pytest
 import torch
 
+from hyperplanes.data.upright import upright, y_up_from
 from hyperplanes.geometry import ImagePlanes, Sphere, cameras, carve, cast
 from hyperplanes.geometry.distortion import DistortedCamera, distorted
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.rendering import Marched, render
+from hyperplanes.views import Views
+from tests.reference_rendering import ring
 from tests.test_conventions import HEIGHT, WIDTH, K, opencv_pixels, poses, some_points
 
 LENS = torch.tensor([-0.28, 0.07, 0.002, -0.001, -0.01], dtype=torch.float64)
@@ -64,6 +69,66 @@ def test_no_distortion_changes_nothing():
     plain = ImagePlanes(images, bare).lookup(some_points())
     behind_glass = ImagePlanes(images, distorted(bare, torch.zeros(5))).lookup(some_points())
     torch.testing.assert_close(behind_glass.colours, plain.colours)
+
+
+def test_project_and_unproject_apply_the_lens_as_opencv_does():
+    ours, points = lenses(), some_points()
+    pixels = ours.project(points.expand(6, -1, 3))
+    shown = pixels.isfinite().all(-1)
+    assert shown.double().mean() > 0.8
+    np.testing.assert_allclose(pixels[shown], opencv_pixels(points, K, poses(), LENS)[shown.numpy()], atol=1e-9)
+    near = shown & (pixels > 0).all(-1) & (pixels < torch.tensor([WIDTH, HEIGHT])).all(-1)
+    z = (poses()[:, 2, :3] @ points.T + poses()[:, 2, 3:])[..., None]
+    again = ours.unproject(pixels.nan_to_num(), z)
+    torch.testing.assert_close(again[near], points.expand(6, -1, 3)[near], atol=1e-4, rtol=0)
+
+
+def test_what_a_lens_cannot_show_is_not_projected():
+    matrix = torch.tensor([[10.0, 0.0, 20.0], [0.0, 10.0, 20.0], [0.0, 0.0, 1.0]])
+    bare = cameras.pinhole(matrix, torch.eye(4)[None], 41, 41)
+    ours = distorted(bare, torch.tensor([-1 / 3, 0.0, 0.0, 0.0, 0.0]))
+    pixels = ours.project(torch.tensor([[[0.9, 0.0, 1.0], [1.1, 0.0, 1.0]]]))[0]
+    assert pixels[0].tolist() == pytest.approx([20 + 10 * (0.9 - 0.9**3 / 3), 20.0], abs=1e-5)
+    assert pixels[1].isnan().all()
+
+
+def test_what_would_lose_the_lens_is_refused():
+    with pytest.raises(ValueError, match=r"scale: .* got a DistortedCamera; use cameras.resized"):
+        lenses().scale(torch.tensor([2.0]))
+    with pytest.raises(ValueError, match=r"scale: .* use cameras.resized"):
+        lenses().scale_(2.0)
+    with pytest.raises(ValueError, match=r"point_3d: expected shape \(6, point, 3\), got \(9, 3\)"):
+        lenses().project(torch.zeros(9, 3, dtype=torch.float64))
+    assert torch.equal(lenses().clone().distortion, lenses().distortion)
+
+
+def test_pictures_through_a_lens_lose_no_pixel():
+    """Source of truth: every ray of the picture rendered by itself; a strong barrel lens shrinks the ball's image."""
+    bare = ring(2, (24, 24))
+    ours = distorted(bare, torch.tensor([-0.9, 0.5, 0.0, 0.0, 0.0]))
+    grid = full(Sphere(), 8)
+
+    def ball(points, directions):
+        return points.abs(), 30.0 * (points.norm(dim=-1) < 0.9)
+
+    picture = render(ball, ours, Marched(40), occupancy=grid)
+    views = Views(picture.images, ours)
+    for view in range(2):
+        seen = render(ball, views.rays(view), Marched(40), occupancy=grid, differentiable=False)
+        torch.testing.assert_close(picture.images[view].flatten(1).T, seen.colour)
+    assert (render(ball, bare, Marched(40), occupancy=grid).opacity - picture.opacity).abs().max() > 0.9
+
+
+def test_turned_worlds_keep_their_lenses():
+    ours = lenses()
+    views = Views(torch.zeros(6, 3, HEIGHT, WIDTH, dtype=torch.float64), ours)
+    turned = upright(views, "z").cameras
+    assert isinstance(turned, DistortedCamera)
+    points = some_points()
+    moved = points @ y_up_from("z")[:3, :3].T
+    torch.testing.assert_close(
+        turned.project(moved.expand(6, -1, 3)), ours.project(points.expand(6, -1, 3)), equal_nan=True
+    )
 
 
 def test_wrong_lenses_are_stopped():

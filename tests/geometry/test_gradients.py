@@ -54,7 +54,7 @@ def test_lookup(backend, chosen):
 
     def run(points, images, change, shift):
         ours = cameras.pinhole(grown(matrix, change), moved(pose, shift), 6, 7)
-        found = ImagePlanes(images, ours, backend=backend).lookup(points, views, bearings=True)
+        found = ImagePlanes(images, ours, backend=backend).lookup(points, views, return_directions=True)
         return found.colours, found.coordinates, found.directions, found.distances
 
     small = torch.zeros(4, dtype=torch.float64), torch.zeros(3, 6, dtype=torch.float64)

@@ -8,7 +8,7 @@ import torch
 
 from hyperplanes.geometry import ImagePlanes, cameras
 from hyperplanes.geometry.lookup import _INSTALLED, backends, choose, lookup
-from hyperplanes.geometry.storage import pack, unpack
+from hyperplanes.geometry.packed_images import pack, unpack
 from tests import reference
 
 BACKENDS = ["torch", "cpu"]
@@ -86,7 +86,7 @@ def test_edge_cases_have_the_stated_values(backend):
         ((1e6, -1e6, 1.0), 9.0, (1.0, -1.0), False),  # far outside
         ((0.0, 0.0, -1.0), 9.0, (0.0, 0.0), False),  # behind
         ((0.3, 0.1, 0.0), 9.0, (0.0, 0.0), False),  # at z = 0
-        ((0.0, 0.0, 5e-5), 9.0, (0.0, 0.0), False),  # nearer than NEAREST_DEPTH
+        ((0.0, 0.0, 5e-5), 9.0, (0.0, 0.0), False),  # nearer than MIN_Z
         ((math.nan, 0.0, 1.0), 9.0, (0.0, 0.0), False),
         ((0.0, math.inf, math.inf), 9.0, (0.0, 0.0), False),
     ]
@@ -193,11 +193,11 @@ def test_images_changed_in_place_are_seen():
     torch.testing.assert_close(planes.lookup(points).colours, before / 2, atol=2e-3, rtol=0)
 
 
-def test_bearings_match_centres():
+def test_directions_and_distances_match_centres():
     """Closed form: centre + distance * direction = point, directions are unit vectors."""
     points, ours, images = scene(points=20)
     views = torch.tensor([[4, 0]]).expand(20, 2)
-    found = ImagePlanes(images, ours).lookup(points, views, bearings=True)
+    found = ImagePlanes(images, ours).lookup(points, views, return_directions=True)
     back = cameras.centres(ours)[views] + found.distances[..., None] * found.directions
     torch.testing.assert_close(back, points[:, None].expand_as(back))
     torch.testing.assert_close(found.directions.norm(dim=-1), torch.ones(20, 2))
@@ -206,26 +206,26 @@ def test_bearings_match_centres():
 
 def test_the_operator_passes_torchs_own_checks():
     """Schema, fake tensor and autograd registration, by torch.library.opcheck."""
-    from hyperplanes.geometry import lookup_op
+    from hyperplanes.geometry.kernels import lookup_operator
 
     points, ours, images = scene(points=7)
     matrices = cameras.projection_matrices(ours)
     leaves = (points.requires_grad_(), matrices.requires_grad_(), images.requires_grad_())
     tests = ("test_schema", "test_autograd_registration", "test_faketensor")
     for views in (None, torch.zeros(7, 2, dtype=torch.long)):
-        torch.library.opcheck(lookup_op.lookup, (*leaves, None, 0, views, 1.0), test_utils=tests)
+        torch.library.opcheck(lookup_operator.lookup, (*leaves, None, 0, views, 1.0), test_utils=tests)
 
 
 def test_compiled_code_gives_the_same():
     """Another implementation: eager mode. One graph with gradients; shape checks would not
     trace."""
-    from hyperplanes.geometry import lookup_op
+    from hyperplanes.geometry.kernels import lookup_operator
 
     points, ours, images = scene(points=50)
     matrices = cameras.projection_matrices(ours)
 
     def loss(points, images):
-        colours, coordinates, _ = lookup_op.lookup(2 * points, matrices, images, None, 0, None, 1.0)
+        colours, coordinates, _ = lookup_operator.lookup(2 * points, matrices, images, None, 0, None, 1.0)
         return colours.square().sum() + coordinates.sin().sum()
 
     values = []

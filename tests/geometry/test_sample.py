@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from hyperplanes.geometry import cameras, sample
 from hyperplanes.geometry.lookup import _INSTALLED, lookup
-from hyperplanes.geometry.storage import pack, unpack
+from hyperplanes.geometry.packed_images import pack, unpack
 
 BACKENDS = ["torch", "cpu"]
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
@@ -199,9 +199,9 @@ def test_no_point_no_view_no_channel(backend):
         found = sample(*leaves, backend=backend)
         assert found.shape == (len(where), len(ours), ours.shape[1])
     assert sample(images, coordinates[:1], backend=backend).shape == (1, 4, 3)
-    from hyperplanes.geometry import sampling_op
+    from hyperplanes.geometry.kernels import sample_operator
 
-    for value in sampling_op.sample_backward(images, coordinates[:0], None, 0, torch.zeros(0, 4, 3), True, True):
+    for value in sample_operator.sample_backward(images, coordinates[:0], None, 0, torch.zeros(0, 4, 3), True, True):
         assert not value.any()
 
 
@@ -224,27 +224,27 @@ def test_the_result_does_not_depend_on_the_threads():
 
 def test_the_operator_passes_torchs_own_checks():
     """Schema, fake tensor and autograd registration, by torch.library.opcheck."""
-    from hyperplanes.geometry import sampling_op
+    from hyperplanes.geometry.kernels import sample_operator
 
     images, coordinates = scene(points=7)
     tests = ("test_schema", "test_autograd_registration", "test_faketensor")
     leaves = images.requires_grad_(), coordinates.requires_grad_()
-    torch.library.opcheck(sampling_op.sample, (*leaves, None, 0, 1.0), test_utils=tests)
+    torch.library.opcheck(sample_operator.sample, (*leaves, None, 0, 1.0), test_utils=tests)
     bare = images.detach(), coordinates.detach()
     pull = torch.ones(7, 4, 3)
     for geometry, pixels in ((True, True), (True, False), (False, True)):
         arguments = (*bare, None, 0, pull, geometry, pixels)
-        torch.library.opcheck(sampling_op.sample_backward, arguments, test_utils=("test_schema", "test_faketensor"))
+        torch.library.opcheck(sample_operator.sample_backward, arguments, test_utils=("test_schema", "test_faketensor"))
 
 
 def test_compiled_code_gives_the_same():
     """Another implementation: eager mode. One graph with gradients; shape checks would not trace."""
-    from hyperplanes.geometry import sampling_op
+    from hyperplanes.geometry.kernels import sample_operator
 
     images, coordinates = scene(points=50)
 
     def loss(images, coordinates):
-        return sampling_op.sample(images, 0.9 * coordinates, None, 0, 1.0).square().sum()
+        return sample_operator.sample(images, 0.9 * coordinates, None, 0, 1.0).square().sum()
 
     values = []
     for function in (loss, torch.compile(loss, backend="aot_eager", fullgraph=True)):

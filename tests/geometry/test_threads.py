@@ -7,8 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from hyperplanes.geometry import ImagePlanes, cameras, threads
-from hyperplanes.geometry.threads import share
+from hyperplanes.geometry import ImagePlanes, cameras
+from hyperplanes.geometry.kernels import threads
+from hyperplanes.geometry.kernels.threads import parallel_for
 
 
 def lookups(count, size=8, exact=False):
@@ -18,11 +19,11 @@ def lookups(count, size=8, exact=False):
     return ImagePlanes(images, ours, exact=exact).lookup(points).colours
 
 
-def test_share_covers_every_index_once():
-    spans = share(lambda start, stop: (start, stop), 10_001, 37)
+def test_parallel_for_covers_every_index_once():
+    spans = parallel_for(lambda start, stop: (start, stop), 10_001, 37)
     assert sorted(spans)[0][0] == 0
     assert sum(stop - start for start, stop in spans) == 10_001
-    assert share(lambda start, stop: 1, 0, 5) == []
+    assert parallel_for(lambda start, stop: 1, 0, 5) == []
 
 
 @pytest.mark.parametrize(("size", "exact"), [(8, False), (8, True), (150, True)])

@@ -208,5 +208,7 @@ def test_a_broken_density_stays_in_its_own_ray(poison):
 def test_the_depth_is_that_of_the_samples_where_they_are_given():
     # two samples of weights 1/2 and 1/4 at 1.1 and 2.4 in the intervals (1, 2) and (2, 3): (0.55 + 0.6) / 0.75
     density = torch.full((1, 2), math.log(2.0))
-    seen, _ = composite(torch.ones(1, 2, 3), density, torch.tensor([[1.0, 2.0, 3.0]]), at=torch.tensor([[1.1, 2.4]]))
+    seen, _ = composite(
+        torch.ones(1, 2, 3), density, torch.tensor([[1.0, 2.0, 3.0]]), distances=torch.tensor([[1.1, 2.4]])
+    )
     assert seen.depth.item() == pytest.approx(1.15 / 0.75)

@@ -21,16 +21,16 @@ def test_samples_are_those_of_a_walk_ray_by_ray(bounds):
     for index in range(len(rays)):
         ray = (rays.origins[index].tolist(), rays.directions[index].tolist())
         expected = march_ray(*ray, 2.0, 4.0, 0.07, 0.5, occupied, bounds.centre, bounds.radius)
-        assert found.middles[found.ray == index].tolist() == pytest.approx(expected)
+        assert found.distances[found.ray == index].tolist() == pytest.approx(expected)
     assert len(found) > 100
-    assert found.width == 0.07
+    assert found.step == 0.07
 
 
 @pytest.mark.parametrize("seed", [None, 3])
 def test_samples_lie_in_occupied_voxels(seed):
     grid, rays = random_grid(OFF_CENTRE), some_rays(200)
     found = march(rays, grid, 0.05, None if seed is None else torch.Generator().manual_seed(seed))
-    points = rays.origins[found.ray] + found.middles[:, None] * rays.directions[found.ray]
+    points = rays.origins[found.ray] + found.distances[:, None] * rays.directions[found.ray]
     occupied = grid.occupied.tolist()
     assert len(points) > 100
     assert all(voxel_is_occupied(occupied, OFF_CENTRE.centre, OFF_CENTRE.radius, p) for p in points.tolist())
@@ -40,7 +40,7 @@ def test_samples_stand_ray_by_ray_near_ones_first():
     found = march(some_rays(50), full(Sphere(), 4), 0.1, torch.Generator().manual_seed(0))
     same = found.ray.diff() == 0
     assert (found.ray.diff() >= 0).all()
-    torch.testing.assert_close(found.middles.diff()[same], torch.full_like(found.middles.diff()[same], 0.1))
+    torch.testing.assert_close(found.distances.diff()[same], torch.full_like(found.distances.diff()[same], 0.1))
 
 
 def straight(near, far, origin=-3.0):
@@ -52,16 +52,16 @@ def straight(near, far, origin=-3.0):
 
 def test_one_sample_in_the_middle_of_every_step():
     # from 2 to 4 by steps of 0.5: 2.25, 2.75, 3.25, 3.75
-    assert march(straight([2.0], [4.0]), full(Sphere(), 2), 0.5).middles.tolist() == [2.25, 2.75, 3.25, 3.75]
+    assert march(straight([2.0], [4.0]), full(Sphere(), 2), 0.5).distances.tolist() == [2.25, 2.75, 3.25, 3.75]
 
 
 def test_a_generator_shifts_each_ray_by_one_uniform_fraction_of_a_step():
     rays = straight([2.0] * 3000, [4.0] * 3000)
     found = march(rays, full(Sphere(), 2), 0.5, torch.Generator().manual_seed(0))
-    first = found.middles[found.ray.diff(prepend=torch.tensor([-1])) > 0]
+    first = found.distances[found.ray.diff(prepend=torch.tensor([-1])) > 0]
     offset = ((first - 2) / 0.5).sort().values
     assert (offset - (torch.arange(3000) + 0.5) / 3000).abs().max() < 2.7 / 3000**0.5
-    assert torch.equal(found.middles, march(rays, full(Sphere(), 2), 0.5, torch.Generator().manual_seed(0)).middles)
+    assert torch.equal(found.distances, march(rays, full(Sphere(), 2), 0.5, torch.Generator().manual_seed(0)).distances)
 
 
 def test_what_misses_has_no_samples():
@@ -79,13 +79,13 @@ def test_a_ray_from_inside_looks_only_ahead():
     rays = cast(camera, torch.zeros(9, dtype=torch.long), pixel_grid(3, 3))
     found = march(rays, full(Sphere(), 4), 0.05)
     assert (rays.near == 0).all()
-    assert (found.middles > 0).all()
-    assert (found.middles < rays.far[found.ray]).all()
+    assert (found.distances > 0).all()
+    assert (found.distances < rays.far[found.ray]).all()
     assert set(found.ray.tolist()) == set(range(9))
 
 
 def test_only_part_of_a_sphere_is_walked_beyond_it_nothing():
     rays = some_rays(20)
     found = march(rays, full(Sphere(), 4), 0.1)
-    points = rays.origins[found.ray] + found.middles[:, None] * rays.directions[found.ray]
+    points = rays.origins[found.ray] + found.distances[:, None] * rays.directions[found.ray]
     assert (points.abs() <= 1).all()

@@ -1,4 +1,4 @@
-"""What a GPU's shorter matrix products do to pictures, seen without one."""
+"""What TF32 matrix products do to pictures, without a GPU."""
 
 import torch
 from torch.nn.functional import linear
@@ -7,20 +7,20 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.fields import base
 from hyperplanes.geometry.cameras import select
 from hyperplanes.metrics import psnr
-from hyperplanes.rendering.renderer import shorter_products
+from hyperplanes.rendering.renderer import allow_tf32
 from hyperplanes.views import Views
 from tests.reference_rendering import ring
 
 
-def test_products_of_a_gpu_are_shorter_there_alone_and_for_a_while():
+def test_tf32_is_allowed_on_a_gpu_alone_and_while_the_context_lasts():
     before = torch.get_float32_matmul_precision()
     for name, expected in (("cpu", before), ("cuda", "high")):
-        with shorter_products(torch.device(name)):
+        with allow_tf32(torch.device(name)):
             assert torch.get_float32_matmul_precision() == expected
         assert torch.get_float32_matmul_precision() == before
 
 
-def test_pictures_bear_the_shorter_products_of_a_gpu(monkeypatch):
+def test_tf32_products_leave_pictures_as_they_are(monkeypatch):
     # Source of truth: operands rounded to 10 bits of fraction by hand, as tensor cores read them.
     model = HyperPlanes.from_pretrained("cars-64")
     generator = torch.Generator().manual_seed(0)

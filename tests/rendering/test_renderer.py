@@ -2,11 +2,13 @@ import math
 
 import pytest
 import torch
+from kornia.geometry.camera import PinholeCamera
 
+import hyperplanes
 from hyperplanes.geometry.cameras import pinhole, symmetric_intrinsics
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
-from hyperplanes.rendering import Hierarchical, Marched, march, render, render_in_chunks
+from hyperplanes.rendering import Hierarchical, Marched, Sampler, march, render
 from tests.reference_rendering import ball_hit, composite_ray, ring, soft_ball, some_rays
 
 DOUBLE = torch.float64
@@ -55,7 +57,7 @@ def test_marched_equals_the_loop_over_its_samples():
     seen = render(soft_ball, rays, Marched(50, 1e-12), occupancy=grid, background=0.2)
     samples = march(rays, grid, 2 / 50)
     for index in range(len(rays)):
-        t = samples.middles[samples.ray == index]
+        t = samples.distances[samples.ray == index]
         direction = rays.directions[index].expand(len(t), 3)
         colour, density = soft_ball(rays.origins[index] + t[:, None] * direction, direction)
         thickness = [0.0, *(density * 2 / 50).cumsum(0).tolist()]  # the gaps between live voxels let everything pass
@@ -92,8 +94,8 @@ def test_fine_samples_bring_the_coarse_picture_nearer():
 @torch.no_grad()
 def test_stopping_changes_a_colour_by_less_than_the_threshold(stop):
     rays = some_rays(100)
-    whole = render(soft_ball, rays, Marched(64, 1e-12), occupancy=GRID)
-    stopped = render(soft_ball, rays, Marched(64, stop), occupancy=GRID)
+    whole = render(soft_ball, rays, Marched(64, 1e-12), occupancy=GRID, differentiable=False)
+    stopped = render(soft_ball, rays, Marched(64, stop), occupancy=GRID, differentiable=False)
     assert (stopped.colour - whole.colour).abs().max() < stop
     assert (stopped.opacity - whole.opacity).abs().max() < stop
     assert stopped.samples < whole.samples
@@ -102,8 +104,8 @@ def test_stopping_changes_a_colour_by_less_than_the_threshold(stop):
 def test_the_picture_is_the_same_with_and_without_gradients():
     rays = some_rays(50)
     with_gradients = render(soft_ball, rays, Marched(64, 1e-9), occupancy=GRID)
-    with torch.no_grad():
-        without = render(soft_ball, rays, Marched(64, 1e-9), occupancy=GRID)
+    without = render(soft_ball, rays, Marched(64, 1e-9), occupancy=GRID, differentiable=False)
+    assert not without.colour.requires_grad
     torch.testing.assert_close(with_gradients.colour, without.colour, atol=1e-8, rtol=0)
     torch.testing.assert_close(with_gradients.depth, without.depth, atol=1e-6, rtol=0)
 
@@ -111,9 +113,9 @@ def test_the_picture_is_the_same_with_and_without_gradients():
 @pytest.mark.parametrize("sampling", PROTOCOLS)
 def test_chunks_make_the_same_picture(sampling):
     rays = some_rays(37, dtype=torch.float32)
-    whole = render_in_chunks(soft_ball, rays, sampling, chunk=1000, occupancy=GRID)
+    whole = render(soft_ball, rays, sampling, differentiable=False, chunk=1000, occupancy=GRID)
     for chunk in (1, 10, 37):
-        parts = render_in_chunks(soft_ball, rays, sampling, chunk=chunk, occupancy=GRID)
+        parts = render(soft_ball, rays, sampling, differentiable=False, chunk=chunk, occupancy=GRID)
         torch.testing.assert_close(parts.colour, whole.colour, atol=1e-6, rtol=0)
         torch.testing.assert_close(parts.opacity, whole.opacity, atol=1e-6, rtol=0)
         torch.testing.assert_close(parts.depth, whole.depth, atol=1e-4, rtol=0)
@@ -187,13 +189,13 @@ def test_the_proposal_draws_the_coarse_picture_and_learns_from_it():
 @pytest.mark.parametrize("background", [0.0, 0.4, 1.0])
 def test_rays_that_meet_nothing_are_background(background):
     empty = Occupancy(torch.zeros(4, 4, 4, dtype=torch.bool), Sphere())
-    for context in (torch.no_grad, torch.enable_grad):
-        with context():
-            seen = render(soft_ball, some_rays(3), Marched(), occupancy=empty, background=background)
-            assert (seen.colour == background).all()
-            assert (seen.opacity == 0).all()
-            assert (seen.depth == 0).all()
-            assert seen.samples == 0
+    for differentiable in (False, True):
+        sampling = {"sampling": Marched(), "occupancy": empty, "differentiable": differentiable}
+        seen = render(soft_ball, some_rays(3), background=background, **sampling)
+        assert (seen.colour == background).all()
+        assert (seen.opacity == 0).all()
+        assert (seen.depth == 0).all()
+        assert seen.samples == 0
     seen = render(fog(0.0), some_rays(3), Hierarchical(8, 8), background=background)
     torch.testing.assert_close(seen.colour, torch.full((3, 3), background, dtype=DOUBLE))
 
@@ -260,7 +262,7 @@ def test_gradients_of_cameras():
         pose = torch.cat([torch.cat([torch.matrix_exp(cross), shift[:, None]], 1), pose[3:]])
         scale = torch.stack([focal, focal, torch.ones_like(focal)])
         cameras = pinhole(matrix * scale[:, None], (pose @ straight)[None], 2, 3)
-        rays = cast(cameras, torch.zeros(6, dtype=torch.long), pixel_grid(2, 3), span="depth")
+        rays = cast(cameras, torch.zeros(6, dtype=torch.long), pixel_grid(2, 3), span="constant")
         return render(field, rays, Hierarchical(5, 0)).colour
 
     turn, shift = torch.full((3,), 0.1, dtype=DOUBLE), torch.full((3,), 0.05, dtype=DOUBLE)
@@ -299,17 +301,76 @@ def test_a_proposal_sees_each_ray_by_itself_and_its_whole_length():
 @torch.no_grad()
 def test_a_threshold_of_zero_never_stops():
     rays = some_rays(30)
-    whole = render(fog(50.0), rays, Marched(64, 0.0), occupancy=GRID)
+    whole = render(fog(50.0), rays, Marched(64, 0.0), occupancy=GRID, differentiable=False)
     assert whole.samples == len(march(rays, GRID, 2 / 64))
-    torch.testing.assert_close(
-        whole.colour, render(fog(50.0), rays, Marched(64, 1e-3), occupancy=GRID).colour, atol=1e-3, rtol=0
-    )
+    stopped = render(fog(50.0), rays, Marched(64, 1e-3), occupancy=GRID, differentiable=False)
+    torch.testing.assert_close(whole.colour, stopped.colour, atol=1e-3, rtol=0)
 
 
 def test_chunks_keep_the_coarse_picture_and_no_rays_make_no_chunks():
     rays = some_rays(11)
     whole = render(soft_ball, rays, Hierarchical(8, 4))
-    parts = render_in_chunks(soft_ball, rays, Hierarchical(8, 4), chunk=4)
+    parts = render(soft_ball, rays, Hierarchical(8, 4), differentiable=False, chunk=4)
     torch.testing.assert_close(parts.coarse, whole.coarse)
     for sampling in PROTOCOLS:
-        assert render_in_chunks(soft_ball, rays[:0], sampling, occupancy=GRID).colour.shape == (0, 3)
+        assert render(soft_ball, rays[:0], sampling, occupancy=GRID, differentiable=False).colour.shape == (0, 3)
+
+
+def test_a_lambda_and_a_kornia_camera_make_a_picture():
+    # Closed form: fog of density 0.7 in the unit sphere, at every pixel 1 - exp(-sigma length of the ray in it).
+    cameras = ring(2, (9, 7))
+    bare = PinholeCamera(cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
+    pictures = hyperplanes.render(
+        lambda points, directions: (torch.zeros_like(points), torch.full(points.shape[:1], 0.7)), bare
+    )
+    rays = clipped(cameras)
+    expected = 1 - torch.exp(-0.7 * (rays.far - rays.near))
+    assert pictures.images.shape == (2, 3, 9, 7)
+    torch.testing.assert_close(pictures.opacity.flatten(), expected, atol=0.7 / 160, rtol=0)
+    torch.testing.assert_close(pictures.images[:, 0].flatten(), 1 - expected, atol=0.7 / 160, rtol=0)
+
+
+@pytest.mark.parametrize("sampling", PROTOCOLS)
+def test_a_picture_is_the_pixels_of_its_rays(sampling):
+    cameras, bounds = ring(1, (6, 5)), Sphere((0.1, 0.0, -0.1), 0.9)
+    picture = render(soft_ball, cameras, sampling, bounds=bounds, background=0.3)
+    rays = cast(cameras, torch.zeros(30, dtype=torch.long), pixel_grid(6, 5), bounds, span=sampling.span)
+    seen = render(soft_ball, rays, sampling, bounds=bounds, background=0.3, differentiable=False)
+    torch.testing.assert_close(picture.images[0].flatten(1).T, seen.colour)
+    torch.testing.assert_close(picture.depth.flatten(), seen.depth)
+    assert picture.samples == seen.samples
+
+
+def test_rays_alone_are_rendered_by_the_papers_sampler():
+    rays = some_rays(4)
+    assert torch.equal(render(soft_ball, rays).colour, render(soft_ball, rays, Hierarchical()).colour)
+    marched = render(soft_ball, rays, bounds=Sphere()).colour
+    assert torch.equal(marched, render(soft_ball, rays, Marched(), occupancy=full(Sphere(), 1)).colour)
+
+
+@pytest.mark.parametrize("sampling", PROTOCOLS)
+def test_pictures_keep_gradients_on_request(sampling):
+    level = torch.tensor(0.5, requires_grad=True)
+
+    def field(points, directions):
+        return level.expand(len(points), 3), soft_ball(points, directions)[1]
+
+    assert not render(field, ring(1), sampling).images.requires_grad
+    render(field, ring(1), sampling, differentiable=True).images.sum().backward()
+    assert level.grad > 0
+
+
+def test_a_field_with_values_of_another_shape_is_named():
+    with pytest.raises(
+        ValueError, match=r"field: expected colours \(\d+, 3\) and densities \(\d+,\), got .* and \(\d+, 1\)"
+    ):
+        render(lambda points, _: (points, points[:, :1]), ring(1))
+
+
+def test_samplers_say_what_they_need():
+    for sampling in PROTOCOLS:
+        assert isinstance(sampling, Sampler)
+    assert Marched(60, 0.1).for_rendering == Marched(100, 0.1)
+    assert Hierarchical(3, 4).for_rendering == Hierarchical(3, 4)
+    assert Marched().needs_occupancy
+    assert not Hierarchical().needs_occupancy

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyperplanes.geometry import kernel_memory as memory
-from hyperplanes.geometry.lookup_torch import NEAREST_DEPTH
-from hyperplanes.geometry.threads import share
+from hyperplanes.geometry.kernels import memory
+from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.threads import parallel_for
+from hyperplanes.geometry.lookup_torch import MIN_Z
 
 __all__ = ["lookup", "lookup_backward"]
 
@@ -37,12 +38,12 @@ def lookup(
     """Colours (point, view, channel), coordinates (point, view, 2) and validity (point, view), planar in memory."""
     colours, coordinates, valid = _empty(points, images, views, memory.uninitialised)
     if valid.numel():
-        kernel = memory.kernel("forward", points.dtype, views is not None)
+        kernel = compile_kernel("lookup_forward.forward", points.dtype, views is not None)
         number = memory.number(points)
         fixed = (*_geometry(points, matrices, views), *memory.planes(images, packed, bits), number(background))
         flat = [memory.flat(value) for value in (colours, coordinates, valid.view(torch.uint8))]
-        fixed += (number(NEAREST_DEPTH), *flat)
-        share(lambda start, stop: kernel(*fixed, start, stop), len(points), _chunk(points, packed, views))
+        fixed += (number(MIN_Z), *flat)
+        parallel_for(lambda start, stop: kernel(*fixed, start, stop), len(points), _chunk(points, packed, views))
     return colours, coordinates, valid
 
 
@@ -99,9 +100,9 @@ def _geometry_gradient(
     rows = np.zeros((3, memory.pitch(points)), memory.number(points))
     if not grad_coordinates.numel():
         return torch.zeros_like(points), torch.zeros_like(matrices)
-    kernel = memory.kernel("backward", points.dtype, views is not None)
+    kernel = compile_kernel("lookup_backward.backward", points.dtype, views is not None)
     number = memory.number(points)
-    fixed = (*_geometry(points, matrices, views), *memory.planes(images, packed, bits), number(NEAREST_DEPTH))
+    fixed = (*_geometry(points, matrices, views), *memory.planes(images, packed, bits), number(MIN_Z))
     fixed += (*memory.strided(grad_colours), *memory.strided(grad_coordinates), rows.reshape(-1))
 
     def work(start: int, stop: int) -> np.ndarray:
@@ -109,7 +110,7 @@ def _geometry_gradient(
         kernel(*fixed, sums, len(points), start, stop)
         return sums
 
-    total = sum(share(work, len(points), _chunk(points, packed, views)), np.zeros((len(matrices), 12)))
+    total = sum(parallel_for(work, len(points), _chunk(points, packed, views)), np.zeros((len(matrices), 12)))
     grad_points = torch.from_numpy(np.ascontiguousarray(rows[:, : len(points)].T))
     return grad_points, torch.from_numpy(total).to(matrices).reshape(matrices.shape)
 
@@ -119,13 +120,13 @@ def _image_gradient(
 ) -> Tensor:
     filled, gradient = memory.pixel_gradient(images)
     if grad_colours.numel():
-        kernel = memory.kernel("image_backward", points.dtype, views is not None)
-        fixed = (*_geometry(points, matrices, views), *images.shape[2:], memory.number(points)(NEAREST_DEPTH))
+        kernel = compile_kernel("lookup_backward.image_backward", points.dtype, views is not None)
+        fixed = (*_geometry(points, matrices, views), *images.shape[2:], memory.number(points)(MIN_Z))
         channels = images.shape[1]
         fixed += (*memory.strided(grad_colours), channels, memory.pixel_pitch(channels), filled, len(points))
         # One plane at a time, whose pixels stay in the cache; but every call reads through all chosen views.
         step = 1 if views is None else -(-len(images) // torch.get_num_threads())
-        share(lambda start, stop: kernel(*fixed, start, stop), len(images), step)
+        parallel_for(lambda start, stop: kernel(*fixed, start, stop), len(images), step)
     return gradient
 
 
@@ -178,14 +179,14 @@ lookup.register_autograd(_gradients, setup_context=_setup)
 
 @lookup.register_kernel("cuda")
 def _(points, matrices, images, packed, bits, views, background):
-    from hyperplanes.geometry import lookup_triton
+    from hyperplanes.geometry.kernels import lookup_triton
 
     return lookup_triton.lookup(points, matrices, images, views, background)
 
 
 @lookup_backward.register_kernel("cuda")
 def _(points, matrices, images, packed, bits, views, grad_colours, grad_coordinates, geometry, pixels):
-    from hyperplanes.geometry import lookup_triton
+    from hyperplanes.geometry.kernels import lookup_triton
 
     return lookup_triton.lookup_backward(
         points, matrices, images, views, grad_colours, grad_coordinates, geometry, pixels

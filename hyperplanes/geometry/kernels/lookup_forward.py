@@ -17,7 +17,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.blocks import (
+from hyperplanes.geometry.kernels.blocks import (
     BLOCK,
     CHANNELS,
     COLUMN,
@@ -31,8 +31,8 @@ from hyperplanes.geometry.blocks import (
     place,
     project,
 )
-from hyperplanes.geometry.interpolation import fetch_packed, fetch_pixels, fetch_plane, interleave, room
-from hyperplanes.geometry.vector_memory import load, store
+from hyperplanes.geometry.kernels.interpolation import fetch_packed, fetch_pixels, fetch_plane, interleave, room
+from hyperplanes.geometry.kernels.llvm import load, store
 
 __all__ = ["forward", "forward_chosen", "grouped", "scratch", "take"]
 

@@ -1,4 +1,4 @@
-"""The CPU kernels of the fused lookup's gradient; see `kernels_cpu` for how they are arranged.
+"""The CPU kernels of the fused lookup's gradient; see `lookup_forward` for how they are arranged.
 
 Incoming gradients have whatever strides autograd gives them. They come flat, with the strides of (point, view, channel)
 as a tuple; where a stride over points is 1, as for gradients laid out like the results, LLVM reads whole vectors.
@@ -10,7 +10,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.blocks import (
+from hyperplanes.geometry.kernels.blocks import (
     BLOCK,
     CHANNELS,
     COLUMN,
@@ -31,9 +31,9 @@ from hyperplanes.geometry.blocks import (
     project,
     start_pull,
 )
-from hyperplanes.geometry.interpolation import interleave, pull_packed, pull_pixels, pull_plane, room
-from hyperplanes.geometry.kernels_cpu import grouped, scratch, take
-from hyperplanes.geometry.vector_memory import add_pixels, load
+from hyperplanes.geometry.kernels.interpolation import interleave, pull_packed, pull_pixels, pull_plane, room
+from hyperplanes.geometry.kernels.llvm import add_pixels, load
+from hyperplanes.geometry.kernels.lookup_forward import grouped, scratch, take
 
 __all__ = ["backward", "backward_chosen", "clear", "image_backward", "image_backward_chosen", "splat"]
 

@@ -14,7 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyperplanes.geometry.lookup_torch import NEAREST_DEPTH
+from hyperplanes.geometry.lookup_torch import MIN_Z
 
 __all__ = ["lookup", "lookup_backward"]
 
@@ -195,7 +195,7 @@ def lookup(
         chosen = points if views is None else views.contiguous()
         _forward[(triton.cdiv(total, _BLOCK),)](  # pyright: ignore[reportIndexIssue]
             points, matrices, images, chosen, colours, coordinates, valid.view(torch.uint8), total, slots, height,
-            width, background, NEAREST_DEPTH, CHANNELS=channels, CHOSEN=views is not None, BLOCK=_BLOCK,
+            width, background, MIN_Z, CHANNELS=channels, CHOSEN=views is not None, BLOCK=_BLOCK,
         )  # fmt: skip
     return colours.permute(2, 0, 1), coordinates.permute(2, 0, 1), valid.T
 
@@ -218,7 +218,7 @@ def lookup_backward(
         chosen = points if views is None else views.contiguous()
         _backward[(triton.cdiv(total, _BLOCK),)](  # pyright: ignore[reportIndexIssue]
             points, matrices, images, chosen, colour, coordinate, grad_points, grad_matrices, grad_images,
-            *colour.stride(), *coordinate.stride(), total, slots, height, width, NEAREST_DEPTH, CHANNELS=channels,
+            *colour.stride(), *coordinate.stride(), total, slots, height, width, MIN_Z, CHANNELS=channels,
             CHOSEN=views is not None, GEOMETRY=geometry, PIXELS=pixels, BLOCK=_BLOCK,
         )  # fmt: skip
     return grad_points, grad_matrices, grad_images

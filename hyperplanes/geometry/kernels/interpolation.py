@@ -12,7 +12,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.blocks import (
+from hyperplanes.geometry.kernels.blocks import (
     ACROSS,
     BLOCK,
     CHANNELS,
@@ -28,7 +28,7 @@ from hyperplanes.geometry.blocks import (
     inlined,
     inner,
 )
-from hyperplanes.geometry.vector_memory import bits_of, blend, load, load_int, read, slopes, spread, store, store_int
+from hyperplanes.geometry.kernels.llvm import bits_of, blend, load, load_int, read, slopes, spread, store, store_int
 
 __all__ = [
     "fetch_packed",

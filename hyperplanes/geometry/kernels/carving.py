@@ -1,6 +1,6 @@
 """The CPU kernel of the visual hull: a few voxels in a row at once, view after view, until masks have ruled them out.
 
-The arithmetic is that of `occupancy._carve_plainly` on LANES voxels along z, as loops that LLVM vectorises.
+The arithmetic is that of `occupancy._carve_torch` on LANES voxels along z, as loops that LLVM vectorises.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.blocks import inner
-from hyperplanes.geometry.vector_memory import load, read, store
+from hyperplanes.geometry.kernels.blocks import inner
+from hyperplanes.geometry.kernels.llvm import load, read, store
 
 __all__ = ["carve"]
 

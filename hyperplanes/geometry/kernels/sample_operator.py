@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyperplanes.geometry import kernel_memory as memory
-from hyperplanes.geometry.threads import share
+from hyperplanes.geometry.kernels import memory
+from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.threads import parallel_for
 
 __all__ = ["sample", "sample_backward"]
 
@@ -29,7 +30,7 @@ def sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bits: int
     colours = _planar(coordinates, images.shape[1], memory.uninitialised)
     total = len(coordinates)
     if colours.numel():
-        kernel = memory.kernel("sample", coordinates.dtype)
+        kernel = compile_kernel("sample.sample", coordinates.dtype)
         fixed = (*memory.planes(images, packed, bits), memory.number(coordinates)(background))
         chunk = _chunk(total, len(images))
         fixed += (*memory.strided(coordinates), memory.flat(colours), memory.pitch(coordinates), total, chunk)
@@ -48,7 +49,7 @@ def sample_backward(
     grad_coordinates = _planar(coordinates, 2, memory.uninitialised) if geometry else coordinates.new_empty(0)
     if not grad_colours.numel():
         return grad_images, torch.zeros_like(coordinates) if geometry else grad_coordinates
-    kernel = memory.kernel("sample_backward", coordinates.dtype)
+    kernel = compile_kernel("sample.sample_backward", coordinates.dtype)
     chunk = total if pixels else _chunk(total, len(images))  # two threads must not add to one pixel: a plane each
     fixed = (*memory.planes(images, packed, bits), *memory.strided(coordinates), *memory.strided(grad_colours))
     fixed += (memory.flat(grad_coordinates) if geometry else empty, memory.pitch(coordinates), filled)
@@ -59,7 +60,7 @@ def sample_backward(
 
 def _spread(work: Callable[[int, int], None], pieces: int) -> None:
     """The work in a few calls a thread: each sets memory aside, whose first touch takes a tenth of a plane's time."""
-    share(work, pieces, -(-pieces // (4 * torch.get_num_threads())))
+    parallel_for(work, pieces, -(-pieces // (4 * torch.get_num_threads())))
 
 
 def _chunk(total: int, planes: int) -> int:

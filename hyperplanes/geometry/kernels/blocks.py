@@ -11,7 +11,8 @@ from typing import no_type_check
 
 from numba import njit
 
-from hyperplanes.geometry.vector_memory import load, read, store
+from hyperplanes.geometry.kernels.compiling import FASTMATH
+from hyperplanes.geometry.kernels.llvm import load, read, store
 
 __all__ = [
     "BLOCK",
@@ -41,8 +42,8 @@ TILE, SLOPES, CHANNELS = BLOCK * 19, BLOCK * 27, BLOCK * 33
 
 # Everything of fast maths but the assumption that there are no NaN and no infinities. What runs once a lookup is
 # forced inline; LLVM calls it otherwise, which costs more than its work.
-inner = njit(fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy", nogil=True)
-inlined = njit(fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy", nogil=True, forceinline=True)
+inner = njit(fastmath=FASTMATH, error_model="numpy", nogil=True)
+inlined = njit(fastmath=FASTMATH, error_model="numpy", nogil=True, forceinline=True)
 
 
 @inner

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import no_type_check
 
-from hyperplanes.geometry.blocks import (
+from hyperplanes.geometry.kernels.blocks import (
     BLOCK,
     CHANNELS,
     GRAD_U,
@@ -22,7 +22,7 @@ from hyperplanes.geometry.blocks import (
     inner,
     locate,
 )
-from hyperplanes.geometry.interpolation import (
+from hyperplanes.geometry.kernels.interpolation import (
     fetch_packed,
     fetch_pixels,
     fetch_plane,
@@ -32,9 +32,9 @@ from hyperplanes.geometry.interpolation import (
     pull_plane,
     room,
 )
-from hyperplanes.geometry.kernels_cpu import scratch
-from hyperplanes.geometry.kernels_gradient import splat
-from hyperplanes.geometry.vector_memory import load, store
+from hyperplanes.geometry.kernels.llvm import load, store
+from hyperplanes.geometry.kernels.lookup_backward import splat
+from hyperplanes.geometry.kernels.lookup_forward import scratch
 
 __all__ = ["sample", "sample_backward"]
 
@@ -75,7 +75,7 @@ def sample_backward(images, packed, bits, height, width, coordinates, by, grad_c
                     grad_images, pixel, total, chunk, start, stop):  # fmt: skip
     """Gradients with respect to coordinates and pixels, from pieces start..stop; none where its array is empty.
 
-    `grad_images` is as in `kernels_gradient.image_backward`; where it is asked for, a piece is a whole plane, since
+    `grad_images` is as in `lookup_backward.image_backward`; where it is asked for, a piece is a whole plane, since
     two threads must not add to one pixel.
     """
     channels, size, pieces = images.shape[1], height * width, -(-total // chunk)

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
-__all__ = ["Packed", "pack", "unpack"]
+__all__ = ["PackedImages", "pack", "unpack"]
 
 
 @dataclass(frozen=True)
-class Packed:
+class PackedImages:
     """Three-channel images, one 32-bit word a pixel, the first channel in the lowest bits.
 
     Attributes:
@@ -30,7 +30,7 @@ class Packed:
 
 
 @torch.no_grad()
-def pack(images: Float[Tensor, "view channel height width"]) -> Packed | None:
+def pack(images: Float[Tensor, "view channel height width"]) -> PackedImages | None:
     """The images in the better of the two formats, or None where they cannot be packed.
 
     Images that were 8-bit files come out exact. All others are off by at most 1/2046, a quarter of the 1/512 that the
@@ -50,9 +50,9 @@ def pack(images: Float[Tensor, "view channel height width"]) -> Packed | None:
     scaled = images.float() * 255
     eight = scaled.round()
     if (scaled - eight).abs().max() < 1e-2:
-        return Packed(_words(eight, 8), 8)
+        return PackedImages(_words(eight, 8), 8)
     steps = images.new_tensor([2047.0, 2047.0, 1023.0], dtype=torch.float32)[:, None, None]
-    return Packed(_words((images.float() * steps).round(), 11), 11)
+    return PackedImages(_words((images.float() * steps).round(), 11), 11)
 
 
 def _words(channels: Tensor, bits: int) -> Tensor:
@@ -60,7 +60,7 @@ def _words(channels: Tensor, bits: int) -> Tensor:
     return whole[:, 0] | (whole[:, 1] << bits) | (whole[:, 2] << 2 * bits)
 
 
-def unpack(packed: Packed) -> Float[Tensor, "view 3 height width"]:
+def unpack(packed: PackedImages) -> Float[Tensor, "view 3 height width"]:
     """The images as float32 in [0, 1].
 
     >>> unpack(pack(torch.tensor([1.0, 0.2, 0.0]).reshape(1, 3, 1, 1))).flatten().tolist()

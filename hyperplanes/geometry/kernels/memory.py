@@ -12,7 +12,6 @@ __all__ = [
     "BLOCK",
     "array",
     "flat",
-    "kernel",
     "number",
     "pitch",
     "pixel_gradient",
@@ -49,13 +48,6 @@ def strided(value: Tensor) -> tuple[np.ndarray, tuple[int, ...]]:
     """The memory that a tensor spans, from its first element on, and its strides."""
     span = 1 + sum((size - 1) * stride for size, stride in zip(value.shape, value.stride(), strict=True))
     return value.detach().as_strided((span if value.numel() else 0,), (1,)).numpy(), value.stride()
-
-
-def kernel(name: str, dtype: torch.dtype, chosen: bool = False) -> Any:
-    """The compiled kernel, as `compiling.compiled` has it."""
-    from hyperplanes.geometry.compiling import compiled
-
-    return compiled(name, str(dtype).removeprefix("torch."), chosen)
 
 
 def array(tensor: Tensor) -> np.ndarray:

@@ -1,0 +1,79 @@
+"""Transmittance inside a grid of voxels: ray marching compiled by numba on the CPU, plain PyTorch elsewhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import no_type_check
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from hyperplanes.geometry.kernels.compiling import compile_function
+from hyperplanes.geometry.kernels.threads import parallel_for
+
+__all__ = ["compiled_transmittance", "transmittance"]
+
+CELLS = 1 << 12  # that are processed together
+MAX_OPTICAL_DEPTH = 12.0  # beyond it the transmittance is zero in single precision
+
+
+def compiled_transmittance() -> Callable[..., None] | None:
+    """The compiled loop over voxels, or None where numba is missing."""
+    return compile_function(_transmittance)
+
+
+def transmittance(
+    optical_depth: Float[Tensor, "x y z"], cells: Int[Tensor, "cell 3"], directions: Float[Tensor, "direction 3"]
+) -> Float[Tensor, "cell direction"]:
+    """Transmittance from outside the grid to the centres of voxels, along each direction.
+
+    The ray is marched backwards from the voxel's centre in steps of one voxel, the first of which leaves the voxel
+    itself; every step adds the optical depth of the voxel that it ends in.
+
+    Args:
+        optical_depth: density of each voxel times its side.
+        cells: indices (x, y, z) of voxels.
+        directions: unit vectors from outside towards the voxels.
+
+    Returns:
+        Transmittances in [0, 1].
+    """
+    found = torch.empty(len(cells), len(directions), device=optical_depth.device)
+    kernel = compiled_transmittance()
+    if kernel is not None and optical_depth.device.type == "cpu":
+        arrays = (optical_depth.contiguous().numpy(), cells.contiguous().numpy(), directions.contiguous().numpy())
+        parallel_for(lambda start, stop: kernel(*arrays, found.numpy(), start, stop), len(cells), CELLS)
+        return found
+    side, flat = optical_depth.shape[0], optical_depth.flatten()
+    for start in range(0, len(cells), CELLS):
+        total = torch.zeros_like(found[start : start + CELLS])
+        centres = cells[start : start + CELLS, None].float() + 0.5
+        for step in range(math.ceil(math.sqrt(3) * side)):
+            here = (centres - (step + 1) * directions).floor().long()
+            inside = ((here >= 0) & (here < side)).all(-1)
+            here = here.clamp(0, side - 1)
+            total += flat[(here[..., 0] * side + here[..., 1]) * side + here[..., 2]] * inside
+        found[start : start + CELLS] = torch.exp(-total)
+    return found
+
+
+@no_type_check
+def _transmittance(optical_depth, cells, directions, found, start, stop):
+    """Transmittances of cells start..stop, into `found`."""
+    side = optical_depth.shape[0]
+    for cell in range(start, stop):
+        for direction in range(directions.shape[0]):
+            x, y, z = directions[direction, 0], directions[direction, 1], directions[direction, 2]
+            total, step = 0.0, 1.0
+            while total < MAX_OPTICAL_DEPTH:
+                # The voxel that holds the next point of the ray; the ray ends where there is none.
+                at_x = int(math.floor(cells[cell, 0] + 0.5 - step * x))
+                at_y = int(math.floor(cells[cell, 1] + 0.5 - step * y))
+                at_z = int(math.floor(cells[cell, 2] + 0.5 - step * z))
+                if min(at_x, at_y, at_z) < 0 or max(at_x, at_y, at_z) >= side:
+                    break
+                total += optical_depth[at_x, at_y, at_z]
+                step += 1.0
+            found[cell, direction] = math.exp(-total)
