@@ -125,7 +125,7 @@ def examine_renderers() -> list[Check]:
     Returns:
         One outcome a renderer, and one for all of them.
     """
-    from data_gen.backends import probe_all
+    from data_gen.rendering.renderers import probe_all
 
     probes = probe_all()
     working = [probe for probe in probes if probe.works]

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 from small_demo import demo_folder, only_object
 
-from data_gen.backends import RendererError
+from data_gen.rendering.renderers import RendererError
 from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
 from hyperplanes.commands import VERBS
@@ -147,7 +147,7 @@ def test_without_any_renderer_one_line_says_what_to_install(tmp_path, monkeypatc
     def nothing(_):
         raise RendererError("no renderer works here; apt-get install -y libegl1 libgl1")
 
-    monkeypatch.setattr("data_gen.backends.find_backend", nothing)
+    monkeypatch.setattr("data_gen.rendering.renderers.find_renderer", nothing)
     assert main(["generate", "--class", "car", "--out", str(tmp_path)]) == 2
     assert "apt-get install -y libegl1 libgl1" in complaint(capsys)
 

@@ -136,11 +136,11 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
 
 
 def _generate(settings: DemoSettings, folder: Path, console: Console) -> None:
-    from data_gen.backends import find_backend
-    from data_gen.dataset import Procedural, generate
+    from data_gen.datasets.generate import Procedural, generate
+    from data_gen.rendering.renderers import find_renderer
     from hyperplanes.commands.generate import summary
 
-    backend = find_backend()
+    backend = find_renderer()
     console.say(f"renderer: {backend.name} ({backend.detail})")
     for line in backend.advice:
         console.say(f"a faster one: {line}")

@@ -22,7 +22,7 @@ from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalNa
 from hyperplanes.words import duration
 
 if TYPE_CHECKING:
-    from data_gen.dataset import MeshFolder, Procedural, Report
+    from data_gen.datasets.generate import GenerationReport, MeshFolder, Procedural
 
 __all__ = ["Arguments", "run", "source_of", "summary"]
 
@@ -88,7 +88,7 @@ def source_of(arguments: Arguments) -> Procedural | MeshFolder:
     Raises:
         ValueError: both or none of --class and --meshes.
     """
-    from data_gen.dataset import MeshFolder, Procedural
+    from data_gen.datasets.generate import MeshFolder, Procedural
 
     if (arguments.class_name is None) == (arguments.meshes is None):
         found = "none" if arguments.meshes is None else "both"
@@ -100,7 +100,7 @@ def source_of(arguments: Arguments) -> Procedural | MeshFolder:
     return Procedural(str(arguments.class_name), arguments.count, arguments.seed)
 
 
-def summary(report: Report, out: Path) -> str:
+def summary(report: GenerationReport, out: Path) -> str:
     """One line about what was written."""
     splits = ", ".join(f"{count} {split}" for split, count in report.splits.items() if count)
     reused = f", {report.reused} of them from before" if report.reused else ""
@@ -118,13 +118,13 @@ def unlisted(names: list[str]) -> str:
 
 def run(arguments: Arguments) -> int:
     """Generate the data set and say what was skipped."""
-    from data_gen.backends import find_backend
-    from data_gen.dataset import generate
-    from data_gen.manifest import verify
+    from data_gen.datasets.generate import generate
+    from data_gen.datasets.manifest import verify
+    from data_gen.rendering.renderers import find_renderer
 
     console = Console()
     source = source_of(arguments)
-    backend = find_backend(arguments.renderer)
+    backend = find_renderer(arguments.renderer)
     console.say(f"renderer: {backend.name} ({backend.detail})")
     for line in backend.advice:
         console.say(f"a faster one: {line}")

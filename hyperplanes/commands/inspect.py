@@ -75,7 +75,7 @@ def run(arguments: Arguments) -> int:
         for line in checkpoint_lines(arguments.path):
             console.say(line)
         return 0
-    from data_gen.inspect import inspect
+    from data_gen.datasets.inspect import inspect
 
     out = arguments.out or Path("runs/inspect") / arguments.path.resolve().name
     found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums)

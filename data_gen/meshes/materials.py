@@ -1,0 +1,269 @@
+"""Colours, textures and materials of a mesh, brought into the few forms that every renderer draws alike.
+
+After ``canonical_visual`` a mesh has vertex colours, face colours, or a ``PBRMaterial`` whose base texture is RGB or
+RGBA and has coordinates. Textures, vertex and face colours are sRGB, the factors of materials LINEAR.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import PIL.Image
+import trimesh
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
+
+from data_gen.meshes.files import IMAGE_FORMATS
+
+__all__ = [
+    "DEFAULT_COLOUR",
+    "ColourSpace",
+    "Visual",
+    "canonical_visual",
+    "linear_from_srgb",
+    "srgb_from_linear",
+    "texture_of",
+    "visual_of",
+]
+
+ColourSpace = Literal["scene", "gltf", "srgb"]
+"""What plain colours are before: ``scene`` as they are after, ``gltf`` all linear, ``srgb`` all sRGB."""
+
+DEFAULT_COLOUR = (0.6, 0.6, 0.6, 1.0)
+"""Linear RGBA of a surface that says nothing about its colour: a light grey."""
+
+_MAP_SLOTS = ("metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
+
+
+Visual = ColorVisuals | TextureVisuals
+
+
+def visual_of(mesh: trimesh.Trimesh) -> Visual:
+    """The colours or the texture of a mesh; colours that are not defined where it has neither.
+
+    >>> visual_of(trimesh.Trimesh()).defined
+    False
+    """
+    visual = mesh.visual
+    return ColorVisuals(mesh) if visual is None else visual
+
+
+def texture_of(mesh: trimesh.Trimesh) -> TextureVisuals | None:
+    """The texture of a mesh, if it has one."""
+    visual = mesh.visual
+    return visual if isinstance(visual, TextureVisuals) else None
+
+
+def linear_from_srgb(colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Turn sRGB colours into linear ones; a fourth channel (alpha) stays.
+
+    Args:
+        colours: ``(..., 3)`` or ``(..., 4)``, 0 to 255.
+
+    Returns:
+        The same shape.
+
+    >>> linear_from_srgb(np.array([0, 188, 255, 128], np.uint8)).tolist()
+    [0, 128, 255, 128]
+    """
+    result = np.array(colours, dtype=np.uint8, copy=True)
+    value = result[..., :3] / 255.0
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    result[..., :3] = np.round(linear * 255.0)
+    return result
+
+
+def srgb_from_linear(colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Turn linear colours into sRGB ones; a fourth channel (alpha) stays.
+
+    Args:
+        colours: ``(..., 3)`` or ``(..., 4)``, 0 to 255.
+
+    Returns:
+        The same shape.
+
+    >>> srgb_from_linear(np.array([0, 128, 255, 128], np.uint8)).tolist()
+    [0, 188, 255, 128]
+    """
+    result = np.array(colours, dtype=np.uint8, copy=True)
+    value = result[..., :3] / 255.0
+    srgb = np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 0.0031308) ** (1 / 2.4) - 0.055)
+    result[..., :3] = np.round(srgb * 255.0)
+    return result
+
+
+def canonical_visual(
+    mesh: trimesh.Trimesh, label: str, *, colours: ColourSpace = "scene", images: dict[Any, Any] | None = None
+) -> tuple[Any, list[str], bool]:
+    """Bring what colours a mesh into a form that every renderer draws alike.
+
+    Args:
+        mesh: The mesh, which is not changed.
+        label: What to call it in a warning.
+        colours: What its plain colours are.
+        images: Converted textures, shared between the meshes of a scene.
+
+    Returns:
+        The visual, warnings that name what was lost, and whether the surface can be seen at all.
+    """
+    visual = visual_of(mesh)
+    images = {} if images is None else images
+    if isinstance(visual, TextureVisuals):
+        return _textured(visual, mesh, label, colours, images)
+    if not visual.defined:
+        return TextureVisuals(material=PBRMaterial(baseColorFactor=DEFAULT_COLOUR, metallicFactor=0.0)), [], True
+    kind = str(visual.kind)
+    return _coloured(visual.vertex_colors if kind == "vertex" else visual.face_colors, kind, label, colours)
+
+
+def _coloured(values: Any, kind: str, label: str, colours: ColourSpace) -> tuple[Any, list[str], bool]:
+    values = np.array(values, dtype=np.uint8)
+    warnings = []
+    if not values[:, 3].any():
+        values[:, 3] = 255
+        warnings.append(f"{label}: every colour has alpha 0; taken as opaque")
+    if colours == "gltf":
+        values = srgb_from_linear(values)
+    keyword = "vertex_colors" if kind == "vertex" else "face_colors"
+    return ColorVisuals(**{keyword: values}), warnings, True
+
+
+def _textured(
+    visual: TextureVisuals, mesh: trimesh.Trimesh, label: str, colours: ColourSpace, images: dict[Any, Any]
+) -> tuple[Any, list[str], bool]:
+    warnings: list[str] = []
+    material = visual.material
+    if isinstance(material, MultiMaterial):
+        warnings.append(f"{label}: several materials on one surface; the first of {len(material.materials)} taken")
+        material = material.materials[0] if material.materials else SimpleMaterial()
+    is_gltf = isinstance(material, PBRMaterial)
+    data = _pbr_values(material, images) if is_gltf else _mtl_values(material, images)
+    if colours == "srgb" and is_gltf and data.get("baseColorFactor") is not None:
+        factor = np.round(np.asarray(data["baseColorFactor"]) * 255.0).astype(np.uint8)
+        data["baseColorFactor"] = linear_from_srgb(factor) / 255.0
+    coordinates = _coordinates(visual, len(mesh.vertices), label, warnings)
+    if coordinates is None:
+        _drop_textures(data, label, warnings)
+    painted = _vertex_paint(visual, len(mesh.vertices))
+    if painted is not None and data.get("baseColorTexture") is None:
+        tint = srgb_from_linear(np.round(data["baseColorFactor"] * 255.0).astype(np.uint8))
+        if colours == "gltf":
+            painted = srgb_from_linear(painted)
+        if data["alphaMode"] == "OPAQUE":
+            painted[:, 3] = tint[3] = 255
+        return _coloured((painted * (tint / 255.0)).round(), "vertex", label, "scene")
+    if painted is not None and (painted[:, :3] < 255).any():
+        warnings.append(f"{label}: vertex colours left out, its texture counts")
+    data = {key: value for key, value in data.items() if value is not None}
+    if data["alphaMode"] == "OPAQUE":
+        data["baseColorFactor"][3] = 1.0
+        if "baseColorTexture" in data:
+            data["baseColorTexture"] = _shared(data["baseColorTexture"], "RGB", images)
+    return TextureVisuals(uv=coordinates, material=PBRMaterial(**data)), warnings, _visible(data)
+
+
+def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> None:
+    """A surface without coordinates takes the mean colour of its texture."""
+    image = data.get("baseColorTexture")
+    if image is not None:
+        mean = np.asarray(image.convert("RGB"), dtype=np.float64).reshape(-1, 3).mean(axis=0)
+        data["baseColorFactor"][:3] *= linear_from_srgb(mean.astype(np.uint8)) / 255.0
+        warnings.append(f"{label}: texture without texture coordinates; its mean colour taken")
+    for slot in ("baseColorTexture", *_MAP_SLOTS):
+        data.pop(slot, None)
+
+
+def _vertex_paint(visual: TextureVisuals, count: int) -> npt.NDArray[np.uint8] | None:
+    """RGBA of vertex colours that lie on top of a material, as they stand in the file."""
+    paint = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
+    if paint is None or len(paint) != count:
+        return None
+    paint = np.asarray(paint)
+    top = 1.0 if paint.dtype.kind == "f" else float(np.iinfo(paint.dtype).max)
+    rgba = np.full((count, 4), 255, dtype=np.uint8)
+    rgba[:, : paint.shape[1]] = np.clip(np.round(paint * (255.0 / top)), 0, 255)
+    return rgba
+
+
+def _coordinates(visual: TextureVisuals, count: int, label: str, warnings: list[str]) -> npt.NDArray[np.float64] | None:
+    if visual.uv is None or not len(visual.uv):
+        return None
+    uv = np.array(visual.uv, dtype=np.float64)
+    if uv.ndim != 2 or uv.shape[0] != count or uv.shape[1] < 2:
+        warnings.append(f"{label}: texture coordinates of shape {uv.shape} for {count} vertices; left out")
+        return None
+    uv = uv[:, :2]
+    wrong = ~np.isfinite(uv).all(axis=1)
+    if wrong.any():
+        uv[wrong] = 0.0
+        warnings.append(f"{label}: {int(wrong.sum())} texture coordinates are not finite; set to 0")
+    return uv
+
+
+def _pbr_values(material: PBRMaterial, images: dict[Any, Any]) -> dict[str, Any]:
+    factor = material.baseColorFactor
+    emissive = material.emissiveFactor
+    cutoff = 0.5 if material.alphaCutoff is None else float(material.alphaCutoff)
+    return {
+        "name": material.name,
+        "alphaMode": material.alphaMode if material.alphaMode in ("MASK", "BLEND") else "OPAQUE",
+        "alphaCutoff": min(max(cutoff, 0.0), 1.0),
+        "baseColorFactor": np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64) / 255.0,
+        "baseColorTexture": _shared(material.baseColorTexture, "RGBA", images),
+        "metallicFactor": material.metallicFactor,
+        "roughnessFactor": material.roughnessFactor,
+        **{slot: _shared(getattr(material, slot), "RGB", images) for slot in _MAP_SLOTS},
+        "emissiveFactor": None if emissive is None else np.asarray(emissive, dtype=np.float64)[:3],
+        "doubleSided": bool(material.doubleSided),
+    }
+
+
+def _mtl_values(material: SimpleMaterial, images: dict[Any, Any]) -> dict[str, Any]:
+    image = _shared(material.image, "RGBA", images)
+    factor = linear_from_srgb(np.asarray(material.diffuse, dtype=np.uint8)) / 255.0
+    if image is not None:
+        factor[:3] = 1.0
+    shininess = max(float(material.glossiness or 1.0), 0.0)
+    return {
+        "name": material.name,
+        "alphaMode": "BLEND",
+        "baseColorFactor": factor,
+        "baseColorTexture": image,
+        "metallicFactor": 0.0,
+        "roughnessFactor": float((2.0 / (shininess + 2.0)) ** 0.25),
+    }
+
+
+def _shared(image: PIL.Image.Image | None, mode: str, images: dict[Any, Any]) -> PIL.Image.Image | None:
+    """An image of 8 bits a channel: RGB, or RGBA where alpha is wanted and there is some."""
+    if image is None:
+        return None
+    key = (id(image), mode)
+    if key not in images:
+        images[key] = (_plain(image, mode), image)  # the source too: its id must not be given to another
+    return images[key][0]
+
+
+def _plain(image: PIL.Image.Image, mode: str) -> PIL.Image.Image | None:
+    """The image converted; None for one that cannot be decoded, of which the reader of the file has warned."""
+    if image.format not in (None, *IMAGE_FORMATS):
+        return None
+    try:
+        image.load()
+    except (OSError, SyntaxError, ValueError):
+        return None
+    if image.mode.startswith(("I", "F")):
+        top = 65535.0 if image.mode.startswith("I") else 1.0
+        image = PIL.Image.fromarray(np.clip(np.asarray(image) / top * 255.0, 0, 255).astype(np.uint8))
+    return image.convert("RGBA" if mode == "RGBA" and image.has_transparency_data else "RGB")
+
+
+def _visible(data: dict[str, Any]) -> bool:
+    """Whether any point of a surface can have alpha above 0."""
+    alpha = float(data["baseColorFactor"][3])
+    image = data.get("baseColorTexture")
+    if image is not None and image.mode == "RGBA":
+        alpha *= image.getchannel("A").getextrema()[1] / 255.0
+    return alpha >= data["alphaCutoff"] if data["alphaMode"] == "MASK" else alpha > 0
