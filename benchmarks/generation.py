@@ -149,20 +149,13 @@ def generated(objects: int, out: Path, supersample: int = SUPERSAMPLE) -> Run:
         out: where to.
         supersample: samples along a side of a pixel.
     """
-    from data_gen.datasets.generate import Procedural, generate
+    from data_gen.datasets.generate import GenerationConfig, Procedural, generate
 
     ends: list[float] = []
 
     def run() -> int:
-        generate(
-            Procedural("car", objects),
-            out,
-            views=VIEWS,
-            resolution=RESOLUTION,
-            supersample=supersample,
-            held_out=0,
-            progress=lambda *_: ends.append(time.perf_counter()),
-        )
+        config = GenerationConfig(views=VIEWS, resolution=RESOLUTION, supersample=supersample, held_out=0)
+        generate(Procedural("car", objects), out, config, progress=lambda *_: ends.append(time.perf_counter()))
         return objects * VIEWS
 
     begun = time.perf_counter()
@@ -235,18 +228,12 @@ def memory(objects: int, folder: Path) -> Row:
     Returns:
         Medians of the resident memory in MB over the second and the last tenth of the objects, and the growth.
     """
-    from data_gen.datasets.generate import Procedural, generate
+    from data_gen.datasets.generate import GenerationConfig, Procedural, generate
 
     sizes: list[float] = []
-    generate(
-        Procedural("car", objects),
-        folder / "stream",
-        views=2,
-        resolution=32,
-        held_out=0,
-        recycle=objects,
-        progress=lambda *_: sizes.append(resident_megabytes()),
-    )
+    config = GenerationConfig(views=2, resolution=32, held_out=0, recycle=objects)
+    cars = Procedural("car", objects)
+    generate(cars, folder / "stream", config, progress=lambda *_: sizes.append(resident_megabytes()))
     tenth = max(1, len(sizes) // 10)
     early, late = statistics.median(sizes[tenth : 2 * tenth]), statistics.median(sizes[-tenth:])
     return {

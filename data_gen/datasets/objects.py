@@ -8,26 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from data_gen.datasets.config import RenderConfig
 from data_gen.datasets.layouts import LAYOUTS, RenderedObject
-from data_gen.datasets.sources import Item, seed_of
-from data_gen.rigs import Rig, make_rig
+from data_gen.datasets.sources import Item
 from hyperplanes.data.files import encode_json, sha256, write_folder, write_whole
 
-__all__ = ["open_renderer", "rig_of"]
-
-
-def rig_of(settings: dict[str, Any], name: str) -> Rig:
-    """The cameras of one object.
-
-    Args:
-        settings: rig, views, resolution, seed, distance and field_of_view (degrees or None).
-        name: of the object, on which random rigs depend.
-
-    Returns:
-        The rig.
-    """
-    numbers = {key: settings[key] for key in ("views", "resolution", "distance", "field_of_view")}
-    return make_rig(settings["rig"], **numbers, seed=seed_of(settings["seed"], "rig", name) % 2**32)
+__all__ = ["open_renderer"]
 
 
 @contextmanager
@@ -35,47 +21,50 @@ def open_renderer(settings: dict[str, Any]) -> Generator[Callable[[dict[str, Any
     """A function from an `Item`'s fields to the record of the object it wrote; one renderer serves all calls.
 
     Args:
-        settings: the arguments of `data_gen.datasets.generate.generate` as JSON, with `out`, `renderer`, `distance`,
-            `field_of_view`, `up` and `supersample`.
+        settings: `out`, the folder of the data set, and `render`, a `RenderConfig` as JSON.
 
     Yields:
         The function. It raises ValueError, with the reason, for an object that cannot be drawn.
     """
     from data_gen.rendering.mesh_renderer import MeshRenderer
 
-    with MeshRenderer(settings["renderer"], settings["supersample"]) as renderer:
-        yield lambda fields: _write(_draw(renderer, Item(**fields), settings), settings)
+    config, out = RenderConfig.from_json(settings["render"]), Path(settings["out"])
+    with MeshRenderer(config.renderer, config.supersample) as renderer:
+
+        def process(fields: dict[str, Any]) -> dict[str, Any]:
+            rendered = _render(renderer, Item(**fields), config)
+            return _write(rendered, LAYOUTS[config.layout].files(rendered), out)
+
+        yield process
 
 
-def _draw(renderer: Any, item: Item, settings: dict[str, Any]) -> RenderedObject:
+def _render(renderer: Any, item: Item, config: RenderConfig) -> RenderedObject:
     from data_gen.meshes.mesh import load_mesh, prepare_scene, render_ready
 
     if item.path is not None:
-        mesh = load_mesh(item.path, up=settings["up"], name=item.name)
+        mesh = load_mesh(item.path, up=config.up, name=item.name)
     else:
         from data_gen.shapes import make
 
         mesh = prepare_scene(make(str(item.class_name), int(item.seed or 0)), item.name, closed=True)
-    rig = rig_of(settings, item.name)
-    channels = [channel for channel in settings["channels"] if channel != "mesh"]
+    rig = config.make_rig(item.name)
+    channels = [channel for channel in config.channels if channel != "mesh"]
     rendering = renderer.render(
         render_ready(mesh),
         rig,
-        lighting=settings["lighting"],
+        lighting=config.lighting,
         channels=channels,
         name=item.name,
-        seed=seed_of(settings["seed"], "lighting", item.name) % 2**32,
+        seed=config.seed_for("lighting", item.name),
     )
     extra = {channel: getattr(rendering, channel) for channel in channels if channel != "rgba"}
-    model: Any = mesh.scene.export(file_type="glb") if "mesh" in settings["channels"] else None
+    model: Any = mesh.scene.export(file_type="glb") if "mesh" in config.channels else None
     return RenderedObject(item, rig, rendering.rgba, extra, model, mesh)
 
 
-def _write(rendered: RenderedObject, settings: dict[str, Any]) -> dict[str, Any]:
-    out = Path(settings["out"])
+def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict[str, Any]:
+    """Write an object's files, then the record that says that they are whole."""
     scratch = out / ".progress" / "unfinished"
-    files = LAYOUTS[settings["layout"]].files(rendered)
-    checksums = {path: sha256(data) for path, data in files.items()}
     if len(files) > 1:
         folder = os.path.commonpath(files)
         write_folder(out / folder, {os.path.relpath(path, folder): data for path, data in files.items()}, scratch)
@@ -94,6 +83,7 @@ def _write(rendered: RenderedObject, settings: dict[str, Any]) -> dict[str, Any]
         record["seed"] = item.seed
     if mesh.warnings:
         record["warnings"] = list(mesh.warnings)
+    checksums = {path: sha256(data) for path, data in files.items()}
     done = {"name": item.name, "record": record, "files": checksums}
     write_whole(out / ".progress" / "done" / f"{item.name}.json", encode_json(done), scratch)
     return done

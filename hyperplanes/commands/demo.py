@@ -109,7 +109,7 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
 
     out = arguments.out
     if stage.name == "data":
-        _generate(settings, out / "data", console)
+        _generate(settings, out / "data")
         return
     data = open_dataset(out / "data")
     if stage.name in MODELS:
@@ -135,28 +135,16 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
             score_method(method, data, out, show, arguments.device)
 
 
-def _generate(settings: DemoSettings, folder: Path, console: Console) -> None:
-    from data_gen.datasets.generate import Procedural, generate
-    from data_gen.rendering.renderers import find_renderer
-    from hyperplanes.commands.generate import summary
+def _generate(settings: DemoSettings, folder: Path) -> None:
+    from importlib import import_module
 
-    backend = find_renderer()
-    console.say(f"renderer: {backend.name} ({backend.detail})")
-    for line in backend.advice:
-        console.say(f"a faster one: {line}")
-    with console.bar("rendering") as bar:
-        report = generate(
-            Procedural(settings.class_name, settings.objects, settings.seed),
-            folder,
-            views=settings.views,
-            resolution=settings.resolution,
-            held_out=settings.held_out,
-            seed=settings.seed,
-            progress=lambda done, total, name: bar.show(done, total, name),
-        )
-    for name, reason in report.skipped:
-        console.warn(f"skipped {name}: {reason}")
-    console.say(summary(report, folder))
+    from hyperplanes.commands import find_verb
+
+    generate = import_module(find_verb("generate").module)
+    names = ("class_name", "seed", "views", "resolution", "held_out")
+    generate.run(
+        generate.Arguments(folder, count=settings.objects, **{name: getattr(settings, name) for name in names})
+    )
 
 
 def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_gen.datasets.generate import MeshFolder, generate
+from data_gen.datasets.generate import GenerationConfig, MeshFolder, generate
 from hyperplanes.data import Dataset, mesh_path, read_channel, read_views
 from hyperplanes.geometry import cameras as camera
 
@@ -15,9 +15,8 @@ def ball(tmp_path_factory):
     (folder / "meshes").mkdir()
     trimesh.creation.icosphere(subdivisions=4, radius=7.0).export(folder / "meshes/ball.ply")
     channels = ("rgba", "depth", "normals", "coordinates", "mesh")
-    generate(
-        MeshFolder(folder / "meshes"), folder / "out", held_out=0, views=2, resolution=32, workers=1, channels=channels
-    )
+    config = GenerationConfig(held_out=0, views=2, resolution=32, workers=1, channels=channels)
+    generate(MeshFolder(folder / "meshes"), folder / "out", config)
     return folder / "out"
 
 

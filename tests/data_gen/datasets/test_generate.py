@@ -16,7 +16,7 @@ import trimesh
 
 from data_gen import SUPERSAMPLE
 from data_gen.datasets import objects
-from data_gen.datasets.generate import PICTURES, MeshFolder, Procedural, generate
+from data_gen.datasets.generate import PICTURES, GenerationConfig, MeshFolder, Procedural, generate
 from data_gen.datasets.inspect import inspect
 from data_gen.datasets.manifest import verify
 from data_gen.datasets.sources import list_items
@@ -30,7 +30,8 @@ CARS = Procedural("car", 5, seed=3)
 SPLITS = ("test", "train", "val")
 SCRIPT = """
 from data_gen.datasets.generate import *
-print(generate(Procedural("car", 5, seed=3), {out!r}, views=4, resolution=16, workers=1, held_out=2,
+config = GenerationConfig(views=4, resolution=16, workers=1, held_out=2)
+print(generate(Procedural("car", 5, seed=3), {out!r}, config,
     progress=lambda *state: print(*state, flush=True)))
 """
 
@@ -46,7 +47,7 @@ def tree(folder):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     out = tmp_path_factory.mktemp("whole") / "cars"
-    report = generate(CARS, out, held_out=2, **SMALL)
+    report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
     return out, report
 
 
@@ -97,7 +98,7 @@ def test_verify_finds_what_is_missing_and_what_has_changed(whole, tmp_path):
     lines = inspect(out, tmp_path / "pictures", 1, checksums=True).lines()
     assert "checksums: car_00000/images/000.png is missing" in lines
     assert "checksums: car_00001/images/001.png has changed since it was written" in lines
-    report = generate(CARS, out, held_out=2, **SMALL)
+    report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
     assert (report.written, report.reused) == (5, 4), "what is missing is made again"
 
 
@@ -119,29 +120,29 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whol
     assert not (out / "manifest.json").exists(), "the end of the run was not awaited"
     unfinished = out / ".progress/unfinished/.junk.part"
     unfinished.write_bytes(b"half a file")
-    report = generate(CARS, out, held_out=2, **SMALL)
+    report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
     assert report.written == 5
     assert report.reused >= after
     assert tree(out) == tree(whole[0])
 
 
 def test_the_number_of_workers_changes_nothing(whole, tmp_path):
-    generate(CARS, tmp_path / "cars", held_out=2, views=4, resolution=16, workers=2, recycle=2)
+    generate(CARS, tmp_path / "cars", GenerationConfig(held_out=2, views=4, resolution=16, workers=2, recycle=2))
     assert tree(tmp_path / "cars") == tree(whole[0])
 
 
 def test_another_configuration_in_the_same_folder_is_refused(whole):
     with pytest.raises(DataError, match=r"cars: expected the data set it holds \(views 4\), found a request for"):
-        generate(CARS, whole[0], held_out=2, views=6, resolution=16)
+        generate(CARS, whole[0], GenerationConfig(held_out=2, views=6, resolution=16))
 
 
 def test_a_folder_with_other_things_in_it_is_refused(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(DataError, match=r"found thesis\.tex; name another one"):
-        generate(CARS, tmp_path, **SMALL)
+        generate(CARS, tmp_path, GenerationConfig(**SMALL))
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match="found a file"):
-        generate(CARS, tmp_path / "file", **SMALL)
+        generate(CARS, tmp_path / "file", GenerationConfig(**SMALL))
 
 
 def test_two_generations_do_not_write_into_one_folder(tmp_path):
@@ -151,7 +152,7 @@ def test_two_generations_do_not_write_into_one_folder(tmp_path):
     with open(tmp_path / ".progress/lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(DataError, match="found another generation at work"):
-            generate(CARS, tmp_path, **SMALL)
+            generate(CARS, tmp_path, GenerationConfig(**SMALL))
 
 
 def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path):
@@ -161,7 +162,7 @@ def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path)
     trimesh.creation.icosphere(subdivisions=1).export(meshes / "ball.obj")
     (meshes / "broken.glb").write_bytes(b"glTF but not really")
     (meshes / "empty.obj").write_text("")
-    report = generate(MeshFolder(meshes), tmp_path / "out", held_out=0, **SMALL)
+    report = generate(MeshFolder(meshes), tmp_path / "out", GenerationConfig(held_out=0, **SMALL))
     assert report.written == 2
     assert [name for name, _ in report.skipped] == ["broken", "empty"]
     assert all(reason.startswith(f"{name}.") for name, reason in report.skipped), "no path of this machine"
@@ -175,7 +176,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypat
     monkeypatch.setattr("data_gen.datasets.generate.TARGET", "limited_worker:open_renderer")
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
     with pytest.raises(DataError, match=r"expected room to write \d+ bytes, found .*; ") as caught:
-        generate(CARS, tmp_path / "out", held_out=2, views=4, resolution=64, workers=1)
+        generate(CARS, tmp_path / "out", GenerationConfig(held_out=2, views=4, resolution=64, workers=1))
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "out").rglob("*.part"))
     assert not (tmp_path / "out/manifest.json").exists()
@@ -199,7 +200,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypat
 )
 def test_arguments_that_make_no_sense_are_named(tmp_path, arguments, message):
     with pytest.raises(ValueError, match=message):
-        generate(CARS, tmp_path / "out", **arguments)
+        generate(CARS, tmp_path / "out", GenerationConfig(**arguments))
     assert not (tmp_path / "out").exists()
 
 
@@ -218,17 +219,15 @@ def test_mesh_files_are_split_by_name_four_to_one(tmp_path):
 
 
 def test_random_rigs_differ_between_objects_and_agree_between_runs():
-    settings = {"rig": "random", "views": 3, "resolution": 8, "seed": 5, "distance": 3.0, "field_of_view": None}
-    from data_gen.datasets.objects import rig_of
-
-    first, again, other = (rig_of(settings, name).world_from_camera for name in ("a", "a", "b"))
+    config = GenerationConfig(rig="random", views=3, resolution=8, seed=5).resolve()
+    first, again, other = (config.make_rig(name).world_from_camera for name in ("a", "a", "b"))
     assert np.array_equal(first, again)
     assert not np.allclose(first, other)
 
 
 def test_progress_is_told(tmp_path):
     told = []
-    generate(Procedural("car", 2), tmp_path, progress=lambda *state: told.append(state), **SMALL)
+    generate(Procedural("car", 2), tmp_path, GenerationConfig(**SMALL), progress=lambda *state: told.append(state))
     assert [state[:2] for state in told] == [(1, 2), (2, 2)]
 
 
@@ -240,25 +239,25 @@ def test_the_manifest_names_the_version_that_made_it(whole):
 
 def test_files_that_have_changed_are_made_again_when_asked(tmp_path, whole):
     out = tmp_path / "cars"
-    generate(CARS, out, held_out=2, **SMALL)
+    generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
     for name in ("car_00001/images/002.png", "car_test_00000/transforms.json"):
         (out / name).write_bytes(b"worm")
-    assert generate(CARS, out, held_out=2, **SMALL).reused == 5
+    assert generate(CARS, out, GenerationConfig(held_out=2, **SMALL)).reused == 5
     assert not verify(out).intact
-    assert generate(CARS, out, held_out=2, verify=True, **SMALL).reused == 3
+    assert generate(CARS, out, GenerationConfig(held_out=2, verify=True, **SMALL)).reused == 3
     assert tree(out) == tree(whole[0])
 
 
 def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
     car = Procedural("car", 1, seed=3)
-    generate(car, tmp_path / "200", rig="paper-200", resolution=8, held_out=0, workers=1)
+    generate(car, tmp_path / "200", GenerationConfig(rig="paper-200", resolution=8, held_out=0, workers=1))
     task = Dataset(tmp_path / "200").task("car_00000")
     expected = make_rig("paper-200", 50, 8)
     assert len(task.support) + len(task.query) == len(expected) == 50
     poses = camera.camera_from_world(expected.cameras(slice(0, None, 2))).float()
     assert torch.allclose(camera.camera_from_world(task.support.cameras), poses, atol=1e-6)
 
-    generate(car, tmp_path / "128", rig="paper-128", views=2, held_out=0, workers=1)
+    generate(car, tmp_path / "128", GenerationConfig(rig="paper-128", views=2, held_out=0, workers=1))
     support = Dataset(tmp_path / "128").task("car_00000").support
     expected = make_rig("paper-128", 2, 128, distance=4.0, field_of_view=RIG_PRESETS["paper-128"].field_of_view)
     assert support.size == (128, 128)
@@ -267,7 +266,7 @@ def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
     manifest = json.loads((tmp_path / "128" / "manifest.json").read_text())
     assert (manifest["near"], manifest["far"]) == (3.0, 5.0)
     with pytest.raises(ValueError, match="rig: expected one of .*paper-200, got 'paper-64'"):
-        generate(car, tmp_path / "64", rig="paper-64")
+        generate(car, tmp_path / "64", GenerationConfig(rig="paper-64"))
 
 
 def test_a_class_that_the_split_file_leaves_out_whole_is_trained_on_and_named(tmp_path):
@@ -304,7 +303,7 @@ def test_an_official_split_file_decides(tmp_path):
     ]
     assert [item.name for item in items if item.unlisted] == ["car_d"]
     out = tmp_path / "out"
-    report = generate(MeshFolder(tree_of_cars, split_file=official), out, **SMALL)
+    report = generate(MeshFolder(tree_of_cars, split_file=official), out, GenerationConfig(**SMALL))
     assert report.unlisted == ["car_d"]
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["not_in_split_file"] == {"count": 1, "split": "train", "names": ["car_d"]}

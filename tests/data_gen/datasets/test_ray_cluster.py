@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from data_gen.datasets.generate import Procedural, generate
+from data_gen.datasets.generate import GenerationConfig, Procedural, generate
 
 HERE = Path(__file__).parent
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed")
@@ -15,7 +15,7 @@ needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="ray is not inst
 
 def run(script, *arguments):
     """In a process of its own: ray leaves threads and sockets behind, and warns about them."""
-    code = f"import sys; sys.path[:0] = [{str(HERE.parents[1])!r}, {str(HERE)!r}]\n{script}"
+    code = f"import sys; sys.path[:0] = [{str(HERE.parents[2])!r}, {str(HERE)!r}]\n{script}"
     return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
 
 
@@ -23,10 +23,10 @@ def run(script, *arguments):
 def test_a_cluster_writes_the_same_bytes(tmp_path):
     local, cluster = tmp_path / "local", tmp_path / "cluster"
     options = {"views": 4, "resolution": 16, "held_out": 1, "workers": 2}
-    generate(Procedural("car", 3), local, **options)
+    generate(Procedural("car", 3), local, GenerationConfig(**options))
     script = (
         "from data_gen.datasets.generate import *\n"
-        f"print(generate(Procedural('car', 3), sys.argv[1], engine='ray', **{options!r}))"
+        f"print(generate(Procedural('car', 3), sys.argv[1], GenerationConfig(engine='ray', **{options!r})))"
     )
     done = run(script, str(cluster))
     assert done.returncode == 0, done.stderr
@@ -60,4 +60,6 @@ def test_without_ray_one_line_says_what_to_do(tmp_path):
     with pytest.raises(
         ValueError, match="^engine: expected ray to be installed, found no such module; pip install ray$"
     ):
-        generate(Procedural("car", 1), tmp_path / "out", held_out=0, views=2, resolution=16, engine="ray")
+        generate(
+            Procedural("car", 1), tmp_path / "out", GenerationConfig(held_out=0, views=2, resolution=16, engine="ray")
+        )

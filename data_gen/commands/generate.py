@@ -12,7 +12,7 @@ Example:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -118,37 +118,20 @@ def unlisted(names: list[str]) -> str:
 
 def run(arguments: Arguments) -> int:
     """Generate the data set and say what was skipped."""
-    from data_gen.datasets.generate import generate
+    from data_gen.datasets.generate import GenerationConfig, generate
     from data_gen.datasets.manifest import verify
     from data_gen.rendering.renderers import find_renderer
 
     console = Console()
     source = source_of(arguments)
-    backend = find_renderer(arguments.renderer)
-    console.say(f"renderer: {backend.name} ({backend.detail})")
-    for line in backend.advice:
+    renderer = find_renderer(arguments.renderer)
+    console.say(f"renderer: {renderer.name} ({renderer.detail})")
+    for line in renderer.advice:
         console.say(f"a faster one: {line}")
+    names = {field.name for field in fields(GenerationConfig)} & {field.name for field in fields(Arguments)}
+    config = GenerationConfig(**{name: getattr(arguments, name) for name in names} | {"renderer": renderer.name})
     with console.bar("rendering") as bar:
-        report = generate(
-            source,
-            arguments.out,
-            rig=arguments.rig,
-            views=arguments.views,
-            resolution=arguments.resolution,
-            distance=arguments.distance,
-            field_of_view=arguments.field_of_view,
-            lighting=arguments.lighting,
-            channels=arguments.channels,
-            held_out=arguments.held_out,
-            workers=arguments.workers,
-            engine=arguments.engine,
-            layout=arguments.layout,
-            seed=arguments.seed,
-            supersample=arguments.supersample,
-            renderer=backend.name,
-            verify=arguments.verify,
-            progress=lambda done, total, name: bar.show(done, total, name),
-        )
+        report = generate(source, arguments.out, config, progress=bar.show)
     for name, reason in report.skipped:
         console.warn(f"skipped {name}: {reason}")
     if report.unlisted:
