@@ -36,10 +36,11 @@ def obvious_loop(objects: int, out: Path) -> dict[str, float]:
     from data_gen.meshes.mesh import prepare_scene
     from data_gen.rigs import fixed
     from data_gen.shapes import make
+    from hyperplanes.axes import flip_camera_axes
 
     rig = fixed(VIEWS, RESOLUTION)
     ends: list[float] = []
-    opengl = rig.world_from_camera * [1.0, -1.0, -1.0, 1.0]
+    opengl = flip_camera_axes(rig.world_from_camera)
     focal = rig.intrinsics[0, 0, 0]
     for item in list_items(Procedural("car", objects), 0):
         mesh = prepare_scene(make("car", int(item.seed or 0)), item.name)
@@ -81,7 +82,7 @@ def stages(objects: int, out: Path) -> dict[str, float]:
     from data_gen.rendering.renderers import find_renderer
     from data_gen.rigs import fixed
     from data_gen.shapes import make
-    from hyperplanes.data.files import sha256, write_folder
+    from hyperplanes.files import sha256, write_folder
 
     rig = fixed(VIEWS, RESOLUTION)
     spent = dict.fromkeys(("mesh", "one sample a pixel drawn", "nine samples a pixel drawn", "png", "written"), 0.0)

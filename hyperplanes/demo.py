@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from hyperplanes.adaptation.base import Pictures
-from hyperplanes.checkpoints import read_json, write_json
+from hyperplanes.checkpoints import read_json
 from hyperplanes.evaluation import ObjectScore, evaluate, make_method
 from hyperplanes.export import save_images
+from hyperplanes.files import write_json
 from hyperplanes.models import OnDevice, choose_device, on_device
 from hyperplanes.presets import Preset
 from hyperplanes.recipes import recipe

@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from data_gen.datasets.sources import Item
 from data_gen.rigs import DEFAULT_DISTANCE, OBJECT_RADIUS, Rig
-from hyperplanes.data.files import encode_json, encode_npz, encode_png
+from hyperplanes.axes import flip_camera_axes
 from hyperplanes.data.transforms_document import transforms_document
+from hyperplanes.files import encode_json, encode_npz, encode_png
 
 __all__ = ["LAYOUTS", "Layout", "RenderedObject"]
 
-_FLIP = np.array([1.0, -1.0, -1.0, 1.0])
 _AUTHORS_FOCAL = 277.77
 
 
@@ -142,7 +142,7 @@ def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
     item, rig = rendered.item, rendered.rig
     arrays = {
         "images": over_white(rendered.rgba).astype(np.float32) / np.float32(255),
-        "cam_poses": (rig.world_from_camera * _FLIP + 0.0).astype(np.float32),
+        "cam_poses": (flip_camera_axes(rig.world_from_camera) + 0.0).astype(np.float32),
         "rgba": rendered.rgba,
         "focal": np.float64(rig.intrinsics[0, 0, 0]),
     }

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from data_gen.datasets.sources import Item
-from hyperplanes.data.errors import DataError
-from hyperplanes.data.files import encode_json, inside, read_json, sha256, write_whole
+from hyperplanes.files import DataError, encode_json, inside, read_json, sha256, write_whole
 
 __all__ = ["FORMAT", "MANIFEST", "GenerationState", "Verification", "build_manifest", "verify"]
 

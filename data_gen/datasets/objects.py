@@ -11,7 +11,7 @@ from typing import Any
 from data_gen.datasets.config import RenderConfig
 from data_gen.datasets.layouts import LAYOUTS, RenderedObject
 from data_gen.datasets.sources import Item
-from hyperplanes.data.files import encode_json, sha256, write_folder, write_whole
+from hyperplanes.files import encode_json, sha256, write_folder, write_whole
 
 __all__ = ["open_renderer"]
 
@@ -70,7 +70,7 @@ def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict
         write_folder(out / folder, {os.path.relpath(path, folder): data for path, data in files.items()}, scratch)
     else:
         for path, data in files.items():
-            write_whole(out / path, data, scratch)
+            write_whole(out / path, data, scratch, durable=False)
     item, mesh = rendered.item, rendered.mesh
     record: dict[str, Any] = {
         "class": item.class_name,
@@ -85,5 +85,5 @@ def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict
         record["warnings"] = list(mesh.warnings)
     checksums = {path: sha256(data) for path, data in files.items()}
     done = {"name": item.name, "record": record, "files": checksums}
-    write_whole(out / ".progress" / "done" / f"{item.name}.json", encode_json(done), scratch)
+    write_whole(out / ".progress" / "done" / f"{item.name}.json", encode_json(done), scratch, durable=False)
     return done

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from hyperplanes.data.errors import DataError
+from hyperplanes.files import DataError
 
 __all__ = ["answer", "main"]
 

@@ -16,14 +16,13 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 
 from data_gen.meshes.files import IMAGE_FORMATS
+from hyperplanes.colour import convert_8bit, linear_from_srgb, srgb_from_linear
 
 __all__ = [
     "DEFAULT_COLOUR",
     "ColourSpace",
     "Visual",
     "canonical_visual",
-    "linear_from_srgb",
-    "srgb_from_linear",
     "texture_of",
     "visual_of",
 ]
@@ -54,44 +53,6 @@ def texture_of(mesh: trimesh.Trimesh) -> TextureVisuals | None:
     """The texture of a mesh, if it has one."""
     visual = mesh.visual
     return visual if isinstance(visual, TextureVisuals) else None
-
-
-def linear_from_srgb(colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Turn sRGB colours into linear ones; a fourth channel (alpha) stays.
-
-    Args:
-        colours: ``(..., 3)`` or ``(..., 4)``, 0 to 255.
-
-    Returns:
-        The same shape.
-
-    >>> linear_from_srgb(np.array([0, 188, 255, 128], np.uint8)).tolist()
-    [0, 128, 255, 128]
-    """
-    result = np.array(colours, dtype=np.uint8, copy=True)
-    value = result[..., :3] / 255.0
-    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    result[..., :3] = np.round(linear * 255.0)
-    return result
-
-
-def srgb_from_linear(colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Turn linear colours into sRGB ones; a fourth channel (alpha) stays.
-
-    Args:
-        colours: ``(..., 3)`` or ``(..., 4)``, 0 to 255.
-
-    Returns:
-        The same shape.
-
-    >>> srgb_from_linear(np.array([0, 128, 255, 128], np.uint8)).tolist()
-    [0, 188, 255, 128]
-    """
-    result = np.array(colours, dtype=np.uint8, copy=True)
-    value = result[..., :3] / 255.0
-    srgb = np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 0.0031308) ** (1 / 2.4) - 0.055)
-    result[..., :3] = np.round(srgb * 255.0)
-    return result
 
 
 def canonical_visual(
@@ -125,7 +86,7 @@ def _coloured(values: Any, kind: str, label: str, colours: ColourSpace) -> tuple
         values[:, 3] = 255
         warnings.append(f"{label}: every colour has alpha 0; taken as opaque")
     if colours == "gltf":
-        values = srgb_from_linear(values)
+        values = convert_8bit(values, srgb_from_linear)
     keyword = "vertex_colors" if kind == "vertex" else "face_colors"
     return ColorVisuals(**{keyword: values}), warnings, True
 
@@ -142,15 +103,15 @@ def _textured(
     data = _pbr_values(material, images) if is_gltf else _mtl_values(material, images)
     if colours == "srgb" and is_gltf and data.get("baseColorFactor") is not None:
         factor = np.round(np.asarray(data["baseColorFactor"]) * 255.0).astype(np.uint8)
-        data["baseColorFactor"] = linear_from_srgb(factor) / 255.0
+        data["baseColorFactor"] = convert_8bit(factor, linear_from_srgb) / 255.0
     coordinates = _coordinates(visual, len(mesh.vertices), label, warnings)
     if coordinates is None:
         _drop_textures(data, label, warnings)
     painted = _vertex_paint(visual, len(mesh.vertices))
     if painted is not None and data.get("baseColorTexture") is None:
-        tint = srgb_from_linear(np.round(data["baseColorFactor"] * 255.0).astype(np.uint8))
+        tint = convert_8bit(np.round(data["baseColorFactor"] * 255.0).astype(np.uint8), srgb_from_linear)
         if colours == "gltf":
-            painted = srgb_from_linear(painted)
+            painted = convert_8bit(painted, srgb_from_linear)
         if data["alphaMode"] == "OPAQUE":
             painted[:, 3] = tint[3] = 255
         return _coloured((painted * (tint / 255.0)).round(), "vertex", label, "scene")
@@ -169,7 +130,7 @@ def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> Non
     image = data.get("baseColorTexture")
     if image is not None:
         mean = np.asarray(image.convert("RGB"), dtype=np.float64).reshape(-1, 3).mean(axis=0)
-        data["baseColorFactor"][:3] *= linear_from_srgb(mean.astype(np.uint8)) / 255.0
+        data["baseColorFactor"][:3] *= convert_8bit(mean.astype(np.uint8), linear_from_srgb) / 255.0
         warnings.append(f"{label}: texture without texture coordinates; its mean colour taken")
     for slot in ("baseColorTexture", *_MAP_SLOTS):
         data.pop(slot, None)
@@ -222,7 +183,7 @@ def _pbr_values(material: PBRMaterial, images: dict[Any, Any]) -> dict[str, Any]
 
 def _mtl_values(material: SimpleMaterial, images: dict[Any, Any]) -> dict[str, Any]:
     image = _shared(material.image, "RGBA", images)
-    factor = linear_from_srgb(np.asarray(material.diffuse, dtype=np.uint8)) / 255.0
+    factor = convert_8bit(np.asarray(material.diffuse, dtype=np.uint8), linear_from_srgb) / 255.0
     if image is not None:
         factor[:3] = 1.0
     shininess = max(float(material.glossiness or 1.0), 0.0)

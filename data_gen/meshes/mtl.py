@@ -14,8 +14,8 @@ import PIL.Image
 from trimesh.visual.material import PBRMaterial
 
 from data_gen.meshes.files import MAX_TEXT_BYTES
-from data_gen.meshes.materials import linear_from_srgb
 from data_gen.meshes.model_folder import ModelFolder
+from hyperplanes.colour import convert_8bit, linear_from_srgb
 
 __all__ = ["decoded", "read_materials"]
 
@@ -78,7 +78,7 @@ def _statements(text: str, library: str, warnings: list[str]) -> list[dict[str, 
 def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) -> PBRMaterial:
     label = f"material {values['name']!r}"
     colour = np.array([*_floats(values.get("kd"), 3, (0.8, 0.8, 0.8), f"{label}: Kd", warnings), 1.0])
-    colour[:3] = linear_from_srgb(np.clip(np.round(colour[:3] * 255.0), 0, 255).astype(np.uint8)) / 255.0
+    colour[:3] = convert_8bit(np.clip(np.round(colour[:3] * 255.0), 0, 255).astype(np.uint8), linear_from_srgb) / 255.0
     colour[3] = _opacity(values, label, warnings)
     image = _texture(values, label, folder, warnings)
     if image is not None:

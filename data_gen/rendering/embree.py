@@ -17,9 +17,10 @@ import numpy.typing as npt
 from data_gen.rendering.lighting import Lighting
 from data_gen.rendering.ray_casting import Caster, Hits, pixel_rays
 from data_gen.rendering.shading import facing, shade
-from data_gen.rendering.surfaces import ShadedSurface, linear
+from data_gen.rendering.surfaces import ShadedSurface
 from data_gen.rendering.textures import MipTexture
 from data_gen.rigs import Rig
+from hyperplanes.colour import linear_from_srgb
 
 __all__ = ["EmbreeRenderer", "Geometry", "cast_geometry"]
 
@@ -187,7 +188,7 @@ class _Scene:
                 colour *= _mixed(surface.colours, surface.faces[number], hits.corners[own])
             if surface.texture is not None:
                 texel = self._texel(surface, surface.texture, hits, own, number, spread)
-                colour[:, :3] *= linear(np.minimum(texel[:, :3] / np.maximum(texel[:, 3:], 1e-4), 1.0))
+                colour[:, :3] *= linear_from_srgb(np.minimum(texel[:, :3] / np.maximum(texel[:, 3:], 1e-4), 1.0))
                 colour[:, 3] *= texel[:, 3]
             if surface.cutoff is not None:
                 colour[:, 3] = colour[:, 3] >= surface.cutoff
@@ -204,7 +205,7 @@ class _Scene:
                 light[own] = surface.emissive
                 if surface.emissive_texture is not None:
                     texel = self._texel(surface, surface.emissive_texture, hits, own, number, spread)
-                    light[own] *= linear(texel[:, :3])
+                    light[own] *= linear_from_srgb(texel[:, :3])
         return light
 
     def _by_surface(self, hits: Hits) -> Iterator[tuple[ShadedSurface, npt.NDArray[np.int64], npt.NDArray[np.int64]]]:

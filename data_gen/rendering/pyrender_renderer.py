@@ -16,10 +16,10 @@ from data_gen.rendering.lighting import Lighting
 from data_gen.rendering.renderers import RendererError
 from data_gen.rendering.surfaces import ShadedSurface
 from data_gen.rigs import Rig
+from hyperplanes.axes import flip_camera_axes
 
 __all__ = ["PyrenderRenderer"]
 
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 # Deleting any EGL renderer ends all others of the process, so there is one, which lives as long as the process does.
 _renderer: Any = None
@@ -65,7 +65,7 @@ class PyrenderRenderer:
         radius = max(float(np.linalg.norm(surface.positions, axis=1).max()) for surface in surfaces)
         try:
             for pose, intrinsics in zip(rig.world_from_camera, rig.intrinsics, strict=True):
-                clip_from_world = _projection(intrinsics, rig, pose, radius) @ np.linalg.inv(pose @ _OPENGL_FROM_OPENCV)
+                clip_from_world = _projection(intrinsics, rig, pose, radius) @ np.linalg.inv(flip_camera_axes(pose))
                 lamps = lighting.directions(pose)
                 yield renderer.draw(drawables, size, clip_from_world, pose[:3, 3], lighting, lamps)
         finally:

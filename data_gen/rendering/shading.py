@@ -12,22 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from data_gen.rendering.lighting import Lighting
+from hyperplanes.colour import srgb_from_linear
 
-__all__ = ["SHOULDER", "encoded", "facing", "shade"]
+__all__ = ["SHOULDER", "facing", "shade"]
 
 Floats = npt.NDArray[np.float64]
 
 SHOULDER = 0.8
 """Reflected light above this is rolled off towards 1."""
-
-
-def encoded(light: Floats) -> Floats:
-    """SRGB values of linear light in [0, 1].
-
-    >>> encoded(np.array([0.0, 0.0031308, 1.0])).round(5).tolist()
-    [0.0, 0.04045, 1.0]
-    """
-    return np.where(light <= 0.0031308, light * 12.92, 1.055 * np.maximum(light, 0.0031308) ** (1.0 / 2.4) - 0.055)
 
 
 def facing(normals: Floats, facets: Floats, towards: Floats) -> Floats:
@@ -89,7 +81,7 @@ def shade(
         light += nl * colour * (diffuse + fresnel * highlight)
     rolled = SHOULDER + (1.0 - SHOULDER) * (1.0 - np.exp((SHOULDER - np.maximum(light, SHOULDER)) / (1.0 - SHOULDER)))
     light = np.where(light > SHOULDER, rolled, light)
-    return encoded(np.clip(light + glow, 0.0, 1.0))
+    return srgb_from_linear(np.clip(light + glow, 0.0, 1.0))
 
 
 def _dot(one: Floats, other: Floats) -> Floats:

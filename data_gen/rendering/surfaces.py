@@ -23,6 +23,7 @@ from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from data_gen.meshes.materials import texture_of, visual_of
+from hyperplanes.colour import linear_from_srgb
 
 __all__ = [
     "DEFAULT_ROUGHNESS",
@@ -31,7 +32,6 @@ __all__ = [
     "MIN_ROUGHNESS",
     "RenderError",
     "ShadedSurface",
-    "linear",
     "shaded_surfaces",
 ]
 
@@ -93,16 +93,6 @@ class ShadedSurface:
     cutoff: float | None
     opaque: bool
     closed: bool = False
-
-
-def linear(srgb: npt.ArrayLike) -> Floats:
-    """Linear light of sRGB values in [0, 1].
-
-    >>> linear([0.0, 0.04045, 1.0]).round(6).tolist()
-    [0.0, 0.003131, 1.0]
-    """
-    value = np.asarray(srgb, dtype=np.float64)
-    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
 def shaded_surfaces(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: str = "object") -> list[ShadedSurface]:
@@ -184,7 +174,7 @@ def _unit(vectors: Floats) -> Floats:
 
 def _linear_colours(colours: Any) -> Floats:
     rgba = np.asarray(colours, dtype=np.float64) / 255.0
-    return np.concatenate((linear(rgba[:, :3]), rgba[:, 3:4]), axis=1)
+    return np.concatenate((linear_from_srgb(rgba[:, :3]), rgba[:, 3:4]), axis=1)
 
 
 def _texture_coordinates(mesh: trimesh.Trimesh, material: dict[str, Any], where: str) -> Floats | None:
@@ -255,7 +245,7 @@ def _fill_from_mtl(fields: dict[str, Any], material: Any, images: dict[Any, Any]
     unset = tuple(material.diffuse) == _UNSET_KD or not diffuse[:3].any()
     if fields["texture"] is not None and unset:
         diffuse = np.array([255.0, 255.0, 255.0, diffuse[3]])
-    fields["base_colour"] = np.append(linear(diffuse[:3] / 255.0), diffuse[3] / 255.0)
+    fields["base_colour"] = np.append(linear_from_srgb(diffuse[:3] / 255.0), diffuse[3] / 255.0)
     fields["opaque"] = fields["base_colour"][3] >= 1.0 and _is_opaque(fields["texture"])
 
 

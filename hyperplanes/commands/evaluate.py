@@ -70,9 +70,9 @@ def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
 
 def run(arguments: Arguments) -> int:
     """Evaluate all methods and print the table."""
-    from hyperplanes.checkpoints import write_json
     from hyperplanes.data import open_dataset
     from hyperplanes.evaluation import make_method
+    from hyperplanes.files import write_json
     from hyperplanes.models import ByProtocol, OnDevice, choose_device, find_checkpoints, on_device
     from hyperplanes.presets import PROTOCOLS
     from hyperplanes.recipes import score_all

@@ -6,7 +6,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-from hyperplanes.data.errors import DataError
+from hyperplanes.files import DataError
 
 
 @contextmanager
