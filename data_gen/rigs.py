@@ -1,7 +1,7 @@
 """Camera rigs: posed cameras of one size that look at a generated object; fixed, random, in an orbit, or by name.
 
-Conventions: OpenCV camera axes (x right, y down, z forward), a world with y up, ``world_from_camera`` poses, intrinsics
-in pixels with INTEGER pixel centres, so a centred principal point is ``((W - 1) / 2, (H - 1) / 2)``. Objects are
+Conventions: OpenCV camera axes (x right, y down, z forward), a world with y up, `world_from_camera` poses, intrinsics
+in pixels with INTEGER pixel centres, so a centred principal point is `((W - 1) / 2, (H - 1) / 2)`. Objects are
 expected inside the sphere of radius 1 around the origin, at which every camera looks.
 
 A rig is numpy, and `Rig.cameras` makes Kornia cameras of it: worker processes, which import everything else of a rig,
@@ -55,11 +55,11 @@ class RigPreset:
     """Named settings of a rig.
 
     Attributes:
-        kind: The same poses for every object, or random ones for each, anywhere on the sphere.
-        views: Cameras an object.
-        resolution: Pixels along a side.
-        distance: Of the cameras from the origin, in world units.
-        field_of_view: Full angle in degrees; None fits the unit sphere.
+        kind: the same poses for every object, or random ones for each, anywhere on the sphere.
+        views: cameras an object.
+        resolution: pixels along a side.
+        distance: of the cameras from the origin, in world units.
+        field_of_view: full angle in degrees; None fits the unit sphere.
     """
 
     kind: Literal["fixed", "random"]
@@ -89,16 +89,16 @@ class Rig:
     """Posed cameras of one size.
 
     Attributes:
-        world_from_camera: Camera poses ``(view, 4, 4)``, OpenCV axes, in world units.
-        intrinsics: Pinhole matrices ``(view, 3, 3)`` in pixels, integer pixel centres. One ``(3, 3)`` is accepted and
+        world_from_camera: camera poses `(view, 4, 4)`, OpenCV axes, in world units.
+        intrinsics: pinhole matrices `(view, 3, 3)` in pixels, integer pixel centres. One `(3, 3)` is accepted and
             repeated for every view.
-        width: Image width in pixels.
-        height: Image height in pixels.
-        near: Distance along a ray before which there is no object, in world units.
-        far: Distance along a ray after which there is no object, in world units.
+        width: image width in pixels.
+        height: image height in pixels.
+        near: distance along a ray before which there is no object, in world units.
+        far: distance along a ray after which there is no object, in world units.
 
     Raises:
-        ValueError: If a shape is wrong, a number is not finite, a pose is not a rigid motion, or near and far are out
+        ValueError: if a shape is wrong, a number is not finite, a pose is not a rigid motion, or near and far are out
             of order.
     """
 
@@ -141,15 +141,15 @@ class Rig:
 
     @property
     def camera_centres(self) -> Array:
-        """Camera positions ``(view, 3)`` in world units."""
+        """Camera positions `(view, 3)` in world units."""
         return self.world_from_camera[:, :3, 3]
 
     def cameras(self, views: Sequence[int] | slice = slice(None), dtype: torch.dtype | None = None) -> PinholeCamera:
         """The cameras as `hyperplanes.geometry` takes them.
 
         Args:
-            views: Which of them; all by default.
-            dtype: Of their numbers; float64 by default.
+            views: which of them; all by default.
+            dtype: of their numbers; float64 by default.
 
         Returns:
             A batch of Kornia cameras.
@@ -174,18 +174,18 @@ def make_rig(
     """The cameras of a named rig.
 
     Args:
-        name: One of RIGS; of a preset only the kind is taken, all its numbers are arguments here.
-        views: Number of views.
-        resolution: Pixels along a side.
-        seed: Seed of random rigs.
-        distance: Distance of the cameras from the origin in world units.
-        field_of_view: Full angle in degrees; None fits the unit sphere.
+        name: one of RIGS; of a preset only the kind is taken, all its numbers are arguments here.
+        views: number of views.
+        resolution: pixels along a side.
+        seed: seed of random rigs.
+        distance: distance of the cameras from the origin in world units.
+        field_of_view: full angle in degrees; None fits the unit sphere.
 
     Returns:
         The rig.
 
     Raises:
-        ValueError: If no rig has that name, or a number makes no sense.
+        ValueError: if no rig has that name, or a number makes no sense.
     """
     kind = RIG_PRESETS[name].kind if name in RIG_PRESETS else name
     lens = {"distance": distance, "field_of_view": field_of_view}
@@ -215,15 +215,15 @@ def fixed(
     well. Of 50 views, no two are nearer than 15.6 degrees, and no two of a half nearer than 29 degrees.
 
     Args:
-        views: Number of views.
-        resolution: Pixels, one number for a square image or (width, height).
-        distance: Distance of the cameras from the origin in world units.
-        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
-        lowest: Lowest elevation in degrees.
-        highest: Highest elevation in degrees.
+        views: number of views.
+        resolution: pixels, one number for a square image or (width, height).
+        distance: distance of the cameras from the origin in world units.
+        field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
+        lowest: lowest elevation in degrees.
+        highest: highest elevation in degrees.
 
     Returns:
-        A rig of ``views`` cameras.
+        A rig of `views` cameras.
     """
     _check_views(views)
     bottom, top = _height_band(lowest, highest)
@@ -251,16 +251,16 @@ def random(
     """Cameras at random, uniformly in area over a band of elevations: the whole sphere, or the upper half of it.
 
     Args:
-        views: Number of views.
-        resolution: Pixels, one number for a square image or (width, height).
-        seed: Seed of the random numbers; the same seed gives the same poses.
-        distance: Distance of the cameras from the origin in world units.
-        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
-        lowest: Lowest elevation in degrees; 0 for the upper hemisphere.
-        highest: Highest elevation in degrees.
+        views: number of views.
+        resolution: pixels, one number for a square image or (width, height).
+        seed: seed of the random numbers; the same seed gives the same poses.
+        distance: distance of the cameras from the origin in world units.
+        field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
+        lowest: lowest elevation in degrees; 0 for the upper hemisphere.
+        highest: highest elevation in degrees.
 
     Returns:
-        A rig of ``views`` cameras.
+        A rig of `views` cameras.
     """
     _check_views(views)
     generator = np.random.default_rng(seed)
@@ -280,17 +280,17 @@ def orbit(
     """Cameras evenly around the object at one height: a turntable.
 
     Args:
-        views: Number of views; the one after the last would be the first again.
-        resolution: Pixels, one number for a square image or (width, height).
-        elevation: Height of the cameras over the horizon in degrees.
-        distance: Distance of the cameras from the origin in world units.
-        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
+        views: number of views; the one after the last would be the first again.
+        resolution: pixels, one number for a square image or (width, height).
+        elevation: height of the cameras over the horizon in degrees.
+        distance: distance of the cameras from the origin in world units.
+        field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
 
     Returns:
-        A rig of ``views`` cameras, the first in the direction of +z.
+        A rig of `views` cameras, the first in the direction of +z.
 
     Raises:
-        ValueError: If the number of views, elevation, distance or resolution make no sense.
+        ValueError: if the number of views, elevation, distance or resolution make no sense.
     """
     _check_views(views)
     if not -90.0 <= elevation <= 90.0:
@@ -304,13 +304,13 @@ def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:
     """Field of view at which the unit sphere just fits, with a margin of 4 %.
 
     Args:
-        distance: Distance of the camera from the centre of the sphere, more than 1.04.
+        distance: distance of the camera from the centre of the sphere, more than 1.04.
 
     Returns:
-        The full angle in degrees, ``2 asin(1.04 / distance)``.
+        The full angle in degrees, `2 asin(1.04 / distance)`.
 
     Raises:
-        ValueError: If the camera is too near for any angle to do.
+        ValueError: if the camera is too near for any angle to do.
 
     >>> round(fitting_field_of_view(3.0), 3)
     40.567
@@ -326,10 +326,10 @@ def look_at_origin(centres: npt.ArrayLike) -> Array:
     The poses of `hyperplanes.geometry.poses.look_at`, in numpy and exact at the centres; a test compares the two.
 
     Args:
-        centres: Camera positions ``(view, 3)``, none of them the origin.
+        centres: camera positions `(view, 3)`, none of them the origin.
 
     Returns:
-        ``world_from_camera`` ``(view, 4, 4)``, OpenCV axes. Right above or below the origin, where no direction is up,
+        `world_from_camera` `(view, 4, 4)`, OpenCV axes. Right above or below the origin, where no direction is up,
         the world's -z axis is up in the picture.
 
     >>> look_at_origin([[0.0, 0.0, 3.0]])[0].round().astype(int).tolist()

@@ -1,4 +1,4 @@
-"""What data_gen adds to `hyperplanes doctor`: each renderer is made to draw."""
+"""What data_gen adds to `hyperplanes doctor`: a probe of each renderer."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def examine_renderers() -> list[Check]:
 
 
 def _reason(message: str) -> str:
-    """A message without the class it was raised as and the remedy, which is told apart."""
+    """A message without the class of its exception and the remedy, which is printed separately."""
     text = message.partition(" Remedy:")[0].rstrip(".")
     kind, found, rest = text.partition(": ")
     return rest if found and kind.endswith("Error") and " " not in kind else text

@@ -81,4 +81,4 @@ def run(arguments: Arguments) -> int:
     found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums)
     for line in found.lines():
         console.say(line)
-    return int(found.trouble)
+    return int(found.has_problems)

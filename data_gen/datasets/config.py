@@ -1,4 +1,4 @@
-"""What a generation is asked for, and what each object is rendered with once that is resolved."""
+"""The configuration of a generation, and what it resolves to for every object."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ class RenderConfig:
     """What decides the pictures of an object: a `GenerationConfig` in which nothing is left open.
 
     Attributes:
-        rig: A name in `data_gen.rigs.RIGS`.
-        views: Cameras an object.
-        resolution: Pixels along a side.
-        distance: Of the cameras from the origin, in world units.
-        field_of_view: In degrees; None fits the unit sphere.
-        lighting: A name in `data_gen.rendering.lighting.LIGHTING_PRESETS`.
+        rig: a name in `data_gen.rigs.RIGS`.
+        views: cameras an object.
+        resolution: pixels along a side.
+        distance: of the cameras from the origin, in world units.
+        field_of_view: in degrees; None fits the unit sphere.
+        lighting: a name in `data_gen.rendering.lighting.LIGHTING_PRESETS`.
         channels: "rgba", and further ones in alphabetical order.
-        layout: A name in `data_gen.datasets.layouts.LAYOUTS`.
-        seed: Of random rigs and lights.
-        supersample: Samples along a side of a pixel.
-        renderer: A name in `data_gen.rendering.renderers.RENDERERS`.
-        up: The axis that points up in mesh files, y or z.
+        layout: a name in `data_gen.datasets.layouts.LAYOUTS`.
+        seed: of random rigs and lights.
+        supersample: samples along a side of a pixel.
+        renderer: a name in `data_gen.rendering.renderers.RENDERERS`.
+        up: the axis that points up in mesh files, y or z.
     """
 
     rig: str
@@ -57,7 +57,7 @@ class RenderConfig:
         """The cameras of an object.
 
         Args:
-            name: Of the object, on which random rigs depend.
+            name: of the object, on which random rigs depend.
 
         Returns:
             The rig.
@@ -86,23 +86,23 @@ class GenerationConfig:
     Attributes:
         rig: "fixed" (the same poses for all objects), "random" (on the sphere), "hemisphere", "orbit", or a name in
             `data_gen.rigs.RIG_PRESETS`.
-        views: Pictures an object, alternately support and query; the preset's when None, else 50.
-        resolution: Pixels along a side; what the layout or the preset takes for granted when None, else 64.
+        views: pictures an object, alternately support and query; the preset's when None, else 50.
+        resolution: pixels along a side; what the layout's loaders assume or the preset has when None, else 64.
         lighting: "studio", "headlight" or "random".
         channels: "rgba" and any of "depth", "normals", "coordinates", "mesh"; more than rgba needs the native layout.
-        held_out: Objects for the test split, a count or a fraction below 1; see `data_gen.datasets.sources.list_items`.
-        workers: Processes; as many as cores when None.
+        held_out: objects for the test split, a count or a fraction below 1; see `data_gen.datasets.sources.list_items`.
+        workers: processes; as many as cores when None.
         engine: "local", or "ray" for a Ray cluster.
-        layout: A name in `data_gen.datasets.layouts.LAYOUTS`.
-        seed: Of random rigs and lights; shapes have their own in the source.
-        distance: Of the cameras from the object's centre in object radii; what suits the layout or the preset when
+        layout: a name in `data_gen.datasets.layouts.LAYOUTS`.
+        seed: of random rigs and lights; shapes have their own in the source.
+        distance: of the cameras from the object's centre in object radii; what suits the layout or the preset when
             None.
-        field_of_view: In degrees; the preset's when None, or the object just fits.
-        supersample: Samples along a side of a pixel.
-        renderer: A name in `data_gen.rendering.renderers.RENDERERS`; the best that works here when None.
-        timeout: Seconds an object may take.
-        recycle: Objects after which a worker is replaced.
-        verify: Compare files of an earlier call with their checksums, and make objects anew where they differ.
+        field_of_view: in degrees; the preset's when None, or the object just fits.
+        supersample: samples along a side of a pixel.
+        renderer: a name in `data_gen.rendering.renderers.RENDERERS`; the best that works here when None.
+        timeout: seconds an object may take.
+        recycle: objects after which a worker is replaced.
+        verify: compare files of an earlier call with their checksums, and make objects anew where they differ.
     """
 
     rig: str = "fixed"
@@ -127,13 +127,13 @@ class GenerationConfig:
         """Check everything, and settle what was left open: by the layout, else by the preset, else by default.
 
         Args:
-            up: The axis that points up in mesh files.
+            up: the axis that points up in mesh files.
 
         Returns:
             What workers need to know.
 
         Raises:
-            ValueError: If a name is unknown, a number makes no sense, or no renderer works.
+            ValueError: if a name is unknown, a number makes no sense, or no renderer works.
         """
         from data_gen.rendering.renderers import find_renderer
 

@@ -16,16 +16,16 @@ def contact_sheet(images: Sequence[np.ndarray], columns: int, labels: Sequence[s
     """Lay images out in rows over white.
 
     Args:
-        images: Arrays (H, W, 3) or (H, W, 4), uint8 sRGB, all of one height and width; alpha is straight and composited
+        images: arrays (H, W, 3) or (H, W, 4), uint8 sRGB, all of one height and width; alpha is straight and composited
             over white.
-        columns: Images a row.
-        labels: A caption under each image, cut to its width; none if absent.
+        columns: images a row.
+        labels: a caption under each image, cut to its width; none if absent.
 
     Returns:
         The sheet (rows * cell height, columns * cell width, 3), uint8, 4 pixels between the images.
 
     Raises:
-        ValueError: If there are no images, their sizes or types differ from the above, columns is not positive, or the
+        ValueError: if there are no images, their sizes or types differ from the above, columns is not positive, or the
             number of labels is not that of the images.
     """
     if not images or columns < 1:

@@ -32,13 +32,13 @@ class GenerationReport:
     """The outcome of a generation.
 
     Attributes:
-        written: Objects in the data set, those of an earlier, interrupted call included.
-        skipped: Names and reasons of objects that are not in it.
-        seconds: That this call took.
-        images_per_second: That this call wrote.
-        reused: Objects that an earlier call had written.
-        splits: How many objects are in each split.
-        unlisted: Objects that the split file does not name, and that are trained on.
+        written: objects in the data set, those of an earlier, interrupted call included.
+        skipped: names and reasons of objects that are not in it.
+        seconds: that this call took.
+        images_per_second: that this call wrote.
+        reused: objects that an earlier call had written.
+        splits: how many objects are in each split.
+        unlisted: objects that the split file does not name, and that are trained on.
     """
 
     written: int
@@ -63,17 +63,17 @@ def generate(
     object that cannot be drawn, or whose worker crashes or hangs twice, is skipped and listed; the rest goes on.
 
     Args:
-        source: Procedural objects or mesh files.
-        out: The folder; new, empty, or one in which the same generation was interrupted.
-        config: How they are rendered; the defaults of `GenerationConfig` when None.
-        progress: Called with (objects done, objects in all, name) after each object.
+        source: procedural objects or mesh files.
+        out: the folder; new, empty, or one in which the same generation was interrupted.
+        config: how they are rendered; the defaults of `GenerationConfig` when None.
+        progress: called with (objects done, objects in all, name) after each object.
 
     Returns:
         What was written and what was skipped.
 
     Raises:
-        ValueError: An argument that makes no sense, a renderer that does not work, no object that could be drawn.
-        DataError: The folder holds something else, or the disk is full.
+        ValueError: an argument that makes no sense, a renderer that does not work, no object that could be drawn.
+        DataError: the folder holds something else, or the disk is full.
     """
     begun = time.monotonic()
     out, config = Path(out), config or GenerationConfig()

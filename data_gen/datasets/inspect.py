@@ -1,4 +1,4 @@
-"""Look at a data set: contact sheet, cameras around the visual hull, counts, bounds, and the conventions check."""
+"""Inspect a data set: contact sheet, cameras around the visual hull, counts, bounds, and the conventions check."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Inspection:
         description: `hyperplanes.data.describe.Description` of the data set.
         files: the pictures that were written.
         notes: what could not be done and why, one line each.
-        verification: of the checksums, where it was asked for.
+        verification: of the checksums, where it was requested.
     """
 
     description: Any
@@ -34,14 +34,14 @@ class Inspection:
     verification: Verification | None = None
 
     @property
-    def trouble(self) -> bool:
+    def has_problems(self) -> bool:
         """Whether an object cannot be read, its poses contradict its masks, or a file has changed."""
         objects = self.description.objects
         damaged = self.verification is not None and not self.verification.intact
         return damaged or bool(self.description.broken) or not all(one.conventions.consistent for one in objects)
 
     def lines(self) -> list[str]:
-        """All of it for people, a line a fact."""
+        """All of it as text, a line a fact."""
         checked = [] if self.verification is None else self.verification.lines()
         return [*self.description.lines(), *checked, *(f"wrote {path}" for path in self.files), *self.notes]
 

@@ -49,8 +49,8 @@ class Layout:
         files: from an object to its files, relative path to bytes.
         splits: from the objects (in order) to the files that say which split they belong to.
         distance: of the cameras from the origin, so that the near and far planes of the layout's loaders fit.
-        field_of_view: in degrees that the layout's loaders take for granted, or None.
-        resolution: in pixels that they take for granted, or None.
+        field_of_view: in degrees that the layout's loaders assume, or None.
+        resolution: in pixels that they assume, or None.
         scale: their world units in one of ours.
     """
 
@@ -130,7 +130,7 @@ def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
 
     `images` float32 (view, 200, 200, 3) in [0, 1] over white, `cam_poses` float32 (view, 4, 4) OpenGL camera-to-world.
     Their loaders take 277.77 pixels as the focal length, near 2 and far 6, and split the files sorted by name 80/20.
-    For readers that care, and ignored by theirs: `rgba` uint8 with straight alpha, `focal` in pixels. Underscores in
+    Read by `hyperplanes.data`, ignored by theirs: `rgba` uint8 with straight alpha, `focal` in pixels. Underscores in
     names become hyphens, for their loaders take what follows the last underscore as the name.
 
     Args:

@@ -1,4 +1,4 @@
-"""The manifest of a data set: what was asked for, what was written, what was skipped and why; and its check."""
+"""The manifest of a data set: what was requested, written and skipped, and why; and its verification."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Verification:
         return not self.missing and not self.changed
 
     def lines(self) -> list[str]:
-        """The outcome for people, a line a fact."""
+        """The outcome as text, a line a fact."""
         if self.intact:
             return [f"checksums: {self.files:,} files as they were written"]
         return [f"checksums: {name} is missing" for name in self.missing] + [
@@ -63,7 +63,7 @@ def build_manifest(
 
     Args:
         configuration: what decides the bytes.
-        items: all objects that were asked for.
+        items: all requested objects.
         entries: the finished ones.
         skipped: names and reasons of the others.
         facts: what readers need: layout, scene_sphere, near, far, renderer.
@@ -150,7 +150,7 @@ class GenerationState:
             )
             raise DataError(self.out, f"the data set it holds ({was})", f"a request for {now}", "name another folder")
         try:
-            self._claim()
+            self._acquire_lock()
         except BlockingIOError as error:
             self.__exit__()
             raise DataError(self.out, "a folder of its own", "another generation at work", "wait for it") from error
@@ -162,7 +162,7 @@ class GenerationState:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let go of the lock; what is done stays done."""
+        """Release the lock; finished objects stay."""
         if self._lock is not None:
             self._lock.close()
 
@@ -176,7 +176,7 @@ class GenerationState:
             What was noted of each when it was finished.
         """
 
-        def stands(name: str, checksum: str) -> bool:
+        def is_intact(name: str, checksum: str) -> bool:
             path = inside(self.out, name, self.out / MANIFEST)
             return path.is_file() and (not verified or sha256(path.read_bytes()) == checksum)
 
@@ -191,11 +191,11 @@ class GenerationState:
         return {
             name: entry
             for name, entry in entries.items()
-            if all(stands(path, checksum) for path, checksum in entry["files"].items())
+            if all(is_intact(path, checksum) for path, checksum in entry["files"].items())
         }
 
     def finish(self, manifest: dict[str, Any], others: dict[str, bytes]) -> None:
-        """Write what describes the whole, and forget how it came about.
+        """Write what describes the whole, and remove the state of the work.
 
         Args:
             manifest: of the data set.
@@ -207,7 +207,7 @@ class GenerationState:
         with suppress(OSError):
             shutil.rmtree(self.folder)
 
-    def _claim(self) -> None:
+    def _acquire_lock(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = open(self.folder / "lock", "w")
         fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

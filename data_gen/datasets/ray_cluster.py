@@ -56,7 +56,7 @@ def run_on_ray(
         nothing can be done.
 
     Raises:
-        ValueError: Ray is not installed.
+        ValueError: ray is not installed.
     """
     try:
         import ray

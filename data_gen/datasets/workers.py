@@ -1,4 +1,4 @@
-"""Worker processes that may crash, hang or be killed, each at the cost of one item.
+"""A pool of worker processes that may crash, hang or be killed, each at the cost of one item.
 
 Workers are started as commands (`python -m data_gen.datasets.worker_process`), not forked and not spawned by
 multiprocessing: OpenGL does not survive a fork, and a script that calls us needs no `if __name__ == "__main__"`.
@@ -29,7 +29,7 @@ START_SECONDS = 120.0
 
 
 class WorkerError(RuntimeError):
-    """No item can be done: the workers do not start, or report trouble that is nobody's item's."""
+    """No item can be processed: the workers do not start, or report an error that no item has caused."""
 
 
 @dataclass(frozen=True)

@@ -23,18 +23,18 @@ _MOST_FACES_TO_CLOSE = 500_000
 def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, list[str]]:
     """Leave out faces that cannot be drawn and vertices without faces, and make normals agree with faces.
 
-    What changes no picture is done in silence unless it is so much that the file must be damaged: leaving out faces
+    What changes no picture gives no warning unless it is so much that the file must be damaged: leaving out faces
     without area, and turning single normals.
 
     Args:
-        mesh: A mesh whose visual is canonical; it is not changed.
-        label: What to call it in a warning.
+        mesh: a mesh whose visual is canonical; it is not changed.
+        label: what to call it in a warning.
 
     Returns:
         The mesh, or None if no face is left; and warnings.
 
     Raises:
-        ValueError: If a face refers to a vertex that is not there.
+        ValueError: if a face refers to a vertex that is not there.
     """
     warnings: list[str] = []
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
@@ -64,7 +64,7 @@ def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, li
 def shades_smoothly(mesh: trimesh.Trimesh) -> bool:
     """Whether a mesh looks as meant with interpolated normals.
 
-    A mesh with normals of its own does; one with face colours cannot. Otherwise what the file says counts (an OBJ's
+    A mesh with normals of its own does; one with face colours cannot. Otherwise the file decides (an OBJ's
     smoothing groups), and last how many of its edges are sharper than CREASE: hard things stay hard.
     """
     if visual_of(mesh).kind == "face":
@@ -81,8 +81,8 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
     """Simplify those parts whose looks survive it: of one colour, or coloured at the vertices.
 
     Args:
-        parts: Clean meshes.
-        max_faces: Triangles at most, all together.
+        parts: clean meshes.
+        max_faces: triangles at most, all together.
 
     Returns:
         The parts with at most that many triangles, or None where textures or face colours forbid it.

@@ -46,14 +46,14 @@ def read_bytes(path: Path, *, limit: int = MAX_FILE_BYTES) -> bytes:
     """Read a file whose size is checked first.
 
     Args:
-        path: The file.
-        limit: Bytes at most.
+        path: the file.
+        limit: bytes at most.
 
     Returns:
         The content.
 
     Raises:
-        MeshError: If the file is absent, unreadable, empty or larger than the limit.
+        MeshError: if the file is absent, unreadable, empty or larger than the limit.
     """
     try:
         if not path.is_file():
@@ -72,16 +72,16 @@ def check_image(data: bytes, name: str, *, limit: int = MAX_PIXELS) -> int:
     """Decode an image, after its size was checked, to see that it is whole.
 
     Args:
-        data: The bytes of an image file.
-        name: What it is called in a message.
-        limit: Pixels at most.
+        data: the bytes of an image file.
+        name: what it is called in a message.
+        limit: pixels at most.
 
     Returns:
         Its number of pixels.
 
     Raises:
-        MeshError: If it has more pixels than allowed.
-        ValueError: If it is no image, or cut short.
+        MeshError: if it has more pixels than allowed.
+        ValueError: if it is no image, or cut short.
     """
     try:
         with warnings.catch_warnings():

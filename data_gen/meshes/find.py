@@ -19,10 +19,10 @@ class MeshFile:
     """A mesh file that was found.
 
     Attributes:
-        name: Unique in its folder and safe as the name of a file on any system.
-        path: The file.
-        class_name: Its class (``car``), if the tree tells.
-        split: ``train``, ``val`` or ``test``, if the tree or its split file tells.
+        name: unique in its folder and safe as the name of a file on any system.
+        path: the file.
+        class_name: its class (`car`), if the tree states it.
+        split: `train`, `val` or `test`, if the tree or its split file states it.
     """
 
     name: str
@@ -35,10 +35,10 @@ def safe_name(text: str) -> str:
     """Turn any text into the name of a file: letters, digits, dot, hyphen and underscore, at most 100 of them.
 
     Args:
-        text: Any text.
+        text: any text.
 
     Returns:
-        The name; ``mesh`` if nothing of the text is left.
+        The name; `mesh` if nothing of the text is left.
 
     >>> safe_name("Tisch & Stühle/2.glb")
     'Tisch_Stuhle_2.glb'
@@ -51,19 +51,19 @@ def safe_name(text: str) -> str:
 def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> list[MeshFile]:
     """List the meshes under a folder, sorted by name.
 
-    A ShapeNetCore tree (or one class of it) gives ``CLASS_ID`` with class and split: the official split if its file is
-    given or lies in the folder as ``all.csv`` (a model that it does not list has none), else that of the paper. Any
+    A ShapeNetCore tree (or one class of it) gives `CLASS_ID` with class and split: the official split if its file is
+    given or lies in the folder as `all.csv` (a model that it does not list has none), else that of the paper. Any
     other folder gives every mesh file at any depth, named by its path, without class and split, but for hidden files.
 
     Args:
-        folder: The folder.
-        split_file: ShapeNet's official ``all.csv``.
+        folder: the folder.
+        split_file: ShapeNet's official `all.csv`.
 
     Returns:
         The meshes, their names unique even where case does not count.
 
     Raises:
-        MeshError: If the folder is absent or holds no mesh, or the split file cannot be read.
+        MeshError: if the folder is absent or holds no mesh, or the split file cannot be read.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -89,9 +89,9 @@ def _is_mesh(path: Path, root: Path) -> bool:
     return not hidden and path.is_file()
 
 
-def _shapenet(root: Path, split_path: Path, asked_for: bool) -> list[MeshFile]:
+def _shapenet(root: Path, split_path: Path, is_required: bool) -> list[MeshFile]:
     models = find_models(root)
-    split = read_split_file(split_path) if asked_for or split_path.is_file() else paper_split(models)
+    split = read_split_file(split_path) if is_required or split_path.is_file() else paper_split(models)
     return _unique(
         MeshFile(
             name=safe_name(f"{class_of_synset(model.synset)}_{model.model_id}"),

@@ -1,6 +1,6 @@
 """Checks PLY, STL and DAE files before they are loaded, and reads OFF files.
 
-Each check asks whether the file is as long as it says it is: a loader that takes what it gets draws half a chair.
+Each check compares the length of the file with what its header declares.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import trimesh
 
 from data_gen.meshes.files import MeshError
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.mtl import decoded
+from data_gen.meshes.mtl import decode_text
 
 __all__ = ["check_ply", "check_stl", "declared_up", "read_dae", "read_off", "read_ply"]
 
@@ -26,14 +26,14 @@ def check_stl(data: bytes, folder: ModelFolder) -> list[str]:
     """Check that an STL file holds the triangles it declares.
 
     Args:
-        data: The content of the file.
-        folder: Names the file.
+        data: the content of the file.
+        folder: names the file.
 
     Returns:
         Warnings.
 
     Raises:
-        MeshError: If it was cut, or holds no triangles.
+        MeshError: if it was cut, or holds no triangles.
     """
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
     if len(data) >= 84 and len(data) == 84 + 50 * count:
@@ -57,19 +57,19 @@ def check_ply(data: bytes, folder: ModelFolder) -> tuple[int, int, list[str]]:
     """Read the header of a PLY file.
 
     Args:
-        data: The content of the file.
-        folder: Names the file.
+        data: the content of the file.
+        folder: names the file.
 
     Returns:
         Vertices and faces that it declares, and warnings.
 
     Raises:
-        MeshError: If the header is not whole, or declares more than the file can hold.
+        MeshError: if the header is not whole, or declares more than the file can hold.
     """
     head, mark, body = data.partition(b"end_header")
     if not data.startswith(b"ply") or not mark:
         raise MeshError(f"{folder.path}: expected a PLY header to end_header, found none; fetch it again")
-    header = decoded(head)
+    header = decode_text(head)
     body = body.lstrip(b"\r")[1:]
     counts = {name: int(count) for name, count in re.findall(r"^element\s+(\w+)\s+(\d+)", header, re.MULTILINE)}
     ascii_format = re.search(r"^format\s+ascii", header, re.MULTILINE) is not None
@@ -106,14 +106,14 @@ def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     """Read a PLY file and check that it holds what its header declares.
 
     Args:
-        data: The content of the file.
-        folder: Gives its texture.
+        data: the content of the file.
+        folder: gives its texture.
 
     Returns:
         Its geometry, and warnings.
 
     Raises:
-        MeshError: If it was cut or holds no faces.
+        MeshError: if it was cut or holds no faces.
     """
     vertices, faces, warnings = check_ply(data, folder)
     if not faces:
@@ -124,7 +124,7 @@ def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
         raise MeshError(f"{folder.path}: expected {faces} faces, found {found}: the file was cut; fetch it again")
     texture = re.search(rb"^comment\s+TextureFile\s+(.+)$", data[:65536], re.MULTILINE | re.IGNORECASE)
     if texture and folder.lost:
-        warnings.append(f"drawn without its texture {decoded(texture.group(1)).strip()}")
+        warnings.append(f"drawn without its texture {decode_text(texture.group(1)).strip()}")
     return scene, warnings
 
 
@@ -132,16 +132,16 @@ def read_off(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     """Read an OFF file with the colours of its vertices (COFF) or faces.
 
     Args:
-        data: The content of the file.
-        folder: Names the file.
+        data: the content of the file.
+        folder: names the file.
 
     Returns:
         Its geometry, polygons cut into fans, and warnings.
 
     Raises:
-        MeshError: If it is malformed or was cut.
+        MeshError: if it is malformed or was cut.
     """
-    lines = [line.partition("#")[0].split() for line in decoded(data).splitlines()]
+    lines = [line.partition("#")[0].split() for line in decode_text(data).splitlines()]
     lines = [line for line in lines if line]
     if not lines or not re.fullmatch(r"(ST|C|N){0,3}OFF.*", lines[0][0]):
         raise MeshError(
@@ -204,14 +204,14 @@ def read_dae(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     """Read a COLLADA file.
 
     Args:
-        data: The content of the file.
-        folder: Gives its textures.
+        data: the content of the file.
+        folder: gives its textures.
 
     Returns:
         Its geometries, factors of materials as in the file (sRGB), and warnings.
 
     Raises:
-        MeshError: If it declares a document type, which COLLADA needs for nothing, or a number is NaN.
+        MeshError: if it declares a document type, which COLLADA needs for nothing, or a number is NaN.
     """
     if re.search(rb"<!\s*(DOCTYPE|ENTITY)", data, re.IGNORECASE):
         raise MeshError(f"{folder.path}: expected plain COLLADA, found a document type or entity; export it again")
@@ -232,6 +232,6 @@ def read_dae(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
 
 
 def declared_up(data: bytes) -> str | None:
-    """The axis, ``x``, ``y`` or ``z``, that a COLLADA file says is up; None if it does not say."""
+    """The axis, `x`, `y` or `z`, that a COLLADA file declares as up; None if it declares none."""
     found = re.search(rb"<(?:\w+:)?up_axis>\s*([XYZ])_UP", data)
     return found.group(1).decode().lower() if found else None

@@ -15,7 +15,7 @@ from typing import Any
 
 from data_gen.meshes.files import MeshError
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.mtl import decoded
+from data_gen.meshes.mtl import decode_text
 
 __all__ = ["check_gltf", "generator_of"]
 
@@ -45,15 +45,15 @@ def check_gltf(data: bytes, folder: ModelFolder) -> tuple[list[str], set[str | N
     """Check a file, its buffers and its textures.
 
     Args:
-        data: The content of the file; GLB if it begins with ``glTF``.
-        folder: Gives the other files of the model.
+        data: the content of the file; GLB if it begins with `glTF`.
+        folder: gives the other files of the model.
 
     Returns:
         Warnings that name what will not be drawn as the file says, and the names of materials whose base colour
         texture is lost.
 
     Raises:
-        MeshError: If the file was cut, is malformed, or needs what is not supported.
+        MeshError: if the file was cut, is malformed, or needs what is not supported.
     """
     try:
         header, chunk = _glb(data, folder) if folder.path.suffix.lower() == ".glb" else (_json(data, folder), None)
@@ -71,12 +71,12 @@ def check_gltf(data: bytes, folder: ModelFolder) -> tuple[list[str], set[str | N
 def generator_of(data: bytes) -> str:
     """The program that wrote a checked glTF or GLB file, lower case; empty if the file does not say."""
     text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data[:4] == b"glTF" else data
-    return str(json.loads(decoded(text)).get("asset", {}).get("generator", "")).lower()
+    return str(json.loads(decode_text(text)).get("asset", {}).get("generator", "")).lower()
 
 
 def _json(data: bytes, folder: ModelFolder) -> Any:
     try:
-        return json.loads(decoded(data))
+        return json.loads(decode_text(data))
     except (json.JSONDecodeError, RecursionError) as error:
         raise MeshError(f"{folder.path}: expected JSON, found {error}; the file is damaged or was cut") from error
 
@@ -117,9 +117,9 @@ def _check(header: dict[str, Any], chunk: bytes | None, folder: ModelFolder) -> 
             warnings.append(f"{name}: drawn without it")
     buffers = _buffers(header, chunk, folder)
     _check_accessors(header, buffers, folder)
-    bare = _check_textures(header, buffers, folder, warnings)
+    without_texture = _check_textures(header, buffers, folder, warnings)
     _check_primitives(header, warnings, folder)
-    return warnings, bare
+    return warnings, without_texture
 
 
 def _buffers(header: dict[str, Any], chunk: bytes | None, folder: ModelFolder) -> list[bytes]:
@@ -183,7 +183,7 @@ def _check_textures(
     header: dict[str, Any], buffers: list[bytes], folder: ModelFolder, warnings: list[str]
 ) -> set[str | None]:
     """Names of materials whose base colour texture is lost."""
-    bare: set[str | None] = set()
+    without_texture: set[str | None] = set()
     lost: dict[int, str] = {}
     for index, image in enumerate(header.get("images", [])):
         name = image.get("uri") or image.get("name") or f"image {index}"
@@ -202,7 +202,7 @@ def _check_textures(
             continue
         if "uri" not in image or image["uri"].startswith("data:"):
             try:
-                folder.spend_pixels(data, name)
+                folder.count_pixels(data, name)
             except FileNotFoundError:
                 lost[index] = f"{name} ({folder.lost.get(name, 'not decoded')})"
     textures = header.get("textures", [])
@@ -218,7 +218,7 @@ def _check_textures(
                 reason = "which has no image" if source is None else lost[source]
                 warnings.append(f"{label}: drawn without its {slot} {reason}")
                 if slot == "baseColorTexture":
-                    bare.add(material.get("name"))
+                    without_texture.add(material.get("name"))
             if slot == "baseColorTexture" and reference.get("texCoord", 0) != 0:
                 warnings.append(
                     f"{label}: its texture uses the coordinates TEXCOORD_{reference['texCoord']}; TEXCOORD_0 taken"
@@ -230,7 +230,7 @@ def _check_textures(
             ):
                 warnings.append(f"{label}: KHR_texture_transform of its {slot} is not applied")
 
-    return bare
+    return without_texture
 
 
 def _slots(material: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:

@@ -1,6 +1,6 @@
 """Colours, textures and materials of a mesh, brought into the few forms that every renderer draws alike.
 
-After ``canonical_visual`` a mesh has vertex colours, face colours, or a ``PBRMaterial`` whose base texture is RGB or
+After `canonical_visual` a mesh has vertex colours, face colours, or a `PBRMaterial` whose base texture is RGB or
 RGBA and has coordinates. Textures, vertex and face colours are sRGB, the factors of materials LINEAR.
 """
 
@@ -28,10 +28,10 @@ __all__ = [
 ]
 
 ColourSpace = Literal["scene", "gltf", "srgb"]
-"""What plain colours are before: ``scene`` as they are after, ``gltf`` all linear, ``srgb`` all sRGB."""
+"""What plain colours are before: `scene` as they are after, `gltf` all linear, `srgb` all sRGB."""
 
 DEFAULT_COLOUR = (0.6, 0.6, 0.6, 1.0)
-"""Linear RGBA of a surface that says nothing about its colour: a light grey."""
+"""Linear RGBA of a surface without a colour: a light grey."""
 
 _MAP_SLOTS = ("metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
 
@@ -61,10 +61,10 @@ def canonical_visual(
     """Bring what colours a mesh into a form that every renderer draws alike.
 
     Args:
-        mesh: The mesh, which is not changed.
-        label: What to call it in a warning.
-        colours: What its plain colours are.
-        images: Converted textures, shared between the meshes of a scene.
+        mesh: the mesh, which is not changed.
+        label: what to call it in a warning.
+        colours: what its plain colours are.
+        images: converted textures, shared between the meshes of a scene.
 
     Returns:
         The visual, warnings that name what was lost, and whether the surface can be seen at all.
@@ -107,15 +107,15 @@ def _textured(
     coordinates = _coordinates(visual, len(mesh.vertices), label, warnings)
     if coordinates is None:
         _drop_textures(data, label, warnings)
-    painted = _vertex_paint(visual, len(mesh.vertices))
-    if painted is not None and data.get("baseColorTexture") is None:
+    vertex_colours = _material_vertex_colours(visual, len(mesh.vertices))
+    if vertex_colours is not None and data.get("baseColorTexture") is None:
         tint = convert_8bit(np.round(data["baseColorFactor"] * 255.0).astype(np.uint8), srgb_from_linear)
         if colours == "gltf":
-            painted = convert_8bit(painted, srgb_from_linear)
+            vertex_colours = convert_8bit(vertex_colours, srgb_from_linear)
         if data["alphaMode"] == "OPAQUE":
-            painted[:, 3] = tint[3] = 255
-        return _coloured((painted * (tint / 255.0)).round(), "vertex", label, "scene")
-    if painted is not None and (painted[:, :3] < 255).any():
+            vertex_colours[:, 3] = tint[3] = 255
+        return _coloured((vertex_colours * (tint / 255.0)).round(), "vertex", label, "scene")
+    if vertex_colours is not None and (vertex_colours[:, :3] < 255).any():
         warnings.append(f"{label}: vertex colours left out, its texture counts")
     data = {key: value for key, value in data.items() if value is not None}
     if data["alphaMode"] == "OPAQUE":
@@ -136,15 +136,15 @@ def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> Non
         data.pop(slot, None)
 
 
-def _vertex_paint(visual: TextureVisuals, count: int) -> npt.NDArray[np.uint8] | None:
+def _material_vertex_colours(visual: TextureVisuals, count: int) -> npt.NDArray[np.uint8] | None:
     """RGBA of vertex colours that lie on top of a material, as they stand in the file."""
-    paint = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
-    if paint is None or len(paint) != count:
+    attribute = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
+    if attribute is None or len(attribute) != count:
         return None
-    paint = np.asarray(paint)
-    top = 1.0 if paint.dtype.kind == "f" else float(np.iinfo(paint.dtype).max)
+    attribute = np.asarray(attribute)
+    top = 1.0 if attribute.dtype.kind == "f" else float(np.iinfo(attribute.dtype).max)
     rgba = np.full((count, 4), 255, dtype=np.uint8)
-    rgba[:, : paint.shape[1]] = np.clip(np.round(paint * (255.0 / top)), 0, 255)
+    rgba[:, : attribute.shape[1]] = np.clip(np.round(attribute * (255.0 / top)), 0, 255)
     return rgba
 
 

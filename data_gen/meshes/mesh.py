@@ -1,8 +1,8 @@
-"""Any mesh, ready to be drawn: read, checked, turned y up, and scaled to a known size.
+"""Loads any mesh file: read, checked, turned y up, and normalised.
 
 World convention: y up, the centre of the bounding box at the origin, the vertex farthest from it at distance 1
-(``fit="sphere"``), or the longest side of the bounding box 2 units long (``fit="cube"``). Nothing is lost silently:
-what cannot be drawn as the file says is named in ``Mesh.warnings``, what cannot be drawn at all is a ``MeshError``.
+(`fit="sphere"`), or the longest side of the bounding box 2 units long (`fit="cube"`). Nothing is lost silently:
+what cannot be drawn as the file states is named in `Mesh.warnings`, what cannot be drawn at all is a `MeshError`.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class Mesh:
     """A mesh that can be drawn.
 
     Attributes:
-        name: Its name, safe as the name of a file.
-        scene: Its geometries in world coordinates (all node transforms are the identity), y up, normalised.
-        world_from_file: The similarity ``(4, 4)`` that took the file's coordinates here.
-        warnings: What was lost or repaired, one line each.
-        face_count: Triangles.
+        name: its name, safe as the name of a file.
+        scene: its geometries in world coordinates (all node transforms are the identity), y up, normalised.
+        world_from_file: the similarity `(4, 4)` that took the file's coordinates here.
+        warnings: what was lost or repaired, one line each.
+        face_count: triangles.
     """
 
     name: str
@@ -74,18 +74,18 @@ def load_mesh(
     """Read a mesh file.
 
     Args:
-        path: A GLB, glTF, OBJ, PLY, STL, OFF or DAE file. What it refers to is read from its own folder and those
-            inside; for ``SYNSET/ID/models/model_normalized.obj`` of ShapeNet v2 from the folder of the ID.
-        up: The axis that points up in the file. A COLLADA file that declares its own is turned as it says.
-        name: What to call it; the file's name by default.
-        max_faces: Triangles at most.
-        fit: What is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
+        path: a GLB, glTF, OBJ, PLY, STL, OFF or DAE file. What it refers to is read from its own folder and those
+            inside; for `SYNSET/ID/models/model_normalized.obj` of ShapeNet v2 from the folder of the ID.
+        up: the axis that points up in the file. A COLLADA file that declares its own is turned accordingly.
+        name: what to call it; the file's name by default.
+        max_faces: triangles at most.
+        fit: what is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
 
     Returns:
         The mesh.
 
     Raises:
-        MeshError: If it cannot be read, holds nothing to draw, or is refused.
+        MeshError: if it cannot be read, holds nothing to draw, or is refused.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -96,8 +96,8 @@ def load_mesh(
     data = read_bytes(path, limit=MAX_TEXT_BYTES if suffix in _TEXT else MAX_FILE_BYTES)
     folder = ModelFolder(path, model_root(path))
     scene, colours, lines = read_scene(data, folder)
-    told = "; ".join(lines)
-    lost = [f"{reference}: {reason}" for reference, reason in folder.lost.items() if reference not in told]
+    mentioned = "; ".join(lines)
+    lost = [f"{reference}: {reason}" for reference, reason in folder.lost.items() if reference not in mentioned]
     axis = declared_up(data) if suffix == ".dae" else None
     if axis == "x":
         lines.append("declares x up; taken as y up")
@@ -128,24 +128,24 @@ def prepare_scene(
     """Check a scene and bring it into world coordinates; the scene itself is not changed.
 
     Args:
-        scene: Geometries and node transforms.
-        name: What to call the mesh.
-        up: The axis that points up in the scene.
-        max_faces: Triangles at most.
-        fit: What is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
-        colours: ``scene``: vertex and face colours are sRGB, factors of materials linear; ``gltf``: all are linear;
-            ``srgb``: all are sRGB. Textures are always sRGB.
-        warnings: What is already known to be lost.
-        source: What messages begin with; the name by default.
-        closed: Whether all of it is known to be watertight solids wound outwards, so that inner sides, which nobody
-            sees, are not drawn.
+        scene: geometries and node transforms.
+        name: what to call the mesh.
+        up: the axis that points up in the scene.
+        max_faces: triangles at most.
+        fit: what is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
+        colours: `scene`: vertex and face colours are sRGB, factors of materials linear; `gltf`: all are linear;
+            `srgb`: all are sRGB. Textures are always sRGB.
+        warnings: what is already known to be lost.
+        source: what messages begin with; the name by default.
+        closed: whether all of it is known to be watertight solids wound outwards, so that back faces are not
+            drawn.
 
     Returns:
         The mesh.
 
     Raises:
-        MeshError: If there is nothing to draw, or too much.
-        ValueError: If ``up`` or ``fit`` is none of the two.
+        MeshError: if there is nothing to draw, or too much.
+        ValueError: if `up` or `fit` is none of the two.
     """
     if up not in ("y", "z"):
         raise ValueError(f"up: expected 'y' or 'z', received {up!r}")
@@ -189,10 +189,10 @@ def render_ready(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float
     """List what to hand to a renderer.
 
     Args:
-        mesh: The mesh.
+        mesh: the mesh.
 
     Returns:
-        Each geometry, its pose ``world_from_geometry`` ``(4, 4)``, and whether to shade it smoothly.
+        Each geometry, its pose `world_from_geometry` `(4, 4)`, and whether to shade it smoothly.
     """
     ready = []
     for node in sorted(mesh.scene.graph.nodes_geometry):

@@ -25,21 +25,21 @@ _MTL_OPTION = re.compile(
 class ModelFolder(Resolver):
     """Gives a mesh loader the other files of its model, from one folder and no other place.
 
-    Names are taken as people write them: with backslashes, percent-encoded, in the wrong case, as ``model://NAME/rest``
-    (the folder stands for NAME), behind MTL options (``-s 1 1 1 wood.png``), or with the absolute path of the machine
+    Names are accepted as files hold them: with backslashes, percent-encoded, in the wrong case, as `model://NAME/rest`
+    (the folder stands for NAME), behind MTL options (`-s 1 1 1 wood.png`), or with the absolute path of the machine
     they were made on, of which only the last part is looked for.
 
     Args:
-        path: The mesh file; its name is what messages begin with.
-        root: The folder that nothing may leave; the mesh file's own by default.
-        pixels: Pixels that all textures together may have.
+        path: the mesh file; its name is what messages begin with.
+        root: the folder that nothing may leave; the mesh file's own by default.
+        pixels: pixels that all textures together may have.
 
-    A file that is not there, and a texture that cannot be decoded, is a FileNotFoundError and noted in ``lost``.
+    A file that is not there, and a texture that cannot be decoded, is a FileNotFoundError and noted in `lost`.
 
     Attributes:
-        lost: Why each name that was asked for could not be given, by name.
-        notes: What a user should know about names that could be given.
-        refused: The first reason to refuse the whole model, if there was one: loaders swallow exceptions.
+        lost: why each requested name could not be opened.
+        notes: what a user should know about names that could be given.
+        refused: the first reason to refuse the whole model, if there was one: loaders swallow exceptions.
     """
 
     def __init__(self, path: Path, root: Path | None = None, *, pixels: int = MAX_PIXELS) -> None:
@@ -58,7 +58,7 @@ class ModelFolder(Resolver):
         """Give a file to a loader: one that was read before, or a texture.
 
         Args:
-            name: How the mesh refers to it.
+            name: how the mesh refers to it.
 
         Returns:
             Its content.
@@ -70,15 +70,15 @@ class ModelFolder(Resolver):
         """Read a file of the model that is no texture.
 
         Args:
-            name: How the mesh refers to it.
-            limit: Bytes at most.
+            name: how the mesh refers to it.
+            limit: bytes at most.
 
         Returns:
             Its content.
 
         Raises:
-            FileNotFoundError: If there is no such file, or it is empty; noted in ``lost``.
-            MeshError: If it lies outside the model's folder or is too large; noted in ``refused``.
+            FileNotFoundError: if there is no such file, or it is empty; noted in `lost`.
+            MeshError: if it lies outside the model's folder or is too large; noted in `refused`.
         """
         found = self._find(name)
         try:
@@ -96,14 +96,14 @@ class ModelFolder(Resolver):
         """Read a texture of the model, which is decoded once to see that it is whole.
 
         Args:
-            name: How the mesh refers to it.
+            name: how the mesh refers to it.
 
         Returns:
             Its content.
         """
         found = self._find(name)
         if found not in self._images:
-            self.spend_pixels(self.read(name), name)
+            self.count_pixels(self.read(name), name)
             self._images.add(found)
         return self._bytes[found]
 
@@ -118,16 +118,16 @@ class ModelFolder(Resolver):
             raise FileNotFoundError(name)
         return found
 
-    def spend_pixels(self, data: bytes, name: str) -> None:
+    def count_pixels(self, data: bytes, name: str) -> None:
         """Check a texture and count its pixels.
 
         Args:
-            data: The bytes of an image file.
-            name: What the mesh calls it.
+            data: the bytes of an image file.
+            name: what the mesh calls it.
 
         Raises:
-            FileNotFoundError: If it cannot be decoded; noted in ``lost``.
-            MeshError: If the textures are too large.
+            FileNotFoundError: if it cannot be decoded; noted in `lost`.
+            MeshError: if the textures are too large.
         """
         try:
             self.pixels_left -= check_image(data, f"{self.path}: {name}", limit=self.pixels_left)
@@ -142,28 +142,29 @@ class ModelFolder(Resolver):
         """Find a file of the model without reading it.
 
         Args:
-            name: How the mesh refers to it.
+            name: how the mesh refers to it.
 
         Returns:
             The file, or None if there is none.
 
         Raises:
-            MeshError: If the name leaves the model's folder.
+            MeshError: if the name leaves the model's folder.
         """
-        spoken = name.strip().strip('"')
-        for spelling in _spellings(spoken):
-            found = self._inside(spelling, name)
+        plain_name = name.strip().strip('"')
+        for candidate in _candidates(plain_name):
+            found = self._inside(candidate, name)
             if found is not None:
                 return found
-        if _is_absolute(spoken):
-            last = PurePosixPath(spoken.replace("\\", "/")).name
+        if _is_absolute(plain_name):
+            last = PurePosixPath(plain_name.replace("\\", "/")).name
             found = self._inside(last, name) if last else None
             if found is None:
                 raise MeshError(
-                    f"{self.path}: expected references inside {self.root.name}/, found the absolute path {spoken!r}; "
+                    f"{self.path}: expected references inside {self.root.name}/, found the absolute path "
+                    f"{plain_name!r}; "
                     "put the file beside the mesh and name it without a folder"
                 )
-            self._note(f"{spoken}: absolute path not followed, {last} beside the mesh taken")
+            self._note(f"{plain_name}: absolute path not followed, {last} beside the mesh taken")
             return found
         return None
 
@@ -197,7 +198,7 @@ class ModelFolder(Resolver):
             self.notes.append(text)
 
     def keys(self) -> Iterator[str]:
-        """List the files of the mesh's folder, which nothing here needs but the interface asks for.
+        """List the files of the mesh's folder, which the interface requires.
 
         Yields:
             Names relative to the folder of the mesh file.
@@ -209,11 +210,11 @@ class ModelFolder(Resolver):
         """Refuse: a model is only read.
 
         Args:
-            name: The file.
-            data: Its content.
+            name: the file.
+            data: its content.
 
         Raises:
-            PermissionError: Always.
+            PermissionError: always.
         """
         raise PermissionError(f"{name}: the folder of a model is only read")
 
@@ -221,7 +222,7 @@ class ModelFolder(Resolver):
         """The same folder: names keep their meaning.
 
         Args:
-            namespace: Ignored.
+            namespace: ignored.
 
         Returns:
             This resolver.
@@ -229,8 +230,8 @@ class ModelFolder(Resolver):
         return self
 
 
-def _spellings(name: str) -> Iterator[str]:
-    """Ways in which a name may be meant, likeliest first, all relative."""
+def _candidates(name: str) -> Iterator[str]:
+    """Relative paths that a name may stand for, likeliest first."""
     uri = re.match(r"^(?:model|package|file)://(.*)$", name)
     if uri:
         parts = uri.group(1).split("/")
@@ -241,11 +242,11 @@ def _spellings(name: str) -> Iterator[str]:
     yield name
     yield plain
     yield urllib.parse.unquote(plain)
-    bare = plain
-    while (option := _MTL_OPTION.match(bare)) is not None:
-        bare = bare[option.end() :]
-    if bare != plain:
-        yield bare.strip()
+    unprefixed = plain
+    while (option := _MTL_OPTION.match(unprefixed)) is not None:
+        unprefixed = unprefixed[option.end() :]
+    if unprefixed != plain:
+        yield unprefixed.strip()
 
 
 def _is_absolute(name: str) -> bool:

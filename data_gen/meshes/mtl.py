@@ -1,7 +1,7 @@
 """Reads the MTL files (materials and their textures) of an OBJ file.
 
-A texture takes the place of ``Kd``, as in Blender and so in the pictures of ShapeNet: exporters write any Kd beside it.
-``d`` is opacity; ``Tr`` is 1 - d where there is no d, but a lone ``Tr 1`` is what many programs write for opaque.
+A texture takes the place of `Kd`, as in Blender and so in the pictures of ShapeNet: exporters write any Kd beside it.
+`d` is opacity; `Tr` is 1 - d where there is no d, but a lone `Tr 1` is what many programs write for opaque.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from data_gen.meshes.files import MAX_TEXT_BYTES
 from data_gen.meshes.model_folder import ModelFolder
 from hyperplanes.colour import convert_8bit, linear_from_srgb
 
-__all__ = ["decoded", "read_materials"]
+__all__ = ["decode_text", "read_materials"]
 
 _LOST_MAPS = {"map_d": "its opacity map", "map_ke": "its glow map"}
 
 
-def decoded(data: bytes) -> str:
-    """Text of a file that says nothing about its encoding: UTF-8, or one letter a byte if it is not."""
+def decode_text(data: bytes) -> str:
+    """Text of a file that does not declare its encoding: UTF-8, else Latin-1."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -34,9 +34,9 @@ def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str
     """Read all material libraries of an OBJ file; the folder refuses what lies outside it.
 
     Args:
-        libraries: What stands after each ``mtllib``: one name, which may hold spaces, or several.
-        folder: Gives the files.
-        warnings: Receives what was lost, by name.
+        libraries: what stands after each `mtllib`: one name, which may hold spaces, or several.
+        folder: gives the files.
+        warnings: receives what was lost, by name.
 
     Returns:
         Materials by name, colours linear.
@@ -47,7 +47,7 @@ def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str
         names = [line] if whole or len(line.split()) < 2 else line.split()
         for name in names:
             try:
-                text = decoded(folder.read(name, limit=MAX_TEXT_BYTES))
+                text = decode_text(folder.read(name, limit=MAX_TEXT_BYTES))
             except FileNotFoundError:
                 continue
             for values in _statements(text, name, warnings):

@@ -22,7 +22,7 @@ from trimesh.visual.material import PBRMaterial
 from data_gen.meshes.files import MeshError
 from data_gen.meshes.materials import DEFAULT_COLOUR
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.mtl import decoded, read_materials
+from data_gen.meshes.mtl import decode_text, read_materials
 
 __all__ = ["read_obj"]
 
@@ -44,17 +44,17 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     """Read an OBJ file and the materials and textures that it names.
 
     Args:
-        data: The content of the file.
-        folder: Gives the other files of the model.
+        data: the content of the file.
+        folder: gives the other files of the model.
 
     Returns:
         One geometry a material, in the file's coordinates; and warnings that name what was lost. Plain colours are
-        linear in materials and sRGB at vertices. ``metadata["smooth"]`` is what the file's smoothing groups say.
+        linear in materials and sRGB at vertices. `metadata["smooth"]` is what the file's smoothing groups say.
 
     Raises:
-        MeshError: If a line cannot be understood, a face refers to a vertex that is not there, or there are no faces.
+        MeshError: if a line cannot be understood, a face refers to a vertex that is not there, or there are no faces.
     """
-    text = decoded(data)
+    text = decode_text(data)
     warnings: list[str] = []
     rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
     numbers: dict[str, list[int]] = {"v": [], "vt": [], "vn": []}
@@ -104,7 +104,7 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
 
 
 def _lines(text: str) -> Any:
-    """Number and content of each line that says something; continued lines are joined, comments taken off."""
+    """Number and content of each statement; continued lines are joined, comments removed."""
     if "\\\n" in text or "\\\r\n" in text:
         text = text.replace("\\\r\n", " ").replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), 1):

@@ -25,17 +25,17 @@ def read_scene(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourS
     """Read a mesh file of any format.
 
     Args:
-        data: The content of the file.
-        folder: Names the file and gives the others of its model.
+        data: the content of the file.
+        folder: names the file and gives the others of its model.
 
     Returns:
         A scene in the file's coordinates, what its plain colours are, and warnings.
 
     Raises:
-        MeshError: If the file is damaged, was cut, or is refused.
+        MeshError: if the file is damaged, was cut, or is refused.
     """
     try:
-        with _strict():
+        with _strict_loaders():
             found = _read(data, folder.path.suffix.lower(), folder)
     except MeshError as error:
         raise folder.refused or error from error
@@ -64,17 +64,17 @@ def _read(data: bytes, suffix: str, folder: ModelFolder) -> tuple[trimesh.Scene,
     if suffix == ".dae":
         scene, lines = read_dae(data, folder)
         return scene, "srgb", lines
-    lines, bare = (check_stl(data, folder), set()) if suffix == ".stl" else check_gltf(data, folder)
+    lines, without_texture = (check_stl(data, folder), set()) if suffix == ".stl" else check_gltf(data, folder)
     scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
-    _grey_out(scene, bare)
+    _set_default_colour(scene, without_texture)
     if suffix == ".stl":
         for geometry in scene.geometry.values():
             geometry.metadata["smooth"] = False
-    painted_as_seen = suffix == ".stl" or "trimesh" in generator_of(data)
-    return scene, "scene" if painted_as_seen else "gltf", lines
+    factors_are_srgb = suffix == ".stl" or "trimesh" in generator_of(data)
+    return scene, "scene" if factors_are_srgb else "gltf", lines
 
 
-def _grey_out(scene: trimesh.Scene, names: set[str | None]) -> None:
+def _set_default_colour(scene: trimesh.Scene, names: set[str | None]) -> None:
     """Give white materials that lost their texture the default colour: white on white would be lost to the eye too."""
     for geometry in scene.geometry.values():
         material = getattr(getattr(geometry, "visual", None), "material", None)
@@ -86,7 +86,7 @@ def _grey_out(scene: trimesh.Scene, names: set[str | None]) -> None:
 
 
 @contextlib.contextmanager
-def _strict() -> Generator[None, None, None]:
+def _strict_loaders() -> Generator[None, None, None]:
     """Keep the loaders' log quiet, and turn numpy's remark that a text was not read to its end into an error."""
     logger = logging.getLogger("trimesh")
     level = logger.level

@@ -97,9 +97,9 @@ class ShapeNetModel:
     """One model of a tree.
 
     Attributes:
-        synset: Number of its class, 8 digits.
-        model_id: Its name in the tree, unique in its class.
-        path: Its OBJ file.
+        synset: number of its class, 8 digits.
+        model_id: its name in the tree, unique in its class.
+        path: its OBJ file.
     """
 
     synset: str
@@ -120,13 +120,13 @@ def synset_of_class(name: str) -> str:
     """Number of a class.
 
     Args:
-        name: A class name (``car``, ``airplane``) or a number (``02958343``).
+        name: a class name (`car`, `airplane`) or a number (`02958343`).
 
     Returns:
         Its synset, 8 digits.
 
     Raises:
-        ValueError: If ShapeNetCore has no such class.
+        ValueError: if ShapeNetCore has no such class.
 
     >>> synset_of_class("airplane")
     '02691156'
@@ -145,10 +145,10 @@ def model_root(path: Path) -> Path:
     """The folder that holds all files of a model.
 
     Args:
-        path: A mesh file.
+        path: a mesh file.
 
     Returns:
-        That of the ID for ``ID/models/model_normalized.obj``, whose textures are in ``ID/images``; else the file's.
+        That of the ID for `ID/models/model_normalized.obj`, whose textures are in `ID/images`; else the file's.
     """
     two_up = path.name == _V2.name and path.parent.resolve().name == _V2.parent.name
     return path.parent.resolve().parent if two_up else path.parent
@@ -163,7 +163,7 @@ def find_models(folder: Path) -> list[ShapeNetModel]:
     """List the models of a tree, or of one class of it.
 
     Args:
-        folder: The folder with the synsets, or one synset's.
+        folder: the folder with the synsets, or one synset's.
 
     Returns:
         The models, sorted by synset and name. A folder without a model file in it is not one of them.
@@ -181,10 +181,10 @@ def paper_split(models: list[ShapeNetModel]) -> dict[tuple[str, str], str]:
     """The split of the paper's 200 x 200 data, as AtlasNet's: a class's names sorted, 80 % to train, the rest to test.
 
     Args:
-        models: The models, of any classes in any order.
+        models: the models, of any classes in any order.
 
     Returns:
-        ``train`` or ``test`` by synset and model.
+        `train` or `test` by synset and model.
     """
     split = {}
     for synset in sorted({model.synset for model in models}):
@@ -196,16 +196,16 @@ def paper_split(models: list[ShapeNetModel]) -> dict[tuple[str, str], str]:
 
 
 def read_split_file(path: Path) -> dict[tuple[str, str], str]:
-    """Read ShapeNet's official split, ``all.csv`` with ``id,synsetId,subSynsetId,modelId,split``.
+    """Read ShapeNet's official split, `all.csv` with `id,synsetId,subSynsetId,modelId,split`.
 
     Args:
-        path: The file.
+        path: the file.
 
     Returns:
-        ``train``, ``val`` or ``test`` by synset and model.
+        `train`, `val` or `test` by synset and model.
 
     Raises:
-        MeshError: If it cannot be read, a column is missing or a split is none of the three.
+        MeshError: if it cannot be read, a column is missing or a split is none of the three.
     """
     split = {}
     try:

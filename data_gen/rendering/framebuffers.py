@@ -1,4 +1,4 @@
-"""Where OpenGL draws the samples of a picture, and the pass that averages them. Imports OpenGL.
+"""Framebuffers for supersampling in OpenGL, and the pass that averages the samples. Imports OpenGL.
 
 Averaging is left to OpenGL: a ninth of the bytes is read back, already with straight alpha. There is no multisampling:
 Mesa's software renderer shades each multisample, at more cost than a sample of its own has (5.0 ms against 2.9 for four
@@ -42,12 +42,12 @@ class SampleFramebuffers:
     """Frame buffers for one size of picture.
 
     Args:
-        width: Pixels across.
-        height: Pixels down.
-        side: Samples along a side of a pixel.
+        width: pixels across.
+        height: pixels down.
+        side: samples along a side of a pixel.
 
     Attributes:
-        size: The arguments, by which one asks whether buffers fit.
+        size: the arguments.
         drawn: OpenGL's name of the frame buffer to draw into, side times as wide and high, with depth.
     """
 
@@ -74,7 +74,7 @@ class SampleFramebuffers:
         """Average what was drawn.
 
         Returns:
-            sRGB with straight alpha ``(height, width, 4)``, the row that OpenGL has at the bottom first.
+            sRGB with straight alpha `(height, width, 4)`, bottom row first.
         """
         width, height, _ = self.size
         GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._averaged)

@@ -29,8 +29,8 @@ class Light:
     """A directional light.
 
     Attributes:
-        direction: Unit vector towards the light, in world axes, or in OpenCV camera axes for a headlight.
-        colour: Linear RGB; 1 makes a white surface that faces the light white.
+        direction: unit vector towards the light, in world axes, or in OpenCV camera axes for a headlight.
+        colour: linear RGB; 1 makes a white surface that faces the light white.
     """
 
     direction: Vector
@@ -42,21 +42,21 @@ class Lighting:
     """Directional lights over an ambient light that fades from the sky to the ground.
 
     Attributes:
-        lights: Up to MAX_LIGHTS directional lights.
-        sky: Ambient light on a surface that faces up, linear RGB.
-        ground: Ambient light on a surface that faces down, linear RGB.
-        follows_camera: Whether the lights' directions are in OpenCV camera axes instead of world axes.
-        lasting: Whether so much is lit by it that a renderer may compile it in.
+        lights: up to MAX_LIGHTS directional lights.
+        sky: ambient light on a surface that faces up, linear RGB.
+        ground: ambient light on a surface that faces down, linear RGB.
+        follows_camera: whether the lights' directions are in OpenCV camera axes instead of world axes.
+        is_constant: whether it is the same for many objects, so that a renderer may compile it into a shader.
 
     Raises:
-        ValueError: If there are too many lights, a direction is not a unit vector or a colour is negative.
+        ValueError: if there are too many lights, a direction is not a unit vector or a colour is negative.
     """
 
     lights: tuple[Light, ...]
     sky: Vector
     ground: Vector
     follows_camera: bool = False
-    lasting: bool = False
+    is_constant: bool = False
 
     def __post_init__(self) -> None:
         if len(self.lights) > MAX_LIGHTS:
@@ -73,17 +73,17 @@ class Lighting:
         """Unit vectors towards the lights in world axes.
 
         Args:
-            world_from_camera: The pose ``(4, 4)`` of the camera, OpenCV axes.
+            world_from_camera: the pose `(4, 4)` of the camera, OpenCV axes.
 
         Returns:
-            Directions ``(light, 3)``.
+            Directions `(light, 3)`.
         """
         directions = np.array([light.direction for light in self.lights], dtype=np.float64).reshape(-1, 3)
         return directions @ world_from_camera[:3, :3].T if self.follows_camera else directions
 
     @property
     def colours(self) -> npt.NDArray[np.float64]:
-        """Colours of the lights ``(light, 3)``, linear RGB."""
+        """Colours of the lights `(light, 3)`, linear RGB."""
         return np.array([light.colour for light in self.lights], dtype=np.float64).reshape(-1, 3)
 
 
@@ -91,14 +91,14 @@ def resolve_lighting(lighting: str | Lighting, *, seed: int = 0) -> Lighting:
     """Return the lighting of a name, or the lighting itself.
 
     Args:
-        lighting: ``studio``, ``headlight``, ``random``, or a Lighting, which is returned as it is.
-        seed: Seed of ``random``; the same seed gives the same lights.
+        lighting: `studio`, `headlight`, `random`, or a Lighting, which is returned as it is.
+        seed: seed of `random`; the same seed gives the same lights.
 
     Returns:
         The lighting.
 
     Raises:
-        ValueError: If no preset has that name.
+        ValueError: if no preset has that name.
     """
     if isinstance(lighting, Lighting):
         return lighting
@@ -139,7 +139,7 @@ def _random(seed: int) -> Lighting:
 
 
 # Key, fill and rim. An upright wall reflects 0.69 of its colour when it faces +z, 0.58 at +x, 0.50 at -x, 0.44 at -z; a
-# floor 0.91 and a ceiling 0.27: every side is told from its neighbour, none is black.
+# floor 0.91 and a ceiling 0.27: every side differs from its neighbour, none is black.
 _STUDIO = Lighting(
     lights=(
         Light(_towards(35.0, 45.0), _grey(0.54)),
@@ -148,7 +148,7 @@ _STUDIO = Lighting(
     ),
     sky=_grey(0.40),
     ground=_grey(0.27),
-    lasting=True,
+    is_constant=True,
 )
 
 _HEADLIGHT = Lighting(

@@ -1,6 +1,6 @@
-"""Meshes and cameras in, pictures out: the one way to draw in data_gen.
+"""Renders meshes from the cameras of a rig into RGBA, depth, normals, coordinates and mask.
 
-Pictures are RGBA with straight (not premultiplied) alpha: ``rgb * a + white * (1 - a)`` composites over white without
+Pictures are RGBA with straight (not premultiplied) alpha: `rgb * a + white * (1 - a)` composites over white without
 dark fringes. They are drawn over black at a multiple of the resolution, averaged while premultiplied, and divided by
 their alpha at the end. Depth, normals, coordinates and mask are not averaged: they are those of the pixel's centre.
 """
@@ -36,15 +36,15 @@ MAX_SUPERSAMPLE = 8
 
 @dataclass(frozen=True)
 class Rendering:
-    """Pictures of one object. Channels that were not asked for are None; empty pixels are 0 in every channel.
+    """Pictures of one object. Channels that were not requested are None; empty pixels are 0 in every channel.
 
     Attributes:
-        rgba: Colours uint8 ``(view, height, width, 4)``, sRGB, straight alpha.
-        depth: Distance along the camera's z axis float32 ``(view, height, width)``, world units.
-        normals: Unit normals towards the camera float32 ``(view, height, width, 3)``, world axes, as they are shaded:
+        rgba: colours uint8 `(view, height, width, 4)`, sRGB, straight alpha.
+        depth: distance along the camera's z axis float32 `(view, height, width)`, world units.
+        normals: unit normals towards the camera float32 `(view, height, width, 3)`, world axes, as they are shaded:
             interpolated on what is smooth, the face's own elsewhere.
-        coordinates: Points on the surface float32 ``(view, height, width, 3)``, world units.
-        mask: Whether the pixel's centre sees a surface that is at least half opaque, bool ``(view, height, width)``.
+        coordinates: points on the surface float32 `(view, height, width, 3)`, world units.
+        mask: whether the pixel's centre sees a surface that is at least half opaque, bool `(view, height, width)`.
     """
 
     rgba: npt.NDArray[np.uint8] | None = None
@@ -54,7 +54,7 @@ class Rendering:
     mask: npt.NDArray[np.bool_] | None = None
 
 
-class _Engine(Protocol):
+class _Backend(Protocol):
     detail: str
 
     def draw(
@@ -69,17 +69,17 @@ class MeshRenderer:
     must all be used in the thread that made the first.
 
     Args:
-        renderer: What `find_renderer` returned, the name of a renderer, or None for the best that works here.
-        supersample: Samples along a side of a pixel, 1 to MAX_SUPERSAMPLE: 3 gives alpha ten values, 4 seventeen.
+        renderer: what `find_renderer` returned, the name of a renderer, or None for the best that works here.
+        supersample: samples along a side of a pixel, 1 to MAX_SUPERSAMPLE: 3 gives alpha ten values, 4 seventeen.
 
     Raises:
-        RendererError: If no renderer works, or the one asked for does not.
-        ValueError: If supersample is out of range or the renderer has an unknown name.
+        RendererError: if no renderer works, or the one named does not.
+        ValueError: if supersample is out of range or the renderer has an unknown name.
 
     Attributes:
-        name: Name of the renderer, one of `data_gen.rendering.renderers.RENDERERS`.
-        detail: What draws, e.g. the OpenGL renderer and version.
-        supersample: Samples along a side of a pixel.
+        name: name of the renderer, one of `data_gen.rendering.renderers.RENDERERS`.
+        detail: what draws, e.g. the OpenGL renderer and version.
+        supersample: samples along a side of a pixel.
     """
 
     def __init__(self, renderer: RendererInfo | str | None = None, supersample: int = SUPERSAMPLE) -> None:
@@ -87,8 +87,8 @@ class MeshRenderer:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, received {supersample}")
         self.name = renderer if isinstance(renderer, str) else (renderer or find_renderer()).name
         self.supersample = supersample
-        self._engine: _Engine | None = _make_engine(self.name)
-        self.detail = self._engine.detail
+        self._backend: _Backend | None = _make_backend(self.name)
+        self.detail = self._backend.detail
 
     def __enter__(self) -> MeshRenderer:
         """Return itself."""
@@ -101,8 +101,8 @@ class MeshRenderer:
         self.close()
 
     def close(self) -> None:
-        """Let go of the renderer. The process keeps its OpenGL context for the next MeshRenderer."""
-        self._engine = None
+        """Release the renderer. The process keeps its OpenGL context for the next MeshRenderer."""
+        self._backend = None
 
     def render(
         self,
@@ -117,21 +117,21 @@ class MeshRenderer:
         """Draw an object from every camera of a rig.
 
         Args:
-            parts: Meshes with their poses and whether they are smooth.
-            rig: The cameras.
-            lighting: Name of a preset or a Lighting.
-            channels: What to return, of CHANNELS.
-            name: What to call the object in errors.
-            seed: Seed of random lighting.
+            parts: meshes with their poses and whether they are smooth.
+            rig: the cameras.
+            lighting: name of a preset or a Lighting.
+            channels: what to return, of CHANNELS.
+            name: what to call the object in errors.
+            seed: seed of random lighting.
 
         Returns:
-            The channels asked for.
+            The requested channels.
 
         Raises:
-            RenderError: If the parts cannot be drawn, or nothing of them is visible in any view.
-            ValueError: If the MeshRenderer is closed, or lighting or a channel has an unknown name.
+            RenderError: if the parts cannot be drawn, or nothing of them is visible in any view.
+            ValueError: if the MeshRenderer is closed, or lighting or a channel has an unknown name.
         """
-        if self._engine is None:
+        if self._backend is None:
             raise ValueError("renderer: expected an open one, received one that was closed")
         unknown = sorted(set(channels) - set(CHANNELS))
         if unknown or not channels:
@@ -142,7 +142,7 @@ class MeshRenderer:
         surfaces = shaded_surfaces(parts, name)
         pictures: dict[str, npt.NDArray] = {}
         if "rgba" in channels:
-            pictures["rgba"] = np.stack(list(self._engine.draw(surfaces, rig, lights, self.supersample)))
+            pictures["rgba"] = np.stack(list(self._backend.draw(surfaces, rig, lights, self.supersample)))
             visible = pictures["rgba"][..., 3].any()
         if set(channels) - {"rgba"}:
             from data_gen.rendering.embree import cast_geometry
@@ -158,7 +158,7 @@ class MeshRenderer:
         return Rendering(**pictures)
 
 
-def _make_engine(name: str) -> _Engine:
+def _make_backend(name: str) -> _Backend:
     if name not in RENDERERS:
         raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}")
     try:

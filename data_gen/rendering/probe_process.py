@@ -22,13 +22,13 @@ def draw_trial_picture(name: str) -> str:
     """Draw half a picture full of red triangle and check it.
 
     Args:
-        name: Which renderer.
+        name: which renderer.
 
     Returns:
         What drew it, one line.
 
     Raises:
-        RendererError: If the picture is another one.
+        RendererError: if the picture is another one.
     """
     corners = [[-9.0, -9.0, 0.0], [0.0, -9.0, 0.0], [0.0, 9.0, 0.0], [-9.0, 9.0, 0.0]]
     sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)

@@ -2,7 +2,7 @@
 
 pyrender keeps the context, the vertex buffers and the textures; the pass itself is our own, because pyrender's lights
 back faces with ambient light only, squares the alpha of what is translucent, multiplies vertex colours in after the
-light, and reads a depth buffer that nobody needs. Every sample is shaded for itself.
+light, and reads a depth buffer that is not needed. Every sample is shaded (supersampling, not multisampling).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pyrender import Mesh, MetallicRoughnessMaterial, Node, Primitive, Renderer,
 from data_gen.rendering.framebuffers import SampleFramebuffers
 from data_gen.rendering.lighting import Lighting
 from data_gen.rendering.shader_program import (
-    CLEAR_TEXELS,
-    SOLID_TEXELS,
+    OPAQUE_TEXELS,
+    TRANSLUCENT_TEXELS,
     ShaderProgram,
     constants_of_lighting,
     constants_of_surface,
@@ -32,22 +32,22 @@ __all__ = ["Drawable", "SurfaceRenderer"]
 Floats = npt.NDArray[np.float64]
 
 _OUTER, _INNER = 1.0, -1.0
-# Pictures are drawn upside down, so that the rows that OpenGL reads from the bottom come out with the first on top;
-# which turns every triangle around.
+# Drawn with flipped rows, so that glReadPixels, which starts at the bottom, returns the first row on top; the flip
+# reverses the winding of every triangle.
 _HIDDEN = {_OUTER: GL.GL_FRONT, _INNER: GL.GL_BACK}
-_UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
+_FLIP_ROWS = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 class Drawable:
     """A surface with the pyrender objects that hold its buffers and textures.
 
     Args:
-        surface: What to draw.
+        surface: what to draw.
         textures: pyrender textures made so far, by the identity of their texels, so that surfaces share them.
 
     Attributes:
-        defines: What its program needs to be compiled with.
-        constants: What of its material may be compiled in.
+        defines: what its program needs to be compiled with.
+        constants: what of its material may be compiled in.
     """
 
     def __init__(self, surface: ShadedSurface, textures: dict[int, Texture]) -> None:
@@ -72,7 +72,7 @@ class Drawable:
         needs = {
             "TEXTURE": self.base_texture is not None,
             "EMISSIVE_TEXTURE": self.emissive_texture is not None,
-            "CLEAR": not surface.opaque or surface.cutoff is not None,
+            "TRANSLUCENT": not surface.opaque or surface.cutoff is not None,
             "ALIGNED": _aligned(surface),
         }
         self.constants = constants_of_surface(surface)
@@ -87,7 +87,7 @@ class SurfaceRenderer(Renderer):
         """Put surfaces into the context, in place of those that were there.
 
         Args:
-            surfaces: What to draw from now on; none empties the context.
+            surfaces: what to draw from now on; none empties the context.
 
         Returns:
             What `draw` takes: what is solid first, by the program that draws it.
@@ -107,20 +107,20 @@ class SurfaceRenderer(Renderer):
         clip_from_world: Floats,
         camera: Floats,
         lighting: Lighting,
-        lamps: Floats,
+        light_directions: Floats,
     ) -> npt.NDArray[np.uint8]:
         """Draw one view.
 
         Args:
-            drawables: What `load` returned.
-            size: Pixels across, pixels down, and samples along a side of a pixel.
-            clip_from_world: OpenGL's view and projection ``(4, 4)``.
-            camera: The camera's position ``(3,)`` in world axes.
-            lighting: The lights.
-            lamps: Unit vectors to the lights ``(light, 3)`` in world axes.
+            drawables: what `load` returned.
+            size: pixels across, pixels down, and samples along a side of a pixel.
+            clip_from_world: OpenGL's view and projection `(4, 4)`.
+            camera: the camera's position `(3,)` in world axes.
+            lighting: the lights.
+            light_directions: unit vectors to the lights `(light, 3)` in world axes.
 
         Returns:
-            sRGB with straight alpha ``(height, width, 4)``, first row on top.
+            sRGB with straight alpha `(height, width, 4)`, first row on top.
         """
         buffers = self._buffers(size)
         GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, buffers.drawn)
@@ -133,24 +133,24 @@ class SurfaceRenderer(Renderer):
         GL.glEnable(GL.GL_CULL_FACE)
         GL.glClearColor(0.0, 0.0, 0.0, 0.0)
         GL.glClear(int(GL.GL_COLOR_BUFFER_BIT) | int(GL.GL_DEPTH_BUFFER_BIT))
-        view = (_UPSIDE_DOWN @ clip_from_world, camera, lighting, lamps)
+        view = (_FLIP_ROWS @ clip_from_world, camera, lighting, light_directions)
         bound: ShaderProgram | None = None
         # Outer sides first: what they hide is not shaded. The inner ones of what is closed cannot be seen.
         for side in (_OUTER, _INNER):
             for drawable in drawables:
                 if side == _OUTER or not drawable.surface.closed:
                     bound = self._bind(drawable, bound, view)
-                    self._draw_triangles(drawable, bound, SOLID_TEXELS, side)
-        clear = [drawable for drawable in drawables if not drawable.surface.opaque]
-        if clear:
-            clear.sort(key=lambda drawable: -float(np.linalg.norm(drawable.centre - camera)))
+                    self._draw_triangles(drawable, bound, OPAQUE_TEXELS, side)
+        translucent = [drawable for drawable in drawables if not drawable.surface.opaque]
+        if translucent:
+            translucent.sort(key=lambda drawable: -float(np.linalg.norm(drawable.centre - camera)))
             GL.glEnable(GL.GL_BLEND)
             GL.glBlendFunc(GL.GL_ONE, GL.GL_ONE_MINUS_SRC_ALPHA)
             GL.glDepthMask(GL.GL_FALSE)
-            for drawable in clear:
+            for drawable in translucent:
                 bound = self._bind(drawable, bound, view)
                 for side in (_INNER, _OUTER):
-                    self._draw_triangles(drawable, bound, CLEAR_TEXELS, side)
+                    self._draw_triangles(drawable, bound, TRANSLUCENT_TEXELS, side)
             GL.glDepthMask(GL.GL_TRUE)
         picture = buffers.read()
         GL.glUseProgram(0)

@@ -30,10 +30,10 @@ class PyrenderRenderer:
     """Draws with the one pyrender OffscreenRenderer of this process.
 
     Args:
-        platform: ``egl`` or ``osmesa``.
+        platform: `egl` or `osmesa`.
 
     Raises:
-        RendererError: If OpenGL is loaded for another platform, or cannot be used in this thread or process.
+        RendererError: if OpenGL is loaded for another platform, or cannot be used in this thread or process.
     """
 
     def __init__(self, platform: str) -> None:
@@ -50,13 +50,13 @@ class PyrenderRenderer:
         """Draw all views, one after the other.
 
         Args:
-            surfaces: What to draw.
-            rig: The cameras.
-            lighting: The lights.
-            supersample: Samples along a side of a pixel.
+            surfaces: what to draw.
+            rig: the cameras.
+            lighting: the lights.
+            supersample: samples along a side of a pixel.
 
         Yields:
-            sRGB with straight alpha ``(height, width, 4)``.
+            sRGB with straight alpha `(height, width, 4)`.
         """
         _check_owner()
         renderer = self._renderer
@@ -66,8 +66,8 @@ class PyrenderRenderer:
         try:
             for pose, intrinsics in zip(rig.world_from_camera, rig.intrinsics, strict=True):
                 clip_from_world = _projection(intrinsics, rig, pose, radius) @ np.linalg.inv(flip_camera_axes(pose))
-                lamps = lighting.directions(pose)
-                yield renderer.draw(drawables, size, clip_from_world, pose[:3, 3], lighting, lamps)
+                light_directions = lighting.directions(pose)
+                yield renderer.draw(drawables, size, clip_from_world, pose[:3, 3], lighting, light_directions)
         finally:
             renderer.load([])
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from data_gen.rendering.surfaces import ShadedSurface
 
-__all__ = ["Caster", "Hits", "pixel_rays"]
+__all__ = ["Hits", "RayCaster", "pixel_rays"]
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -25,11 +25,11 @@ class Hits:
     """Where rays first meet a face.
 
     Attributes:
-        rays: Index ``(hit,)`` of the ray.
-        faces: Index ``(hit,)`` of the face among those of all surfaces.
-        distances: Multiple ``(hit,)`` of the ray's direction at which it meets the face.
-        points: Where they meet ``(hit, 3)``, world axes.
-        corners: Barycentric weights ``(hit, 3)`` of the face's corners.
+        rays: index `(hit,)` of the ray.
+        faces: index `(hit,)` of the face among those of all surfaces.
+        distances: multiple `(hit,)` of the ray's direction at which it meets the face.
+        points: where they meet `(hit, 3)`, world axes.
+        corners: barycentric weights `(hit, 3)` of the face's corners.
     """
 
     rays: Indices
@@ -39,17 +39,17 @@ class Hits:
     corners: Floats
 
 
-class Caster:
+class RayCaster:
     """Casts rays at surfaces.
 
     Args:
-        surfaces: The surfaces; faces are numbered through them in order.
+        surfaces: the surfaces; faces are numbered through them in order.
 
     Attributes:
-        facets: Face normals ``(face, 3)``, not normalised, in the sense of the winding.
-        slopes: Gradients ``(face, 2, 3)`` of the barycentric weights of each face's second and third corner.
-        owner: Index ``(face,)`` of the surface that a face belongs to.
-        first_face: Index ``(surface,)`` of each surface's first face.
+        facets: face normals `(face, 3)`, not normalised, in the sense of the winding.
+        gradients: gradients `(face, 2, 3)` of the barycentric weights of each face's second and third corner.
+        owner: index `(face,)` of the surface that a face belongs to.
+        first_face: index `(surface,)` of each surface's first face.
     """
 
     def __init__(self, surfaces: Sequence[ShadedSurface]) -> None:
@@ -64,8 +64,8 @@ class Caster:
         edges = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
         self.facets = np.cross(*edges)
         area = np.sum(self.facets**2, axis=1, keepdims=True)
-        slopes = np.stack((np.cross(edges[1], self.facets), np.cross(self.facets, edges[0])), axis=1)
-        self.slopes = np.divide(slopes, area[..., None], out=np.zeros_like(slopes), where=area[..., None] > 0)
+        gradients = np.stack((np.cross(edges[1], self.facets), np.cross(self.facets, edges[0])), axis=1)
+        self.gradients = np.divide(gradients, area[..., None], out=np.zeros_like(gradients), where=area[..., None] > 0)
         self._scene = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
 
@@ -73,9 +73,9 @@ class Caster:
         """Find the first face on each ray.
 
         Args:
-            origin: Where all rays start ``(3,)``.
-            directions: Their directions ``(ray, 3)``, of any length.
-            after: Multiples of the directions ``(ray,)`` before which nothing counts, or None for 0.
+            origin: where all rays start `(3,)`.
+            directions: their directions `(ray, 3)`, of any length.
+            after: multiples of the directions `(ray,)` before which nothing counts, or None for 0.
 
         Returns:
             The hits, in the order of the rays; rays that meet nothing have none.
@@ -95,7 +95,7 @@ class Caster:
             start, height, facets = start[met], height[met], facets[met]
         distances = np.einsum("ri,ri->r", start - origin, facets) / height
         points = origin + distances[:, None] * directions
-        corners = np.einsum("rci,ri->rc", self.slopes[faces], points - start)
+        corners = np.einsum("rci,ri->rc", self.gradients[faces], points - start)
         corners = np.clip(np.concatenate((1.0 - corners.sum(axis=1, keepdims=True), corners), axis=1), 0.0, 1.0)
         return Hits(rays, faces, distances, points, corners)
 
@@ -104,13 +104,13 @@ def pixel_rays(pose: Floats, intrinsics: Floats, columns: Floats, rows: Floats) 
     """Rays through points of the image, scaled so that their multiples are depths along the camera's z axis.
 
     Args:
-        pose: world_from_camera ``(4, 4)``, OpenCV axes.
-        intrinsics: Pinhole matrix ``(3, 3)`` in pixels, integer pixel centres.
-        columns: x coordinates ``(column,)`` in pixels.
-        rows: y coordinates ``(row,)`` in pixels.
+        pose: world_from_camera `(4, 4)`, OpenCV axes.
+        intrinsics: pinhole matrix `(3, 3)` in pixels, integer pixel centres.
+        columns: x coordinates `(column,)` in pixels.
+        rows: y coordinates `(row,)` in pixels.
 
     Returns:
-        Directions ``(row x column, 3)`` in world axes, rows first.
+        Directions `(row x column, 3)` in world axes, rows first.
     """
     matrix = pose[:3, :3] @ np.linalg.inv(intrinsics)
     down = np.asarray(rows, dtype=np.float64)[:, None] * matrix[:, 1] + matrix[:, 2]

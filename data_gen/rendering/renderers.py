@@ -1,8 +1,8 @@
-"""Which renderer works on this machine: found out by drawing a triangle in a subprocess, never guessed.
+"""Which renderer works on this machine: each is probed by drawing a triangle in a subprocess.
 
-Order: what the caller or the environment asks for; pyrender on EGL; pyrender on OSMesa; Embree ray casting, which needs
+Order: what the caller or the environment names; pyrender on EGL; pyrender on OSMesa; Embree ray casting, which needs
 nothing beyond the installed packages. A library that is missing, a driver that crashes and a driver that draws nothing
-all show in the subprocess, and none of them can hurt the process that asks.
+all show in the subprocess, and none of them can crash the calling process.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _OPENGL_PLATFORMS = {"egl": "pyrender-egl", "osmesa": "pyrender-osmesa"}
 
 
 class RendererError(ValueError):
-    """No renderer works, or the one that was asked for does not."""
+    """No renderer works, or the one that was named does not."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class RendererInfo:
     """A renderer that works here.
 
     Attributes:
-        name: One of RENDERERS.
-        detail: What draws, e.g. the OpenGL renderer and version.
-        advice: What could be done to get a better one, one line each; empty when this is the best.
+        name: one of RENDERERS.
+        detail: what draws, e.g. the OpenGL renderer and version.
+        advice: what could be done to get a better one, one line each; empty when this is the best.
     """
 
     name: str
@@ -66,11 +66,11 @@ class ProbeResult:
     """What came of trying one renderer.
 
     Attributes:
-        name: One of RENDERERS.
-        works: Whether it drew the test picture right.
-        seconds: How long the trial took, start of the subprocess included.
-        message: What draws, or what went wrong, one line.
-        remedy: The command that should mend it; empty when it works.
+        name: one of RENDERERS.
+        works: whether it drew the test picture right.
+        seconds: how long the trial took, start of the subprocess included.
+        message: what draws, or what went wrong, one line.
+        remedy: the command that should fix it; empty when it works.
     """
 
     name: str
@@ -87,18 +87,18 @@ def probe(name: str) -> ProbeResult:
     """Try one renderer in a subprocess; a second call in this process answers from memory.
 
     Args:
-        name: One of RENDERERS.
+        name: one of RENDERERS.
 
     Returns:
         The outcome. A renderer that does not work is an outcome, not an error.
 
     Raises:
-        ValueError: If no renderer has that name.
+        ValueError: if no renderer has that name.
     """
     if name not in RENDERERS:
         raise ValueError(_unknown(name))
     if name not in _cache:
-        _cache[name] = _try(name)
+        _cache[name] = _run_probe(name)
     return _cache[name]
 
 
@@ -115,23 +115,23 @@ def find_renderer(prefer: str | None = None) -> RendererInfo:
     """Find the best renderer that works here.
 
     The answer is kept for this process and, through an environment variable, for those that it starts. Without
-    ``prefer`` the environment decides: HYPERPLANES_RENDERER names a renderer, which then must work; PYOPENGL_PLATFORM
+    `prefer` the environment decides: HYPERPLANES_RENDERER names a renderer, which then must work; PYOPENGL_PLATFORM
     (egl or osmesa) only puts one in front.
 
     Args:
-        prefer: One of RENDERERS, which then must work, or None for the best that does.
+        prefer: one of RENDERERS, which then must work, or None for the best that does.
 
     Returns:
         The renderer, with advice when a better one could be had.
 
     Raises:
-        RendererError: If the renderer asked for, or every renderer, does not work; the message holds the remedy.
-        ValueError: If no renderer has the name asked for.
+        RendererError: if the renderer named, or every renderer, does not work; the message holds the remedy.
+        ValueError: if no renderer has that name.
     """
     chosen = prefer or os.environ.get(CHOICE_VARIABLE) or None
     if chosen is not None and chosen not in RENDERERS:
         raise ValueError(_unknown(chosen))
-    known = _inherited()
+    known = _found_before()
     if known is not None and chosen in {None, known.name}:
         return known
     if chosen is not None:
@@ -164,7 +164,7 @@ def remedy(name: str) -> str:
     """The command that should make a renderer work on Debian and Ubuntu.
 
     Args:
-        name: One of RENDERERS.
+        name: one of RENDERERS.
 
     Returns:
         A line for a shell.
@@ -180,7 +180,7 @@ def _advice(failure: ProbeResult) -> str:
     return f"{failure.name} does not work here ({failure.message}); to get it: {failure.remedy}"
 
 
-def _inherited() -> RendererInfo | None:
+def _found_before() -> RendererInfo | None:
     """What an earlier call, here or in a parent process, has found."""
     text = os.environ.get(_FOUND_VARIABLE)
     if not text:
@@ -198,7 +198,7 @@ def _remember(backend: RendererInfo) -> RendererInfo:
     return backend
 
 
-def _try(name: str) -> ProbeResult:
+def _run_probe(name: str) -> ProbeResult:
     environment = {key: value for key, value in os.environ.items() if key != _FOUND_VARIABLE}
     command = [sys.executable, "-m", "data_gen.rendering.probe_process", name]
     start = time.monotonic()
@@ -215,9 +215,9 @@ def _try(name: str) -> ProbeResult:
     lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
     if done.returncode == 0 and lines:
         return ProbeResult(name, True, seconds, lines[-1], "")
-    noise = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    errors = [line.strip() for line in done.stderr.splitlines() if line.strip()]
     if done.returncode < 0:
         message = f"crashed with signal {-done.returncode}"
     else:
-        message = noise[-1] if noise else f"exit code {done.returncode}"
+        message = errors[-1] if errors else f"exit code {done.returncode}"
     return ProbeResult(name, False, seconds, message, _REMEDIES[name])

@@ -1,7 +1,7 @@
 """The OpenGL program that shades surfaces, compiled for what a surface needs. Imports OpenGL.
 
 Shading is the formula of `data_gen.rendering.shading`, with which `embree` shades too, arranged for speed: software
-OpenGL spends half of its time here. Half vectors are never normalised (``|L + V|^2 = 2 + 2 L.V``), the curves of sRGB
+OpenGL spends half of its time here. Half vectors are never normalised (`|L + V|^2 = 2 + 2 L.V`), the curves of sRGB
 are polynomials (their errors, of 0.05 of 255, are below that of the 8 bits that follow), lights are unrolled, what a
 surface does not have is not compiled in, and what is the same for nearly all surfaces is compiled in as a constant:
 llvmpipe loads a uniform anew for every few pixels (2.2 ms a picture of a car with constants, 3.1 with uniforms).
@@ -23,15 +23,15 @@ from data_gen.rendering.shading import SHOULDER
 from data_gen.rendering.surfaces import DEFAULT_ROUGHNESS, ShadedSurface
 
 __all__ = [
-    "CLEAR_TEXELS",
-    "SOLID_TEXELS",
+    "OPAQUE_TEXELS",
+    "TRANSLUCENT_TEXELS",
     "ShaderProgram",
     "compile_program",
     "constants_of_lighting",
     "constants_of_surface",
 ]
 
-SOLID_TEXELS, CLEAR_TEXELS = 0, 1
+OPAQUE_TEXELS, TRANSLUCENT_TEXELS = 0, 1
 """Which texels of a surface that is not opaque are drawn: those that hide what is behind, or the others."""
 
 Floats = npt.NDArray[np.float64]
@@ -98,19 +98,19 @@ void main() {
 #endif
 #ifdef TEXTURE
     vec4 texel = texture(base_texture, point_uv);
-#ifdef CLEAR
+#ifdef TRANSLUCENT
     texel.rgb = min(texel.rgb / max(texel.a, 1e-4), 1.0);
 #endif
     base *= vec4(linear(texel.rgb), texel.a);
 #endif
-    vec3 glow = emissive;
+    vec3 emission = emissive;
 #ifdef EMISSIVE_TEXTURE
-    glow *= linear(texture(emissive_texture, point_uv).rgb);
+    emission *= linear(texture(emissive_texture, point_uv).rgb);
 #endif
-#ifdef CLEAR
+#ifdef TRANSLUCENT
     float alpha = base.a;
     if (cutoff >= 0.0) alpha = alpha < cutoff ? 0.0 : 1.0;
-    if ((layer == CLEAR_TEXELS) == (alpha >= 0.999) || alpha < 0.001) discard;
+    if ((layer == TRANSLUCENT_TEXELS) == (alpha >= 0.999) || alpha < 0.001) discard;
 #endif
 
     vec3 towards = camera - point;
@@ -125,30 +125,30 @@ void main() {
 #endif
     n *= inversesqrt(dot(n, n));
     float facing = dot(n, towards);
-    float seen = max(facing, 0.05) * (1.0 - shadowing) + shadowing;
+    float masking = max(facing, 0.05) * (1.0 - shadowing) + shadowing;
 
-    vec3 matt = mix(ground, sky, 0.5 + 0.5 * n.y);
-    vec3 straight = vec3(0.0);
+    vec3 diffuse = mix(ground, sky, 0.5 + 0.5 * n.y);
+    vec3 specular = vec3(0.0);
     vec3 grazing = vec3(0.0);
     for (int i = 0; i < LIGHTS; i++) {
         float nl = max(dot(n, light_direction[i]), 0.0);
         float m = max(1.0 + dot(towards, light_direction[i]), 1e-5);
         float t = max(nl + facing, 0.0);
-        float d = t * t * (narrowness - 1.0) + 2.0 * m;
+        float d = t * t * (squared_alpha - 1.0) + 2.0 * m;
         float slope = 1.0 - sqrt(0.5 * m);
         float slope2 = slope * slope;
         float fresnel = slope2 * slope2 * slope;
         vec3 lit = nl * light_colour[i];
-        vec3 high = lit * (narrowness * m * m / (d * d * seen * (nl * (1.0 - shadowing) + shadowing)));
-        matt += lit;
+        vec3 high = lit * (squared_alpha * m * m / (d * d * masking * (nl * (1.0 - shadowing) + shadowing)));
+        diffuse += lit;
         grazing += high * fresnel;
-        straight += high * (1.0 - fresnel);
+        specular += high * (1.0 - fresnel);
     }
-    vec3 light = base.rgb * (1.0 - 0.5 * metallic) * matt + mix(vec3(0.04), base.rgb, metallic) * straight + grazing;
+    vec3 light = base.rgb * (1.0 - 0.5 * metallic) * diffuse + mix(vec3(0.04), base.rgb, metallic) * specular + grazing;
     vec3 over = max(light - SHOULDER, 0.0);
     light = min(light, SHOULDER) + (1.0 - SHOULDER) * (1.0 - exp(over * (-1.0 / (1.0 - SHOULDER))));
-    pixel = vec4(encoded(clamp(light + glow, 0.0, 1.0)), 1.0);
-#ifdef CLEAR
+    pixel = vec4(encoded(clamp(light + emission, 0.0, 1.0)), 1.0);
+#ifdef TRANSLUCENT
     pixel = vec4(pixel.rgb * alpha, alpha);
 #endif
 }
@@ -163,7 +163,7 @@ _TYPES = {
     "base_colour": "vec4",
     "emissive": "vec3",
     "metallic": "float",
-    "narrowness": "float",
+    "squared_alpha": "float",
     "shadowing": "float",
     "side": "float",
 }
@@ -180,7 +180,7 @@ def constants_of_surface(surface: ShadedSurface) -> dict[str, str]:
     if surface.metallic == 0.0:
         constants["metallic"] = "0.0"
     if surface.roughness in _COMMON_ROUGHNESS:
-        constants |= {name: f"{value:.9g}" for name, value in _gloss(surface.roughness).items()}
+        constants |= {name: f"{value:.9g}" for name, value in _roughness_constants(surface.roughness).items()}
     if surface.closed:
         constants["side"] = "1.0"
     return constants
@@ -189,7 +189,7 @@ def constants_of_surface(surface: ShadedSurface) -> dict[str, str]:
 @lru_cache(maxsize=8)
 def constants_of_lighting(lighting: Lighting) -> dict[str, str]:
     """Lights that are for many objects and views, as GLSL by name; none of others."""
-    if not lighting.lasting or lighting.follows_camera or not lighting.lights:
+    if not lighting.is_constant or lighting.follows_camera or not lighting.lights:
         return {}
     unused = [np.zeros(3)] * (MAX_LIGHTS - len(lighting.lights))
     arrays = {"light_direction": lighting.directions(np.eye(4)), "light_colour": lighting.colours}
@@ -201,8 +201,8 @@ def _vector(values: Sequence[float] | Floats) -> str:
     return f"vec3({', '.join(f'{value:.9g}' for value in values)})"
 
 
-def _gloss(roughness: float) -> dict[str, float]:
-    return {"narrowness": roughness**4, "shadowing": (roughness + 1.0) ** 2 / 8.0}
+def _roughness_constants(roughness: float) -> dict[str, float]:
+    return {"squared_alpha": roughness**4, "shadowing": (roughness + 1.0) ** 2 / 8.0}
 
 
 def compile_program(vertex: str, fragment: str, constants: dict[str, Any]) -> int:
@@ -211,7 +211,7 @@ def compile_program(vertex: str, fragment: str, constants: dict[str, Any]) -> in
     Args:
         vertex: GLSL without its version.
         fragment: GLSL without its version.
-        constants: Values of the preprocessor's names.
+        constants: values of the preprocessor's names.
 
     Returns:
         OpenGL's name of the program.
@@ -233,8 +233,8 @@ class ShaderProgram:
     """The shaders for surfaces that need the same, and where their uniforms are.
 
     Args:
-        defines: What the surfaces need: UV and COLOUR with the number of their vertex attribute, TEXTURE,
-            EMISSIVE_TEXTURE, CLEAR and ALIGNED, and LIGHTS, how many there are.
+        defines: what the surfaces need: UV and COLOUR with the number of their vertex attribute, TEXTURE,
+            EMISSIVE_TEXTURE, TRANSLUCENT and ALIGNED, and LIGHTS, how many there are.
         constants: GLSL of what would else be uniforms.
 
     Attributes:
@@ -242,7 +242,7 @@ class ShaderProgram:
     """
 
     def __init__(self, defines: dict[str, int], constants: dict[str, str]) -> None:
-        numbers = {"MAX_LIGHTS": MAX_LIGHTS, "SHOULDER": SHOULDER, "CLEAR_TEXELS": CLEAR_TEXELS}
+        numbers = {"MAX_LIGHTS": MAX_LIGHTS, "SHOULDER": SHOULDER, "TRANSLUCENT_TEXELS": TRANSLUCENT_TEXELS}
         values = "".join(
             f"const {kind} {name} = {constants[name]};\n" if name in constants else f"uniform {kind} {name};\n"
             for name, kind in _TYPES.items()
@@ -260,12 +260,12 @@ class ShaderProgram:
             self._places[name] = GL.glGetUniformLocation(self.handle, name)
         return self._places[name]
 
-    def set_view(self, clip_from_world: Floats, camera: Floats, lighting: Lighting, lamps: Floats) -> None:
+    def set_view(self, clip_from_world: Floats, camera: Floats, lighting: Lighting, light_directions: Floats) -> None:
         """Set what all surfaces of a view share; arguments as of `SurfaceRenderer.draw`."""
         GL.glUniformMatrix4fv(self._at("clip_from_world"), 1, GL.GL_TRUE, clip_from_world.astype(np.float32))
         GL.glUniform3fv(self._at("camera"), 1, camera.astype(np.float32))
         if self._lights and self._at("light_direction") >= 0:
-            GL.glUniform3fv(self._at("light_direction"), self._lights, lamps.astype(np.float32))
+            GL.glUniform3fv(self._at("light_direction"), self._lights, light_directions.astype(np.float32))
             GL.glUniform3fv(self._at("light_colour"), self._lights, lighting.colours.astype(np.float32))
         GL.glUniform3f(self._at("sky"), *lighting.sky)
         GL.glUniform3f(self._at("ground"), *lighting.ground)
@@ -274,13 +274,13 @@ class ShaderProgram:
         """Set what is a surface's own.
 
         Args:
-            surface: The surface.
-            layer: SOLID_TEXELS or CLEAR_TEXELS.
+            surface: the surface.
+            layer: OPAQUE_TEXELS or TRANSLUCENT_TEXELS.
             side: 1 where the faces' outer sides are drawn, -1 for the inner ones.
         """
         GL.glUniform4f(self._at("base_colour"), *surface.base_colour)
         GL.glUniform3f(self._at("emissive"), *surface.emissive)
-        for name, value in _gloss(surface.roughness).items():
+        for name, value in _roughness_constants(surface.roughness).items():
             GL.glUniform1f(self._at(name), value)
         GL.glUniform1f(self._at("metallic"), surface.metallic)
         GL.glUniform1f(self._at("side"), side)

@@ -1,11 +1,11 @@
-"""What a renderer needs of a mesh, in one form for all renderers: triangles in the world, and a small material model.
+"""What both renderers draw: triangles in world coordinates, with a small material model.
 
-Colours. Textures, vertex colours, face colours and the Kd of an MTL file are sRGB, as those who paint them see them; a
-glTF ``baseColorFactor`` and ``emissiveFactor`` are linear, as glTF says. Everything is linear in a ShadedSurface.
+Colours. Textures, vertex colours, face colours and the Kd of an MTL file are sRGB; a
+glTF `baseColorFactor` and `emissiveFactor` are linear, as glTF specifies. Everything is linear in a ShadedSurface.
 
 Material. Lambertian plus a soft GGX highlight. There is no environment to be mirrored, so metal would be black:
-metalness counts for at most MAX_METALLIC, and is 0 where a file says nothing. Roughness counts for at least
-MIN_ROUGHNESS, and is DEFAULT_ROUGHNESS where a file says nothing; a texture of both counts with its mean. Normal and
+metalness counts for at most MAX_METALLIC, and is 0 where a file states none. Roughness counts for at least
+MIN_ROUGHNESS, and is DEFAULT_ROUGHNESS where a file states none; a texture of both counts with its mean. Normal and
 occlusion maps are not drawn.
 """
 
@@ -47,7 +47,7 @@ DEFAULT_ROUGHNESS = 0.8
 MAX_TEXTURE_SIDE = 2048
 """Larger textures are reduced to this many texels a side before they are drawn."""
 
-_UNSET_KD = (102, 102, 102, 255)
+_DEFAULT_KD = (102, 102, 102, 255)
 _PLAIN = 0.72
 
 Floats = npt.NDArray[np.float64]
@@ -62,21 +62,21 @@ class ShadedSurface:
     """Triangles of one material, in world axes.
 
     Attributes:
-        positions: Vertices ``(vertex, 3)``.
-        faces: Vertex indices ``(face, 3)``.
-        normals: Unit vertex normals ``(vertex, 3)``; zero where there is none, which stands for the face's own.
-        uv: Texture coordinates ``(vertex, 2)``, v upwards, repeating outside [0, 1]; None without textures.
-        colours: Linear RGBA ``(vertex, 4)`` that multiplies the base colour, or None.
-        base_colour: Linear RGBA ``(4,)``.
-        texture: Base colour texture uint8 ``(height, width, 4)``, sRGB, first row on top, PREMULTIPLIED so that
+        positions: vertices `(vertex, 3)`.
+        faces: vertex indices `(face, 3)`.
+        normals: unit vertex normals `(vertex, 3)`; zero where there is none, which stands for the face's own.
+        uv: texture coordinates `(vertex, 2)`, v upwards, repeating outside [0, 1]; None without textures.
+        colours: linear RGBA `(vertex, 4)` that multiplies the base colour, or None.
+        base_colour: linear RGBA `(4,)`.
+        texture: base colour texture uint8 `(height, width, 4)`, sRGB, first row on top, PREMULTIPLIED so that
             filtering does not mix in what is transparent; None without.
-        emissive: Linear RGB ``(3,)`` that is added to the reflected light.
-        emissive_texture: Like texture, multiplies emissive.
-        roughness: In [MIN_ROUGHNESS, 1].
-        metallic: In [0, MAX_METALLIC].
-        cutoff: Alpha below this is not there, and from it on is opaque; None for alpha that blends.
-        opaque: Whether all of it hides what is behind.
-        closed: Whether it is known to be made of watertight solids wound outwards, of which no inner side is seen.
+        emissive: linear RGB `(3,)` that is added to the reflected light.
+        emissive_texture: like texture, multiplies emissive.
+        roughness: in [MIN_ROUGHNESS, 1].
+        metallic: in [0, MAX_METALLIC].
+        cutoff: alpha below this is transparent, from it on opaque (glTF MASK); None for alpha that blends.
+        opaque: whether all of it hides what is behind.
+        closed: whether it is known to be made of watertight solids wound outwards, of which no inner side is seen.
     """
 
     positions: Floats
@@ -99,16 +99,16 @@ def shaded_surfaces(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: st
     """Bring the parts of an object into the form that the renderers draw.
 
     Args:
-        parts: Meshes, their poses ``world_from_mesh`` ``(4, 4)`` (any affine map, mirroring included) and whether each
-            is shaded smoothly. Face colours are drawn flat in any case. A mesh whose ``metadata["closed"]`` is true
+        parts: meshes, their poses `world_from_mesh` `(4, 4)` (any affine map, mirroring included) and whether each
+            is shaded smoothly. Face colours are drawn flat in any case. A mesh whose `metadata["closed"]` is true
             is taken for closed.
-        name: What to call the object in errors.
+        name: what to call the object in errors.
 
     Returns:
         One surface a part, in order; parts without faces are left out.
 
     Raises:
-        RenderError: If a part is no Trimesh, a pose is no finite affine map, a face's vertex is not finite, a
+        RenderError: if a part is no Trimesh, a pose is no finite affine map, a face's vertex is not finite, a
             texture has no coordinates, a material is of an unknown kind, or no part has a face.
     """
     images: dict[Any, npt.NDArray[np.uint8]] = {}
@@ -242,7 +242,7 @@ def _fill_from_mtl(fields: dict[str, Any], material: Any, images: dict[Any, Any]
     diffuse = np.asarray(material.diffuse, dtype=np.float64)
     fields["texture"] = _texels(material.image, images, keep_alpha=True)
     # A texture is written with a Kd of black by some programs, and trimesh fills a Kd in where there is none.
-    unset = tuple(material.diffuse) == _UNSET_KD or not diffuse[:3].any()
+    unset = tuple(material.diffuse) == _DEFAULT_KD or not diffuse[:3].any()
     if fields["texture"] is not None and unset:
         diffuse = np.array([255.0, 255.0, 255.0, diffuse[3]])
     fields["base_colour"] = np.append(linear_from_srgb(diffuse[:3] / 255.0), diffuse[3] / 255.0)

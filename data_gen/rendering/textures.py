@@ -1,4 +1,4 @@
-"""Textures sampled in numpy as OpenGL samples them: bilinear in a level, linear between two levels, repeating."""
+"""Trilinear texture sampling in NumPy, as OpenGL does it: mipmaps, bilinear in a level, repeating."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-__all__ = ["MipTexture"]
+__all__ = ["MipmappedTexture"]
 
 Singles = npt.NDArray[np.float32]
 
 
-class MipTexture:
-    """A texture with its reductions to one half, one quarter and so on.
+class MipmappedTexture:
+    """A texture with its mipmaps.
 
     Args:
-        texels: uint8 ``(height, width, 4)``, first row on top.
+        texels: uint8 `(height, width, 4)`, first row on top.
     """
 
     def __init__(self, texels: npt.NDArray[np.uint8]) -> None:
@@ -33,11 +33,11 @@ class MipTexture:
         """Look texels up.
 
         Args:
-            uv: Coordinates ``(point, 2)``, v upwards, repeating outside [0, 1].
-            level: Binary logarithm ``(point,)`` of the texels between neighbouring samples; 0 and less is full size.
+            uv: coordinates `(point, 2)`, v upwards, repeating outside [0, 1].
+            level: binary logarithm `(point,)` of the texels between neighbouring samples; 0 and less is full size.
 
         Returns:
-            RGBA ``(point, 4)`` in [0, 1], as the texture holds it.
+            RGBA `(point, 4)` in [0, 1], as the texture holds it.
         """
         level = np.clip(level, 0.0, len(self._sizes) - 1.0)
         low = np.floor(level).astype(np.int64)
@@ -45,8 +45,8 @@ class MipTexture:
         between = (level - low).astype(np.float32)
         mixed = np.flatnonzero(between > 0.0)
         if len(mixed):
-            share = between[mixed, None]
-            colours[mixed] += share * (self._bilinear(uv[mixed], low[mixed] + 1) - colours[mixed])
+            weight = between[mixed, None]
+            colours[mixed] += weight * (self._bilinear(uv[mixed], low[mixed] + 1) - colours[mixed])
         return colours
 
     def _bilinear(self, uv: npt.NDArray[np.float64], level: npt.NDArray[np.int64]) -> Singles:

@@ -184,7 +184,7 @@ def car(rng: np.random.Generator) -> list[Part]:
     """A car.
 
     Args:
-        rng: Source of every choice.
+        rng: source of every choice.
 
     Returns:
         Its parts in metres, y up, front along +z, standing on y = 0.

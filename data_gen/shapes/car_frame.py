@@ -17,17 +17,17 @@ class Style:
     """Proportions of a body; every pair is the range a value is drawn from.
 
     Attributes:
-        length: Metres.
-        width: Metres, without mirrors.
-        height: Metres, ground to roof.
-        glass: Where glass begins and ends as fractions of the length from the tail: foot of the rear window, rear end
+        length: metres.
+        width: metres, without mirrors.
+        height: metres, ground to roof.
+        glass: where glass begins and ends as fractions of the length from the tail: foot of the rear window, rear end
             of the roof, front end of the roof, foot of the windscreen.
-        belt: Height of the window sills as a fraction of the height.
-        deck: Height of the tail's lid as a fraction of the height.
-        nose: Height of the bonnet's front edge as a fraction of the height.
-        clearance: Metres under the floor.
-        wheel: Outer radius of the tyres in metres.
-        roof: Width of the roof as a fraction of the body's.
+        belt: height of the window sills as a fraction of the height.
+        deck: height of the tail's lid as a fraction of the height.
+        nose: height of the bonnet's front edge as a fraction of the height.
+        clearance: metres under the floor.
+        wheel: outer radius of the tyres in metres.
+        roof: width of the roof as a fraction of the body's.
     """
 
     length: tuple[float, float]

@@ -65,7 +65,7 @@ def chair(rng: np.random.Generator) -> list[Part]:
     """A chair.
 
     Args:
-        rng: Source of every choice.
+        rng: source of every choice.
 
     Returns:
         Its parts in metres, y up, the sitter looking along +z, standing on y = 0.

@@ -18,13 +18,13 @@ class Frame:
 
     Attributes:
         kind: "dining", "lounge", "office", "bar" or "rocking".
-        width: Of the seat.
-        depth: Of the seat.
-        seat: Height of the seat's upper side over the floor.
-        thick: Thickness of the seat.
-        back: Height of the back over the seat; 0 for none.
-        lean: Degrees by which the back reclines.
-        round_seat: Whether the seat is a disc.
+        width: of the seat.
+        depth: of the seat.
+        seat: height of the seat's upper side over the floor.
+        thick: thickness of the seat.
+        back: height of the back over the seat; 0 for none.
+        lean: degrees by which the back reclines.
+        round_seat: whether the seat is a disc.
     """
 
     kind: str

@@ -200,7 +200,7 @@ def lamp(rng: np.random.Generator) -> list[Part]:
     """A lamp.
 
     Args:
-        rng: Source of every choice.
+        rng: source of every choice.
 
     Returns:
         Its parts in metres, y up, front along +z.

@@ -38,12 +38,12 @@ class Shade:
     """What a shade is like, in metres.
 
     Attributes:
-        shape: Key of the outline.
-        radius: Largest radius.
-        height: Extent along its axis.
-        segments: Sides; 4 or 6 for angular ones.
-        cloth: Material of the outer side.
-        trim: Material of the rims; none if absent.
+        shape: key of the outline.
+        radius: largest radius.
+        height: extent along its axis.
+        segments: sides; 4 or 6 for angular ones.
+        cloth: material of the outer side.
+        trim: material of the rims; none if absent.
     """
 
     shape: str
@@ -107,10 +107,10 @@ def shell(style: Shade, name: str, metal: Material, bulb: bool = True) -> list[P
     """A shade whose rim is on y = 0 around the y axis, its spokes and bulb.
 
     Args:
-        style: What it is like.
-        name: Prefix of the parts' names.
-        metal: Material of the fittings.
-        bulb: Whether a bulb hangs in it.
+        style: what it is like.
+        name: prefix of the parts' names.
+        metal: material of the fittings.
+        bulb: whether a bulb hangs in it.
 
     Returns:
         The parts. A hub on the axis reaches from 0.6 to 0.86 of the height; whatever carries the shade joins it there.

@@ -80,10 +80,10 @@ def table_body(rng: np.random.Generator, height: float, radius: float, metal: Ma
     """The body of a table lamp, from y = 0 to a neck at `height`.
 
     Args:
-        rng: Source of the choices.
-        height: Metres.
-        radius: Largest radius in metres.
-        metal: Material of fittings.
+        rng: source of the choices.
+        height: metres.
+        radius: largest radius in metres.
+        metal: material of fittings.
 
     Returns:
         The parts; the topmost reaches at least to `height` on the axis.

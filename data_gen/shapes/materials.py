@@ -21,8 +21,8 @@ class Material:
     """A painted surface.
 
     Attributes:
-        name: What it is, for people.
-        image: Pixels (h, w, 3), uint8 sRGB, row 0 at the top (v = 1). One pixel for a plain colour.
+        name: what it is, for people.
+        image: pixels (h, w, 3), uint8 sRGB, row 0 at the top (v = 1). One pixel for a plain colour.
     """
 
     name: str

@@ -29,9 +29,9 @@ class Part:
     """A solid with a material on each face.
 
     Attributes:
-        name: What it is: "wheel", "left_wing".
-        solid: The geometry, in the object's frame.
-        materials: The materials used.
+        name: what it is: "wheel", "left_wing".
+        solid: the geometry, in the object's frame.
+        materials: the materials used.
         chosen: (F,) index into `materials` of each face.
     """
 
@@ -64,7 +64,7 @@ def atlas(materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:
     """Pack materials into one image.
 
     Args:
-        materials: Plain ones (one pixel) and patterned ones, each at most 240 pixels wide.
+        materials: plain ones (one pixel) and patterned ones, each at most 240 pixels wide.
 
     Returns:
         The image (H, 256, 3), uint8, and for each material the affine map (2, 2) of its uv into the image's: rows
@@ -145,8 +145,8 @@ def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> tr
     """Join parts into a scene with one textured geometry.
 
     Args:
-        name: Name of the geometry.
-        parts: The painted solids.
+        name: name of the geometry.
+        parts: the painted solids.
         roughness: PBR roughness of all of it, in [0, 1].
 
     Returns:

@@ -57,10 +57,10 @@ def fuselage_side(
     """Side view of a fuselage, tail at u = 0: decoration, a row of windows, doors, cockpit glass.
 
     Args:
-        rng: Source of the choices.
-        livery: Colours.
-        windows: Where the row begins and ends, as shares of the length from the tail; none if absent.
-        cockpit: Whether the windscreen is painted on.
+        rng: source of the choices.
+        livery: colours.
+        windows: where the row begins and ends, as shares of the length from the tail; none if absent.
+        cockpit: whether the windscreen is painted on.
 
     Returns:
         The material, for coordinates projected along x.

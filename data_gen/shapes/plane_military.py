@@ -60,7 +60,7 @@ def fighter(rng: np.random.Generator) -> list[Part]:
     """A fighter jet.
 
     Args:
-        rng: Source of every choice.
+        rng: source of every choice.
 
     Returns:
         Its parts in metres, y up, nose along +z.

@@ -43,7 +43,7 @@ def test_a_right_data_set_is_described_and_drawn(tmp_path):
     assert np.allclose(one.extent, 2 * RADIUS, atol=0.35), "the hull is the ball, voxels and pixels rounded up"
     assert one.conventions.consistent
     assert one.conventions.scores["as declared"] > 0.5
-    assert not found.trouble
+    assert not found.has_problems
     sheet = np.array(Image.open(found.files[0]))
     assert sheet.shape[1] > 6 * SIZE
     assert [path.name for path in found.files] == ["contact_sheet.png", "cameras.png"]
@@ -62,14 +62,14 @@ def test_a_right_data_set_is_described_and_drawn(tmp_path):
 )
 def test_poses_that_are_mistaken_are_recognised_and_named(tmp_path, change, name):
     found = inspect(write(tmp_path / "ball", change), tmp_path / "out")
-    assert found.trouble
+    assert found.has_problems
     assert found.description.objects[0].conventions.best == name
     assert f"if the poses are {name}" in "\n".join(found.lines())
 
 
 def test_without_masks_it_says_that_nothing_was_checked(tmp_path):
     found = inspect(write(tmp_path / "ball", alpha=False), tmp_path / "out")
-    assert not found.trouble
+    assert not found.has_problems
     assert "conventions: not checked, the images have no masks" in found.lines()
 
 
@@ -80,7 +80,7 @@ def test_an_object_that_cannot_be_read_is_listed_and_the_rest_is_looked_at(tmp_p
     found = inspect(tmp_path / "set", tmp_path / "out")
     assert [one.name for one in found.description.objects] == ["b"]
     assert found.description.broken[0][0] == "a"
-    assert found.trouble
+    assert found.has_problems
     with pytest.raises(DataError):
         inspect(tmp_path / "nothing", tmp_path / "out")
 

@@ -32,7 +32,7 @@ def pretend(fresh):
                 name, works, 0.1, "fine" if works else "no library", "" if works else renderers._REMEDIES[name]
             )
 
-        fresh.setattr(renderers, "_try", attempt)
+        fresh.setattr(renderers, "_run_probe", attempt)
         return tried
 
     return arrange
