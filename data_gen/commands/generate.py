@@ -12,9 +12,9 @@ Example:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from data_gen import SUPERSAMPLE
 from hyperplanes.commands.console import Console
@@ -129,7 +129,8 @@ def run(arguments: Arguments) -> int:
     for line in renderer.advice:
         console.say(f"a faster one: {line}")
     names = {field.name for field in fields(GenerationConfig)} & {field.name for field in fields(Arguments)}
-    config = GenerationConfig(**{name: getattr(arguments, name) for name in names} | {"renderer": renderer.name})
+    given: dict[str, Any] = {name: getattr(arguments, name) for name in names}
+    config = replace(GenerationConfig(**given), renderer=renderer.name)
     with console.bar("rendering") as bar:
         report = generate(source, arguments.out, config, progress=bar.show)
     for name, reason in report.skipped:

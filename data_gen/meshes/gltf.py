@@ -1,23 +1,29 @@
-"""Checks a glTF or GLB file before it is loaded: whole, only of parts that are understood, and no larger than it is.
+"""Reads glTF and GLB files with trimesh, after checks: whole, without unsupported extensions, all its textures decoded.
 
-A loader that is handed an unknown compression fills in zeros, one that is handed a wrong count allocates it, and one
-that cannot decode a texture goes on without. Here the first two are refused and the third is named.
+trimesh alone ignores `extensionsRequired` (geometry compressed by Draco comes out as zeros), allocates whatever an
+accessor counts, and drops a texture that it cannot decode without a warning. Its public loader takes bytes only, so the
+JSON is parsed twice: here and there.
 """
 
 from __future__ import annotations
 
 import base64
 import binascii
+import io
 import json
 import struct
 import urllib.parse
 from typing import Any
 
+import numpy as np
+import trimesh
+
 from data_gen.meshes.files import MeshError
+from data_gen.meshes.materials import DEFAULT_COLOUR, ColourSpace
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.mtl import decode_text
 
-__all__ = ["check_gltf", "generator_of"]
+__all__ = ["read_gltf"]
 
 _REMEDY = {
     "KHR_draco_mesh_compression": "export it without Draco compression",
@@ -41,37 +47,47 @@ _FINE_EXTENSIONS = {
 _MODES = {0: "points", 1: "lines", 2: "lines", 3: "lines", 6: "triangle fans"}
 
 
-def check_gltf(data: bytes, folder: ModelFolder) -> tuple[list[str], set[str | None]]:
-    """Check a file, its buffers and its textures.
+def read_gltf(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
+    """Read a glTF or GLB file whose buffers and textures have been checked.
 
     Args:
-        data: the content of the file; GLB if it begins with `glTF`.
+        data: the content of the file; GLB if the file is called so.
         folder: gives the other files of the model.
 
     Returns:
-        Warnings that name what will not be drawn as the file says, and the names of materials whose base colour
-        texture is lost.
+        Its scene; what its plain colours are (trimesh writes factors as sRGB); and warnings that name what will not be
+        drawn as the file states.
 
     Raises:
         MeshError: if the file was cut, is malformed, or needs what is not supported.
     """
+    suffix = folder.path.suffix.lower()
     try:
-        header, chunk = _glb(data, folder) if folder.path.suffix.lower() == ".glb" else (_json(data, folder), None)
+        header, chunk = _glb(data, folder) if suffix == ".glb" else (_json(data, folder), None)
         if not isinstance(header, dict):
             raise MeshError(f"{folder.path}: expected a glTF object, found {type(header).__name__}; export it again")
-        return _check(header, chunk, folder)
+        warnings, untextured = _check(header, chunk, folder)
+        by_trimesh = "trimesh" in str(header.get("asset", {}).get("generator", "")).lower()
     except MeshError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise MeshError(
             f"{folder.path}: expected a valid glTF, found {type(error).__name__} at {error}; export it again"
         ) from error
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
+    for geometry in scene.geometry.values():
+        material = getattr(getattr(geometry, "visual", None), "material", None)
+        if material is not None and material.name in untextured:
+            _set_default_colour(material)
+    return scene, "scene" if by_trimesh else "gltf", warnings
 
 
-def generator_of(data: bytes) -> str:
-    """The program that wrote a checked glTF or GLB file, lower case; empty if the file does not say."""
-    text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data[:4] == b"glTF" else data
-    return str(json.loads(decode_text(text)).get("asset", {}).get("generator", "")).lower()
+def _set_default_colour(material: Any) -> None:
+    """Grey for a white material whose texture is lost: white would not be seen over white."""
+    factor = material.baseColorFactor
+    white = factor is None or (np.asarray(factor)[:3] == 255).all()
+    if white and getattr(material, "baseColorTexture", None) is None:
+        material.baseColorFactor = DEFAULT_COLOUR
 
 
 def _json(data: bytes, folder: ModelFolder) -> Any:

@@ -1,5 +1,7 @@
 """Reads the MTL files (materials and their textures) of an OBJ file.
 
+trimesh's reader drops opacity (`d`, `Tr`), emission, and textures behind options (`map_Kd -s 1 1 1 wood.png`).
+
 A texture takes the place of `Kd`, as in Blender and so in the pictures of ShapeNet: exporters write any Kd beside it.
 `d` is opacity; `Tr` is 1 - d where there is no d, but a lone `Tr 1` is what many programs write for opaque.
 """

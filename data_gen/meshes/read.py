@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import logging
 import warnings as python_warnings
 from collections.abc import Generator
 
-import numpy as np
 import trimesh
 
 from data_gen.meshes.files import MeshError
-from data_gen.meshes.formats import check_stl, read_dae, read_off, read_ply
-from data_gen.meshes.gltf import check_gltf, generator_of
-from data_gen.meshes.materials import DEFAULT_COLOUR, ColourSpace
+from data_gen.meshes.formats import read_dae, read_off, read_ply, read_stl
+from data_gen.meshes.gltf import read_gltf
+from data_gen.meshes.materials import ColourSpace
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.obj import read_obj
 
 __all__ = ["read_scene"]
+
+_READERS = {".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl, ".dae": read_dae}
 
 
 def read_scene(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
@@ -52,37 +52,10 @@ def read_scene(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourS
 
 
 def _read(data: bytes, suffix: str, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
-    if suffix == ".obj":
-        scene, lines = read_obj(data, folder)
-        return scene, "scene", lines
-    if suffix == ".off":
-        scene, lines = read_off(data, folder)
-        return scene, "scene", lines
-    if suffix == ".ply":
-        scene, lines = read_ply(data, folder)
-        return scene, "scene", lines
-    if suffix == ".dae":
-        scene, lines = read_dae(data, folder)
-        return scene, "srgb", lines
-    lines, without_texture = (check_stl(data, folder), set()) if suffix == ".stl" else check_gltf(data, folder)
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
-    _set_default_colour(scene, without_texture)
-    if suffix == ".stl":
-        for geometry in scene.geometry.values():
-            geometry.metadata["smooth"] = False
-    factors_are_srgb = suffix == ".stl" or "trimesh" in generator_of(data)
-    return scene, "scene" if factors_are_srgb else "gltf", lines
-
-
-def _set_default_colour(scene: trimesh.Scene, names: set[str | None]) -> None:
-    """Give white materials that lost their texture the default colour: white on white would be lost to the eye too."""
-    for geometry in scene.geometry.values():
-        material = getattr(getattr(geometry, "visual", None), "material", None)
-        if material is None or material.name not in names or getattr(material, "baseColorTexture", None) is not None:
-            continue
-        factor = material.baseColorFactor
-        if factor is None or (np.asarray(factor)[:3] == 255).all():
-            material.baseColorFactor = DEFAULT_COLOUR
+    if suffix in (".glb", ".gltf"):
+        return read_gltf(data, folder)
+    scene, lines = _READERS[suffix](data, folder)
+    return scene, "srgb" if suffix == ".dae" else "scene", lines
 
 
 @contextlib.contextmanager

@@ -18,75 +18,24 @@ __all__ = [
     "model_root",
     "paper_split",
     "read_split_file",
-    "synset_of_class",
 ]
 
-SYNSETS = {
-    "02691156": "plane",
-    "02747177": "trash_bin",
-    "02773838": "bag",
-    "02801938": "basket",
-    "02808440": "bathtub",
-    "02818832": "bed",
-    "02828884": "bench",
-    "02843684": "birdhouse",
-    "02871439": "bookshelf",
-    "02876657": "bottle",
-    "02880940": "bowl",
-    "02924116": "bus",
-    "02933112": "cabinet",
-    "02942699": "camera",
-    "02946921": "can",
-    "02954340": "cap",
-    "02958343": "car",
-    "02992529": "cellphone",
-    "03001627": "chair",
-    "03046257": "clock",
-    "03085013": "keyboard",
-    "03207941": "dishwasher",
-    "03211117": "display",
-    "03261776": "earphone",
-    "03325088": "faucet",
-    "03337140": "file_cabinet",
-    "03467517": "guitar",
-    "03513137": "helmet",
-    "03593526": "jar",
-    "03624134": "knife",
-    "03636649": "lamp",
-    "03642806": "laptop",
-    "03691459": "loudspeaker",
-    "03710193": "mailbox",
-    "03759954": "microphone",
-    "03761084": "microwave",
-    "03790512": "motorbike",
-    "03797390": "mug",
-    "03928116": "piano",
-    "03938244": "pillow",
-    "03948459": "pistol",
-    "03991062": "pot",
-    "04004475": "printer",
-    "04074963": "remote",
-    "04090263": "rifle",
-    "04099429": "rocket",
-    "04225987": "skateboard",
-    "04256520": "sofa",
-    "04330267": "stove",
-    "04379243": "table",
-    "04401088": "telephone",
-    "04460130": "tower",
-    "04468005": "train",
-    "04530566": "watercraft",
-    "04554684": "washer",
-}
+_TABLE = """
+    02691156 plane  02747177 trash_bin  02773838 bag  02801938 basket  02808440 bathtub  02818832 bed
+    02828884 bench  02843684 birdhouse  02871439 bookshelf  02876657 bottle  02880940 bowl  02924116 bus
+    02933112 cabinet  02942699 camera  02946921 can  02954340 cap  02958343 car  02992529 cellphone
+    03001627 chair  03046257 clock  03085013 keyboard  03207941 dishwasher  03211117 display
+    03261776 earphone  03325088 faucet  03337140 file_cabinet  03467517 guitar  03513137 helmet  03593526 jar
+    03624134 knife  03636649 lamp  03642806 laptop  03691459 loudspeaker  03710193 mailbox
+    03759954 microphone  03761084 microwave  03790512 motorbike  03797390 mug  03928116 piano  03938244 pillow
+    03948459 pistol  03991062 pot  04004475 printer  04074963 remote  04090263 rifle  04099429 rocket
+    04225987 skateboard  04256520 sofa  04330267 stove  04379243 table  04401088 telephone  04460130 tower
+    04468005 train  04530566 watercraft  04554684 washer
+"""
+
+SYNSETS: dict[str, str] = dict(zip(_TABLE.split()[::2], _TABLE.split()[1::2], strict=True))
 """The 55 classes of ShapeNetCore: synset number to a name without spaces."""
 
-_OTHER_NAMES = {
-    "airplane": "plane",
-    "aeroplane": "plane",
-    "vessel": "watercraft",
-    "boat": "watercraft",
-    "couch": "sofa",
-}
 _V1, _V2 = Path("model.obj"), Path("models/model_normalized.obj")
 _SPLITS = {"train": "train", "val": "val", "validation": "val", "test": "test"}
 _TRAIN_SHARE = 0.8
@@ -114,31 +63,6 @@ def class_of_synset(synset: str) -> str:
     'car'
     """
     return SYNSETS.get(synset.zfill(8), synset)
-
-
-def synset_of_class(name: str) -> str:
-    """Number of a class.
-
-    Args:
-        name: a class name (`car`, `airplane`) or a number (`02958343`).
-
-    Returns:
-        Its synset, 8 digits.
-
-    Raises:
-        ValueError: if ShapeNetCore has no such class.
-
-    >>> synset_of_class("airplane")
-    '02691156'
-    """
-    if name.zfill(8) in SYNSETS:
-        return name.zfill(8)
-    plain = name.strip().lower().replace(" ", "_")
-    plain = _OTHER_NAMES.get(plain, plain)
-    for synset, known in SYNSETS.items():
-        if known == plain:
-            return synset
-    raise ValueError(f"class: expected one of {', '.join(SYNSETS.values())} or a synset number, received {name!r}")
 
 
 def model_root(path: Path) -> Path:
