@@ -77,7 +77,7 @@ def stages(objects: int, out: Path) -> dict[str, float]:
     from data_gen import SUPERSAMPLE
     from data_gen.datasets.layouts import LAYOUTS, RenderedObject
     from data_gen.datasets.sources import Procedural, list_items
-    from data_gen.meshes.mesh import prepare_scene, render_ready
+    from data_gen.meshes.mesh import mesh_parts, prepare_scene
     from data_gen.rendering.mesh_renderer import MeshRenderer
     from data_gen.rendering.renderers import find_renderer
     from data_gen.rigs import fixed
@@ -95,7 +95,7 @@ def stages(objects: int, out: Path) -> dict[str, float]:
             marks = [time.process_time()]
             mesh = prepare_scene(make("car", int(item.seed or 0)), item.name, closed=True)
             marks.append(time.process_time())
-            parts = render_ready(mesh)
+            parts = mesh_parts(mesh)
             sparse.render(parts, rig)
             marks.append(time.process_time())
             rgba = renderer.render(parts, rig).rgba

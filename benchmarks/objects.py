@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from data_gen.meshes.mesh import prepare_scene, render_ready
+from data_gen.meshes.mesh import mesh_parts, prepare_scene
 from data_gen.rendering.mesh_renderer import MeshRenderer
 from data_gen.rigs import fixed
 from data_gen.shapes import make
@@ -23,7 +23,7 @@ def held_out(count: int, size: int, views: int = 50, device: torch.device | str 
     with MeshRenderer() as renderer:
         for seed in range(FIRST_SEED, FIRST_SEED + count):
             mesh = prepare_scene(make("car", seed), f"car-{seed}")
-            pixels = torch.tensor(renderer.render(render_ready(mesh), rig).rgba).permute(0, 3, 1, 2).float() / 255
+            pixels = torch.tensor(renderer.render(mesh_parts(mesh), rig).rgba).permute(0, 3, 1, 2).float() / 255
             masks = pixels[:, 3:]
             seen = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks).to(device)
             even = torch.arange(0, views, 2)

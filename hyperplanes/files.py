@@ -213,8 +213,8 @@ def encode_json(value: Any) -> bytes:
 def encode_png(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], *, small: bool = False) -> bytes:
     """PNG bytes of (height, width), (height, width, 3) or (height, width, 4) pixels; the same pixels, the same bytes.
 
-    Rows are not filtered: drawn pictures, most of them background, come out as small (6.3 kB for 6.6 at 128x128) in
-    less than half of the time that Pillow takes, which tries five filters on every row.
+    Rows are not filtered: drawn pictures, most of them background, take 6.8 kB and 0.27 ms at 128x128. Pillow, which
+    tries five filters on every row, takes 6.9 kB and 0.54 ms at its fastest level, 6.6 kB and 0.64 ms at this one.
 
     Args:
         pixels: the image; 16-bit only where it need not be small.

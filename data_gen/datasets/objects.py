@@ -39,7 +39,7 @@ def open_renderer(settings: dict[str, Any]) -> Generator[Callable[[dict[str, Any
 
 
 def _render(renderer: Any, item: Item, config: RenderConfig) -> RenderedObject:
-    from data_gen.meshes.mesh import load_mesh, prepare_scene, render_ready
+    from data_gen.meshes.mesh import load_mesh, mesh_parts, prepare_scene
 
     if item.path is not None:
         mesh = load_mesh(item.path, up=config.up, name=item.name)
@@ -50,7 +50,7 @@ def _render(renderer: Any, item: Item, config: RenderConfig) -> RenderedObject:
     rig = config.make_rig(item.name)
     channels = [channel for channel in config.channels if channel != "mesh"]
     rendering = renderer.render(
-        render_ready(mesh),
+        mesh_parts(mesh),
         rig,
         lighting=config.lighting,
         channels=channels,

@@ -1,35 +1,21 @@
 """The same work on a Ray cluster: one actor a renderer, an actor's death costs one item. Ray is optional.
 
 Every machine of the cluster needs this package and the folder of the data set (a shared file system). A cluster is
-found through RAY_ADDRESS; without it Ray starts on this machine alone, and ends with the work.
+found through RAY_ADDRESS; without it Ray starts on this machine alone, and ends with the work. Ray's ActorPool has no
+time limit an item and ends with the first actor that dies.
 """
 
 from __future__ import annotations
 
 import os
-import time
-from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
-from data_gen.datasets.worker_process import answer
-from data_gen.datasets.workers import ATTEMPTS, START_SECONDS, Outcome, WorkerError
+from data_gen.datasets.worker_process import process_item
+from data_gen.datasets.workers import START_SECONDS, Outcome, WorkerLost, run_workers, worker_environment
 
 __all__ = ["run_on_ray"]
-
-
-class _Renderer:
-    """What an actor holds: the opened target."""
-
-    def __init__(self, target: str, settings: dict[str, Any]) -> None:
-        module, _, function = target.partition(":")
-        self._context = getattr(import_module(module), function)(settings)
-        self._process = self._context.__enter__()
-
-    def answer(self, item: dict[str, Any]) -> dict[str, Any]:
-        return answer(self._process, item)
 
 
 def run_on_ray(
@@ -41,7 +27,7 @@ def run_on_ray(
     timeout: float = 300.0,
     recycle: int = 200,
 ) -> Generator[Outcome, None, None]:
-    """Do items in Ray actors, as they come; `data_gen.datasets.workers.run_isolated` with the cluster's processors.
+    """Process items in Ray actors: `data_gen.datasets.workers.run_isolated` with the cluster's processors.
 
     Args:
         target: "module:function", importable on every machine.
@@ -52,8 +38,7 @@ def run_on_ray(
         recycle: items after which an actor is replaced by a new one.
 
     Yields:
-        One outcome an item, in the order in which they end. WorkerError comes out of it when an actor reports that
-        nothing can be done.
+        What `run_workers` yields.
 
     Raises:
         ValueError: ray is not installed.
@@ -64,80 +49,55 @@ def run_on_ray(
         raise ValueError("engine: expected ray to be installed, found no such module; pip install ray") from error
     started = not ray.is_initialized()
     if started:
-        _start(ray, workers)
+        options: dict[str, Any] = {"log_to_driver": False, "runtime_env": {"env_vars": worker_environment()}}
+        if "RAY_ADDRESS" not in os.environ:
+            options |= {"include_dashboard": False, "num_cpus": workers or len(os.sched_getaffinity(0))}
+        ray.init(**options)
     try:
         count = workers or int(ray.cluster_resources().get("CPU", 1))
-        yield from _run(ray, target, settings, iter(items), count, timeout, recycle)
+        yield from run_workers(lambda: _RayWorker(ray, target, settings, timeout), items, count, recycle)
     finally:
         if started:
             ray.shutdown()
 
 
-def _start(ray: Any, workers: int | None) -> None:
-    root = str(Path(__file__).resolve().parents[2])
-    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {"PYTHONPATH": path, "LP_NUM_THREADS": "0", "OMP_NUM_THREADS": "1"}
-    options: dict[str, Any] = {"log_to_driver": False, "runtime_env": {"env_vars": environment}}
-    if "RAY_ADDRESS" not in os.environ:
-        options |= {"include_dashboard": False, "num_cpus": workers or len(os.sched_getaffinity(0))}
-    ray.init(**options)
+class _Actor:
+    """What an actor holds: the opened target."""
+
+    def __init__(self, target: str, settings: dict[str, Any]) -> None:
+        module, _, function = target.partition(":")
+        self._context = getattr(import_module(module), function)(settings)
+        self._process = self._context.__enter__()
+
+    def answer(self, item: dict[str, Any]) -> dict[str, Any]:
+        return process_item(self._process, item)
 
 
-def _run(
-    ray: Any,
-    target: str,
-    settings: dict[str, Any],
-    pending: Iterator[dict[str, Any]],
-    count: int,
-    timeout: float,
-    recycle: int,
-) -> Generator[Outcome, None, None]:
-    make = ray.remote(num_cpus=1, max_restarts=0)(_Renderer)
-    idle: list[tuple[Any, int]] = []  # actors, and how many items each may still do
-    again: deque[tuple[dict[str, Any], int]] = deque()
-    running: dict[Any, tuple[Any, int, dict[str, Any], int, float]] = {}
-    while True:
-        while len(running) < count:
-            entry = again.popleft() if again else next(((item, 1) for item in pending), None)
-            if entry is None:
-                break
-            fresh = not idle
-            actor, left = (make.remote(target, settings), recycle) if fresh else idle.pop()
-            deadline = time.monotonic() + timeout + (START_SECONDS if fresh else 0.0)
-            running[actor.answer.remote(entry[0])] = (actor, left - 1, *entry, deadline)
-        if not running:
-            return
-        soonest = min(state[-1] for state in running.values()) - time.monotonic()
-        ready, _ = ray.wait(list(running), num_returns=1, timeout=max(0.0, soonest))
-        late = [future for future, state in running.items() if state[-1] <= time.monotonic() and future not in ready]
-        for future in [*ready, *late]:
-            actor, left, item, attempt, _ = running.pop(future)
-            reply: dict[str, Any] = (
-                {"lost": f"no answer within {timeout:g} s"} if future in late else _reply(ray, future)
-            )
-            if "fatal" in reply:
-                raise WorkerError(reply["fatal"])
-            if "lost" not in reply:
-                if left > 0:
-                    idle.append((actor, left))
-                result, reason = reply.get("ok"), reply.get("skip")
-                yield Outcome(item, result, reason)
-                continue
-            ray.kill(actor)
-            if attempt < ATTEMPTS:
-                again.append((item, attempt + 1))
-            else:
-                yield Outcome(item, None, f"failed {attempt} times: {reply['lost']}")
+class _RayWorker:
+    """An actor that is sent one item at a time."""
 
+    def __init__(self, ray: Any, target: str, settings: dict[str, Any], timeout: float) -> None:
+        self._ray, self._timeout, self._left_to_start = ray, timeout, START_SECONDS
+        self._actor = ray.remote(num_cpus=1, max_restarts=0)(_Actor).remote(target, settings)
 
-def _reply(ray: Any, future: Any) -> dict[str, Any]:
-    """An actor's answer; one that died in its first breath reports why, for no item can be done then."""
-    try:
-        return ray.get(future)
-    except ray.exceptions.ActorDiedError as error:
-        cause = getattr(error, "cause", None) or getattr(error, "error_msg", "")
-        if "creation task" in str(error) and "Error" in str(error):
-            return {"fatal": " ".join(str(cause or error).split())[-300:]}
-        return {"lost": "its actor died"}
-    except ray.exceptions.RayError as error:
-        return {"lost": f"{type(error).__name__}"}
+    def process(self, item: dict[str, Any]) -> dict[str, Any]:
+        errors = self._ray.exceptions
+        try:
+            reply = self._ray.get(self._actor.answer.remote(item), timeout=self._timeout + self._left_to_start)
+        except errors.GetTimeoutError as error:
+            raise WorkerLost(f"no answer within {self._timeout:g} s") from error
+        except errors.ActorDiedError as error:
+            if "creation task" in str(error) and "Error" in str(error):  # it could not start, so no item can be done
+                cause = getattr(error, "cause", None) or getattr(error, "error_msg", "")
+                return {"fatal": " ".join(str(cause or error).split())[-300:]}
+            raise WorkerLost("its actor died") from error
+        except errors.RayError as error:
+            raise WorkerLost(type(error).__name__) from error
+        self._left_to_start = 0.0
+        return reply
+
+    def kill(self) -> None:
+        self._ray.kill(self._actor)
+
+    def stop(self) -> None:
+        self._ray.kill(self._actor)

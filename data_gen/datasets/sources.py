@@ -118,7 +118,7 @@ def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
 
 
 def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
-    from data_gen.meshes.mesh import find_meshes
+    from data_gen.meshes.find import find_meshes
 
     if source.up not in ("y", "z"):
         raise ValueError(f"up: expected y or z, got {source.up!r}")

@@ -16,7 +16,7 @@ from typing import Any
 
 from hyperplanes.files import DataError
 
-__all__ = ["answer", "main"]
+__all__ = ["main", "process_item"]
 
 
 def main() -> int:
@@ -29,7 +29,7 @@ def main() -> int:
         with getattr(import_module(module), function)(settings) as process:
             answers.write(json.dumps({"ready": True}) + "\n")
             for line in iter(sys.stdin.readline, ""):
-                answers.write(json.dumps(answer(process, json.loads(line))) + "\n")
+                answers.write(json.dumps(process_item(process, json.loads(line))) + "\n")
     except BrokenPipeError:
         return 1
     except Exception as error:  # the renderer cannot be made: no item can be done
@@ -38,11 +38,11 @@ def main() -> int:
     return 0
 
 
-def answer(process: Callable[[Any], dict[str, Any]], item: Any) -> dict[str, Any]:
-    """Do one item, and say how it went.
+def process_item(process: Callable[[Any], dict[str, Any]], item: Any) -> dict[str, Any]:
+    """Process one item, and catch what it raises.
 
     Args:
-        process: what does it.
+        process: the function of an item.
         item: the item.
 
     Returns:

@@ -2,39 +2,46 @@
 
 Workers are started as commands (`python -m data_gen.datasets.worker_process`), not forked and not spawned by
 multiprocessing: OpenGL does not survive a fork, and a script that calls us needs no `if __name__ == "__main__"`.
+concurrent.futures would also lose the other items with a process that crashes, and has no time limit an item.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import selectors
+import select
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from queue import SimpleQueue
+from typing import IO, Any, Protocol
 
-__all__ = ["Outcome", "WorkerError", "run_isolated"]
+__all__ = ["Outcome", "Worker", "WorkerError", "WorkerLost", "run_isolated", "run_workers", "worker_environment"]
 
 ATTEMPTS = 2
 """How often an item is tried whose worker crashes or hangs."""
 
 START_SECONDS = 120.0
+"""Time that a worker has to start, above that of its first item."""
 
 
 class WorkerError(RuntimeError):
     """No item can be processed: the workers do not start, or report an error that no item has caused."""
 
 
+class WorkerLost(Exception):
+    """A worker crashed, or was too slow; the message says which."""
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """What became of an item.
+    """The outcome of an item.
 
     Attributes:
         item: the item.
@@ -47,6 +54,29 @@ class Outcome:
     reason: str | None
 
 
+class Worker(Protocol):
+    """Processes one item after the other."""
+
+    def process(self, item: dict[str, Any]) -> dict[str, Any]:
+        """The answer of `worker_process.process_item`; WorkerLost when there is none."""
+        ...
+
+    def kill(self) -> None:
+        """End it at once; called from any thread, so that `process` raises WorkerLost."""
+        ...
+
+    def stop(self) -> None:
+        """End it after its last item, and free what it holds."""
+        ...
+
+
+def worker_environment() -> dict[str, str]:
+    """Environment variables of a worker: it imports this package from here, and uses one core."""
+    root = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {"PYTHONPATH": path, "LP_NUM_THREADS": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
 def run_isolated(
     target: str,
     settings: dict[str, Any],
@@ -56,7 +86,7 @@ def run_isolated(
     timeout: float = 300.0,
     recycle: int = 200,
 ) -> Generator[Outcome, None, None]:
-    """Do items in worker processes, as they come.
+    """Process items in worker processes of this machine.
 
     Args:
         target: "module:function"; called with the settings, it gives a context manager around a function of an item.
@@ -67,153 +97,174 @@ def run_isolated(
         recycle: items after which a worker is replaced by a new one.
 
     Yields:
+        What `run_workers` yields.
+    """
+    yield from run_workers(lambda: _ProcessWorker(target, settings, timeout), items, workers, recycle)
+
+
+def run_workers(
+    make_worker: Callable[[], Worker], items: Iterable[dict[str, Any]], count: int, recycle: int
+) -> Generator[Outcome, None, None]:
+    """Process items in workers, each driven by a thread, whose errors are raised here.
+
+    Args:
+        make_worker: makes a worker.
+        items: taken one by one, when a worker is free.
+        count: how many workers.
+        recycle: items after which a worker is replaced by a new one.
+
+    Yields:
         One outcome an item, in the order in which they end. Leaving the loop kills the workers. WorkerError comes
         out of it when a worker reports that nothing can be done.
 
     Raises:
         ValueError: fewer than one worker.
     """
-    if workers < 1:
-        raise ValueError(f"workers: expected at least 1, got {workers}")
-    pool: list[_Worker] = []
-    pending, again = iter(items), deque[tuple[dict[str, Any], int]]()
-    selector = selectors.DefaultSelector()
-    try:
-        while True:
-            while len(pool) < workers:
-                entry = again.popleft() if again else _first(pending)
-                if entry is None:
+    if count < 1:
+        raise ValueError(f"workers: expected at least 1, got {count}")
+    pending, lock, stopping = iter(items), threading.Lock(), threading.Event()
+    free = threading.Semaphore(count)  # an item is taken only when the outcome of an earlier one has been handled
+    ended: SimpleQueue[Outcome | Exception | None] = SimpleQueue()
+    alive: set[Worker] = set()
+
+    def open_worker() -> Worker:
+        with lock:
+            if stopping.is_set():
+                raise WorkerLost("stopped")
+            worker = make_worker()
+            alive.add(worker)
+            return worker
+
+    def close_worker(worker: Worker, *, kill: bool) -> None:
+        if kill:
+            worker.kill()
+        worker.stop()
+        with lock:
+            alive.discard(worker)
+
+    def serve() -> None:
+        worker, left = None, 0
+        try:
+            while free.acquire() and not stopping.is_set():
+                with lock:
+                    item = next(pending, None)
+                if item is None:
                     break
-                worker = _Worker(target, settings, timeout, recycle)
-                selector.register(worker.answers, selectors.EVENT_READ, worker)
-                pool.append(worker)
-                worker.give(*entry)
-            if not pool:
-                return
-            soonest = min(worker.deadline for worker in pool) - time.monotonic()
-            ready = {key.data for key, _ in selector.select(max(0.0, soonest))}
-            for worker in list(pool):
-                outcome, alive = worker.collect() if worker in ready else worker.check()
-                if outcome is not None and outcome.result is None and not alive and worker.attempt < ATTEMPTS:
-                    again.append((outcome.item, worker.attempt + 1))
-                elif outcome is not None:
-                    yield outcome
-                if outcome is None and alive:
-                    continue
-                entry = None
-                if alive and not worker.spent:
-                    entry = again.popleft() if again else _first(pending)
-                if entry is not None:
-                    worker.give(*entry)
-                else:
-                    selector.unregister(worker.answers)
-                    worker.stop(kill=not alive)
-                    pool.remove(worker)
+                answer: dict[str, Any] = {}
+                for attempt in range(1, ATTEMPTS + 1):
+                    if worker is None:
+                        worker, left = open_worker(), recycle
+                    try:
+                        answer = worker.process(item)
+                        break
+                    except WorkerLost as error:
+                        close_worker(worker, kill=True)
+                        worker, answer = None, {"skip": f"failed {attempt} times: {error}"}
+                if "fatal" in answer:
+                    raise WorkerError(answer["fatal"])
+                left -= 1
+                if worker is not None and left <= 0:
+                    close_worker(worker, kill=False)
+                    worker = None
+                ended.put(Outcome(item, answer.get("ok"), answer.get("skip")))
+        except Exception as error:
+            ended.put(error)
+        finally:
+            free.release()  # for the other threads, which have to see the end of the items, too
+            if worker is not None:
+                close_worker(worker, kill=stopping.is_set())
+            ended.put(None)
+
+    threads = [threading.Thread(target=serve, daemon=True) for _ in range(count)]
+    try:
+        for thread in threads:
+            thread.start()
+        running = count
+        while running:
+            outcome = ended.get()
+            if outcome is None:
+                running -= 1
+            elif isinstance(outcome, Exception):
+                raise outcome
+            else:
+                yield outcome
+                free.release()
     finally:
-        for worker in pool:
-            worker.stop(kill=True)
-        selector.close()
+        stopping.set()
+        with lock:
+            for worker in alive:
+                worker.kill()
+        free.release(count)
+        for thread in threads:
+            thread.join()
 
 
-def _first(pending: Iterator[dict[str, Any]]) -> tuple[dict[str, Any], int] | None:
-    item = next(pending, None)
-    return None if item is None else (item, 1)
+class _ProcessWorker:
+    """A process that is sent one item at a time."""
 
-
-class _Worker:
-    """One process, at work on one item at a time."""
-
-    def __init__(self, target: str, settings: dict[str, Any], timeout: float, recycle: int) -> None:
-        self.log: IO[bytes] = tempfile.TemporaryFile()
-        self.timeout, self.left = timeout, recycle
-        self.started = False
-        self.item: dict[str, Any] = {}
-        self.attempt = 0
-        root = str(Path(__file__).resolve().parents[2])
-        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        threads = {"LP_NUM_THREADS": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        self.process = subprocess.Popen(
+    def __init__(self, target: str, settings: dict[str, Any], timeout: float) -> None:
+        self._log: IO[bytes] = tempfile.TemporaryFile()
+        self._timeout, self._started, self._buffer = timeout, False, b""
+        self._process = subprocess.Popen(
             [sys.executable, "-m", "data_gen.datasets.worker_process", target],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=self.log,
-            env={**os.environ, **threads, "PYTHONPATH": path},
+            stderr=self._log,
+            env={**os.environ, **worker_environment()},
             start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends its workers
         )
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.items, self.answers = self.process.stdin, self.process.stdout
-        self.buffer = b""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._items, self._answers = self._process.stdin, self._process.stdout
         self._send(settings)
 
-    @property
-    def spent(self) -> bool:
-        return self.left <= 0
-
-    def give(self, item: dict[str, Any], attempt: int) -> None:
-        self.item, self.attempt = item, attempt
-        self.left -= 1
-        self.deadline = time.monotonic() + self.timeout + (0.0 if self.started else START_SECONDS)
+    def process(self, item: dict[str, Any]) -> dict[str, Any]:
         self._send(item)
-
-    def collect(self) -> tuple[Outcome | None, bool]:
-        """Read what has come; an outcome when the item is through, and whether the process can go on."""
-        data = os.read(self.answers.fileno(), 1 << 20)
-        if not data:
-            return self._failed(f"its worker {self._end()}")
-        self.buffer += data
-        while b"\n" in self.buffer:
-            line, _, self.buffer = self.buffer.partition(b"\n")
+        deadline = time.monotonic() + self._timeout + (0.0 if self._started else START_SECONDS)
+        while True:
+            while b"\n" not in self._buffer:
+                if not select.select([self._answers], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                    raise WorkerLost(f"no answer within {self._timeout:g} s")
+                data = os.read(self._answers.fileno(), 1 << 20)
+                if not data:
+                    raise WorkerLost(f"its worker {self._end()}")
+                self._buffer += data
+            line, _, self._buffer = self._buffer.partition(b"\n")
             answer = json.loads(line)
-            if "fatal" in answer:
-                raise WorkerError(answer["fatal"])
-            if "ready" in answer:
-                self.started = True
-                self.deadline = time.monotonic() + self.timeout
-                continue
-            return Outcome(self.item, answer.get("ok"), answer.get("skip")), True
-        return None, True
+            if "ready" not in answer:
+                return answer
+            self._started, deadline = True, time.monotonic() + self._timeout
 
-    def check(self) -> tuple[Outcome | None, bool]:
-        """Nothing has come: has it taken too long?"""
-        if time.monotonic() < self.deadline:
-            return None, True
-        return self._failed(f"no answer within {self.timeout:g} s")
+    def kill(self) -> None:
+        self._process.kill()
 
-    def stop(self, kill: bool) -> None:
-        """End the process: by the end of its input, or at once."""
-        if kill:
-            self.process.kill()
-        for pipe in (self.items, self.answers):
+    def stop(self) -> None:
+        for pipe in (self._items, self._answers):
             try:
                 pipe.close()
             except BrokenPipeError:
                 pass
         try:
-            self.process.wait(timeout=10)
+            self._process.wait(timeout=10)
         except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        self.log.close()
-
-    def _failed(self, reason: str) -> tuple[Outcome, bool]:
-        self.process.kill()
-        return Outcome(self.item, None, f"failed {self.attempt} times: {reason}"), False
+            self._process.kill()
+            self._process.wait()
+        self._log.close()
 
     def _end(self) -> str:
         try:
-            code = self.process.wait(timeout=10)
+            code = self._process.wait(timeout=10)
         except subprocess.TimeoutExpired:
             return "closed its output"
         if code < 0:
             return f"was ended by {signal.Signals(-code).name}"
-        self.log.seek(0)
-        lines = self.log.read()[-2000:].decode(errors="replace").strip().splitlines()
+        self._log.seek(0)
+        lines = self._log.read()[-2000:].decode(errors="replace").strip().splitlines()
         return f"ended with exit code {code}{': ' + lines[-1] if lines else ''}"
 
     def _send(self, value: dict[str, Any]) -> None:
         try:
-            self.items.write(json.dumps(value).encode() + b"\n")
-            self.items.flush()
+            self._items.write(json.dumps(value).encode() + b"\n")
+            self._items.flush()
         except BrokenPipeError:  # it has ended already, which shows when its answer is read
             pass

@@ -11,7 +11,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 
 from data_gen.meshes.materials import visual_of
 
-__all__ = ["CREASE", "clean", "decimate", "shades_smoothly"]
+__all__ = ["CREASE", "clean", "decimate", "is_smooth"]
 
 CREASE = 40.0
 """Angle between two faces, in degrees, from which an edge counts as sharp where a file has no normals."""
@@ -61,7 +61,7 @@ def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, li
     return _part(mesh, used, kept, corners.reshape(-1, 3), normals), warnings
 
 
-def shades_smoothly(mesh: trimesh.Trimesh) -> bool:
+def is_smooth(mesh: trimesh.Trimesh) -> bool:
     """Whether a mesh looks as meant with interpolated normals.
 
     A mesh with normals of its own does; one with face colours cannot. Otherwise the file decides (an OBJ's
@@ -111,7 +111,7 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
             nearest = KDTree(np.asarray(part.vertices)).query(points)[1]
             visual = ColorVisuals(vertex_colors=np.asarray(visual.vertex_colors)[nearest])
         small = trimesh.Trimesh(points, faces, visual=visual, process=False)
-        small.metadata["smooth"] = shades_smoothly(part)
+        small.metadata["smooth"] = is_smooth(part)
         result.append(small)
     return result if sum(len(part.faces) for part in result) <= max_faces else None
 

@@ -121,7 +121,7 @@ def _textured(
     if data["alphaMode"] == "OPAQUE":
         data["baseColorFactor"][3] = 1.0
         if "baseColorTexture" in data:
-            data["baseColorTexture"] = _shared(data["baseColorTexture"], "RGB", images)
+            data["baseColorTexture"] = _converted(data["baseColorTexture"], "RGB", images)
     return TextureVisuals(uv=coordinates, material=PBRMaterial(**data)), warnings, _visible(data)
 
 
@@ -172,17 +172,17 @@ def _pbr_values(material: PBRMaterial, images: dict[Any, Any]) -> dict[str, Any]
         "alphaMode": material.alphaMode if material.alphaMode in ("MASK", "BLEND") else "OPAQUE",
         "alphaCutoff": min(max(cutoff, 0.0), 1.0),
         "baseColorFactor": np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64) / 255.0,
-        "baseColorTexture": _shared(material.baseColorTexture, "RGBA", images),
+        "baseColorTexture": _converted(material.baseColorTexture, "RGBA", images),
         "metallicFactor": material.metallicFactor,
         "roughnessFactor": material.roughnessFactor,
-        **{slot: _shared(getattr(material, slot), "RGB", images) for slot in _MAP_SLOTS},
+        **{slot: _converted(getattr(material, slot), "RGB", images) for slot in _MAP_SLOTS},
         "emissiveFactor": None if emissive is None else np.asarray(emissive, dtype=np.float64)[:3],
         "doubleSided": bool(material.doubleSided),
     }
 
 
 def _mtl_values(material: SimpleMaterial, images: dict[Any, Any]) -> dict[str, Any]:
-    image = _shared(material.image, "RGBA", images)
+    image = _converted(material.image, "RGBA", images)
     factor = convert_8bit(np.asarray(material.diffuse, dtype=np.uint8), linear_from_srgb) / 255.0
     if image is not None:
         factor[:3] = 1.0
@@ -197,17 +197,17 @@ def _mtl_values(material: SimpleMaterial, images: dict[Any, Any]) -> dict[str, A
     }
 
 
-def _shared(image: PIL.Image.Image | None, mode: str, images: dict[Any, Any]) -> PIL.Image.Image | None:
+def _converted(image: PIL.Image.Image | None, mode: str, images: dict[Any, Any]) -> PIL.Image.Image | None:
     """An image of 8 bits a channel: RGB, or RGBA where alpha is wanted and there is some."""
     if image is None:
         return None
     key = (id(image), mode)
     if key not in images:
-        images[key] = (_plain(image, mode), image)  # the source too: its id must not be given to another
+        images[key] = (_convert(image, mode), image)  # the source too: its id must not be given to another
     return images[key][0]
 
 
-def _plain(image: PIL.Image.Image, mode: str) -> PIL.Image.Image | None:
+def _convert(image: PIL.Image.Image, mode: str) -> PIL.Image.Image | None:
     """The image converted; None for one that cannot be decoded, of which the reader of the file has warned."""
     if image.format not in (None, *IMAGE_FORMATS):
         return None

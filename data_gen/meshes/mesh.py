@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from data_gen.meshes.clean import clean, decimate, shades_smoothly
+from data_gen.meshes.clean import clean, decimate, is_smooth
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, read_bytes
-from data_gen.meshes.find import MeshFile, find_meshes, safe_name
+from data_gen.meshes.find import safe_name
 from data_gen.meshes.formats import declared_up
 from data_gen.meshes.materials import ColourSpace, canonical_visual
 from data_gen.meshes.model_folder import ModelFolder
@@ -28,11 +28,9 @@ __all__ = [
     "MAX_FACES",
     "Mesh",
     "MeshError",
-    "MeshFile",
-    "find_meshes",
     "load_mesh",
     "prepare_scene",
-    "render_ready",
+    "mesh_parts",
 ]
 
 MAX_FACES = 2_000_000
@@ -155,7 +153,7 @@ def prepare_scene(
     found = list(warnings)
     _refuse_too_many(scene, max_faces, source)
     with np.errstate(all="ignore"):
-        parts = _parts(scene, colours, found, source)
+        parts = _clean_parts(scene, colours, found, source)
     if not parts:
         raise MeshError(f"{source}: expected triangles to draw, found none; {'; '.join(found) or 'export it again'}")
     faces = sum(len(part.faces) for part in parts)
@@ -168,12 +166,12 @@ def prepare_scene(
             )
         parts, closed = smaller, False
         found.append(f"decimated from {faces} to {sum(len(part.faces) for part in parts)} triangles")
-    world_from_file = _normalising(parts, up, fit, source, found)
+    world_from_file = _normalising_transform(parts, up, fit, source, found)
     ready = trimesh.Scene()
     for number, part in enumerate(parts):
         key = f"part_{number:04d}"
-        smooth = shades_smoothly(part)
-        moved = _moved(part, world_from_file)
+        smooth = is_smooth(part)
+        moved = _transformed(part, world_from_file)
         moved.metadata = {"smooth": smooth, "closed": closed}
         ready.add_geometry(moved, geom_name=key, node_name=key)
     return Mesh(
@@ -185,8 +183,8 @@ def prepare_scene(
     )
 
 
-def render_ready(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]]:
-    """List what to hand to a renderer.
+def mesh_parts(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]]:
+    """The parts of a mesh as `MeshRenderer.render` takes them.
 
     Args:
         mesh: the mesh.
@@ -214,7 +212,7 @@ def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:
         )
 
 
-def _parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], source: str) -> list[trimesh.Trimesh]:
+def _clean_parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], source: str) -> list[trimesh.Trimesh]:
     """Clean meshes in the file's axes, one a node that can be seen."""
     parts = []
     images: dict[Any, Any] = {}
@@ -236,7 +234,7 @@ def _parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], source:
             found.append(f"{key}: fully transparent, left out")
             continue
         try:
-            part, lines = clean(_moved(geometry, transform, visual), str(key))
+            part, lines = clean(_transformed(geometry, transform, visual), str(key))
         except ValueError as error:
             raise MeshError(f"{source}: {error}; the file is damaged") from error
         found += lines
@@ -245,7 +243,7 @@ def _parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], source:
     return parts
 
 
-def _moved(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visual: Any = None) -> trimesh.Trimesh:
+def _transformed(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visual: Any = None) -> trimesh.Trimesh:
     """A copy in the coordinates that the transform leads to; a mirroring one also turns the faces around."""
     linear = transform[:3, :3]
     vertices = np.asarray(mesh.vertices, dtype=np.float64) @ linear.T + transform[:3, 3]
@@ -260,7 +258,7 @@ def _moved(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visual: An
     return result
 
 
-def _normalising(
+def _normalising_transform(
     parts: list[trimesh.Trimesh], up: str, fit: str, source: str, found: list[str]
 ) -> npt.NDArray[np.float64]:
     turn = _Y_FROM_Z if up == "z" else np.eye(4)

@@ -81,7 +81,7 @@ class EmbreeRenderer:
                 samples = scene.trace(pose, intrinsics, columns, rows, lighting, supersample)
                 blocks = samples.reshape(bottom - top, supersample, right - left, supersample, 4)
                 picture[top:bottom, left:right] = 255.0 * blocks.mean(axis=(1, 3))
-            yield _straight(picture)
+            yield _unpremultiplied(picture)
 
 
 def cast_geometry(surfaces: Sequence[ShadedSurface], rig: Rig) -> Iterator[Geometry]:
@@ -185,7 +185,7 @@ class _Scene:
         for surface, number, selected in self._by_surface(hits):
             colour = np.broadcast_to(surface.base_colour, (len(selected), 4)).copy()
             if surface.colours is not None:
-                colour *= _mixed(surface.colours, surface.faces[number], hits.corners[selected])
+                colour *= _interpolate(surface.colours, surface.faces[number], hits.corners[selected])
             if surface.texture is not None:
                 texel = self._texel(surface, surface.texture, hits, selected, number, spread)
                 colour[:, :3] *= linear_from_srgb(np.minimum(texel[:, :3] / np.maximum(texel[:, 3:], 1e-4), 1.0))
@@ -218,7 +218,7 @@ class _Scene:
     def _interpolated(self, hits: Hits, field: str, width: int) -> Floats:
         values = np.empty((len(hits.rays), width))
         for surface, number, selected in self._by_surface(hits):
-            values[selected] = _mixed(getattr(surface, field), surface.faces[number], hits.corners[selected])
+            values[selected] = _interpolate(getattr(surface, field), surface.faces[number], hits.corners[selected])
         return values
 
     def _texel(
@@ -257,13 +257,13 @@ class _Scene:
         return self._textures[id(texels)]
 
 
-def _straight(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+def _unpremultiplied(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
     """Straight uint8 of premultiplied RGBA, both from 0 to 255."""
     alpha = picture[..., 3:]
     colour = np.divide(picture[..., :3] * 255.0, alpha, out=np.zeros_like(picture[..., :3]), where=alpha > 0)
     return np.clip(np.rint(np.concatenate((colour, alpha), axis=-1)), 0, 255).astype(np.uint8)
 
 
-def _mixed(values: Floats, faces: npt.NDArray[np.int64], corners: Floats) -> Floats:
+def _interpolate(values: Floats, faces: npt.NDArray[np.int64], corners: Floats) -> Floats:
     """Vertex values interpolated by barycentric weights: (vertex, value), (hit, 3), (hit, 3) -> (hit, value)."""
     return np.einsum("hc,hcx->hx", corners, values[faces])

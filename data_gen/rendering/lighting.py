@@ -111,7 +111,7 @@ def resolve_lighting(lighting: str | Lighting, *, seed: int = 0) -> Lighting:
     raise ValueError(f"lighting: expected one of {', '.join(LIGHTING_PRESETS)} or a Lighting, received {lighting!r}")
 
 
-def _towards(azimuth: float, elevation: float) -> Vector:
+def _direction(azimuth: float, elevation: float) -> Vector:
     """Unit vector at angles in degrees; azimuth starts at +z and turns towards +x."""
     across = math.cos(math.radians(elevation))
     return (
@@ -133,7 +133,7 @@ def _random(seed: int) -> Lighting:
     for strength in (0.5, 0.22, 0.12):
         azimuth, height = generator.uniform(0.0, 360.0), generator.uniform(0.1, 0.95)
         brightness, warmth = strength * generator.uniform(0.75, 1.15), generator.uniform(-0.08, 0.08)
-        lights.append(Light(_towards(azimuth, math.degrees(math.asin(height))), _grey(brightness, warmth)))
+        lights.append(Light(_direction(azimuth, math.degrees(math.asin(height))), _grey(brightness, warmth)))
     ambient = generator.uniform(0.25, 0.36)
     return Lighting(tuple(lights), sky=_grey(ambient), ground=_grey(ambient * generator.uniform(0.6, 0.9)))
 
@@ -142,9 +142,9 @@ def _random(seed: int) -> Lighting:
 # floor 0.91 and a ceiling 0.27: every side differs from its neighbour, none is black.
 _STUDIO = Lighting(
     lights=(
-        Light(_towards(35.0, 45.0), _grey(0.54)),
-        Light(_towards(-75.0, 20.0), _grey(0.18)),
-        Light(_towards(165.0, 30.0), _grey(0.13)),
+        Light(_direction(35.0, 45.0), _grey(0.54)),
+        Light(_direction(-75.0, 20.0), _grey(0.18)),
+        Light(_direction(165.0, 30.0), _grey(0.13)),
     ),
     sky=_grey(0.40),
     ground=_grey(0.27),

@@ -15,10 +15,10 @@ from data_gen.rendering.mesh_renderer import MeshRenderer
 from data_gen.rendering.renderers import RendererError
 from data_gen.rigs import Rig, look_at_origin
 
-__all__ = ["draw_trial_picture"]
+__all__ = ["draw_test_image"]
 
 
-def draw_trial_picture(name: str) -> str:
+def draw_test_image(name: str) -> str:
     """Draw half a picture full of red triangle and check it.
 
     Args:
@@ -49,4 +49,4 @@ def draw_trial_picture(name: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(draw_trial_picture(sys.argv[1]) + "\n")
+    sys.stdout.write(draw_test_image(sys.argv[1]) + "\n")

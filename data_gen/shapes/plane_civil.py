@@ -7,7 +7,7 @@ import numpy as np
 from data_gen.shapes.materials import Material, plain, shade
 from data_gen.shapes.parts import Part
 from data_gen.shapes.plane_livery import draw_livery, fuselage_side, tail_sign, wing_skin
-from data_gen.shapes.plane_parts import airscrew, fin, fuselage, jet_engine, pair, pylon, undercarriage, wing
+from data_gen.shapes.plane_parts import fin, fuselage, jet_engine, pair, propeller, pylon, undercarriage, wing
 from data_gen.shapes.primitives import ball, rod
 
 __all__ = ["airliner", "tail", "turboprop"]
@@ -142,7 +142,7 @@ def turboprop(rng: np.random.Generator) -> list[Part]:
             12,
         )
         parts += pair([Part.of(f"left_nacelle_{k}", pod.moved(at[0], at[1], at[2] - 1.2 * size), plain(livery.accent))])
-        screw = airscrew(
+        screw = propeller(
             f"left_propeller_{k}", 3.1 * size, blades, (x, at[1], at[2] + 3.45 * size), rng.uniform(0, 90), livery.metal
         )
         parts += pair(screw)

@@ -15,7 +15,7 @@ from data_gen.shapes.primitives import ball, cylinder, rod
 from data_gen.shapes.profiles import airfoil, rectangle, superellipse
 from data_gen.shapes.solids import Solid, lathe, loft
 
-__all__ = ["airscrew", "fin", "fuselage", "jet_engine", "pair", "pylon", "undercarriage", "wing"]
+__all__ = ["propeller", "fin", "fuselage", "jet_engine", "pair", "pylon", "undercarriage", "wing"]
 
 _BLACK = plain((36, 36, 40), "black")
 
@@ -119,7 +119,7 @@ def jet_engine(name: str, radius: float, length: float, at: tuple[float, float, 
     return [Part.of(part, solid.turned("x", 90).moved(*at), material) for part, solid, material in parts]
 
 
-def airscrew(
+def propeller(
     name: str, radius: float, blades: int, at: tuple[float, float, float], turn: float, spinner: Material
 ) -> list[Part]:
     """A propeller with its spinner, facing +z.

@@ -90,7 +90,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
         f"for o in run_isolated('faulty_worker:serve', dict(folder={str(tmp_path)!r}), items, workers=1):\n"
         "    print(o.result['process'], flush=True)\n"
     )
-    path = os.pathsep.join([str(HERE.parents[1]), str(HERE)])
+    path = os.pathsep.join([str(HERE.parents[2]), str(HERE)])
     parent = subprocess.Popen(
         [sys.executable, "-c", script], stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path}
     )

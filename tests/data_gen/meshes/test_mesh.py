@@ -26,8 +26,8 @@ from mesh_writers import (
     write_obj,
 )
 
-from data_gen.meshes.find import safe_name
-from data_gen.meshes.mesh import MeshError, find_meshes, load_mesh, prepare_scene, render_ready
+from data_gen.meshes.find import find_meshes, safe_name
+from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts, prepare_scene
 
 SHARED = Path(__file__).parents[2] / ".." / "shared" / "meshes"
 
@@ -52,7 +52,7 @@ def write_any(folder, kind):
 
 def corners(mesh):
     """Corners of all faces in the world, in the order of the file."""
-    return np.concatenate([part.vertices[part.faces] for part, _, _ in render_ready(mesh)])
+    return np.concatenate([part.vertices[part.faces] for part, _, _ in mesh_parts(mesh)])
 
 
 def colour(part):
@@ -116,7 +116,7 @@ def test_the_cube_fit_makes_the_longest_side_2(tmp_path):
 def test_node_transforms_and_instances_are_baked(tmp_path):
     nodes = [{"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0], "scale": [2, 2, 2]}]
     mesh = load_mesh(write_glb(tmp_path / "a.glb", nodes=nodes))
-    parts = sorted(render_ready(mesh), key=lambda part: part[0].scale)
+    parts = sorted(mesh_parts(mesh), key=lambda part: part[0].scale)
     assert [len(part.faces) for part, _, _ in parts] == [4, 4]
     assert all(np.array_equal(pose, np.eye(4)) for _, pose, _ in parts)
     in_file = trimesh.transform_points(parts[1][0].vertices, np.linalg.inv(mesh.world_from_file))
@@ -129,7 +129,7 @@ def test_normals_follow_a_stretching_transform(tmp_path):
     normal = np.array([[np.sqrt(0.5), np.sqrt(0.5), 0]] * 4)
     nodes = [{"mesh": 0, "scale": [4, 1, 1]}]
     path = write_glb(tmp_path / "a.glb", positions=points, faces=[[0, 1, 2], [0, 2, 3]], normals=normal, nodes=nodes)
-    part, _, smooth = render_ready(load_mesh(path))[0]
+    part, _, smooth = mesh_parts(load_mesh(path))[0]
     assert smooth
     assert np.allclose(part.vertex_normals, np.array([0.25, 1, 0]) / np.hypot(0.25, 1), atol=1e-6)
 
@@ -137,9 +137,9 @@ def test_normals_follow_a_stretching_transform(tmp_path):
 def test_obj_colours_are_made_linear_and_a_texture_takes_their_place(tmp_path):
     # sRGB 188 / 255 is linear 128 / 255.
     plain = load_mesh(write_obj(tmp_path, mtl="newmtl paint\nKd 0.737255 0 1\n"))
-    assert colour(render_ready(plain)[0][0]) == [128, 0, 255, 255]
+    assert colour(mesh_parts(plain)[0][0]) == [128, 0, 255, 255]
     path = write_obj(tmp_path, mtl="newmtl paint\nKd 0 0 0\nmap_Kd wood.png\n", texture=picture(colour=(9, 8, 7)))
-    part = render_ready(load_mesh(path))[0][0]
+    part = mesh_parts(load_mesh(path))[0][0]
     assert colour(part) == [255] * 4
     assert part.visual.material.baseColorTexture.getpixel((0, 0)) == (9, 8, 7)
     assert np.allclose(part.visual.uv[part.faces[3]], [[1, 0], [0, 1], [1, 1]])
@@ -155,7 +155,7 @@ def test_obj_polygons_relative_indices_tabs_and_several_libraries(tmp_path):
     )
     mesh = load_mesh(write_obj(tmp_path, body=body))
     assert mesh.warnings == ()
-    (red, _, _), (blue, _, _) = render_ready(mesh)
+    (red, _, _), (blue, _, _) = mesh_parts(mesh)
     assert (len(red.faces), len(blue.faces)) == (2, 3)
     assert colour(red) == [255, 0, 0, 255]
     assert colour(blue) == [0, 0, 255, 128]
@@ -163,13 +163,13 @@ def test_obj_polygons_relative_indices_tabs_and_several_libraries(tmp_path):
 
 def test_obj_smoothing_groups_count_where_there_are_no_normals(tmp_path):
     solid = OBJ_SOLID + "{}\n" + OBJ_FACES
-    smooth = [render_ready(load_mesh(write_obj(tmp_path, body=solid.format(line))))[0][2] for line in ("s 1", "s off")]
+    smooth = [mesh_parts(load_mesh(write_obj(tmp_path, body=solid.format(line))))[0][2] for line in ("s 1", "s off")]
     assert smooth == [True, False]
 
 
 def test_without_normals_round_things_are_smooth_and_hard_things_flat():
     shapes = {"ball": trimesh.creation.icosphere(subdivisions=3), "box": trimesh.creation.box()}
-    smooth = {name: render_ready(prepare_scene(trimesh.Scene(shape), name))[0][2] for name, shape in shapes.items()}
+    smooth = {name: mesh_parts(prepare_scene(trimesh.Scene(shape), name))[0][2] for name, shape in shapes.items()}
     assert smooth == {"ball": True, "box": False}
 
 
@@ -177,11 +177,11 @@ def test_vertex_colours_stay_srgb(tmp_path):
     seen = np.array([[255, 0, 0, 255], [0, 128, 0, 255], [0, 0, 64, 255], [7, 7, 7, 255]], dtype=np.uint8)
     (tmp_path / "a.ply").write_bytes(ply_bytes(colours=seen))
     (tmp_path / "a.off").write_text(off_text(head="COFF", vertex_tail=" 0.5 0 1 1"))
-    ply, off = (render_ready(load_mesh(tmp_path / name))[0] for name in ("a.ply", "a.off"))
+    ply, off = (mesh_parts(load_mesh(tmp_path / name))[0] for name in ("a.ply", "a.off"))
     assert np.array_equal(ply[0].visual.vertex_colors, seen)
     assert np.array_equal(off[0].visual.vertex_colors, [[128, 0, 255, 255]] * 4)
     obj = write_obj(tmp_path, body="v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 0 0 1\nf 1 2 3\n")
-    part = render_ready(load_mesh(obj))[0][0]
+    part = mesh_parts(load_mesh(obj))[0][0]
     assert np.array_equal(part.visual.vertex_colors[:, :3], [[255, 0, 0], [255, 0, 0], [0, 0, 255]])
 
 
@@ -190,7 +190,7 @@ def test_gltf_vertex_colours_are_linear_and_tinted_by_the_material(tmp_path):
     painted = np.array([[0.50196, 0.50196, 1, 1]] * 4)
     material = {"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 1, 1]}}
     mesh = load_mesh(write_glb(tmp_path / "a.glb", colours=painted, material=material))
-    part = render_ready(mesh)[0][0]
+    part = mesh_parts(mesh)[0][0]
     assert mesh.warnings == ()
     assert np.array_equal(part.visual.vertex_colors, [[188, 0, 255, 255]] * 4)
 
@@ -201,7 +201,7 @@ def test_colours_of_ply_faces_are_kept(tmp_path):
     points = "".join(" ".join(str(float(value)) for value in point) + "\n" for point in TETRAHEDRON)
     faces = "".join(f"3 {a} {b} {c} {10 * a} {10 * b} {10 * c}\n" for a, b, c in TETRAHEDRON_FACES)
     (tmp_path / "a.ply").write_bytes(head + (points + faces).encode())
-    part, _, smooth = render_ready(load_mesh(tmp_path / "a.ply"))[0]
+    part, _, smooth = mesh_parts(load_mesh(tmp_path / "a.ply"))[0]
     assert not smooth
     assert np.array_equal(part.visual.face_colors[:, :3], 10 * TETRAHEDRON_FACES)
 
@@ -216,7 +216,7 @@ def test_a_prepared_scene_survives_its_own_export(tmp_path):
     assert again.warnings == ()
     assert np.allclose(again.world_from_file, np.eye(4), atol=1e-6)
     before, after = (
-        sorted((part for part, _, _ in render_ready(each)), key=lambda part: part.scale) for each in (mesh, again)
+        sorted((part for part, _, _ in mesh_parts(each)), key=lambda part: part.scale) for each in (mesh, again)
     )
     for first, second in zip(before, after, strict=True):
         assert np.allclose(first.vertices[first.faces], second.vertices[second.faces], atol=1e-6)
@@ -226,7 +226,7 @@ def test_a_prepared_scene_survives_its_own_export(tmp_path):
 def test_face_colours_are_shaded_flat(tmp_path):
     tails = (" 255 0 0", " 0 255 0", " 0 0 255", " 9 9 9")
     (tmp_path / "a.off").write_text(off_text(face_tails=tails))
-    part, _, smooth = render_ready(load_mesh(tmp_path / "a.off"))[0]
+    part, _, smooth = mesh_parts(load_mesh(tmp_path / "a.off"))[0]
     assert not smooth
     assert np.array_equal(part.visual.face_colors[:, :3], [[255, 0, 0], [0, 255, 0], [0, 0, 255], [9, 9, 9]])
 
@@ -241,7 +241,7 @@ def test_gltf_materials_keep_their_factors_textures_and_alpha_mode(tmp_path):
     }
     image = picture("RGBA", colour=(1, 2, 3, 200))
     mesh = load_mesh(write_glb(tmp_path / "a.glb", uv=SQUARE_UV, material=material, image=image))
-    kept = render_ready(mesh)[0][0].visual.material
+    kept = mesh_parts(mesh)[0][0].visual.material
     assert mesh.warnings == ()
     assert (kept.alphaMode, kept.alphaCutoff, kept.doubleSided) == ("MASK", 0.25, True)
     assert (kept.metallicFactor, kept.roughnessFactor) == (0.25, 0.75)
@@ -256,7 +256,7 @@ def test_collada_turns_as_it_declares_and_finds_its_texture(tmp_path):
     assert mesh.warnings == ()
     assert np.allclose(mesh.world_from_file[:3, :3] @ [0, 0, 1] * RADIUS, [0, 1, 0])
     # Its 0.5 is sRGB 128, linear 55.
-    assert colour(render_ready(mesh)[0][0]) == [255, 55, 0, 255]
+    assert colour(mesh_parts(mesh)[0][0]) == [255, 55, 0, 255]
 
 
 def test_a_prepared_scene_leaves_the_given_one_alone():
@@ -268,7 +268,7 @@ def test_a_prepared_scene_leaves_the_given_one_alone():
     mesh = prepare_scene(scene, "box")
     assert np.allclose(box.extents, 4)
     assert np.allclose(mesh.scene.extents, 2 / np.sqrt(3))
-    assert colour(render_ready(mesh)[0][0]) == [10, 20, 30, 255]
+    assert colour(mesh_parts(mesh)[0][0]) == [10, 20, 30, 255]
     assert mesh.world_from_file[0, 0] == pytest.approx(1 / np.sqrt(12))
 
 
@@ -315,7 +315,7 @@ def test_all_real_meshes_load_with_their_losses_named():
             outcomes[file.name] = str(error)
             continue
         assert np.isclose(np.linalg.norm(corners(mesh), axis=-1).max(), 1.0)
-        for part, _, _ in render_ready(mesh):
+        for part, _, _ in mesh_parts(mesh):
             assert isinstance(part.visual, trimesh.visual.ColorVisuals) or isinstance(
                 part.visual.material.baseColorTexture, PIL.Image.Image | None
             )

@@ -31,7 +31,7 @@ from mesh_writers import (
 )
 
 from data_gen.meshes import files
-from data_gen.meshes.mesh import MeshError, load_mesh, prepare_scene, render_ready
+from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts, prepare_scene
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.rendering.mesh_renderer import MeshRenderer
 from data_gen.rigs import fixed
@@ -41,7 +41,7 @@ WOOD = PAINT + "map_Kd wood.png\n"
 
 
 def only_part(mesh):
-    ((part, _, _),) = render_ready(mesh)
+    ((part, _, _),) = mesh_parts(mesh)
     return part
 
 
@@ -426,7 +426,7 @@ def test_too_many_faces_are_decimated_where_the_looks_survive(tmp_path):
     mesh = prepare_scene(trimesh.Scene(ball.copy()), "ball", max_faces=2000)
     assert warning(mesh) == f"decimated from {len(ball.faces)} to {mesh.face_count} triangles"
     assert 1000 < mesh.face_count <= 2000
-    part, _, smooth = render_ready(mesh)[0]
+    part, _, smooth = mesh_parts(mesh)[0]
     assert smooth
     assert np.isclose(outwards(part), 4 / 3 * np.pi, rtol=0.02)
 
@@ -459,7 +459,7 @@ def test_a_million_faces_are_drawn_as_they_are(tmp_path):
     assert (mesh.face_count, mesh.warnings) == (2**20, ())
     rig = fixed(1, 64)
     with MeshRenderer() as renderer:
-        alpha = renderer.render(render_ready(mesh), rig).rgba[0, ..., 3] / 255
+        alpha = renderer.render(mesh_parts(mesh), rig).rgba[0, ..., 3] / 255
     radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(1 / 3.0))
     assert alpha.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
 
@@ -635,7 +635,7 @@ def test_many_textures_count_together(tmp_path, monkeypatch):
     for index in range(3):
         (tmp_path / f"{index}.png").write_bytes(picture(size=(10, 10)))
     path = write_obj(tmp_path, mtl=mtl, body=body)
-    assert len(render_ready(load_mesh(path))) == 3
+    assert len(mesh_parts(load_mesh(path))) == 3
     monkeypatch.setattr(ModelFolder.__init__, "__kwdefaults__", {"pixels": 250})
     assert "2.png: expected textures of at most 50 pixels" in refusal(path)
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from mesh_writers import OBJ_FACES, OBJ_SOLID, picture
 
-from data_gen.meshes.mesh import MeshError, find_meshes, load_mesh, render_ready
+from data_gen.meshes.find import find_meshes
+from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts
 from data_gen.meshes.shapenet import SYNSETS, class_of_synset, paper_split, read_split_file
 
 CAR, CHAIR, PLANE, LAMP = "02958343", "03001627", "02691156", "03636649"
@@ -24,7 +25,7 @@ def write_model(root, synset, model, version, *, texture=None):
 
 
 def texel(mesh):
-    ((part, _, _),) = render_ready(mesh)
+    ((part, _, _),) = mesh_parts(mesh)
     return part.visual.material.baseColorTexture.getpixel((0, 0))
 
 

@@ -17,7 +17,7 @@ from drawn_parts import draw_tricky, sheet
 from PIL import Image
 
 from data_gen import rigs
-from data_gen.meshes.mesh import prepare_scene, render_ready
+from data_gen.meshes.mesh import mesh_parts, prepare_scene
 from data_gen.rendering.lighting import Lighting
 from data_gen.rendering.mesh_renderer import CHANNELS, MeshRenderer, RenderError
 from data_gen.rendering.renderers import RENDERERS, RendererError, probe
@@ -198,7 +198,7 @@ def test_inner_sides_of_generated_objects_are_never_seen(class_name):
         for seed in range(4):
             whole, outer = (
                 renderer.render(
-                    render_ready(prepare_scene(make(class_name, seed), "it", closed=closed)), rigs.fixed(6, 64)
+                    mesh_parts(prepare_scene(make(class_name, seed), "it", closed=closed)), rigs.fixed(6, 64)
                 ).rgba
                 for closed in (False, True)
             )
