@@ -22,9 +22,9 @@ from data_gen.rendering.renderers import RENDERERS, RendererError, RendererInfo,
 from data_gen.rendering.surfaces import RenderError, ShadedSurface, shaded_surfaces
 from data_gen.rigs import Rig
 
-__all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "Part", "RenderError", "MeshRenderer", "Rendering"]
+__all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "PlacedMesh", "RenderError", "Rendering"]
 
-Part = tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]
+PlacedMesh = tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]
 """A mesh, its pose world_from_mesh (4, 4), and whether it is shaded smoothly."""
 
 CHANNELS = ("rgba", "depth", "normals", "coordinates", "mask")
@@ -54,7 +54,7 @@ class Rendering:
     mask: npt.NDArray[np.bool_] | None = None
 
 
-class _Backend(Protocol):
+class _ViewRenderer(Protocol):
     detail: str
 
     def draw(
@@ -65,7 +65,7 @@ class _Backend(Protocol):
 class MeshRenderer:
     """Draws meshes with the renderer that works here. A context manager.
 
-    All Rasterisers of a process that draw with pyrender share its one renderer, so making another costs nothing; they
+    All MeshRenderers of a process that draw with pyrender share its one renderer, so making another costs nothing; they
     must all be used in the thread that made the first.
 
     Args:
@@ -87,8 +87,8 @@ class MeshRenderer:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, received {supersample}")
         self.name = renderer if isinstance(renderer, str) else (renderer or find_renderer()).name
         self.supersample = supersample
-        self._backend: _Backend | None = _make_backend(self.name)
-        self.detail = self._backend.detail
+        self._renderer: _ViewRenderer | None = _make_renderer(self.name)
+        self.detail = self._renderer.detail
 
     def __enter__(self) -> MeshRenderer:
         """Return itself."""
@@ -102,11 +102,11 @@ class MeshRenderer:
 
     def close(self) -> None:
         """Release the renderer. The process keeps its OpenGL context for the next MeshRenderer."""
-        self._backend = None
+        self._renderer = None
 
     def render(
         self,
-        parts: Sequence[Part],
+        parts: Sequence[PlacedMesh],
         rig: Rig,
         *,
         lighting: str | Lighting = "studio",
@@ -131,7 +131,7 @@ class MeshRenderer:
             RenderError: if the parts cannot be drawn, or nothing of them is visible in any view.
             ValueError: if the MeshRenderer is closed, or lighting or a channel has an unknown name.
         """
-        if self._backend is None:
+        if self._renderer is None:
             raise ValueError("renderer: expected an open one, received one that was closed")
         unknown = sorted(set(channels) - set(CHANNELS))
         if unknown or not channels:
@@ -142,7 +142,7 @@ class MeshRenderer:
         surfaces = shaded_surfaces(parts, name)
         pictures: dict[str, npt.NDArray] = {}
         if "rgba" in channels:
-            pictures["rgba"] = np.stack(list(self._backend.draw(surfaces, rig, lights, self.supersample)))
+            pictures["rgba"] = np.stack(list(self._renderer.draw(surfaces, rig, lights, self.supersample)))
             visible = pictures["rgba"][..., 3].any()
         if set(channels) - {"rgba"}:
             from data_gen.rendering.embree import cast_geometry
@@ -158,7 +158,7 @@ class MeshRenderer:
         return Rendering(**pictures)
 
 
-def _make_backend(name: str) -> _Backend:
+def _make_renderer(name: str) -> _ViewRenderer:
     if name not in RENDERERS:
         raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}")
     try:

@@ -187,15 +187,15 @@ def _found_before() -> RendererInfo | None:
         return None
     try:
         record = json.loads(text)
-        backend = RendererInfo(str(record["name"]), str(record["detail"]), tuple(map(str, record["advice"])))
+        found = RendererInfo(str(record["name"]), str(record["detail"]), tuple(map(str, record["advice"])))
     except (ValueError, KeyError, TypeError):
         return None
-    return backend if backend.name in RENDERERS else None
+    return found if found.name in RENDERERS else None
 
 
-def _remember(backend: RendererInfo) -> RendererInfo:
-    os.environ[_FOUND_VARIABLE] = json.dumps(asdict(backend))
-    return backend
+def _remember(found: RendererInfo) -> RendererInfo:
+    os.environ[_FOUND_VARIABLE] = json.dumps(asdict(found))
+    return found
 
 
 def _run_probe(name: str) -> ProbeResult:
