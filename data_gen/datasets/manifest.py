@@ -1,4 +1,8 @@
-"""The manifest of a data set: what was requested, written and skipped, and why; and its verification."""
+"""The manifest of a data set: what was requested, written and skipped, and why; and its verification.
+
+Objects stay folders and files that other projects' loaders read, which the archives of WebDataset or Hugging Face
+datasets are not; so what exists, with its checksums, is kept here as one JSON.
+"""
 
 from __future__ import annotations
 

@@ -91,18 +91,7 @@ def _fixed_bytes(header: str, counts: dict[str, int]) -> int:
 
 
 def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
-    """Read a PLY file and check that it holds what its header declares.
-
-    Args:
-        data: the content of the file.
-        folder: gives its texture.
-
-    Returns:
-        Its geometry, and warnings.
-
-    Raises:
-        MeshError: if it was cut or holds no faces.
-    """
+    """The geometry of a PLY file, and warnings; a MeshError if it was cut or holds no faces."""
     vertices, faces, warnings = _check_ply(data, folder)
     if not faces:
         raise MeshError(f"{folder.path}: expected faces, found {vertices} points only; make a surface of them first")
@@ -117,18 +106,7 @@ def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
 
 
 def read_off(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
-    """Read an OFF file with the colours of its vertices (COFF) or faces.
-
-    Args:
-        data: the content of the file.
-        folder: names the file.
-
-    Returns:
-        Its geometry, polygons cut into fans, and warnings.
-
-    Raises:
-        MeshError: if it is malformed or was cut.
-    """
+    """The geometry of an OFF file with the colours of its vertices (COFF) or faces, polygons as fans; and warnings."""
     lines = [line.partition("#")[0].split() for line in decode_text(data).splitlines()]
     lines = [line for line in lines if line]
     if not lines or not re.fullmatch(r"(ST|C|N){0,3}OFF.*", lines[0][0]):
@@ -189,14 +167,7 @@ def _colours(values: Any) -> Any:
 
 
 def read_dae(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
-    """Read a COLLADA file.
-
-    Args:
-        data: the content of the file.
-        folder: gives its textures.
-
-    Returns:
-        Its geometries, factors of materials as in the file (sRGB), and warnings.
+    """The geometries of a COLLADA file, factors of materials as in the file (sRGB), and warnings.
 
     Raises:
         MeshError: if it declares a document type, which COLLADA needs for nothing, or a number is NaN.
