@@ -176,10 +176,10 @@ def make_rig(
     Args:
         name: one of RIGS; of a preset only the kind is taken, all its numbers are arguments here.
         views: number of views.
-        resolution: pixels along a side.
+        resolution: pixels along a side; `fixed`, `random` and `orbit` also take (width, height).
         seed: seed of random rigs.
         distance: distance of the cameras from the origin in world units.
-        field_of_view: full angle in degrees; None fits the unit sphere.
+        field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
 
     Returns:
         The rig.
@@ -214,16 +214,7 @@ def fixed(
     the gaps of the first. Within each half, views come in farthest-first order, so the first few are well spread as
     well. Of 50 views, no two are nearer than 15.6 degrees, and no two of a half nearer than 29 degrees.
 
-    Args:
-        views: number of views.
-        resolution: pixels, one number for a square image or (width, height).
-        distance: distance of the cameras from the origin in world units.
-        field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
-        lowest: lowest elevation in degrees.
-        highest: highest elevation in degrees.
-
-    Returns:
-        A rig of `views` cameras.
+    Elevations are from `lowest` to `highest` degrees; the other arguments are those of `make_rig`.
     """
     _check_views(views)
     bottom, top = _height_band(lowest, highest)
@@ -250,17 +241,8 @@ def random(
 ) -> Rig:
     """Cameras at random, uniformly in area over a band of elevations: the whole sphere, or the upper half of it.
 
-    Args:
-        views: number of views.
-        resolution: pixels, one number for a square image or (width, height).
-        seed: seed of the random numbers; the same seed gives the same poses.
-        distance: distance of the cameras from the origin in world units.
-        field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
-        lowest: lowest elevation in degrees; 0 for the upper hemisphere.
-        highest: highest elevation in degrees.
-
-    Returns:
-        A rig of `views` cameras.
+    Elevations are from `lowest` (0 for the upper hemisphere) to `highest` degrees; the other arguments are those of
+    `make_rig`.
     """
     _check_views(views)
     generator = np.random.default_rng(seed)
@@ -279,15 +261,8 @@ def orbit(
 ) -> Rig:
     """Cameras evenly around the object at one height: a turntable.
 
-    Args:
-        views: number of views; the one after the last would be the first again.
-        resolution: pixels, one number for a square image or (width, height).
-        elevation: height of the cameras over the horizon in degrees.
-        distance: distance of the cameras from the origin in world units.
-        field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
-
-    Returns:
-        A rig of `views` cameras, the first in the direction of +z.
+    The first is in the direction of +z, all are `elevation` degrees over the horizon; the other arguments are those of
+    `make_rig`.
 
     Raises:
         ValueError: if the number of views, elevation, distance or resolution make no sense.

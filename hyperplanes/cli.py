@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         module = find_verb(verb).module
     except ValueError as error:
-        return _complain(str(error))
+        return _complain(f"hyperplanes: {error}")
     try:
         return _run(verb, module, rest)
     except KeyboardInterrupt as interrupt:

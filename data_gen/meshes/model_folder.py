@@ -198,35 +198,15 @@ class ModelFolder(Resolver):
             self.notes.append(text)
 
     def keys(self) -> Iterator[str]:
-        """List the files of the mesh's folder, which the interface requires.
-
-        Yields:
-            Names relative to the folder of the mesh file.
-        """
-        for entry in sorted(self.folder.iterdir()):
-            yield entry.name
+        """Names of the files beside the mesh, as the interface of trimesh's resolvers requires."""
+        yield from sorted(entry.name for entry in self.folder.iterdir())
 
     def write(self, name: str, data: str | bytes) -> None:
-        """Refuse: a model is only read.
-
-        Args:
-            name: the file.
-            data: its content.
-
-        Raises:
-            PermissionError: always.
-        """
+        """Raise a PermissionError: a model is only read."""
         raise PermissionError(f"{name}: the folder of a model is only read")
 
     def namespaced(self, namespace: str) -> ModelFolder:
-        """The same folder: names keep their meaning.
-
-        Args:
-            namespace: ignored.
-
-        Returns:
-            This resolver.
-        """
+        """The same folder: names keep their meaning."""
         return self
 
 

@@ -59,17 +59,7 @@ class EmbreeRenderer:
     def draw(
         self, surfaces: Sequence[ShadedSurface], rig: Rig, lighting: Lighting, supersample: int
     ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Draw all views, one after the other.
-
-        Args:
-            surfaces: what to draw.
-            rig: the cameras.
-            lighting: the lights.
-            supersample: rays along a side of a pixel.
-
-        Yields:
-            sRGB with straight alpha `(height, width, 4)`.
-        """
+        """Draw all views, one after the other, as `mesh_renderer.ViewRenderer` says."""
         scene = _Scene(surfaces)
         for pose, intrinsics in zip(rig.world_from_camera, rig.intrinsics, strict=True):
             picture = np.zeros((rig.height, rig.width, 4), dtype=np.float32)

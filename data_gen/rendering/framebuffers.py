@@ -71,11 +71,7 @@ class SampleFramebuffers:
         self._program = compile_program(_VERTEX, _FRAGMENT, {"SIDE": side})
 
     def read(self) -> npt.NDArray[np.uint8]:
-        """Average what was drawn.
-
-        Returns:
-            sRGB with straight alpha `(height, width, 4)`, bottom row first.
-        """
+        """The averaged samples: sRGB with straight alpha `(height, width, 4)`, bottom row first."""
         width, height, _ = self.size
         GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._averaged)
         GL.glViewport(0, 0, width, height)

@@ -18,11 +18,11 @@ import trimesh
 
 from data_gen import SUPERSAMPLE
 from data_gen.rendering.lighting import Lighting, resolve_lighting
-from data_gen.rendering.renderers import RENDERERS, RendererError, RendererInfo, find_renderer, remedy
+from data_gen.rendering.renderers import REMEDIES, RENDERERS, RendererError, RendererInfo, find_renderer
 from data_gen.rendering.surfaces import RenderError, ShadedSurface, shaded_surfaces
 from data_gen.rigs import Rig
 
-__all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "PlacedMesh", "RenderError", "Rendering"]
+__all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "PlacedMesh", "RenderError", "Rendering", "ViewRenderer"]
 
 PlacedMesh = tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]
 """A mesh, its pose world_from_mesh (4, 4), and whether it is shaded smoothly."""
@@ -54,12 +54,20 @@ class Rendering:
     mask: npt.NDArray[np.bool_] | None = None
 
 
-class _ViewRenderer(Protocol):
+class ViewRenderer(Protocol):
+    """What `EmbreeRenderer` and `PyrenderRenderer` have in common; `detail` says what draws, one line."""
+
     detail: str
 
     def draw(
         self, surfaces: Sequence[ShadedSurface], rig: Rig, lighting: Lighting, supersample: int
-    ) -> Iterator[npt.NDArray[np.uint8]]: ...
+    ) -> Iterator[npt.NDArray[np.uint8]]:
+        """Draw the surfaces from each camera of the rig, with supersample x supersample samples a pixel.
+
+        Yields:
+            sRGB with straight alpha `(height, width, 4)`, a view at a time.
+        """
+        ...
 
 
 class MeshRenderer:
@@ -87,7 +95,7 @@ class MeshRenderer:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, received {supersample}")
         self.name = renderer if isinstance(renderer, str) else (renderer or find_renderer()).name
         self.supersample = supersample
-        self._renderer: _ViewRenderer | None = _make_renderer(self.name)
+        self._renderer: ViewRenderer | None = _make_renderer(self.name)
         self.detail = self._renderer.detail
 
     def __enter__(self) -> MeshRenderer:
@@ -158,7 +166,7 @@ class MeshRenderer:
         return Rendering(**pictures)
 
 
-def _make_renderer(name: str) -> _ViewRenderer:
+def _make_renderer(name: str) -> ViewRenderer:
     if name not in RENDERERS:
         raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}")
     try:
@@ -174,5 +182,5 @@ def _make_renderer(name: str) -> _ViewRenderer:
     except Exception as error:  # missing libraries and drivers show as nearly any type
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise RendererError(
-            f"renderer {name!r}: expected it to start, found {reason}. Remedy: {remedy(name)}"
+            f"renderer {name!r}: expected it to start, found {reason}. Remedy: {REMEDIES[name]}"
         ) from error

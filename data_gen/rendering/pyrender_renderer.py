@@ -47,17 +47,7 @@ class PyrenderRenderer:
     def draw(
         self, surfaces: Sequence[ShadedSurface], rig: Rig, lighting: Lighting, supersample: int
     ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Draw all views, one after the other.
-
-        Args:
-            surfaces: what to draw.
-            rig: the cameras.
-            lighting: the lights.
-            supersample: samples along a side of a pixel.
-
-        Yields:
-            sRGB with straight alpha `(height, width, 4)`.
-        """
+        """Draw all views, one after the other, as `mesh_renderer.ViewRenderer` says."""
         _check_owner()
         renderer = self._renderer
         drawables = renderer.load(surfaces)

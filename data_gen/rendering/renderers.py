@@ -15,15 +15,15 @@ import time
 from dataclasses import asdict, dataclass
 
 __all__ = [
-    "RENDERERS",
     "CHOICE_VARIABLE",
-    "RendererInfo",
+    "REMEDIES",
+    "RENDERERS",
     "ProbeResult",
     "RendererError",
+    "RendererInfo",
     "find_renderer",
     "probe",
     "probe_all",
-    "remedy",
 ]
 
 RENDERERS: tuple[str, ...] = ("pyrender-egl", "pyrender-osmesa", "embree")
@@ -32,13 +32,15 @@ RENDERERS: tuple[str, ...] = ("pyrender-egl", "pyrender-osmesa", "embree")
 CHOICE_VARIABLE = "HYPERPLANES_RENDERER"
 """Environment variable by which a user chooses a renderer."""
 
-_FOUND_VARIABLE = "HYPERPLANES_RENDERER_FOUND"
-_PROBE_SECONDS = 90.0
-_REMEDIES = {
+REMEDIES = {
     "pyrender-egl": "apt-get install -y libegl1 libgl1",
     "pyrender-osmesa": "apt-get install -y libosmesa6 && pip install 'PyOpenGL>=3.1.7'",
     "embree": "pip install embreex",
 }
+"""The command that should make a renderer work on Debian and Ubuntu."""
+
+_FOUND_VARIABLE = "HYPERPLANES_RENDERER_FOUND"
+_PROBE_SECONDS = 90.0
 _OPENGL_PLATFORMS = {"egl": "pyrender-egl", "osmesa": "pyrender-osmesa"}
 
 
@@ -156,20 +158,8 @@ def find_renderer(prefer: str | None = None) -> RendererInfo:
         failures.append(outcome)
     raise RendererError(
         f"no renderer works here ({'; '.join(f'{f.name}: {f.message}' for f in failures)}). "
-        f"Remedy: {_REMEDIES['pyrender-egl']}, or without root: {_REMEDIES['embree']}"
+        f"Remedy: {REMEDIES['pyrender-egl']}, or without root: {REMEDIES['embree']}"
     )
-
-
-def remedy(name: str) -> str:
-    """The command that should make a renderer work on Debian and Ubuntu.
-
-    Args:
-        name: one of RENDERERS.
-
-    Returns:
-        A line for a shell.
-    """
-    return _REMEDIES[name]
 
 
 def _unknown(name: str) -> str:
@@ -210,7 +200,7 @@ def _run_probe(name: str) -> ProbeResult:
         )
     except subprocess.TimeoutExpired:
         message = f"no picture within {_PROBE_SECONDS:g} s"
-        return ProbeResult(name, False, time.monotonic() - start, message, _REMEDIES[name])
+        return ProbeResult(name, False, time.monotonic() - start, message, REMEDIES[name])
     seconds = time.monotonic() - start
     lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
     if done.returncode == 0 and lines:
@@ -220,4 +210,4 @@ def _run_probe(name: str) -> ProbeResult:
         message = f"crashed with signal {-done.returncode}"
     else:
         message = errors[-1] if errors else f"exit code {done.returncode}"
-    return ProbeResult(name, False, seconds, message, _REMEDIES[name])
+    return ProbeResult(name, False, seconds, message, REMEDIES[name])

@@ -206,16 +206,7 @@ def _roughness_constants(roughness: float) -> dict[str, float]:
 
 
 def compile_program(vertex: str, fragment: str, constants: dict[str, Any]) -> int:
-    """Compile and link shaders.
-
-    Args:
-        vertex: GLSL without its version.
-        fragment: GLSL without its version.
-        constants: values of the preprocessor's names.
-
-    Returns:
-        OpenGL's name of the program.
-    """
+    """OpenGL's name of a program of two shaders, GLSL without version; `constants` are defined for the preprocessor."""
     head = "#version 330 core\n" + "".join(f"#define {name} {value}\n" for name, value in constants.items())
     # Some drivers refuse to validate a program while no vertex array is bound.
     array = GL.glGenVertexArrays(1)

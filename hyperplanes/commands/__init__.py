@@ -71,5 +71,5 @@ def find_verb(name: str) -> Verb:
     if name not in verbs:
         near = difflib.get_close_matches(name, verbs, 1)
         known = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(verbs)}"
-        raise ValueError(f"hyperplanes: no verb {name!r}; {known}")
+        raise ValueError(f"no verb {name!r}; {known}")
     return verbs[name]
