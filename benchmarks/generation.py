@@ -65,9 +65,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--full", action="store_true", help="make 1,000 objects x 50 views instead of extrapolating")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     options = parser.parse_args(arguments)
-    from data_gen.backends import find_backend
+    from data_gen.rendering.renderers import find_renderer
 
-    renderer = find_backend().name
+    renderer = find_renderer().name
     with tempfile.TemporaryDirectory() as folder:
         rows = compare(renderer, Path(folder), rounds=2 if options.quick else 5, objects=24 if options.quick else 60)
         rows += stages(renderer, 4 if options.quick else 10, Path(folder))
@@ -78,10 +78,10 @@ def main(arguments: list[str]) -> int:
 
 
 def compare(renderer: str, folder: Path, *, rounds: int, objects: int) -> list[Row]:
-    """Images a second of `data_gen.dataset.generate` and of the obvious loop, which needs OpenGL.
+    """Images a second of `data_gen.datasets.generate.generate` and of the obvious loop, which needs OpenGL.
 
     Args:
-        renderer: a name in `data_gen.backends.BACKENDS`.
+        renderer: a name in `data_gen.rendering.renderers.RENDERERS`.
         folder: where they write.
         rounds: how often each runs.
         objects: how many ours makes a round; the loop makes a sixth.
@@ -142,27 +142,20 @@ def _computed() -> float:
 
 
 def generated(objects: int, out: Path, supersample: int = SUPERSAMPLE) -> Run:
-    """What `data_gen.dataset.generate` takes for cars, with a worker a core.
+    """What `data_gen.datasets.generate.generate` takes for cars, with a worker a core.
 
     Args:
         objects: how many.
         out: where to.
         supersample: samples along a side of a pixel.
     """
-    from data_gen.dataset import Procedural, generate
+    from data_gen.datasets.generate import GenerationConfig, Procedural, generate
 
     ends: list[float] = []
 
     def run() -> int:
-        generate(
-            Procedural("car", objects),
-            out,
-            views=VIEWS,
-            resolution=RESOLUTION,
-            supersample=supersample,
-            held_out=0,
-            progress=lambda *_: ends.append(time.perf_counter()),
-        )
+        config = GenerationConfig(views=VIEWS, resolution=RESOLUTION, supersample=supersample, held_out=0)
+        generate(Procedural("car", objects), out, config, progress=lambda *_: ends.append(time.perf_counter()))
         return objects * VIEWS
 
     begun = time.perf_counter()
@@ -235,18 +228,12 @@ def memory(objects: int, folder: Path) -> Row:
     Returns:
         Medians of the resident memory in MB over the second and the last tenth of the objects, and the growth.
     """
-    from data_gen.dataset import Procedural, generate
+    from data_gen.datasets.generate import GenerationConfig, Procedural, generate
 
     sizes: list[float] = []
-    generate(
-        Procedural("car", objects),
-        folder / "stream",
-        views=2,
-        resolution=32,
-        held_out=0,
-        recycle=objects,
-        progress=lambda *_: sizes.append(resident_megabytes()),
-    )
+    config = GenerationConfig(views=2, resolution=32, held_out=0, recycle=objects)
+    cars = Procedural("car", objects)
+    generate(cars, folder / "stream", config, progress=lambda *_: sizes.append(resident_megabytes()))
     tenth = max(1, len(sizes) // 10)
     early, late = statistics.median(sizes[tenth : 2 * tenth]), statistics.median(sizes[-tenth:])
     return {

@@ -32,14 +32,15 @@ def obvious_loop(objects: int, out: Path) -> dict[str, float]:
     import pyrender
     from PIL import Image
 
-    from data_gen.meshes import prepare_scene
+    from data_gen.datasets.sources import Procedural, list_items
+    from data_gen.meshes.mesh import prepare_scene
     from data_gen.rigs import fixed
     from data_gen.shapes import make
-    from data_gen.sources import Procedural, list_items
+    from hyperplanes.axes import flip_camera_axes
 
     rig = fixed(VIEWS, RESOLUTION)
     ends: list[float] = []
-    opengl = rig.world_from_camera * [1.0, -1.0, -1.0, 1.0]
+    opengl = flip_camera_axes(rig.world_from_camera)
     focal = rig.intrinsics[0, 0, 0]
     for item in list_items(Procedural("car", objects), 0):
         mesh = prepare_scene(make("car", int(item.seed or 0)), item.name)
@@ -74,19 +75,19 @@ def stages(objects: int, out: Path) -> dict[str, float]:
         Milliseconds by stage; and the seconds of processor time that the process took to start.
     """
     from data_gen import SUPERSAMPLE
-    from data_gen.backends import find_backend
-    from data_gen.layouts import LAYOUTS, RenderedObject
-    from data_gen.meshes import prepare_scene, render_ready
-    from data_gen.rasterise import Rasteriser
+    from data_gen.datasets.layouts import LAYOUTS, RenderedObject
+    from data_gen.datasets.sources import Procedural, list_items
+    from data_gen.meshes.mesh import mesh_parts, prepare_scene
+    from data_gen.rendering.mesh_renderer import MeshRenderer
+    from data_gen.rendering.renderers import find_renderer
     from data_gen.rigs import fixed
     from data_gen.shapes import make
-    from data_gen.sources import Procedural, list_items
-    from hyperplanes.data.files import sha256, write_folder
+    from hyperplanes.files import sha256, write_folder
 
     rig = fixed(VIEWS, RESOLUTION)
     spent = dict.fromkeys(("mesh", "one sample a pixel drawn", "nine samples a pixel drawn", "png", "written"), 0.0)
-    with Rasteriser(find_backend().name) as rasteriser:
-        sparse = Rasteriser(rasteriser.name, 1)
+    with MeshRenderer(find_renderer().name) as renderer:
+        sparse = MeshRenderer(renderer.name, 1)
         for index, item in enumerate(list_items(Procedural("car", objects + 1), 0)):
             if index == 1:
                 started = time.process_time()
@@ -94,10 +95,10 @@ def stages(objects: int, out: Path) -> dict[str, float]:
             marks = [time.process_time()]
             mesh = prepare_scene(make("car", int(item.seed or 0)), item.name, closed=True)
             marks.append(time.process_time())
-            parts = render_ready(mesh)
+            parts = mesh_parts(mesh)
             sparse.render(parts, rig)
             marks.append(time.process_time())
-            rgba = rasteriser.render(parts, rig).rgba
+            rgba = renderer.render(parts, rig).rgba
             assert rgba is not None
             marks.append(time.process_time())
             files = LAYOUTS["native"].files(RenderedObject(item, rig, rgba))

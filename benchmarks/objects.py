@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from data_gen.meshes import prepare_scene, render_ready
-from data_gen.rasterise import Rasteriser
+from data_gen.meshes.mesh import mesh_parts, prepare_scene
+from data_gen.rendering.mesh_renderer import MeshRenderer
 from data_gen.rigs import fixed
 from data_gen.shapes import make
-from hyperplanes.geometry import cameras as camera
 from hyperplanes.views import Task, Views
 
 __all__ = ["held_out"]
@@ -19,14 +18,12 @@ FIRST_SEED = 900_000
 def held_out(count: int, size: int, views: int = 50, device: torch.device | str = "cpu") -> list[Task]:
     """Procedural cars never trained on, half of the views support and half query, on the training rig."""
     rig = fixed(views, size)
-    cameras = camera.pinhole(
-        torch.tensor(rig.intrinsics).float(), torch.tensor(rig.camera_from_world).float(), size, size
-    )
+    cameras = rig.cameras(dtype=torch.float32)
     tasks = []
-    with Rasteriser() as rasteriser:
+    with MeshRenderer() as renderer:
         for seed in range(FIRST_SEED, FIRST_SEED + count):
             mesh = prepare_scene(make("car", seed), f"car-{seed}")
-            pixels = torch.tensor(rasteriser.render(render_ready(mesh), rig).rgba).permute(0, 3, 1, 2).float() / 255
+            pixels = torch.tensor(renderer.render(mesh_parts(mesh), rig).rgba).permute(0, 3, 1, 2).float() / 255
             masks = pixels[:, 3:]
             seen = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks).to(device)
             even = torch.arange(0, views, 2)

@@ -1,24 +1,201 @@
-"""Where the cameras of a generated object stand: `fixed`, at `random`, or in an `orbit`. Conventions: `data_gen.rig`.
+"""Camera rigs: posed cameras of one size that look at a generated object; fixed, random, in an orbit, or by name.
 
-Numbers that make no sense are a ValueError that names them.
+Conventions: OpenCV camera axes (x right, y down, z forward), a world with y up, `world_from_camera` poses, intrinsics
+in pixels with INTEGER pixel centres, so a centred principal point is `((W - 1) / 2, (H - 1) / 2)`. Objects are
+expected inside the sphere of radius 1 around the origin, at which every camera looks.
+
+A rig is numpy, and `Rig.cameras` makes Kornia cameras of it: worker processes, which import everything else of a rig,
+take 0.7 s of processor time to start, and importing torch and Kornia would add 1.4 s to each.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from data_gen.rig import DEFAULT_DISTANCE, OBJECT_RADIUS, Rig, fitting_field_of_view, look_at_origin
+if TYPE_CHECKING:
+    import torch
+    from kornia.geometry.camera import PinholeCamera
 
-__all__ = ["fixed", "orbit", "random"]
+__all__ = [
+    "DEFAULT_DISTANCE",
+    "OBJECT_RADIUS",
+    "RIGS",
+    "RIG_PRESETS",
+    "Rig",
+    "RigPreset",
+    "fitting_field_of_view",
+    "fixed",
+    "look_at_origin",
+    "make_rig",
+    "orbit",
+    "random",
+]
 
 Array = npt.NDArray[np.float64]
 
+OBJECT_RADIUS = 1.0
+"""Radius of the sphere around the origin that holds every normalised object, in world units."""
+
+DEFAULT_DISTANCE = 3.0
+"""Distance of the cameras from the origin, in world units."""
+
+_MARGIN = 1.04
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
-_HALF_TURN = _GOLDEN_ANGLE / 2.0
+_BLENDER_FIELD_OF_VIEW = math.degrees(2.0 * math.atan(36.0 / 2.0 / 50.0))  # a lens of 50 mm before a film of 36 mm
+
+
+@dataclass(frozen=True)
+class RigPreset:
+    """Named settings of a rig.
+
+    Attributes:
+        kind: the same poses for every object, or random ones for each, anywhere on the sphere.
+        views: cameras an object.
+        resolution: pixels along a side.
+        distance: of the cameras from the origin, in world units.
+        field_of_view: full angle in degrees; None fits the unit sphere.
+    """
+
+    kind: Literal["fixed", "random"]
+    views: int
+    resolution: int
+    distance: float = DEFAULT_DISTANCE
+    field_of_view: float | None = None
+
+
+RIG_PRESETS: dict[str, RigPreset] = {
+    "paper-128": RigPreset("random", 50, 128, distance=4.0, field_of_view=_BLENDER_FIELD_OF_VIEW),
+    "paper-200": RigPreset("fixed", 50, 200),
+}
+"""The cameras of the paper's two data sets.
+
+`paper-128` follows the ShapeNet renders of "Learned Initializations" (Tancik et al. 2021), the paper's first data set:
+at random all over the sphere, at distance 4 (its loaders sample rays from 2 to 6), with Blender's field of view; the
+unit sphere spans 72 % of the picture. `paper-200` is the paper's second: the same 50 poses for every object.
+"""
+
+RIGS = ("fixed", "random", "hemisphere", "orbit", *RIG_PRESETS)
+"""Names of camera rigs."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Posed cameras of one size.
+
+    Attributes:
+        world_from_camera: camera poses `(view, 4, 4)`, OpenCV axes, in world units.
+        intrinsics: pinhole matrices `(view, 3, 3)` in pixels, integer pixel centres. One `(3, 3)` is accepted and
+            repeated for every view.
+        width: image width in pixels.
+        height: image height in pixels.
+        near: distance along a ray before which there is no object, in world units.
+        far: distance along a ray after which there is no object, in world units.
+
+    Raises:
+        ValueError: if a shape is wrong, a number is not finite, a pose is not a rigid motion, or near and far are out
+            of order.
+    """
+
+    world_from_camera: Array
+    intrinsics: Array
+    width: int
+    height: int
+    near: float
+    far: float
+
+    def __post_init__(self) -> None:
+        poses = np.ascontiguousarray(self.world_from_camera, dtype=np.float64)
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
+            raise ValueError(f"world_from_camera: expected shape (view, 4, 4) with view >= 1, received {poses.shape}")
+        intrinsics = np.asarray(self.intrinsics, dtype=np.float64)
+        if intrinsics.shape not in {(3, 3), (len(poses), 3, 3)}:
+            raise ValueError(f"intrinsics: expected shape (3, 3) or ({len(poses)}, 3, 3), received {intrinsics.shape}")
+        intrinsics = np.array(np.broadcast_to(intrinsics, (len(poses), 3, 3)))
+        if not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
+            raise ValueError("world_from_camera, intrinsics: expected finite numbers, received NaN or infinity")
+        rotations = poses[:, :3, :3]
+        error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
+        if error > 1e-6 or np.linalg.det(rotations).min() < 0:
+            raise ValueError(
+                "world_from_camera: expected rotations without scale or mirroring, received "
+                f"|R R^T - 1| up to {error:.2g} and determinants from {np.linalg.det(rotations).min():.3g}"
+            )
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"width, height: expected at least 1 pixel, received {self.width} x {self.height}")
+        if not 0 < self.near < self.far:
+            raise ValueError(f"near, far: expected 0 < near < far, received {self.near} and {self.far}")
+        poses.flags.writeable = False
+        intrinsics.flags.writeable = False
+        object.__setattr__(self, "world_from_camera", poses)
+        object.__setattr__(self, "intrinsics", intrinsics)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self.world_from_camera)
+
+    @property
+    def camera_centres(self) -> Array:
+        """Camera positions `(view, 3)` in world units."""
+        return self.world_from_camera[:, :3, 3]
+
+    def cameras(self, views: Sequence[int] | slice = slice(None), dtype: torch.dtype | None = None) -> PinholeCamera:
+        """The cameras as `hyperplanes.geometry` takes them.
+
+        Args:
+            views: which of them; all by default.
+            dtype: of their numbers; float64 by default.
+
+        Returns:
+            A batch of Kornia cameras.
+        """
+        from torch import as_tensor
+
+        from hyperplanes.geometry.cameras import pinhole
+
+        extrinsics = as_tensor(np.linalg.inv(self.world_from_camera[views]), dtype=dtype)
+        return pinhole(as_tensor(self.intrinsics[views].copy(), dtype=dtype), extrinsics, self.height, self.width)
+
+
+def make_rig(
+    name: str,
+    views: int,
+    resolution: int,
+    *,
+    seed: int = 0,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+) -> Rig:
+    """The cameras of a named rig.
+
+    Args:
+        name: one of RIGS; of a preset only the kind is taken, all its numbers are arguments here.
+        views: number of views.
+        resolution: pixels along a side; `fixed`, `random` and `orbit` also take (width, height).
+        seed: seed of random rigs.
+        distance: distance of the cameras from the origin in world units.
+        field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
+
+    Returns:
+        The rig.
+
+    Raises:
+        ValueError: if no rig has that name, or a number makes no sense.
+    """
+    kind = RIG_PRESETS[name].kind if name in RIG_PRESETS else name
+    lens = {"distance": distance, "field_of_view": field_of_view}
+    if kind == "fixed":
+        return fixed(views, resolution, **lens)
+    if kind == "orbit":
+        return orbit(views, resolution, **lens)
+    if kind not in RIGS:
+        raise ValueError(f"rig: expected one of {', '.join(RIGS)}, got {name!r}")
+    return random(views, resolution, seed=seed, lowest=-90.0 if kind == "random" else 0.0, **lens)
 
 
 def fixed(
@@ -37,24 +214,17 @@ def fixed(
     the gaps of the first. Within each half, views come in farthest-first order, so the first few are well spread as
     well. Of 50 views, no two are nearer than 15.6 degrees, and no two of a half nearer than 29 degrees.
 
-    Args:
-        views: Number of views.
-        resolution: Pixels, one number for a square image or (width, height).
-        distance: Distance of the cameras from the origin in world units.
-        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
-        lowest: Lowest elevation in degrees.
-        highest: Highest elevation in degrees.
-
-    Returns:
-        A rig of ``views`` cameras.
+    Elevations are from `lowest` to `highest` degrees; the other arguments are those of `make_rig`.
     """
     _check_views(views)
-    band = _height_band(lowest, highest)
+    bottom, top = _height_band(lowest, highest)
     directions = np.empty((views, 3))
     for first in (0, 1):
         count = len(range(first, views, 2))
-        if count:
-            spread = _fibonacci_band(count, *band, level=0.25 + 0.5 * first, turn=first * _HALF_TURN)
+        if count:  # a golden spiral, uniform in area between the two heights
+            heights = bottom + (top - bottom) * (np.arange(count) + 0.25 + 0.5 * first) / count
+            azimuths = first * _GOLDEN_ANGLE / 2.0 + _GOLDEN_ANGLE * np.arange(count, dtype=np.float64)
+            spread = _directions(heights, azimuths)
             directions[first::2] = spread[_farthest_first(spread)]
     return _rig(directions, resolution, distance, field_of_view)
 
@@ -71,17 +241,8 @@ def random(
 ) -> Rig:
     """Cameras at random, uniformly in area over a band of elevations: the whole sphere, or the upper half of it.
 
-    Args:
-        views: Number of views.
-        resolution: Pixels, one number for a square image or (width, height).
-        seed: Seed of the random numbers; the same seed gives the same poses.
-        distance: Distance of the cameras from the origin in world units.
-        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
-        lowest: Lowest elevation in degrees; 0 for the upper hemisphere.
-        highest: Highest elevation in degrees.
-
-    Returns:
-        A rig of ``views`` cameras.
+    Elevations are from `lowest` (0 for the upper hemisphere) to `highest` degrees; the other arguments are those of
+    `make_rig`.
     """
     _check_views(views)
     generator = np.random.default_rng(seed)
@@ -100,18 +261,11 @@ def orbit(
 ) -> Rig:
     """Cameras evenly around the object at one height: a turntable.
 
-    Args:
-        views: Number of views; the one after the last would be the first again.
-        resolution: Pixels, one number for a square image or (width, height).
-        elevation: Height of the cameras over the horizon in degrees.
-        distance: Distance of the cameras from the origin in world units.
-        field_of_view: Full angle across the smaller side in degrees; None fits the unit sphere.
-
-    Returns:
-        A rig of ``views`` cameras, the first in the direction of +z.
+    The first is in the direction of +z, all are `elevation` degrees over the horizon; the other arguments are those of
+    `make_rig`.
 
     Raises:
-        ValueError: If the number of views, elevation, distance or resolution make no sense.
+        ValueError: if the number of views, elevation, distance or resolution make no sense.
     """
     _check_views(views)
     if not -90.0 <= elevation <= 90.0:
@@ -119,6 +273,55 @@ def orbit(
     azimuths = 2.0 * math.pi * np.arange(views) / views
     heights = np.full(views, math.sin(math.radians(elevation)))
     return _rig(_directions(heights, azimuths), resolution, distance, field_of_view)
+
+
+def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:
+    """Field of view at which the unit sphere just fits, with a margin of 4 %.
+
+    Args:
+        distance: distance of the camera from the centre of the sphere, more than 1.04.
+
+    Returns:
+        The full angle in degrees, `2 asin(1.04 / distance)`.
+
+    Raises:
+        ValueError: if the camera is too near for any angle to do.
+
+    >>> round(fitting_field_of_view(3.0), 3)
+    40.567
+    """
+    if not distance > _MARGIN * OBJECT_RADIUS:
+        raise ValueError(f"distance: expected more than {_MARGIN} (the object's radius is 1), received {distance}")
+    return math.degrees(2.0 * math.asin(_MARGIN * OBJECT_RADIUS / distance))
+
+
+def look_at_origin(centres: npt.ArrayLike) -> Array:
+    """Poses of cameras that look at the origin with the world's y axis up in the picture.
+
+    The poses of `hyperplanes.geometry.poses.look_at`, in numpy and exact at the centres; a test compares the two.
+
+    Args:
+        centres: camera positions `(view, 3)`, none of them the origin.
+
+    Returns:
+        `world_from_camera` `(view, 4, 4)`, OpenCV axes. Right above or below the origin, where no direction is up,
+        the world's -z axis is up in the picture.
+
+    >>> look_at_origin([[0.0, 0.0, 3.0]])[0].round().astype(int).tolist()
+    [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]]
+    """
+    positions = np.asarray(centres, dtype=np.float64)
+    forward = -positions / np.linalg.norm(positions, axis=-1, keepdims=True)
+    up = np.where(np.abs(forward[:, 1:2]) < 1.0 - 1e-9, [[0.0, 1.0, 0.0]], [[0.0, 0.0, -1.0]])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    poses = np.zeros((len(positions), 4, 4))
+    poses[:, :3, 0] = right
+    poses[:, :3, 1] = np.cross(forward, right)
+    poses[:, :3, 2] = forward
+    poses[:, :3, 3] = positions
+    poses[:, 3, 3] = 1.0
+    return poses + 0.0  # no negative zeros in what is written to disk
 
 
 def _check_views(views: int) -> None:
@@ -137,12 +340,6 @@ def _height_band(lowest: float, highest: float) -> tuple[float, float]:
     if not -90.0 <= lowest < highest <= 90.0:
         raise ValueError(f"lowest, highest: expected -90 <= lowest < highest <= 90, received {lowest} and {highest}")
     return math.sin(math.radians(lowest)), math.sin(math.radians(highest))
-
-
-def _fibonacci_band(count: int, bottom: float, top: float, *, level: float, turn: float) -> Array:
-    """Directions (count, 3) on a golden spiral, uniform in area between two heights."""
-    heights = bottom + (top - bottom) * (np.arange(count) + level) / count
-    return _directions(heights, turn + _GOLDEN_ANGLE * np.arange(count, dtype=np.float64))
 
 
 def _farthest_first(directions: Array) -> list[int]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
+
+from hyperplanes import files
 
 __all__ = [
     "CheckpointError",
@@ -17,40 +16,11 @@ __all__ = [
     "load_tensors",
     "read_json",
     "save_tensors",
-    "write_json",
-    "write_whole",
 ]
 
 
 class CheckpointError(ValueError):
     """A checkpoint that cannot be used; one line that says which file, what was expected, what was found."""
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file beside its name and rename it when it is whole."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def write_json(path: Path, value: object) -> None:
-    """Write a JSON file, whole or not at all; infinity and what is not a number, which JSON has not, become null."""
-    write_whole(path, (json.dumps(_finite(value), indent=2, sort_keys=True, allow_nan=False) + "\n").encode())
-
-
-def _finite(value: object) -> object:
-    if isinstance(value, Mapping):
-        return {name: _finite(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -59,24 +29,19 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: no such file, or no JSON object in it.
     """
+    if not path.exists():
+        raise CheckpointError(f"{path}: expected a checkpoint's JSON file, found none; `hyperplanes train` writes one")
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise CheckpointError(
-            f"{path}: expected a checkpoint's JSON file, found none; `hyperplanes train` writes one"
-        ) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path}: expected JSON, found something else ({error}); copy the file again") from None
-    if not isinstance(value, dict):
-        raise CheckpointError(f"{path}: expected a JSON object, found {type(value).__name__}")
-    return value
+        return files.read_json(path)
+    except files.DataError as error:
+        raise CheckpointError(str(error)) from None
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
     """Write named tensors as safetensors, whole or not at all."""
     from safetensors.torch import save
 
-    write_whole(path, save({name: value.detach().cpu().contiguous() for name, value in tensors.items()}))
+    files.write_whole(path, save({name: value.detach().cpu().contiguous() for name, value in tensors.items()}))
 
 
 def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:

@@ -5,7 +5,6 @@ A verb's module is imported only when that verb is asked for, so `hyperplanes --
 
 from __future__ import annotations
 
-import difflib
 import errno
 import inspect
 import os
@@ -13,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from hyperplanes.commands import EXAMPLES, VERBS
+from hyperplanes.commands import EXAMPLES, find_verb, find_verbs
 
 __all__ = ["main"]
 
@@ -45,12 +44,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"hyperplanes {version('hyperplanes')}")
         return 0
     verb, *rest = given
-    if verb not in VERBS:
-        near = difflib.get_close_matches(verb, VERBS, 1)
-        known = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(VERBS)}"
-        return _complain(f"hyperplanes: no verb {verb!r}; {known}")
     try:
-        return _run(verb, rest)
+        module = find_verb(verb).module
+    except ValueError as error:
+        return _complain(f"hyperplanes: {error}")
+    try:
+        return _run(verb, module, rest)
     except KeyboardInterrupt as interrupt:
         advice = str(interrupt) or "the same command goes on where it can"
         _complain(f"hyperplanes {verb}: interrupted; {advice}")
@@ -64,10 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(f"hyperplanes {verb}: {_one_line(error)}")
 
 
-def _run(verb: str, rest: list[str]) -> int:
+def _run(verb: str, name: str, rest: list[str]) -> int:
     import tyro
 
-    module = import_module(f"hyperplanes.commands.{verb}")
+    module = import_module(name)
     parsed = tyro.cli(
         module.Arguments,
         prog=f"hyperplanes {verb}",
@@ -93,8 +92,9 @@ def _complain(line: str) -> int:
 
 
 def _overview() -> str:
-    width = max(map(len, VERBS))
-    verbs = "\n".join(f"  {verb:<{width}}  {about}" for verb, about in VERBS.items())
+    found = find_verbs()
+    width = max(map(len, found))
+    verbs = "\n".join(f"  {name:<{width}}  {verb.about}" for name, verb in found.items())
     return (
         "usage: hyperplanes VERB [OPTIONS]\n\n"
         "A hypernetwork looks at a few posed images of an object and writes a NeRF of it in one step.\n\n"

@@ -11,9 +11,10 @@ from typing import Any
 import torch
 
 from hyperplanes.adaptation.base import Adapter, Pictures
-from hyperplanes.checkpoints import read_json, write_json
+from hyperplanes.checkpoints import read_json
 from hyperplanes.evaluation import ObjectScore, evaluate
 from hyperplanes.export import save_images
+from hyperplanes.files import write_json
 from hyperplanes.methods import at_steps, describe_method, make_method
 from hyperplanes.models import OnDevice, choose_device
 from hyperplanes.presets import Preset

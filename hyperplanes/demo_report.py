@@ -14,9 +14,10 @@ import torch
 from PIL import Image
 
 from hyperplanes.adaptation.diagnostics import Diagnostics
-from hyperplanes.checkpoints import read_json, write_whole
+from hyperplanes.checkpoints import read_json
 from hyperplanes.demo import METHODS, MODELS, DemoSettings, describe_row
-from hyperplanes.export import encode_animation, encode_png, orbit_cameras, to_pixels
+from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
+from hyperplanes.files import encode_png, write_whole
 from hyperplanes.models import load_model
 from hyperplanes.report import Exhibit, Look, Report, Row, render_page
 from hyperplanes.report.content import Pixels
@@ -65,7 +66,7 @@ def write_report(
         )
     curves = {method: read_json(folder / method / "training.json")["curve"] for method in MODELS}
     picture = overview(exhibits[:3], rounds[:3], round(SCALE * settings.resolution))
-    write_whole(folder / "overview.png", encode_png(picture))
+    write_whole(folder / "overview.png", encode_png(picture, small=True))
     page = render_page(describe(folder, settings, metrics, exhibits, curves, facts))
     write_whole(folder / "report.html", page.encode())
     return folder / "report.html"

@@ -8,11 +8,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
 
-__all__ = ["REQUIRED", "Check", "examine", "examine_renderers", "healthy"]
+__all__ = ["REQUIRED", "Check", "examine", "healthy"]
 
 REQUIRED = {
     "kornia": "kornia",
@@ -36,6 +36,9 @@ OPTIONAL = {
 """What some things need: modules, each the package of its name, and what for."""
 
 SMALLEST_FREE = 2 * 2**30
+
+GROUP = "hyperplanes.checks"
+"""Entry points of functions that return further checks: of data_gen, its renderers."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,8 @@ def examine(folder: Path = Path()) -> list[Check]:
     checks = [_python(), _torch(), _packages()]
     if all(check.works for check in checks):
         checks += _lookups()
-        checks += examine_renderers()
+        for entry in entry_points(group=GROUP):
+            checks += entry.load()()
     return [*checks, _disk(folder), *(_optional(module) for module in OPTIONAL)]
 
 
@@ -117,31 +121,6 @@ def _lookups() -> list[Check]:
         Check(f"lookup {found.name}", found.available, False, found.reason, remedies.get(found.name, ""))
         for found in backends()
     ]
-
-
-def examine_renderers() -> list[Check]:
-    """Draw a triangle with each renderer, each in a process of its own; any one that works will do.
-
-    Returns:
-        One outcome a renderer, and one for all of them.
-    """
-    from data_gen.backends import probe_all
-
-    probes = probe_all()
-    working = [probe for probe in probes if probe.works]
-    best = f"{working[0].name} draws" if working else "none draws"
-    summary = Check("renderer", bool(working), True, best, probes[0].remedy)
-    return [
-        summary,
-        *(Check(f"renderer {each.name}", each.works, False, _reason(each.message), each.remedy) for each in probes),
-    ]
-
-
-def _reason(message: str) -> str:
-    """A message without the class it was raised as and the remedy, which is told apart."""
-    text = message.partition(" Remedy:")[0].rstrip(".")
-    kind, found, rest = text.partition(": ")
-    return rest if found and kind.endswith("Error") and " " not in kind else text
 
 
 def _disk(folder: Path) -> Check:

@@ -17,7 +17,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, Renderable
-from hyperplanes.checkpoints import write_whole
+from hyperplanes.colour import linear_from_srgb
+from hyperplanes.files import encode_png, write_whole
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.views import Views
 
@@ -29,7 +30,6 @@ __all__ = [
     "TURNTABLE_FORMATS",
     "Surface",
     "encode_animation",
-    "encode_png",
     "extract_mesh",
     "orbit_cameras",
     "save_images",
@@ -50,15 +50,6 @@ def to_pixels(images: Float[Tensor, "view 3 height width"]) -> npt.NDArray[np.ui
     [[[[0, 128, 255]]]]
     """
     return (images.detach().clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
-
-
-def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:
-    """The PNG file of (height, width, 3 or 4) pixels."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
-    return buffer.getvalue()
 
 
 def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds: float = 4.0) -> bytes:
@@ -112,7 +103,7 @@ def save_images(
         stems = [f"{index:04d}" for index in range(len(images))]
     paths = [Path(folder) / f"{stem}.png" for stem in stems]
     for path, pixels in zip(paths, to_pixels(images), strict=True):
-        write_whole(path, encode_png(pixels))
+        write_whole(path, encode_png(pixels, small=True))
     return paths
 
 
@@ -288,7 +279,7 @@ def save_mesh(surface: Surface, path: str | Path) -> Path:
     mesh = _mesh(surface.vertices, surface.faces)
     colours = surface.colours.clip(0, 1)
     if kind == "glb":
-        colours = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+        colours = linear_from_srgb(colours)
     opaque = np.ones((len(colours), 1))
     mesh.visual.vertex_colors = np.round(np.hstack([colours, opaque]) * 255).astype(np.uint8)  # pyright: ignore
     exported = mesh.export(file_type=kind)

@@ -17,7 +17,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
 from hyperplanes.adaptation.fine_tuning import ray_loss
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.checkpoints import write_json
+from hyperplanes.files import write_json
 from hyperplanes.episodes import Episode, Kept, naming, prepare_episode
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers

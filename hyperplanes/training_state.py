@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
-from hyperplanes.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors, write_json
+from hyperplanes.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
+from hyperplanes.files import write_json
 from hyperplanes.optimisers import Muon
 
 __all__ = ["Curve", "check_model", "load_state", "save_state"]

@@ -12,9 +12,8 @@ from hyperplanes.checkpoints import (
     load_tensors,
     read_json,
     save_tensors,
-    write_json,
-    write_whole,
 )
+from hyperplanes.files import write_json, write_whole
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "count": torch.tensor(7), "b": torch.ones(3, 2).T}
 
@@ -139,10 +138,10 @@ def test_a_full_disk_leaves_the_old_file_or_none(tmp_path, full_disk, existing):
 
 
 def test_a_rename_that_fails_leaves_no_partial_file(tmp_path, monkeypatch):
-    def fail(self, target):
+    def fail(source, target):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    monkeypatch.setattr(Path, "replace", fail)
+    monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="Input/output error"):
         write_whole(tmp_path / "file", b"content")
     assert os.listdir(tmp_path) == []

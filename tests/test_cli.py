@@ -15,10 +15,10 @@ import pytest
 from PIL import Image
 from small_demo import demo_folder, first_object
 
-from data_gen.backends import RendererError
+from data_gen.rendering.renderers import RendererError
 from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
-from hyperplanes.commands import VERBS
+from hyperplanes.commands import find_verbs
 from hyperplanes.data import read_task
 from hyperplanes.demo import DemoSettings, recipes
 from hyperplanes.fields.baked import BakedField
@@ -50,10 +50,10 @@ def test_help_loads_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout.splitlines()[-1] == "[]"
-    assert all(verb in done.stdout for verb in VERBS)
+    assert all(verb in done.stdout for verb in find_verbs())
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", find_verbs())
 def test_every_verb_has_help_with_an_example_and_no_torch(verb):
     script = (
         f"import sys; from hyperplanes.cli import main\ntry:\n    main([{verb!r}, '--help'])\n"
@@ -147,7 +147,7 @@ def test_without_any_renderer_one_line_says_what_to_install(tmp_path, monkeypatc
     def nothing(_):
         raise RendererError("no renderer works here; apt-get install -y libegl1 libgl1")
 
-    monkeypatch.setattr("data_gen.backends.find_backend", nothing)
+    monkeypatch.setattr("data_gen.rendering.renderers.find_renderer", nothing)
     assert main(["generate", "--class", "car", "--out", str(tmp_path)]) == 2
     assert "apt-get install -y libegl1 libgl1" in complaint(capsys)
 

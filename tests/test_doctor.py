@@ -4,21 +4,21 @@ import sys
 
 import pytest
 
-from data_gen import backends
-from data_gen.backends import Probe
+from data_gen.rendering import renderers
+from data_gen.rendering.renderers import ProbeResult
 from hyperplanes import doctor
 from hyperplanes.cli import main
 from hyperplanes.doctor import Check, examine, healthy
 
 WORKING = [
-    Probe("pyrender-egl", False, 1.0, "no libEGL", "apt-get install -y libegl1 libgl1"),
-    Probe("embree", True, 1.0, "Embree ray casting", ""),
+    ProbeResult("pyrender-egl", False, 1.0, "no libEGL", "apt-get install -y libegl1 libgl1"),
+    ProbeResult("embree", True, 1.0, "Embree ray casting", ""),
 ]
-NONE = [Probe("embree", False, 1.0, "no module named embreex", "pip install embreex")]
+NONE = [ProbeResult("embree", False, 1.0, "no module named embreex", "pip install embreex")]
 
 
 def test_optional_parts_may_be_missing(monkeypatch, capsys):
-    monkeypatch.setattr(backends, "probe_all", lambda: WORKING)
+    monkeypatch.setattr(renderers, "probe_all", lambda: WORKING)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name in doctor.OPTIONAL else object())
     assert main(["doctor"]) == 0
@@ -29,7 +29,7 @@ def test_optional_parts_may_be_missing(monkeypatch, capsys):
 
 
 def test_no_renderer_is_a_broken_machine(monkeypatch, capsys):
-    monkeypatch.setattr(backends, "probe_all", lambda: NONE)
+    monkeypatch.setattr(renderers, "probe_all", lambda: NONE)
     assert main(["doctor"]) == 1
     said = capsys.readouterr()
     assert "pip install embreex" in said.out
@@ -37,7 +37,7 @@ def test_no_renderer_is_a_broken_machine(monkeypatch, capsys):
 
 
 def test_a_missing_package_is_named_and_nothing_else_is_tried(monkeypatch):
-    monkeypatch.setattr(backends, "probe_all", lambda: pytest.fail("probed"))
+    monkeypatch.setattr(renderers, "probe_all", lambda: pytest.fail("probed"))
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name == "kornia" else object())
     checks = examine()
     assert not healthy(checks)

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes import checkpoints
+from hyperplanes import checkpoints, files
 from hyperplanes.adaptation import HyperPlanes, base
 from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.geometry import occupancy
@@ -206,7 +206,7 @@ def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, 
         states[step] = state_of(trainer.model)
         if step == 1:
             trainer.save()
-    write, found = checkpoints.write_whole, []
+    write, found = files.write_whole, []
     for survived in range(5):
         left = iter(range(survived))
 
@@ -216,7 +216,7 @@ def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, 
             write(path, content)
 
         with monkeypatch.context() as patch:
-            patch.setattr(checkpoints, "write_whole", write_some)
+            patch.setattr(files, "write_whole", write_some)
             if survived < 4:
                 with pytest.raises(Killed):
                     trainer.save()

@@ -50,4 +50,5 @@ def test_its_metadata(wheel):
     assert "Requires-Python: >=3.11" in metadata
     scripts = next(name for name in wheel.namelist() if name.endswith("entry_points.txt"))
     assert "hyperplanes = hyperplanes.cli:main" in wheel.read(scripts).decode()
+    assert "generate = data_gen.commands:GENERATE" in wheel.read(scripts).decode()
     assert any(name.endswith("licenses/LICENSE") for name in wheel.namelist())

@@ -34,14 +34,14 @@ def assemble(class_name: str, seed: int) -> list[Part]:
     """The painted solids of an object, before they are joined.
 
     Args:
-        class_name: One of `CLASSES`.
-        seed: Any non-negative integer; the same one gives the same parts.
+        class_name: one of `CLASSES`.
+        seed: any non-negative integer; the same one gives the same parts.
 
     Returns:
         Parts in metres, y up, front along +z.
 
     Raises:
-        ValueError: If the class is unknown or the seed is negative.
+        ValueError: if the class is unknown or the seed is negative.
     """
     if class_name not in CLASSES:
         raise ValueError(f"class_name: expected one of {', '.join(CLASSES)}, got {class_name!r}")
@@ -54,8 +54,8 @@ def make(class_name: str, seed: int) -> trimesh.Scene:
     """A procedural object.
 
     Args:
-        class_name: One of `CLASSES`.
-        seed: Any non-negative integer; the same one gives the same vertices, faces and pixels.
+        class_name: one of `CLASSES`.
+        seed: any non-negative integer; the same one gives the same vertices, faces and pixels.
 
     Returns:
         A scene with one textured geometry, named after the class: metres, y up, front along +z. Its `metadata["parts"]`

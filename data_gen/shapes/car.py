@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from data_gen.shapes.car_body import body
-from data_gen.shapes.car_frame import STYLES, Frame, draw_frame
-from data_gen.shapes.materials import Colour, Material, plain, shade, tint
+from data_gen.shapes.car_frame import STYLES, CarFrame, sample_frame
+from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.parts import Part
 from data_gen.shapes.patterns import wheel_face
 from data_gen.shapes.primitives import ball, box, cylinder, tapered
@@ -36,7 +36,7 @@ _PAINTS: tuple[tuple[float, float, float, float], ...] = (  # hue, saturation, v
 )
 
 
-def _wheels(rng: np.random.Generator, frame: Frame) -> list[Part]:
+def _wheels(rng: np.random.Generator, frame: CarFrame) -> list[Part]:
     """Four tyres with rims, their outer faces a little outside the flanks."""
     radius, width = frame.wheel, 0.21
     rubber = plain((27, 27, 29), "rubber")
@@ -62,7 +62,7 @@ def _wheels(rng: np.random.Generator, frame: Frame) -> list[Part]:
     return parts
 
 
-def _ends(rng: np.random.Generator, frame: Frame, paint: Colour) -> list[Part]:
+def _ends(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> list[Part]:
     """Lamps, grille, bumpers and number plates."""
     half = frame.length / 2
     parts: list[Part] = []
@@ -70,7 +70,7 @@ def _ends(rng: np.random.Generator, frame: Frame, paint: Colour) -> list[Part]:
     red = plain((190, 24, 28), "tail_lamp")
     black = plain((33, 33, 36), "grille")
     chrome = plain((176, 180, 186), "chrome")
-    trim = plain(shade(paint, 0.55), "bumper") if rng.random() < 0.5 else black
+    trim = plain(brighten(paint, 0.55), "bumper") if rng.random() < 0.5 else black
     front_half = float(frame.half_width(half))
     low = frame.floor + 0.12
     lamp_y = frame.nose - 0.21
@@ -105,7 +105,7 @@ def _ends(rng: np.random.Generator, frame: Frame, paint: Colour) -> list[Part]:
     return parts
 
 
-def _mirrors(frame: Frame, material: Material) -> list[Part]:
+def _mirrors(frame: CarFrame, material: Material) -> list[Part]:
     """Outside mirrors on short arms, handles on the doors."""
     _, rear, front, cowl = frame.glass
     z = 0.75 * cowl + 0.25 * front
@@ -126,7 +126,7 @@ def _mirrors(frame: Frame, material: Material) -> list[Part]:
     return parts + [part.mirrored() for part in parts]
 
 
-def _extras(rng: np.random.Generator, frame: Frame, paint: Colour) -> list[Part]:
+def _extras(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> list[Part]:
     """What some cars carry: a load bed, roof rails, a spoiler, a taxi sign, an exhaust."""
     parts: list[Part] = []
     half, black = frame.length / 2, plain((36, 36, 40), "black")
@@ -184,13 +184,13 @@ def car(rng: np.random.Generator) -> list[Part]:
     """A car.
 
     Args:
-        rng: Source of every choice.
+        rng: source of every choice.
 
     Returns:
         Its parts in metres, y up, front along +z, standing on y = 0.
     """
     names = list(STYLES)
-    frame = draw_frame(rng, names[rng.choice(len(names), p=np.array([3, 1.5, 2.5, 1.5, 2.5, 1.5, 1.5, 2]) / 16)])
+    frame = sample_frame(rng, names[rng.choice(len(names), p=np.array([3, 1.5, 2.5, 1.5, 2.5, 1.5, 1.5, 2]) / 16)])
     weights = np.array([paint[3] for paint in _PAINTS])
     hue, saturation, value, _ = _PAINTS[rng.choice(len(_PAINTS), p=weights / weights.sum())]
     paint = tint(rng, hue, saturation, value, 0.08)

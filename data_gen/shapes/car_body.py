@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_gen.shapes.car_frame import Frame
-from data_gen.shapes.materials import Colour, Material, plain, shade, tint
+from data_gen.shapes.car_frame import CarFrame
+from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.parts import Part
 from data_gen.shapes.solids import Solid, loft
 
 __all__ = ["body"]
 
 
-def _sections(frame: Frame, stations: np.ndarray) -> np.ndarray:
+def _sections(frame: CarFrame, stations: np.ndarray) -> np.ndarray:
     """Outlines (k, 20, 2) of the body at the stations: up the left side (+x) from the floor, over, down the right."""
     half = frame.half_width(stations)
     top = frame.top(stations)
@@ -50,7 +50,7 @@ def _sections(frame: Frame, stations: np.ndarray) -> np.ndarray:
     return np.concatenate([left, left[:, ::-1] * [-1, 1]], axis=1)
 
 
-def _stations(frame: Frame, pillars: list[float]) -> np.ndarray:
+def _stations(frame: CarFrame, pillars: list[float]) -> np.ndarray:
     """Where along z the body has a section: bends of the silhouette, window posts, and around the wheel arches."""
     half = frame.length / 2
     fixed = [-half, -half + 0.06, half - 0.12, half, 0.45 * frame.glass[3] + 0.55 * half, *frame.glass]
@@ -67,7 +67,7 @@ def _stations(frame: Frame, pillars: list[float]) -> np.ndarray:
     return np.array(keep)
 
 
-def _pillars(frame: Frame) -> list[float]:
+def _pillars(frame: CarFrame) -> list[float]:
     """Positions of the upright posts between the side windows."""
     _, rear, front, _ = frame.glass
     if frame.style in ("coupe", "sports"):
@@ -79,14 +79,14 @@ def _pillars(frame: Frame) -> list[float]:
     return [0.62 * front + 0.38 * rear, 0.22 * front + 0.78 * rear]
 
 
-def _flank(rng: np.random.Generator, frame: Frame, paint: Colour, pillars: list[float], solid: Solid) -> Material:
+def _flank(rng: np.random.Generator, frame: CarFrame, paint: Colour, pillars: list[float], solid: Solid) -> Material:
     """The painted sides, seen along x over the body's bounds: door gaps, a dark sill, a moulding, some with a decal."""
     (_, low, back), (_, high, front) = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     row, column = np.mgrid[0:80, 0:224]
     z, y = back + (column + 0.5) / 224 * (front - back), high - (row + 0.5) / 80 * (high - low)
     image = np.tile(np.array(paint, dtype=np.uint8), (80, 224, 1))
-    sill, dark = frame.floor + 0.07, shade(paint, 0.45)
-    image[y < sill + 0.05] = shade(paint, 0.7)
+    sill, dark = frame.floor + 0.07, brighten(paint, 0.45)
+    image[y < sill + 0.05] = brighten(paint, 0.7)
     contrast: Colour = (226, 222, 208) if sum(paint) < 400 else (40, 42, 50)
     choice = rng.random()
     middle = (sill + frame.belt) / 2
@@ -96,7 +96,7 @@ def _flank(rng: np.random.Generator, frame: Frame, paint: Colour, pillars: list[
     elif choice < 0.28 and frame.style in ("sports", "coupe", "hatchback"):
         centre = 0.5 * (pillars[0] + cowl)
         image[np.hypot(z - centre, y - middle) < 0.2] = contrast
-        image[np.hypot(z - centre, y - middle) < 0.13] = shade(contrast, 0.45)
+        image[np.hypot(z - centre, y - middle) < 0.13] = brighten(contrast, 0.45)
     elif choice < 0.5 and frame.style == "van":
         image[(np.abs(z - 0.5 * (rear + pillars[0])) < 0.9) & (np.abs(y - middle) < 0.17)] = contrast
     elif choice < 0.6:
@@ -110,7 +110,7 @@ def _flank(rng: np.random.Generator, frame: Frame, paint: Colour, pillars: list[
     return Material("flank", image)
 
 
-def body(rng: np.random.Generator, frame: Frame, paint: Colour) -> Part:
+def body(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> Part:
     """The shell with its glass, trim and wheel wells."""
     pillars = _pillars(frame)
     stations = _stations(frame, pillars)

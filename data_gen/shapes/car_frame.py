@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["STYLES", "Frame", "Style", "draw_frame"]
+__all__ = ["STYLES", "CarFrame", "Style", "sample_frame"]
 
 
 @dataclass(frozen=True)
@@ -17,17 +17,17 @@ class Style:
     """Proportions of a body; every pair is the range a value is drawn from.
 
     Attributes:
-        length: Metres.
-        width: Metres, without mirrors.
-        height: Metres, ground to roof.
-        glass: Where glass begins and ends as fractions of the length from the tail: foot of the rear window, rear end
+        length: metres.
+        width: metres, without mirrors.
+        height: metres, ground to roof.
+        glass: where glass begins and ends as fractions of the length from the tail: foot of the rear window, rear end
             of the roof, front end of the roof, foot of the windscreen.
-        belt: Height of the window sills as a fraction of the height.
-        deck: Height of the tail's lid as a fraction of the height.
-        nose: Height of the bonnet's front edge as a fraction of the height.
-        clearance: Metres under the floor.
-        wheel: Outer radius of the tyres in metres.
-        roof: Width of the roof as a fraction of the body's.
+        belt: height of the window sills as a fraction of the height.
+        deck: height of the tail's lid as a fraction of the height.
+        nose: height of the bonnet's front edge as a fraction of the height.
+        clearance: metres under the floor.
+        wheel: outer radius of the tyres in metres.
+        roof: width of the roof as a fraction of the body's.
     """
 
     length: tuple[float, float]
@@ -72,7 +72,7 @@ STYLES: dict[str, Style] = {
 
 
 @dataclass(frozen=True)
-class Frame:
+class CarFrame:
     """Measures of one car that its parts share, in metres; z from the tail at -length / 2 to the nose."""
 
     style: str
@@ -114,7 +114,7 @@ class Frame:
         return np.max([np.where(r > 0, self.wheel + r, 0) for r in rise], axis=0)
 
 
-def draw_frame(rng: np.random.Generator, name: str) -> Frame:
+def sample_frame(rng: np.random.Generator, name: str) -> CarFrame:
     """Draw the measures of a car of the named style."""
     style = STYLES[name]
     length, width, height = rng.uniform(*style.length), rng.uniform(*style.width), rng.uniform(*style.height)
@@ -122,7 +122,7 @@ def draw_frame(rng: np.random.Generator, name: str) -> Frame:
     wheel = rng.uniform(*style.wheel)
     overhang = rng.uniform(0.17, 0.2), rng.uniform(0.16, 0.19)
     belt = (style.belt + rng.uniform(-0.02, 0.02)) * height
-    return Frame(
+    return CarFrame(
         style=name,
         length=length,
         width=width,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_gen.shapes.chair_backs import arms, back
-from data_gen.shapes.chair_frame import Frame, Palette, draw_palette
+from data_gen.shapes.chair_frame import ChairFrame, Palette, sample_palette
 from data_gen.shapes.chair_legs import legs
 from data_gen.shapes.parts import Part
 from data_gen.shapes.primitives import box, cushion
@@ -19,7 +19,7 @@ __all__ = ["chair"]
 _KINDS = {"dining": 0.5, "lounge": 0.2, "office": 0.14, "bar": 0.08, "rocking": 0.08}
 
 
-def _frame(rng: np.random.Generator) -> Frame:
+def _frame(rng: np.random.Generator) -> ChairFrame:
     """Draw the kind of chair and its measures."""
     kind = list(_KINDS)[int(rng.choice(len(_KINDS), p=list(_KINDS.values())))]
     width, depth = rng.uniform(0.4, 0.52), rng.uniform(0.4, 0.5)
@@ -38,10 +38,10 @@ def _frame(rng: np.random.Generator) -> Frame:
     elif kind == "dining" and rng.random() < 0.06:
         back_height, round_seat = 0.0, True
         width = depth = rng.uniform(0.31, 0.37)
-    return Frame(kind, width, depth, seat, thick, float(back_height), lean, round_seat)
+    return ChairFrame(kind, width, depth, seat, thick, float(back_height), lean, round_seat)
 
 
-def _seat(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _seat(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """The seat, with a cushion on some."""
     middle = frame.seat - frame.thick / 2
     if frame.round_seat:
@@ -65,13 +65,13 @@ def chair(rng: np.random.Generator) -> list[Part]:
     """A chair.
 
     Args:
-        rng: Source of every choice.
+        rng: source of every choice.
 
     Returns:
         Its parts in metres, y up, the sitter looking along +z, standing on y = 0.
     """
     frame = _frame(rng)
-    palette = draw_palette(rng, frame.kind)
+    palette = sample_palette(rng, frame.kind)
     parts = _seat(rng, frame, palette) + legs(rng, frame, palette) + back(rng, frame, palette)
     chance = {"dining": 0.22, "lounge": 0.85, "office": 0.65, "bar": 0.0, "rocking": 0.75}[frame.kind]
     if frame.back > 0.3 and rng.random() < chance:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from data_gen.shapes.chair_frame import Frame, Palette
+from data_gen.shapes.chair_frame import ChairFrame, Palette
 from data_gen.shapes.parts import Part
 from data_gen.shapes.primitives import box, cushion, panel, post, rod, tube
 
@@ -16,7 +16,7 @@ _SINK = 0.03
 """Metres by which a back reaches into the seat."""
 
 
-def _posts(frame: Frame, palette: Palette, size: float, top: float = 1.0) -> list[Part]:
+def _posts(frame: ChairFrame, palette: Palette, size: float, top: float = 1.0) -> list[Part]:
     """The two uprights that carry a back."""
     x = frame.width / 2 - size / 2 - 0.012
     foot, head = frame.at_back(x, -_SINK / frame.back), frame.at_back(x, top)
@@ -24,7 +24,7 @@ def _posts(frame: Frame, palette: Palette, size: float, top: float = 1.0) -> lis
     return [left, left.mirrored()]
 
 
-def _rail(frame: Frame, palette: Palette, share: float, height: float, bow: float, name: str) -> Part:
+def _rail(frame: ChairFrame, palette: Palette, share: float, height: float, bow: float, name: str) -> Part:
     """A bar across the back, bowed backwards in the middle."""
     x = np.linspace(frame.width / 2 - 0.03, -frame.width / 2 + 0.03, 7)
     depth = bow * (1 - (2 * x / frame.width) ** 2)
@@ -32,7 +32,7 @@ def _rail(frame: Frame, palette: Palette, share: float, height: float, bow: floa
     return Part.of(name, tube(path, 0.02, height, sides=4), palette.frame)
 
 
-def _ladder(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _ladder(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Posts with two to five bowed slats."""
     count = int(rng.integers(2, 6))
     height = rng.uniform(0.45, 0.75) * frame.back * 0.75 / count
@@ -42,7 +42,7 @@ def _ladder(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Pa
     return _posts(frame, palette, rng.uniform(0.03, 0.042)) + slats
 
 
-def _spindles(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _spindles(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """A bowed top rail on thin rods that spread upwards."""
     count = int(rng.integers(4, 9))
     bow, top = rng.uniform(0.01, 0.05), 0.93
@@ -57,7 +57,7 @@ def _spindles(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[
     return parts
 
 
-def _panel(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _panel(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """A curved shell that rises from the seat, its head rounded off or square."""
     lean = frame.back * np.tan(np.radians(frame.lean))
     width = frame.width - 0.02
@@ -74,7 +74,7 @@ def _panel(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Par
     return [Part.of("back", solid.projected("z").moved(0, frame.seat - _SINK, z), palette.seat)]
 
 
-def _framed(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _framed(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Posts and rails around a crossed, splatted or filled middle."""
     size = rng.uniform(0.03, 0.042)
     parts = _posts(frame, palette, size)
@@ -99,7 +99,7 @@ def _framed(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Pa
     return parts
 
 
-def _padded(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _padded(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """An upholstered slab that stands on the seat."""
     thick = rng.uniform(0.08, 0.13) * (1.25 if frame.kind == "lounge" else 0.8)
     wide = frame.width * rng.uniform(0.9, 1.0)
@@ -112,7 +112,7 @@ def _padded(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Pa
     return [Part.of("back", pad, palette.seat)]
 
 
-def _office(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _office(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """A pad on a bracket, with a headrest on some."""
     gap = rng.uniform(0.05, 0.12)
     wide = frame.width * rng.uniform(0.85, 0.98)
@@ -134,7 +134,7 @@ def _office(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Pa
     return parts
 
 
-BACKS: dict[str, Callable[[np.random.Generator, Frame, Palette], list[Part]]] = {
+BACKS: dict[str, Callable[[np.random.Generator, ChairFrame, Palette], list[Part]]] = {
     "ladder": _ladder,
     "spindles": _spindles,
     "panel": _panel,
@@ -153,7 +153,7 @@ _CHOICES = {
 }
 
 
-def back(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def back(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Draw a back that suits the chair's kind, and build it; nothing for a stool."""
     if frame.back == 0:
         return []
@@ -162,7 +162,7 @@ def back(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]
     return BACKS[list(choices)[int(rng.choice(len(choices), p=weights / weights.sum()))]](rng, frame, palette)
 
 
-def arms(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def arms(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Armrests: upholstered blocks, boards on posts, or bent loops."""
     x, high = frame.width / 2, frame.seat + rng.uniform(0.18, 0.23)
     rear, front = -frame.depth / 2 + 0.04, frame.depth / 2 - rng.uniform(0.04, 0.12)

@@ -6,25 +6,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_gen.shapes.materials import Colour, Material, plain, shade, tint
+from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.patterns import print_of, weave, wood
 
-__all__ = ["Frame", "Palette", "draw_palette"]
+__all__ = ["ChairFrame", "Palette", "sample_palette"]
 
 
 @dataclass(frozen=True)
-class Frame:
+class ChairFrame:
     """Measures of a chair in metres; its seat is centred on x = z = 0, its back at negative z.
 
     Attributes:
         kind: "dining", "lounge", "office", "bar" or "rocking".
-        width: Of the seat.
-        depth: Of the seat.
-        seat: Height of the seat's upper side over the floor.
-        thick: Thickness of the seat.
-        back: Height of the back over the seat; 0 for none.
-        lean: Degrees by which the back reclines.
-        round_seat: Whether the seat is a disc.
+        width: of the seat.
+        depth: of the seat.
+        seat: height of the seat's upper side over the floor.
+        thick: thickness of the seat.
+        back: height of the back over the seat; 0 for none.
+        lean: degrees by which the back reclines.
+        round_seat: whether the seat is a disc.
     """
 
     kind: str
@@ -70,7 +70,7 @@ _WOODS: tuple[Colour, ...] = (
 _DYES = (0.0, 0.02, 0.05, 0.09, 0.13, 0.2, 0.3, 0.38, 0.47, 0.54, 0.6, 0.64, 0.75, 0.9, 0.97)
 
 
-def draw_palette(rng: np.random.Generator, kind: str) -> Palette:
+def sample_palette(rng: np.random.Generator, kind: str) -> Palette:
     """Materials that go together for a chair of the kind."""
     colour = tint(rng, _DYES[int(rng.integers(len(_DYES)))], rng.uniform(0.35, 0.8), rng.uniform(0.4, 0.8), 0.05)
     level = int(rng.choice([52, 64, 128, 158]))
@@ -79,7 +79,7 @@ def draw_palette(rng: np.random.Generator, kind: str) -> Palette:
     wooden = kind != "office" and rng.random() < 0.72
     if wooden:
         painted = rng.random() < 0.18
-        frame = plain(shade(colour, 0.85), "painted") if painted else wood(rng, timber)
+        frame = plain(brighten(colour, 0.85), "painted") if painted else wood(rng, timber)
     else:
         frame = metal
     if kind in ("lounge", "office") or rng.random() < 0.55:
@@ -87,11 +87,11 @@ def draw_palette(rng: np.random.Generator, kind: str) -> Palette:
         if choice < 0.3:
             seat = weave(rng, colour)
         elif choice < (0.45 if kind == "office" else 0.7):
-            other = shade(colour, 0.5) if rng.random() < 0.5 else (226, 214, 188)
+            other = brighten(colour, 0.5) if rng.random() < 0.5 else (226, 214, 188)
             seat = print_of(rng, colour, other)
         else:
             dark = kind == "office" and rng.random() < 0.3
-            seat = plain(shade((44, 46, 52), rng.uniform(0.8, 1.8)) if dark else colour, "leather")
+            seat = plain(brighten((44, 46, 52), rng.uniform(0.8, 1.8)) if dark else colour, "leather")
     elif wooden:
         seat = wood(rng, timber, int(rng.integers(1, 5)))
     else:

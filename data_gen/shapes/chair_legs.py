@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from data_gen.shapes.chair_frame import Frame, Palette
+from data_gen.shapes.chair_frame import ChairFrame, Palette
 from data_gen.shapes.materials import plain
 from data_gen.shapes.parts import Part
 from data_gen.shapes.primitives import ball, cone, cylinder, post, rod, tapered, torus, tube
@@ -18,7 +18,7 @@ _BITE = 0.012
 """Metres by which a part reaches into the one that it is joined to."""
 
 
-def _corners(frame: Frame, inset: float) -> list[tuple[str, float, float]]:
+def _corners(frame: ChairFrame, inset: float) -> list[tuple[str, float, float]]:
     """Where legs meet the seat: name, x and z of each."""
     if frame.kind == "lounge":
         inset += 0.06  # the cushion's lower corners are round
@@ -28,7 +28,7 @@ def _corners(frame: Frame, inset: float) -> list[tuple[str, float, float]]:
     return [("front_left", x, z), ("front_right", -x, z), ("rear_left", x, -z), ("rear_right", -x, -z)]
 
 
-def _stretchers(rng: np.random.Generator, frame: Frame, palette: Palette, feet: dict, heads: dict) -> list[Part]:
+def _stretchers(rng: np.random.Generator, frame: ChairFrame, palette: Palette, feet: dict, heads: dict) -> list[Part]:
     """Bars between legs given by the centres of their feet and heads."""
 
     def along(name: str, height: float) -> tuple[float, float, float]:
@@ -54,7 +54,7 @@ def _stretchers(rng: np.random.Generator, frame: Frame, palette: Palette, feet: 
     return parts
 
 
-def _four(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _four(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Four legs, square or round, upright or splayed, tapered downwards, often with stretchers."""
     splay = rng.uniform(0.02, 0.09) if rng.random() < 0.5 or frame.round_seat else 0.0
     size = rng.uniform(0.028, 0.05) * (1.25 if frame.kind == "lounge" else 1)
@@ -84,7 +84,7 @@ def _four(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part
     return parts
 
 
-def _turned(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _turned(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Four legs turned on a lathe, with beads and waists."""
     high = frame.under + _BITE
     stops = np.array([0, 0.06, 0.12, 0.3, 0.52, 0.58, 0.64, 0.7, 0.88, 1.0])
@@ -96,7 +96,7 @@ def _turned(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Pa
     return parts + _stretchers(rng, frame, palette, points, heads)
 
 
-def _hairpin(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _hairpin(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Four bent wires, each a V that stands on its tip."""
     parts = []
     out = rng.uniform(0.0, 0.06)
@@ -110,7 +110,7 @@ def _hairpin(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[P
     return parts
 
 
-def _sled(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _sled(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Two bent runners, joined under the seat."""
     width = rng.uniform(0.022, 0.034)
     x, z, top = frame.width / 2 - 0.035, frame.depth / 2 - 0.04, frame.under - 0.3 * width
@@ -125,7 +125,7 @@ def _sled(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part
     return [runner, bearer, runner.mirrored(), bearer.mirrored(), Part.of("bearer", cross, palette.metal)]
 
 
-def _cantilever(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _cantilever(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """One bent tube a side that leaves the seat at the front and runs back along the floor, as in Bauhaus chairs."""
     width = rng.uniform(0.022, 0.03)
     x, z, top = frame.width / 2 - 0.02, frame.depth / 2 - 0.02, frame.under - 0.25 * width
@@ -147,7 +147,7 @@ def _cantilever(rng: np.random.Generator, frame: Frame, palette: Palette) -> lis
     return [side, side.mirrored(), Part.of("floor_rail", floor, palette.metal), Part.of("rail", rail, palette.metal)]
 
 
-def _column(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _column(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """A pillar on a disc or a trumpet foot."""
     radius = 0.5 * frame.width * rng.uniform(0.8, 0.98)
     top = frame.under + _BITE
@@ -167,7 +167,7 @@ def _column(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Pa
     return parts
 
 
-def _star(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _star(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """A gas spring on a five-armed star with casters."""
     reach = 0.5 * frame.width * rng.uniform(1.05, 1.2)
     black = plain((40, 40, 44), "caster")
@@ -192,7 +192,7 @@ def _star(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part
     return [*parts, Part.of("mount", mount, black)]
 
 
-def _rockers(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def _rockers(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Four legs on two curved runners."""
     size = rng.uniform(0.032, 0.044)
     x, z = frame.width / 2 - 0.04, frame.depth / 2 - 0.05
@@ -213,7 +213,7 @@ def _rockers(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[P
     return parts
 
 
-LEGS: dict[str, Callable[[np.random.Generator, Frame, Palette], list[Part]]] = {
+LEGS: dict[str, Callable[[np.random.Generator, ChairFrame, Palette], list[Part]]] = {
     "four": _four,
     "turned": _turned,
     "hairpin": _hairpin,
@@ -234,7 +234,7 @@ _CHOICES = {
 }
 
 
-def legs(rng: np.random.Generator, frame: Frame, palette: Palette) -> list[Part]:
+def legs(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Draw a way to stand that suits the chair's kind, and build it."""
     choices = _CHOICES[frame.kind]
     weights = np.array(list(choices.values()))

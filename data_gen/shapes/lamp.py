@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from data_gen.shapes.lamp_shades import Shade, draw_cloth, draw_shade, shell
-from data_gen.shapes.lamp_stands import draw_metal, floor_stand, foot, table_body
+from data_gen.shapes.lamp_shades import Shade, sample_cloth, sample_shade, shell
+from data_gen.shapes.lamp_stands import floor_stand, foot, sample_metal, table_body
 from data_gen.shapes.materials import Material, plain, tint
 from data_gen.shapes.parts import Part
 from data_gen.shapes.primitives import ball, cone, cylinder, rod, tube
@@ -49,10 +49,10 @@ def _on_top(style: Shade, height: float, metal: Material) -> list[Part]:
 
 def _table(rng: np.random.Generator) -> list[Part]:
     """A ceramic, wooden or metal body under a shade."""
-    metal = draw_metal(rng)
+    metal = sample_metal(rng)
     height = rng.uniform(0.2, 0.36)
     radius = rng.uniform(0.07, 0.13)
-    style = draw_shade(rng, rng.uniform(0.14, 0.2), rng.uniform(0.16, 0.25), _CLOTH)
+    style = sample_shade(rng, rng.uniform(0.14, 0.2), rng.uniform(0.16, 0.25), _CLOTH)
     if rng.random() < 0.08:  # a globe straight on a foot
         size = rng.uniform(0.11, 0.15)
         globe = ball(size, size, size, 20, 12).moved(0, 0.05 + 0.93 * size)
@@ -60,22 +60,22 @@ def _table(rng: np.random.Generator) -> list[Part]:
         return [
             *foot(rng, 0.75 * size, metal),
             Part.of("collar", collar, metal),
-            Part.of("globe", globe, draw_cloth(rng)),
+            Part.of("globe", globe, sample_cloth(rng)),
         ]
     return [*table_body(rng, height, radius, metal), *_on_top(style, height, metal)]
 
 
 def _floor(rng: np.random.Generator) -> list[Part]:
     """A tall stand under a shade."""
-    metal = draw_metal(rng)
+    metal = sample_metal(rng)
     height = rng.uniform(0.95, 1.3)
-    style = draw_shade(rng, rng.uniform(0.2, 0.27), rng.uniform(0.24, 0.36), _CLOTH)
+    style = sample_shade(rng, rng.uniform(0.2, 0.27), rng.uniform(0.24, 0.36), _CLOTH)
     return [*floor_stand(rng, height, metal), *_on_top(style, height, metal)]
 
 
 def _arc(rng: np.random.Generator) -> list[Part]:
     """A heavy foot, a wide bow, and a shade that hangs from its end over the front."""
-    metal = draw_metal(rng)
+    metal = sample_metal(rng)
     reach, height = rng.uniform(0.65, 0.9), rng.uniform(1.25, 1.5)
     angles = np.linspace(0, 0.97 * np.pi, 13)
     straight = rng.uniform(0.35, 0.55) * height
@@ -84,7 +84,7 @@ def _arc(rng: np.random.Generator) -> list[Part]:
     path = [(0.0, 0.01, -0.5 * reach), *zip(np.zeros(13), y, z, strict=True)]
     bow = tube(path, 0.032, sides=8)
     end_y, end_z = float(y[-1]), float(z[-1])
-    style = draw_shade(rng, rng.uniform(0.18, 0.25), rng.uniform(0.16, 0.24), _HARD)
+    style = sample_shade(rng, rng.uniform(0.18, 0.25), rng.uniform(0.16, 0.24), _HARD)
     rim = end_y - 0.8 * style.height
     stand = _moved(foot(rng, rng.uniform(0.16, 0.21), metal), 0, 0, -0.5 * reach)
     return [*stand, Part.of("bow", bow, metal), *_moved(shell(style, "main", metal), 0, rim, end_z)]
@@ -93,8 +93,8 @@ def _arc(rng: np.random.Generator) -> list[Part]:
 def _desk(rng: np.random.Generator) -> list[Part]:
     """Two jointed arms and a turnable metal head."""
     colour = plain(tint(rng, rng.random(), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)), "paint")
-    metal = colour if rng.random() < 0.5 else draw_metal(rng)
-    style = draw_shade(
+    metal = colour if rng.random() < 0.5 else sample_metal(rng)
+    style = sample_shade(
         rng, rng.uniform(0.085, 0.115), rng.uniform(0.12, 0.16), ("dome", "coolie", "bell", "empire", "tulip")
     )
     style = replace(style, cloth=colour, trim=None, segments=24)
@@ -128,17 +128,17 @@ def _ceiling(top: float, metal: Material) -> list[Part]:
 
 def _pendant(rng: np.random.Generator) -> list[Part]:
     """One shade on a cord, or a paper lantern, or a glass globe."""
-    metal = draw_metal(rng)
+    metal = sample_metal(rng)
     drop = rng.uniform(0.2, 0.5)
     if rng.random() < 0.3:
         size = rng.uniform(0.15, 0.21)
         flat = rng.uniform(0.75, 1.1)
-        globe = Part.of("lantern", ball(size, size * flat, size, 20, 14), draw_cloth(rng))
+        globe = Part.of("lantern", ball(size, size * flat, size, 20, 14), sample_cloth(rng))
         top = size * flat
         collar = cylinder(0.05, 0.04, 14)
         parts = [globe, Part.of("collar", collar.moved(0, 0.985 * top), metal)]
     else:
-        style = draw_shade(rng, rng.uniform(0.16, 0.24), rng.uniform(0.15, 0.26), (*_HARD, "drum", "barrel"))
+        style = sample_shade(rng, rng.uniform(0.16, 0.24), rng.uniform(0.15, 0.26), (*_HARD, "drum", "barrel"))
         parts, top = shell(style, "main", metal), 0.8 * style.height
         if style.shape in ("dome", "coolie"):
             cover = lathe([(style.radius_at(1.0) - 0.004, 0.985 * style.height), (0.02, 1.12 * style.height)], 24)
@@ -152,7 +152,7 @@ def _pendant(rng: np.random.Generator) -> list[Part]:
 
 def _chandelier(rng: np.random.Generator) -> list[Part]:
     """A turned column with curved arms that carry candles or small shades."""
-    metal = draw_metal(rng)
+    metal = sample_metal(rng)
     count = int(rng.integers(4, 9))
     reach, rise, drop = rng.uniform(0.26, 0.36), rng.uniform(0.02, 0.12), rng.uniform(0.25, 0.4)
     radii = np.concatenate([[0.012], rng.uniform(0.02, 0.065, 7), [0.016]])
@@ -161,7 +161,7 @@ def _chandelier(rng: np.random.Generator) -> list[Part]:
     parts.append(Part.of("pendant_ball", ball(0.03, 0.036, 0.03, 12, 8).moved(0, -0.16), metal))
     shaded = rng.random() < 0.6
     up = not shaded or rng.random() < 0.6
-    style = draw_shade(rng, 0.075, 0.09, ("empire", "slanted", "bell", "tulip"))
+    style = sample_shade(rng, 0.075, 0.09, ("empire", "slanted", "bell", "tulip"))
     style = replace(style, segments=12, trim=None)
     share = np.linspace(0, 1, 8)
     sag = rng.uniform(0.06, 0.12)
@@ -200,7 +200,7 @@ def lamp(rng: np.random.Generator) -> list[Part]:
     """A lamp.
 
     Args:
-        rng: Source of every choice.
+        rng: source of every choice.
 
     Returns:
         Its parts in metres, y up, front along +z.

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_gen.shapes.materials import Colour, Material, plain, shade, tint
+from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.parts import Part
 from data_gen.shapes.patterns import print_of, weave
 from data_gen.shapes.primitives import ball, cylinder, rod
 from data_gen.shapes.solids import Solid, lathe
 
-__all__ = ["Shade", "draw_cloth", "draw_shade", "shell"]
+__all__ = ["Shade", "sample_cloth", "sample_shade", "shell"]
 
 _WALL = 0.012
 _GLOW = plain((250, 226, 150), "bulb")
@@ -38,12 +38,12 @@ class Shade:
     """What a shade is like, in metres.
 
     Attributes:
-        shape: Key of the outline.
-        radius: Largest radius.
-        height: Extent along its axis.
-        segments: Sides; 4 or 6 for angular ones.
-        cloth: Material of the outer side.
-        trim: Material of the rims; none if absent.
+        shape: key of the outline.
+        radius: largest radius.
+        height: extent along its axis.
+        segments: sides; 4 or 6 for angular ones.
+        cloth: material of the outer side.
+        trim: material of the rims; none if absent.
     """
 
     shape: str
@@ -59,7 +59,7 @@ class Shade:
         return float(np.interp(share, levels, radii)) * self.radius
 
 
-def draw_cloth(rng: np.random.Generator) -> Material:
+def sample_cloth(rng: np.random.Generator) -> Material:
     """Cloth, paper or glass of a shade: warm or colourful, plain or printed."""
     hues = (0.1, 0.12, 0.08, 0.02, 0.97, 0.33, 0.48, 0.57, 0.63, 0.78, 0.14)
     hue = hues[int(rng.integers(len(hues)))]
@@ -69,16 +69,16 @@ def draw_cloth(rng: np.random.Generator) -> Material:
         return plain(colour, "cloth")
     if choice < 0.55:
         return weave(rng, colour)
-    other: Colour = (240, 222, 176) if rng.random() < 0.6 else shade(colour, 0.5)
+    other: Colour = (240, 222, 176) if rng.random() < 0.6 else brighten(colour, 0.5)
     return print_of(rng, colour, other)
 
 
-def draw_shade(rng: np.random.Generator, radius: float, height: float, shapes: tuple[str, ...]) -> Shade:
+def sample_shade(rng: np.random.Generator, radius: float, height: float, shapes: tuple[str, ...]) -> Shade:
     """Draw a shade of about the given size among the named shapes."""
     shape = shapes[int(rng.integers(len(shapes)))]
     angular = shape in ("drum", "slanted", "empire", "inverted") and rng.random() < 0.25
     segments = int(rng.choice([4, 6])) if angular else 24
-    cloth = draw_cloth(rng)
+    cloth = sample_cloth(rng)
     trim = plain(tint(rng, rng.random(), 0.6, 0.4), "trim") if rng.random() < 0.4 else None
     grow = rng.uniform(0.88, 1.12, 2)
     return Shade(
@@ -107,10 +107,10 @@ def shell(style: Shade, name: str, metal: Material, bulb: bool = True) -> list[P
     """A shade whose rim is on y = 0 around the y axis, its spokes and bulb.
 
     Args:
-        style: What it is like.
-        name: Prefix of the parts' names.
-        metal: Material of the fittings.
-        bulb: Whether a bulb hangs in it.
+        style: what it is like.
+        name: prefix of the parts' names.
+        metal: material of the fittings.
+        bulb: whether a bulb hangs in it.
 
     Returns:
         The parts. A hub on the axis reaches from 0.6 to 0.86 of the height; whatever carries the shade joins it there.

@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from data_gen.shapes.materials import Colour, Material, plain, shade, tint
+from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.parts import Part
 from data_gen.shapes.patterns import print_of, wood
 from data_gen.shapes.primitives import ball, box, cylinder, post, rod
 from data_gen.shapes.solids import lathe
 
-__all__ = ["draw_body_material", "draw_metal", "floor_stand", "foot", "table_body"]
+__all__ = ["sample_body_material", "sample_metal", "floor_stand", "foot", "table_body"]
 
 _METALS: tuple[Colour, ...] = (
     (168, 128, 62),
@@ -25,12 +25,12 @@ _METALS: tuple[Colour, ...] = (
 _WOODS: tuple[Colour, ...] = ((176, 122, 72), (130, 82, 48), (92, 58, 40), (200, 154, 100))
 
 
-def draw_metal(rng: np.random.Generator) -> Material:
+def sample_metal(rng: np.random.Generator) -> Material:
     """Brass, black iron, steel, copper or bronze."""
     return plain(_METALS[int(rng.integers(len(_METALS)))], "metal")
 
 
-def draw_body_material(rng: np.random.Generator) -> Material:
+def sample_body_material(rng: np.random.Generator) -> Material:
     """Glazed or printed ceramic, or wood."""
     choice = rng.random()
     if choice < 0.25:
@@ -38,7 +38,7 @@ def draw_body_material(rng: np.random.Generator) -> Material:
     colour = tint(rng, rng.random(), rng.uniform(0.4, 0.8), rng.uniform(0.4, 0.75))
     if choice < 0.6:
         return plain(colour, "glaze")
-    return print_of(rng, colour, (228, 214, 184) if rng.random() < 0.6 else shade(colour, 0.5))
+    return print_of(rng, colour, (228, 214, 184) if rng.random() < 0.6 else brighten(colour, 0.5))
 
 
 def foot(rng: np.random.Generator, radius: float, metal: Material) -> list[Part]:
@@ -80,15 +80,15 @@ def table_body(rng: np.random.Generator, height: float, radius: float, metal: Ma
     """The body of a table lamp, from y = 0 to a neck at `height`.
 
     Args:
-        rng: Source of the choices.
-        height: Metres.
-        radius: Largest radius in metres.
-        metal: Material of fittings.
+        rng: source of the choices.
+        height: metres.
+        radius: largest radius in metres.
+        metal: material of fittings.
 
     Returns:
         The parts; the topmost reaches at least to `height` on the axis.
     """
-    material = draw_body_material(rng)
+    material = sample_body_material(rng)
     choice = rng.random()
     if choice < 0.4:
         body = lathe(_vase(rng, height, radius), 20).repeated(2).creased(50)
@@ -162,6 +162,6 @@ def floor_stand(rng: np.random.Generator, height: float, metal: Material) -> lis
     makers: tuple[Callable[[], list[Part]], ...] = (
         lambda: _pole(rng, height, metal),
         lambda: _turned_pole(rng, height, metal),
-        lambda: _tripod(rng, height, rng.uniform(0.26, 0.36), draw_body_material(rng), metal),
+        lambda: _tripod(rng, height, rng.uniform(0.26, 0.36), sample_body_material(rng), metal),
     )
     return makers[int(rng.choice(3, p=[0.45, 0.2, 0.35]))]()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Colour", "Material", "plain", "shade", "tint"]
+__all__ = ["Colour", "Material", "brighten", "plain", "tint"]
 
 Colour = tuple[int, int, int]
 
@@ -21,8 +21,8 @@ class Material:
     """A painted surface.
 
     Attributes:
-        name: What it is, for people.
-        image: Pixels (h, w, 3), uint8 sRGB, row 0 at the top (v = 1). One pixel for a plain colour.
+        name: what it is called.
+        image: pixels (h, w, 3), uint8 sRGB, row 0 at the top (v = 1). One pixel for a plain colour.
     """
 
     name: str
@@ -34,8 +34,8 @@ def plain(colour: Colour, name: str = "plain") -> Material:
     return Material(name, np.array([[colour]], dtype=np.uint8))
 
 
-def shade(colour: Colour, factor: float) -> Colour:
-    """The colour made darker (factor below 1) or lighter (above 1), clipped to the range."""
+def brighten(colour: Colour, factor: float) -> Colour:
+    """A colour times a factor, which below 1 darkens it, clipped to the range."""
     red, green, blue = (min(255, max(0, round(channel * factor))) for channel in colour)
     return red, green, blue
 

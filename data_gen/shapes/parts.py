@@ -29,9 +29,9 @@ class Part:
     """A solid with a material on each face.
 
     Attributes:
-        name: What it is: "wheel", "left_wing".
-        solid: The geometry, in the object's frame.
-        materials: The materials used.
+        name: what it is: "wheel", "left_wing".
+        solid: the geometry, in the object's frame.
+        materials: the materials used.
         chosen: (F,) index into `materials` of each face.
     """
 
@@ -64,7 +64,7 @@ def atlas(materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:
     """Pack materials into one image.
 
     Args:
-        materials: Plain ones (one pixel) and patterned ones, each at most 240 pixels wide.
+        materials: plain ones (one pixel) and patterned ones, each at most 240 pixels wide.
 
     Returns:
         The image (H, 256, 3), uint8, and for each material the affine map (2, 2) of its uv into the image's: rows
@@ -95,17 +95,12 @@ def atlas(materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:
     return image, maps
 
 
-def corner_normals(solid: Solid) -> np.ndarray:
-    """Shading normals (F, 3, 3) of the faces' corners.
+def corner_normals(solids: Sequence[Solid]) -> np.ndarray:
+    """Shading normals (F, 3, 3) of the corners of all faces of several solids, which share no vertex.
 
     A corner takes the area-weighted mean of the faces around its vertex whose normals are within `solid.crease`
-    degrees of its own face's.
+    degrees of its own face's. All solids at once: many small arrays take longer.
     """
-    return _corner_normals([solid])
-
-
-def _corner_normals(solids: Sequence[Solid]) -> np.ndarray:
-    """Those of several solids (all their F, 3, 3), which share no vertex, at once: many small arrays cost more."""
     starts = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     vertices = np.concatenate([solid.vertices for solid in solids])
     faces = np.concatenate([solid.faces + start for solid, start in zip(solids, starts, strict=False)])
@@ -145,8 +140,8 @@ def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> tr
     """Join parts into a scene with one textured geometry.
 
     Args:
-        name: Name of the geometry.
-        parts: The painted solids.
+        name: name of the geometry.
+        parts: the painted solids.
         roughness: PBR roughness of all of it, in [0, 1].
 
     Returns:
@@ -172,7 +167,7 @@ def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> tr
         positions.append(solid.vertices[solid.faces])
         names.append((part.name, first, len(solid.faces)))
         first += len(solid.faces)
-    columns = np.concatenate(positions), _corner_normals([part.solid for part in parts]), np.concatenate(coordinates)
+    columns = np.concatenate(positions), corner_normals([part.solid for part in parts]), np.concatenate(coordinates)
     corners = np.concatenate([column.reshape(3 * first, -1) for column in columns], axis=1)
     millionths, inverse = _distinct(np.rint(corners * 1e6).astype(np.int64))
     unique = millionths / 1e6

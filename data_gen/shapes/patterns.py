@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_gen.shapes.materials import Colour, Material, shade
+from data_gen.shapes.materials import Colour, Material, brighten
 
 __all__ = ["PRINTS", "checks", "dots", "lines", "print_of", "stripes", "weave", "wheel_face", "wood"]
 
@@ -51,7 +51,7 @@ def wood(rng: np.random.Generator, colour: Colour, boards: int = 1) -> Material:
     level = level * rng.uniform(0.75, 1, boards)[board.astype(int)]
     if boards > 1:
         level = np.where(np.abs(u * boards - np.round(u * boards)) < 0.035 * boards / 4, 1.7, level)
-    return Material("wood", _mix(shade(colour, 1.12), shade(colour, 0.62), level))
+    return Material("wood", _mix(brighten(colour, 1.12), brighten(colour, 0.62), level))
 
 
 def weave(rng: np.random.Generator, colour: Colour) -> Material:
@@ -61,7 +61,7 @@ def weave(rng: np.random.Generator, colour: Colour) -> Material:
     across, along = np.sin(np.pi * count * u) ** 2, np.sin(np.pi * count * v) ** 2
     odd = (np.floor(u * count) + np.floor(v * count)) % 2 == 0
     level = np.where(odd, across, along) * 0.7 + 0.3 * _noise(rng, (8, 8))
-    return Material("weave", _mix(shade(colour, 0.7), shade(colour, 1.15), level))
+    return Material("weave", _mix(brighten(colour, 0.7), brighten(colour, 1.15), level))
 
 
 def stripes(rng: np.random.Generator, first: Colour, second: Colour) -> Material:

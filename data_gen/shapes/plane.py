@@ -31,7 +31,7 @@ def plane(rng: np.random.Generator) -> list[Part]:
     """A plane.
 
     Args:
-        rng: Source of every choice.
+        rng: source of every choice.
 
     Returns:
         Its parts in metres, y up, nose along +z.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_gen.shapes.materials import Material, plain, shade
+from data_gen.shapes.materials import Material, brighten, plain
 from data_gen.shapes.parts import Part
-from data_gen.shapes.plane_livery import draw_livery, fuselage_side, tail_sign, wing_skin
-from data_gen.shapes.plane_parts import airscrew, fin, fuselage, jet_engine, pair, pylon, undercarriage, wing
+from data_gen.shapes.plane_livery import fuselage_side, sample_livery, tail_sign, wing_skin
+from data_gen.shapes.plane_parts import fin, fuselage, jet_engine, pair, propeller, pylon, undercarriage, wing
 from data_gen.shapes.primitives import ball, rod
 
 __all__ = ["airliner", "tail", "turboprop"]
@@ -49,14 +49,14 @@ def tail(
 
 def airliner(rng: np.random.Generator) -> list[Part]:
     """Two or four engines under swept wings, or two at the tail under a T."""
-    livery = draw_livery(rng)
+    livery = sample_livery(rng)
     at_tail = rng.random() < 0.22
     four = not at_tail and rng.random() < 0.22
     length = rng.uniform(34, 48) if not four else rng.uniform(52, 66)
     radius = length * rng.uniform(0.047, 0.058) * (1.1 if four else 1)
     body = fuselage(length, 2 * radius, 2 * radius * rng.uniform(1.0, 1.1), _LINER)
     skin = fuselage_side(rng, livery, (rng.uniform(0.2, 0.26), rng.uniform(0.84, 0.89)), cockpit=True)
-    metal = (126, 132, 144) if rng.random() < 0.6 else shade(livery.base, 0.8)
+    metal = (126, 132, 144) if rng.random() < 0.6 else brighten(livery.base, 0.8)
     panels = wing_skin(rng, metal, livery.accent)
     parts = [Part.of("fuselage", body, skin)]
     span, root = length * rng.uniform(0.42, 0.5), length * rng.uniform(0.17, 0.2)
@@ -75,7 +75,7 @@ def airliner(rng: np.random.Generator) -> list[Part]:
         )
         parts += [let, let.mirrored()]
     belly = ball(0.92 * radius, 0.45 * radius, 0.8 * root, 12, 8).moved(0, -0.78 * radius, z_wing - 0.5 * root)
-    parts.append(Part.of("belly", belly, plain(shade(livery.base, 0.9))))
+    parts.append(Part.of("belly", belly, plain(brighten(livery.base, 0.9))))
     cowl = plain(livery.accent if rng.random() < 0.5 else metal, "cowl")
     size = radius * rng.uniform(0.5, 0.66) * (0.8 if four else 1)
     if at_tail:
@@ -112,7 +112,7 @@ def airliner(rng: np.random.Generator) -> list[Part]:
 
 def turboprop(rng: np.random.Generator) -> list[Part]:
     """Two or four propellers on a straight high wing, a T-tail or a plain one."""
-    livery = draw_livery(rng)
+    livery = sample_livery(rng)
     length = rng.uniform(22, 30)
     radius = length * rng.uniform(0.052, 0.062)
     parts = [
@@ -122,7 +122,7 @@ def turboprop(rng: np.random.Generator) -> list[Part]:
             fuselage_side(rng, livery, (0.24, 0.85), cockpit=True),
         )
     ]
-    metal = shade(livery.base, 0.85) if rng.random() < 0.5 else (126, 132, 144)
+    metal = brighten(livery.base, 0.85) if rng.random() < 0.5 else (126, 132, 144)
     skin = wing_skin(rng, metal, livery.accent)
     span, root = length * rng.uniform(0.48, 0.54), length * rng.uniform(0.1, 0.125)
     y, z = 0.86 * radius, 0.09 * length
@@ -142,7 +142,7 @@ def turboprop(rng: np.random.Generator) -> list[Part]:
             12,
         )
         parts += pair([Part.of(f"left_nacelle_{k}", pod.moved(at[0], at[1], at[2] - 1.2 * size), plain(livery.accent))])
-        screw = airscrew(
+        screw = propeller(
             f"left_propeller_{k}", 3.1 * size, blades, (x, at[1], at[2] + 3.45 * size), rng.uniform(0, 90), livery.metal
         )
         parts += pair(screw)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_gen.shapes.materials import Colour, Material, plain, shade, tint
+from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 
-__all__ = ["Livery", "camouflage", "draw_livery", "fuselage_side", "tail_sign", "wing_skin"]
+__all__ = ["Livery", "camouflage", "sample_livery", "fuselage_side", "tail_sign", "wing_skin"]
 
 _WIDE, _HIGH, _TALL = 224, 56, 96
 _GLASS: Colour = (42, 50, 64)
@@ -23,7 +23,7 @@ class Livery:
     metal: Material
 
 
-def draw_livery(rng: np.random.Generator) -> Livery:
+def sample_livery(rng: np.random.Generator) -> Livery:
     """Two colours that differ clearly, few of them pale."""
     hue = rng.random()
     choice = rng.random()
@@ -57,10 +57,10 @@ def fuselage_side(
     """Side view of a fuselage, tail at u = 0: decoration, a row of windows, doors, cockpit glass.
 
     Args:
-        rng: Source of the choices.
-        livery: Colours.
-        windows: Where the row begins and ends, as shares of the length from the tail; none if absent.
-        cockpit: Whether the windscreen is painted on.
+        rng: source of the choices.
+        livery: colours.
+        windows: where the row begins and ends, as shares of the length from the tail; none if absent.
+        cockpit: whether the windscreen is painted on.
 
     Returns:
         The material, for coordinates projected along x.
@@ -77,14 +77,14 @@ def fuselage_side(
         image[u < 0.3 - 0.22 * (v - 0.5)] = livery.accent
     elif style == 3:
         image[v < low + 0.5 * np.maximum(0, 0.35 - u) ** 0.8] = livery.accent
-        image[np.abs(v - low - 0.06 - 0.5 * np.maximum(0, 0.35 - u) ** 0.8) < 0.025] = shade(livery.accent, 0.6)
+        image[np.abs(v - low - 0.06 - 0.5 * np.maximum(0, 0.35 - u) ** 0.8) < 0.025] = brighten(livery.accent, 0.6)
     elif style == 4:
         for start in (0.2, 0.29, 0.38):
             image[np.abs(u - start + 0.25 * (v - 0.5)) < 0.03] = livery.accent
         image[u > 0.9] = livery.accent
     else:
         image[(v < 0.45) & (v > 0.36)] = livery.accent
-        image[(v < 0.31) & (v > 0.27)] = shade(livery.accent, 0.6)
+        image[(v < 0.31) & (v > 0.27)] = brighten(livery.accent, 0.6)
     if windows is not None:
         start, end = windows
         count = int(rng.integers(16, 30))
@@ -93,7 +93,7 @@ def fuselage_side(
         image[row & (np.abs(v - 0.6) < 0.055)] = _GLASS
         for door in (start - 0.025, end + 0.02, (start + end) / 2):
             edge = (np.abs(u - door) < 0.013) & (v > 0.4) & (v < 0.74)
-            image[edge] = shade(livery.base, 0.72)
+            image[edge] = brighten(livery.base, 0.72)
     if cockpit:
         image[(np.abs(u - 0.952) < 0.022) & (v > 0.6) & (v < 0.74) & (np.abs(u - 0.951) > 0.003)] = _GLASS
     return Material("fuselage", image)
@@ -109,7 +109,7 @@ def tail_sign(rng: np.random.Generator, livery: Livery) -> Material:
         image[(np.floor((v + 0.4 * u) * rng.uniform(4, 7)) % 2) == 0] = second
     elif style == 1:
         image[np.hypot(u - 0.42, v - 0.55) < 0.2] = second
-        image[np.hypot(u - 0.42, v - 0.55) < 0.1] = shade(first, 0.6)
+        image[np.hypot(u - 0.42, v - 0.55) < 0.1] = brighten(first, 0.6)
     elif style == 2:
         image[np.abs(v - 0.3 - 0.6 * np.abs(u - 0.45)) < 0.08] = second
         image[np.abs(v - 0.55 - 0.6 * np.abs(u - 0.45)) < 0.05] = second
@@ -124,12 +124,12 @@ def wing_skin(rng: np.random.Generator, colour: Colour, accent: Colour) -> Mater
     """A wing unrolled: trailing edge at u = 0 and 1, root at v = 0; flaps, panel lines, a coloured tip."""
     u, v = _field(_TALL, _TALL)
     image = _canvas(colour, _TALL, _TALL)
-    image[np.abs(u - 0.5) < 0.07] = shade(colour, 1.12)
+    image[np.abs(u - 0.5) < 0.07] = brighten(colour, 1.12)
     edge = np.minimum(u, 1 - u)
     for low, high in ((0.06, 0.44), (0.47, 0.66), (0.69, 0.92)):
         inside = (edge < 0.13) & (v > low) & (v < high)
-        image[inside] = shade(colour, rng.uniform(0.78, 0.92))
-    image[(np.abs(edge - 0.135) < 0.01) & (v < 0.92)] = shade(colour, 0.55)
+        image[inside] = brighten(colour, rng.uniform(0.78, 0.92))
+    image[(np.abs(edge - 0.135) < 0.01) & (v < 0.92)] = brighten(colour, 0.55)
     if rng.random() < 0.6:
         image[v > rng.uniform(0.82, 0.93)] = accent
     return Material("wing", image)
@@ -146,5 +146,5 @@ def camouflage(rng: np.random.Generator, dark: Colour, light: Colour) -> Materia
     image = _canvas(light, _TALL, _TALL)
     image[field > 0.48] = dark
     if rng.random() < 0.5:
-        image[field < 0.3] = shade(dark, 0.6)
+        image[field < 0.3] = brighten(dark, 0.6)
     return Material("camouflage", image)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_gen.shapes.materials import Colour, Material, plain, shade, tint
+from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.parts import Part
 from data_gen.shapes.plane_livery import camouflage
 from data_gen.shapes.plane_parts import fin, fuselage, pylon, wing
@@ -31,9 +31,9 @@ def _skins(rng: np.random.Generator) -> tuple[Material, Material]:
     if choice < 0.85:
         level = int(rng.integers(96, 150))
         grey: Colour = (level - 6, level, level + 8)
-        return plain(grey, "grey"), plain(shade(grey, 0.72), "dark_grey")
+        return plain(grey, "grey"), plain(brighten(grey, 0.72), "dark_grey")
     colour = tint(rng, rng.random(), 0.75, 0.55)
-    return plain(colour, "display"), plain((222, 206, 150) if rng.random() < 0.5 else shade(colour, 0.5), "trim")
+    return plain(colour, "display"), plain((222, 206, 150) if rng.random() < 0.5 else brighten(colour, 0.5), "trim")
 
 
 def _store(name: str, x: float, y: float, z: float, size: float) -> list[Part]:
@@ -60,7 +60,7 @@ def fighter(rng: np.random.Generator) -> list[Part]:
     """A fighter jet.
 
     Args:
-        rng: Source of every choice.
+        rng: source of every choice.
 
     Returns:
         Its parts in metres, y up, nose along +z.

@@ -15,7 +15,7 @@ from data_gen.shapes.primitives import ball, cylinder, rod
 from data_gen.shapes.profiles import airfoil, rectangle, superellipse
 from data_gen.shapes.solids import Solid, lathe, loft
 
-__all__ = ["airscrew", "fin", "fuselage", "jet_engine", "pair", "pylon", "undercarriage", "wing"]
+__all__ = ["propeller", "fin", "fuselage", "jet_engine", "pair", "pylon", "undercarriage", "wing"]
 
 _BLACK = plain((36, 36, 40), "black")
 
@@ -31,13 +31,13 @@ def fuselage(
     """Body of changing section.
 
     Args:
-        length: From tail to nose; the middle lies at z = 0.
-        width: Largest extent along x.
-        height: Largest extent along y.
-        shape: Rows (share of the length from the tail, share of the width, share of the height, rise of the section's
+        length: from tail to nose; the middle lies at z = 0.
+        width: largest extent along x.
+        height: largest extent along y.
+        shape: rows (share of the length from the tail, share of the width, share of the height, rise of the section's
             middle as a share of the height).
-        boxiness: Exponent of the section's superellipse; 2 for an ellipse.
-        sides: Corners of a section.
+        boxiness: exponent of the section's superellipse; 2 for an ellipse.
+        sides: corners of a section.
 
     Returns:
         The solid, with texture coordinates projected along x.
@@ -63,14 +63,14 @@ def wing(
     """The left half of a wing or tailplane, its root's leading edge at z = 0.
 
     Args:
-        root: Chord at the root.
-        tip: Chord at the tip.
-        span: Extent along x of this half, from `inside`.
-        sweep: How far the tip's leading edge lies behind the root's.
-        rise: How far the tip lies over the root.
-        thickness: Share of the chord.
+        root: chord at the root.
+        tip: chord at the tip.
+        span: extent along x of this half, from `inside`.
+        sweep: how far the tip's leading edge lies behind the root's.
+        rise: how far the tip lies over the root.
+        thickness: share of the chord.
         inside: x at which it begins, inside the fuselage.
-        kink: Share of the span and chord there where the trailing edge bends; none if absent.
+        kink: share of the span and chord there where the trailing edge bends; none if absent.
 
     Returns:
         The solid; texture v runs from root to tip, u around the section from the trailing edge.
@@ -119,18 +119,18 @@ def jet_engine(name: str, radius: float, length: float, at: tuple[float, float, 
     return [Part.of(part, solid.turned("x", 90).moved(*at), material) for part, solid, material in parts]
 
 
-def airscrew(
+def propeller(
     name: str, radius: float, blades: int, at: tuple[float, float, float], turn: float, spinner: Material
 ) -> list[Part]:
     """A propeller with its spinner, facing +z.
 
     Args:
-        name: Prefix of the parts' names.
-        radius: Of the circle that the tips describe.
-        blades: How many.
-        at: Centre of the hub.
-        turn: Degrees by which the first blade stands off the upright.
-        spinner: Material of the hub.
+        name: prefix of the parts' names.
+        radius: of the circle that the tips describe.
+        blades: how many.
+        at: centre of the hub.
+        turn: degrees by which the first blade stands off the upright.
+        spinner: material of the hub.
 
     Returns:
         The parts.

@@ -7,8 +7,8 @@ import numpy as np
 from data_gen.shapes.materials import plain
 from data_gen.shapes.parts import Part
 from data_gen.shapes.plane_civil import tail
-from data_gen.shapes.plane_livery import draw_livery, fuselage_side, tail_sign, wing_skin
-from data_gen.shapes.plane_parts import airscrew, fuselage, pair, undercarriage, wing
+from data_gen.shapes.plane_livery import fuselage_side, sample_livery, tail_sign, wing_skin
+from data_gen.shapes.plane_parts import fuselage, pair, propeller, undercarriage, wing
 from data_gen.shapes.primitives import ball, cone, rod
 
 __all__ = ["biplane", "glider", "light"]
@@ -28,7 +28,7 @@ _LIGHT = (
 
 def light(rng: np.random.Generator) -> list[Part]:
     """One propeller in the nose, a high or low straight wing, fixed wheels."""
-    livery = draw_livery(rng)
+    livery = sample_livery(rng)
     length, width = rng.uniform(7.2, 8.6), rng.uniform(1.05, 1.25)
     height = width * rng.uniform(1.1, 1.25)
     high = rng.random() < 0.5
@@ -65,7 +65,7 @@ def light(rng: np.random.Generator) -> list[Part]:
         (tail_sign(rng, livery), skin),
     )
     nose = (0, -0.13 * height, 0.5 * length + 0.03)
-    parts += airscrew(
+    parts += propeller(
         "propeller", rng.uniform(0.85, 1.0), int(rng.integers(2, 4)), nose, rng.uniform(0, 180), plain(livery.accent)
     )
     low = -0.5 * height - rng.uniform(0.45, 0.6)
@@ -84,7 +84,7 @@ def light(rng: np.random.Generator) -> list[Part]:
 
 def biplane(rng: np.random.Generator) -> list[Part]:
     """Two wings braced with struts, a round engine, an open cockpit."""
-    livery = draw_livery(rng)
+    livery = sample_livery(rng)
     length, width = rng.uniform(6.4, 7.4), rng.uniform(0.95, 1.1)
     shape = (
         (0.0, 0.1, 0.2, 0.1),
@@ -111,7 +111,7 @@ def biplane(rng: np.random.Generator) -> list[Part]:
             (0.25 * x, 0.25 * y, nose + 0.22), (0.52 * width * x, 0.52 * width * y, nose + 0.22), 0.17, sides=6
         )
         parts.append(Part.of(f"cylinder_{k}", cylinder_head, plain((98, 96, 92), "cylinder")))
-    parts += airscrew(
+    parts += propeller(
         "propeller", rng.uniform(0.95, 1.1), 2, (0, 0, nose + 0.5), rng.uniform(0, 180), plain(livery.accent)
     )
     span, chord = rng.uniform(3.8, 4.6), rng.uniform(1.1, 1.3)
@@ -163,7 +163,7 @@ def biplane(rng: np.random.Generator) -> list[Part]:
 
 def glider(rng: np.random.Generator) -> list[Part]:
     """A slender body under very long thin wings."""
-    livery = draw_livery(rng)
+    livery = sample_livery(rng)
     length, width = rng.uniform(6.6, 7.6), rng.uniform(0.62, 0.74)
     shape = (
         (0, 0.12, 0.14, 0.1),

@@ -18,11 +18,11 @@ def box(width: float, height: float, depth: float, radius: float = 0.0, steps: i
     """Box centred on the origin with extents (width, height, depth) along (x, y, z).
 
     Args:
-        width: Extent along x.
-        height: Extent along y.
-        depth: Extent along z.
-        radius: Radius of the upright edges and size of the bevel above and below; 0 for a plain box.
-        steps: Edges that round off each upright edge.
+        width: extent along x.
+        height: extent along y.
+        depth: extent along z.
+        radius: radius of the upright edges and size of the bevel above and below; 0 for a plain box.
+        steps: edges that round off each upright edge.
 
     Returns:
         The solid.
@@ -42,10 +42,10 @@ def tapered(
     """Frustum over two rectangles, centred on y = 0.
 
     Args:
-        bottom: Extents (x, z) of the lower end.
-        top: Extents (x, z) of the upper end.
-        height: Extent along y.
-        shift: Offset (x, z) of the upper end's centre from the lower end's.
+        bottom: extents (x, z) of the lower end.
+        top: extents (x, z) of the upper end.
+        height: extent along y.
+        shift: offset (x, z) of the upper end's centre from the lower end's.
 
     Returns:
         The solid; an upright bar or a leg where it is tall, a slab where it is flat.
@@ -85,10 +85,10 @@ def post(bottom: Point, top: Point, bottom_size: float, top_size: float, sides: 
     """Upright member between two points, its ends level.
 
     Args:
-        bottom: Centre (x, y, z) of the lower end.
-        top: Centre of the upper end, higher than the lower.
-        bottom_size: Width of the lower end: of the square, or across the polygon's corners.
-        top_size: Width of the upper end.
+        bottom: centre (x, y, z) of the lower end.
+        top: centre of the upper end, higher than the lower.
+        bottom_size: width of the lower end: of the square, or across the polygon's corners.
+        top_size: width of the upper end.
         sides: 4 for a square section parallel to the axes, more for a polygon.
 
     Returns:
@@ -105,10 +105,10 @@ def rod(start: Point, end: Point, width: float, height: float | None = None, sid
     """Straight bar between two points.
 
     Args:
-        start: Centre (x, y, z) of one end.
-        end: Centre of the other.
-        width: Sideways extent.
-        height: Extent across it; the width if absent.
+        start: centre (x, y, z) of one end.
+        end: centre of the other.
+        width: sideways extent.
+        height: extent across it; the width if absent.
         sides: 4 for a rectangle, more for a polygon.
 
     Returns:
@@ -121,9 +121,9 @@ def tube(path: Sequence[Point] | np.ndarray, width: float, height: float | None 
     """Bar along a polyline with mitred corners, its section upright or, where it starts upright, facing the front.
 
     Args:
-        path: Points (k, 3).
-        width: Sideways extent.
-        height: Extent across it; the width if absent.
+        path: points (k, 3).
+        width: sideways extent.
+        height: extent across it; the width if absent.
         sides: 4 for a rectangle, more for a polygon.
 
     Returns:
@@ -143,13 +143,13 @@ def panel(
     """Upright plate, curved around its user, standing on y = 0 with its middle front edge at z = 0.
 
     Args:
-        bottom: Width at the foot.
-        top: Width at the head.
-        height: Extent along y.
-        thickness: Extent along z.
-        bow: How far the sides reach forward of the middle.
-        lean: How far the head lies behind the foot.
-        roundness: Share of the width by which the head's corners are rounded off, in [0, 0.9].
+        bottom: width at the foot.
+        top: width at the head.
+        height: extent along y.
+        thickness: extent along z.
+        bow: how far the sides reach forward of the middle.
+        lean: how far the head lies behind the foot.
+        roundness: share of the width by which the head's corners are rounded off, in [0, 0.9].
 
     Returns:
         The solid.
@@ -171,9 +171,9 @@ def cushion(width: float, height: float, depth: float, softness: float = 0.5) ->
     """Box centred on the origin with swelling sides, as upholstery has.
 
     Args:
-        width: Extent along x.
-        height: Extent along y.
-        depth: Extent along z.
+        width: extent along x.
+        height: extent along y.
+        depth: extent along z.
         softness: 0 for nearly a box, 1 for a pillow.
 
     Returns:

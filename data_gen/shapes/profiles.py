@@ -23,10 +23,10 @@ def rounded_rectangle(width: float, height: float, radius: float, steps: int = 3
     """Rectangle with circular corners.
 
     Args:
-        width: Full extent along the first axis.
-        height: Full extent along the second axis.
-        radius: Corner radius; cut down to just under half of the shorter side.
-        steps: Edges a corner.
+        width: full extent along the first axis.
+        height: full extent along the second axis.
+        radius: corner radius; cut down to just under half of the shorter side.
+        steps: edges a corner.
 
     Returns:
         Corners (4 * (steps + 1), 2), starting at the lower right.
@@ -51,10 +51,10 @@ def superellipse(width: float, height: float, exponent: float, corners: int = 16
     """Polygon inscribed in |x / a|^e + |y / b|^e = 1: e = 2 is an ellipse, larger is boxier.
 
     Args:
-        width: Full extent along the first axis, 2 a.
-        height: Full extent along the second axis, 2 b.
-        exponent: The e above, positive.
-        corners: Number of corners.
+        width: full extent along the first axis, 2 a.
+        height: full extent along the second axis, 2 b.
+        exponent: the e above, positive.
+        corners: number of corners.
 
     Returns:
         Corners (corners, 2), the first on the positive first axis.
@@ -70,9 +70,9 @@ def airfoil(chord: float, thickness: float, steps: int = 6) -> np.ndarray:
     """Symmetric wing section after the NACA four-digit thickness law, with a blunt trailing edge.
 
     Args:
-        chord: Length from the trailing edge at 0 to the leading edge at +chord, along the first axis.
-        thickness: Largest extent along the second axis.
-        steps: Edges a side.
+        chord: length from the trailing edge at 0 to the leading edge at +chord, along the first axis.
+        thickness: largest extent along the second axis.
+        steps: edges a side.
 
     Returns:
         Corners (2 * steps + 1, 2): the trailing edge below, the lower side to the leading edge, the upper side back.
@@ -109,7 +109,7 @@ def triangulate(corners: np.ndarray) -> np.ndarray:
     """Cut a simple counter-clockwise polygon into triangles: a zigzag if it is convex, by clipping ears otherwise.
 
     Args:
-        corners: Polygon (n, 2), not self-intersecting, convex or not.
+        corners: polygon (n, 2), not self-intersecting, convex or not.
 
     Returns:
         Indices (n - 2, 3) into `corners`, counter-clockwise, using the corners only. An outline that crosses itself,

@@ -27,13 +27,13 @@ class Solid:
     """A closed triangle mesh.
 
     Attributes:
-        vertices: Corners (V, 3).
-        faces: Indices (F, 3) into `vertices`.
-        uv: Texture coordinates of each face's corners (F, 3, 2), inside [0, 1].
+        vertices: corners (V, 3).
+        faces: indices (F, 3) into `vertices`.
+        uv: texture coordinates of each face's corners (F, 3, 2), inside [0, 1].
         cells: (F, 2): the step along the solid and the step around it that a face belongs to; (-1, 0) and (-1, 1) for
             the first and the last cap.
-        volume: Exact volume of the polyhedron, in the cubed unit of the vertices.
-        crease: Edges sharper than this many degrees are shaded as edges, others smoothly.
+        volume: exact volume of the polyhedron, in the cubed unit of the vertices.
+        crease: edges sharper than this many degrees are shaded as edges, others smoothly.
     """
 
     vertices: np.ndarray
@@ -86,13 +86,13 @@ class Solid:
         """The solid with its texture repeated around it.
 
         Args:
-            times: How often; a divisor of the number of steps around.
+            times: how often; a divisor of the number of steps around.
 
         Returns:
             The same mesh; the caps keep their texture coordinates.
 
         Raises:
-            ValueError: If the steps around cannot be divided evenly.
+            ValueError: if the steps around cannot be divided evenly.
         """
         side = self.cells[:, 0] >= 0
         around = int(self.cells[side, 1].max()) + 1
@@ -174,16 +174,16 @@ def loft(sections: Sequence[np.ndarray] | np.ndarray, stations: Sequence[float] 
     the midpoints of the edges and of the diagonals that cut the side faces.
 
     Args:
-        sections: Outlines (k, n, 2), counter-clockwise. Their coordinates are (x, y) for axis "z", (z, x) for "y",
+        sections: outlines (k, n, 2), counter-clockwise. Their coordinates are (x, y) for axis "z", (z, x) for "y",
             (y, z) for "x".
-        stations: Positions (k,) of the sections along the axis, increasing.
+        stations: positions (k,) of the sections along the axis, increasing.
         axis: "x", "y" or "z".
 
     Returns:
         The solid; u runs around the outline, v along the axis.
 
     Raises:
-        ValueError: If there are fewer than two sections or the stations do not increase.
+        ValueError: if there are fewer than two sections or the stations do not increase.
     """
     outlines, heights = np.asarray(sections, dtype=float), np.asarray(stations, dtype=float)
     if outlines.ndim != 3 or len(outlines) < 2 or len(outlines) != len(heights):
@@ -209,17 +209,17 @@ def lathe(profile: Sequence[tuple[float, float]] | np.ndarray, segments: int = 1
     in place of the circle).
 
     Args:
-        profile: Points (k, 2) of (radius, height). An open profile runs from the bottom to the top of the outer side;
+        profile: points (k, 2) of (radius, height). An open profile runs from the bottom to the top of the outer side;
             its ends are closed by flat discs, or by a tip where the radius is 0. A ring's profile is a
             counter-clockwise closed outline away from the axis.
-        segments: Steps of a turn.
-        ring: Whether the profile is a closed outline (a torus, a tyre, the shell of a shade).
+        segments: steps of a turn.
+        ring: whether the profile is a closed outline (a torus, a tyre, the shell of a shade).
 
     Returns:
         The solid; u runs around the axis, v along the profile.
 
     Raises:
-        ValueError: If a radius inside an open profile, or any radius of a ring, is not positive.
+        ValueError: if a radius inside an open profile, or any radius of a ring, is not positive.
     """
     points = np.asarray(profile, dtype=float)
     inner = points[:, 0] if ring else points[1:-1, 0]
@@ -253,15 +253,15 @@ def sweep(path: Sequence[Sequence[float]] | np.ndarray, outline: np.ndarray, up:
     the centroids; with the centroid on the path, area times path length.
 
     Args:
-        path: Points (k, 3).
-        outline: Section (n, 2), counter-clockwise, with its centroid at the origin: (sideways, upwards).
-        up: Rough direction of the outline's second axis, not along the path.
+        path: points (k, 3).
+        outline: section (n, 2), counter-clockwise, with its centroid at the origin: (sideways, upwards).
+        up: rough direction of the outline's second axis, not along the path.
 
     Returns:
         The solid; u runs around the outline, v along the path.
 
     Raises:
-        ValueError: If the outline's centroid is not at the origin.
+        ValueError: if the outline's centroid is not at the origin.
     """
     points = np.asarray(path, dtype=float)
     shoelace = outline[:, 0] * np.roll(outline[:, 1], -1) - np.roll(outline[:, 0], -1) * outline[:, 1]

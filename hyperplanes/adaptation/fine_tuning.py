@@ -166,4 +166,3 @@ def best_stop(
         if step - best > 2 * every:
             break
     return best
-

@@ -17,8 +17,9 @@ from torch import Tensor, nn
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
 from hyperplanes.adaptation.fine_tuning import FineTuning, Steps, best_stop, minimise
-from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors, write_json
+from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.fields import TARGETS, Target
+from hyperplanes.files import write_json
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy, full

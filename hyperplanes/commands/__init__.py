@@ -1,26 +1,75 @@
-"""The verbs of the command line, one a module: a dataclass `Arguments` and a function `run`."""
+"""The verbs of the command line, one a module: a dataclass `Arguments` and a function `run`.
+
+Another package adds a verb by an entry point of the group `hyperplanes.commands` that names a `Verb`, in a module that
+imports nothing heavy; so does data_gen with `generate` and `inspect`.
+"""
 
 from __future__ import annotations
 
-__all__ = ["EXAMPLES", "VERBS"]
+import difflib
+from dataclasses import dataclass
+
+__all__ = ["EXAMPLES", "VERBS", "Verb", "find_verb", "find_verbs"]
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A verb of the command line.
+
+    Attributes:
+        module: Name of the module with its `Arguments` and its `run`, imported when the verb is used.
+        about: One line about it.
+    """
+
+    module: str
+    about: str
+
 
 VERBS: dict[str, str] = {
     "demo": "everything once, small: data, training, new views and a report, in minutes",
-    "generate": "render meshes, your own or procedural ones, into a data set of posed images",
     "train": "train a model on a data set",
     "evaluate": "compare methods on objects they have never seen, as one table",
     "render": "new views of one object from a few posed images",
     "export": "one object as images, a turntable and a coloured mesh",
     "bake": "one object as a small file of voxels that renders at once, without any network",
     "adapt": "write the weights of one object, to be rendered later without the hypernetwork",
-    "inspect": "say what is in a data set or a checkpoint",
     "presets": "list the named configurations",
     "doctor": "say what works on this machine, and how to mend what does not",
 }
-"""Every verb with one line about it, in the order of the overview."""
+"""The verbs of this package with one line about each, in the order of the overview."""
 
 EXAMPLES = """\
   hyperplanes demo
   hyperplanes generate --class car --count 70 --resolution 64 --seed 0 --out data/cars
   hyperplanes train --data data/cars --preset quick --out runs/cars
   hyperplanes render --checkpoint runs/cars --views photos/ --out new-views/"""
+
+
+def find_verbs() -> dict[str, Verb]:
+    """All verbs by name: those of this package, then those of the other packages that are installed."""
+    from importlib.metadata import entry_points
+
+    own = {name: Verb(f"{__name__}.{name}", about) for name, about in VERBS.items()}
+    return own | {entry.name: entry.load() for entry in entry_points(group=__name__) if entry.name not in own}
+
+
+def find_verb(name: str) -> Verb:
+    """One verb.
+
+    Args:
+        name: As it stands on the command line.
+
+    Returns:
+        The verb.
+
+    Raises:
+        ValueError: No installed package has such a verb.
+    """
+    if name in VERBS:
+        return Verb(f"{__name__}.{name}", VERBS[name])
+    verbs = find_verbs()
+    if name not in verbs:
+        near = difflib.get_close_matches(name, verbs, 1)
+        known = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(verbs)}"
+        raise ValueError(f"no verb {name!r}; {known}")
+    return verbs[name]

@@ -68,8 +68,8 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
 def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
     from hyperplanes.baking import BakedScene, bake
-    from hyperplanes.checkpoints import write_whole
     from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
+    from hyperplanes.files import write_whole
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.metrics import psnr
     from hyperplanes.models import adapt, choose_device, load_model

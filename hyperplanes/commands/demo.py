@@ -110,7 +110,7 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
 
     out = arguments.out
     if stage.name == "data":
-        _generate(settings, out, console)
+        _generate(settings, out)
         return
     data = open_dataset(out / ("unseen" if ":" in stage.name else "data"))
     if stage.name in MODELS:
@@ -140,33 +140,19 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
             score_method(method, data, out, show, arguments.device)
 
 
-def _generate(settings: DemoSettings, out: Path, console: Console) -> None:
-    from data_gen.backends import find_backend
-    from data_gen.dataset import Procedural, generate
-    from hyperplanes.commands.generate import summary
+def _generate(settings: DemoSettings, out: Path) -> None:
+    from importlib import import_module
 
-    backend = find_backend()
-    console.say(f"renderer: {backend.name} ({backend.detail})")
-    for line in backend.advice:
-        console.say(f"a faster one: {line}")
+    from hyperplanes.commands import find_verb
+
+    generate = import_module(find_verb("generate").module)
+    sizes = {name: getattr(settings, name) for name in ("seed", "views", "resolution")}
     unseen = settings.unseen_objects
     for folder, class_name, objects, held_out in (
         (out / "data", settings.class_name, settings.objects, settings.held_out),
         (out / "unseen", settings.unseen_class, unseen, unseen),
     ):
-        with console.bar("rendering") as bar:
-            report = generate(
-                Procedural(class_name, objects, settings.seed),
-                folder,
-                views=settings.views,
-                resolution=settings.resolution,
-                held_out=held_out,
-                seed=settings.seed,
-                progress=lambda done, total, name, bar=bar: bar.show(done, total, name),
-            )
-        for name, reason in report.skipped:
-            console.warn(f"skipped {name}: {reason}")
-        console.say(summary(report, folder))
+        generate.run(generate.Arguments(folder, class_name=class_name, count=objects, held_out=held_out, **sizes))
 
 
 def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:

@@ -83,8 +83,8 @@ def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
 def run(arguments: Arguments) -> int:
     """Evaluate all methods and print the table."""
     from hyperplanes.adaptation.fine_tuning import FineTuning
-    from hyperplanes.checkpoints import write_json
     from hyperplanes.data import open_dataset
+    from hyperplanes.files import write_json
     from hyperplanes.methods import at_steps, make_method
     from hyperplanes.models import ByProtocol, OnDevice, choose_device, find_checkpoints
     from hyperplanes.presets import PROTOCOLS
@@ -120,7 +120,7 @@ def run(arguments: Arguments) -> int:
 
 def _draw(scores: Sequence[Score], methods: Sequence[str], steps: Sequence[int], path: Path) -> None:
     """PSNR over fine-tuning steps of every method that was evaluated at several."""
-    from hyperplanes.checkpoints import write_whole
+    from hyperplanes.files import write_whole
     from hyperplanes.methods import at_steps
     from hyperplanes.report.charts import line_chart, standalone
 

@@ -90,8 +90,8 @@ def after_steps(taken: Sequence[int]) -> str:
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
     from hyperplanes.adaptation.fine_tuning import FineTuning
-    from hyperplanes.checkpoints import write_whole
     from hyperplanes.export import encode_animation, orbit_cameras, save_images, to_pixels
+    from hyperplanes.files import write_whole
     from hyperplanes.metrics import psnr, ssim
     from hyperplanes.models import adapt, choose_device, load_model
     from hyperplanes.presets import PROTOCOLS

@@ -5,14 +5,15 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from hyperplanes.files import DataError
+
 if TYPE_CHECKING:
     from hyperplanes.data.channels import mesh_path, read_channel
     from hyperplanes.data.dataset import Dataset, open_dataset, read_task, read_views
-    from hyperplanes.data.errors import DataError
 
 __all__ = ["DataError", "Dataset", "mesh_path", "open_dataset", "read_channel", "read_task", "read_views"]
 
-_HOMES = {"DataError": "errors", "Dataset": "dataset", "open_dataset": "dataset"}
+_HOMES = {"Dataset": "dataset", "open_dataset": "dataset"}
 _HOMES |= {"mesh_path": "channels", "read_channel": "channels"}
 _HOMES |= {"read_task": "dataset", "read_views": "dataset"}
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from hyperplanes.data.errors import DataError
 from hyperplanes.data.posed import PosedTask
 from hyperplanes.data.transforms_json import read_transforms_task
+from hyperplanes.files import DataError
 
 __all__ = ["FORMAT", "SPLITS", "Catalogue", "is_plain", "native"]
 

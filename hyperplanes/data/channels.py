@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyperplanes.data.errors import DataError
 from hyperplanes.data.npz import read_arrays
+from hyperplanes.files import DataError
 
 __all__ = ["CHANNELS", "mesh_path", "read_channel"]
 

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.errors import DataError
-from hyperplanes.data.files import inside
 from hyperplanes.data.images import image_size, read_image
 from hyperplanes.data.posed import Posed, check_pose, posed
 from hyperplanes.data.undistort import undistort
+from hyperplanes.files import DataError, inside
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["find_model", "read_colmap"]

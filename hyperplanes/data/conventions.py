@@ -10,6 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
+from hyperplanes.axes import flip_camera_axes
 from hyperplanes.data.bounds import estimate_bounds
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
@@ -82,14 +83,17 @@ def check_conventions(views: Views) -> Conventions:
 def _readings(cameras: PinholeCamera) -> dict[str, Tensor]:
     """camera_from_world under each suspicion about the file, which the reader took for OpenGL camera-to-world."""
     declared = camera.camera_from_world(cameras)
-    flip = declared.new_tensor([1.0, -1.0, -1.0, 1.0])
     written = camera.opengl_from_opencv(declared)  # as it stands in a transforms.json
     return {
         AS_DECLARED: declared,
-        "in OpenCV axes (y down, z forward), not OpenGL's": flip[:, None] * declared,
-        "camera-from-world in OpenGL axes, not its inverse": flip[:, None] * written,
+        "in OpenCV axes (y down, z forward), not OpenGL's": _flip_rows(declared),
+        "camera-from-world in OpenGL axes, not its inverse": _flip_rows(written),
         "camera-from-world in OpenCV axes, not OpenGL camera-to-world": written,
     }
+
+
+def _flip_rows(camera_from_world: Tensor) -> Tensor:
+    return flip_camera_axes(camera_from_world.mT).mT
 
 
 def _overlap(masks: Tensor, cameras: PinholeCamera, pose: Tensor) -> float:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from hyperplanes.data.catalogue import SPLITS
-from hyperplanes.data.errors import DataError
 from hyperplanes.data.posed import PosedTask
 from hyperplanes.data.recognise import find_catalogue, posed_folder, read_posed_task
 from hyperplanes.data.transforms_json import find_transforms, read_transforms
+from hyperplanes.files import DataError
 from hyperplanes.views import Task, Views
 
 __all__ = ["Dataset", "Datasets", "open_dataset", "open_datasets", "read_task", "read_views"]

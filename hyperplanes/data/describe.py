@@ -9,7 +9,7 @@ import torch
 
 from hyperplanes.data.conventions import Conventions, check_conventions
 from hyperplanes.data.dataset import Dataset
-from hyperplanes.data.errors import DataError
+from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from hyperplanes.data.errors import DataError
+from hyperplanes.files import DataError
 
 __all__ = ["LARGEST_IMAGE", "composite_over_white", "image_size", "read_image"]
 

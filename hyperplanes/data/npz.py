@@ -11,11 +11,10 @@ import numpy.typing as npt
 
 from hyperplanes.data.bounds import stated_bounds
 from hyperplanes.data.catalogue import SPLITS, Catalogue, is_plain
-from hyperplanes.data.errors import DataError
-from hyperplanes.data.files import read_json
 from hyperplanes.data.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.data.transforms_document import opencv_from_opengl
 from hyperplanes.data.transforms_json import read_transforms_task
+from hyperplanes.files import DataError, read_json
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["AUTHORS_FOCAL", "catalogue", "read_arrays", "read_npz"]

@@ -13,8 +13,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.data.bounds import estimate_bounds
-from hyperplanes.data.errors import DataError
 from hyperplanes.data.images import composite_over_white
+from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, Views

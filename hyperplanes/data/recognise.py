@@ -6,10 +6,9 @@ from pathlib import Path
 
 from hyperplanes.data import colmap, npz, srn
 from hyperplanes.data.catalogue import FORMAT, Catalogue, native
-from hyperplanes.data.errors import DataError
-from hyperplanes.data.files import read_json
 from hyperplanes.data.posed import PosedTask
 from hyperplanes.data.transforms_json import find_transforms, read_transforms_task
+from hyperplanes.files import DataError, read_json
 
 __all__ = ["find_catalogue", "posed_folder", "read_posed_task"]
 

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from hyperplanes.data.bounds import stated_bounds
 from hyperplanes.data.catalogue import Catalogue
-from hyperplanes.data.errors import DataError
 from hyperplanes.data.images import image_size, read_image
 from hyperplanes.data.posed import Posed, PosedTask, check_pose, posed
+from hyperplanes.files import DataError
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["catalogue", "is_srn", "read_srn"]

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.errors import DataError
+from hyperplanes.axes import flip_camera_axes
+from hyperplanes.files import DataError
 
 __all__ = ["calibration", "opencv_from_opengl", "transforms_document"]
 
-_FLIP = np.array([1.0, -1.0, -1.0, 1.0])
 _NO_DISTORTION = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL"}
 
 
@@ -49,7 +49,7 @@ def transforms_document(
     >>> document["cx"], document["frames"][0]["transform_matrix"][2]
     (0.5, [0.0, 0.0, -1.0, 0.0])
     """
-    poses = world_from_camera * _FLIP + 0.0
+    poses = flip_camera_axes(world_from_camera) + 0.0
     shared = bool((intrinsics == intrinsics[:1]).all())
     frames = []
     for index, name in enumerate(file_paths):
@@ -77,7 +77,7 @@ def opencv_from_opengl(world_from_camera: npt.NDArray[np.float64]) -> npt.NDArra
     >>> opencv_from_opengl(np.eye(4)[None])[0].diagonal().tolist()
     [1.0, -1.0, -1.0, 1.0]
     """
-    poses = world_from_camera * _FLIP
+    poses = flip_camera_axes(world_from_camera)
     rotation = poses[:, :3, :3].transpose(0, 2, 1)
     result = np.tile(np.eye(4), (len(poses), 1, 1))
     result[:, :3, :3] = rotation

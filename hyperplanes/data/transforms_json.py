@@ -11,12 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hyperplanes.data.bounds import stated_bounds
-from hyperplanes.data.errors import DataError
-from hyperplanes.data.files import inside, read_json
 from hyperplanes.data.images import image_size, read_image
 from hyperplanes.data.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.data.transforms_document import calibration, opencv_from_opengl
 from hyperplanes.data.undistort import distortion, undistort
+from hyperplanes.files import DataError, inside, read_json
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["find_transforms", "read_transforms", "read_transforms_task"]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 from torch.nn.functional import grid_sample
 
-from hyperplanes.data.errors import DataError
+from hyperplanes.files import DataError
 
 __all__ = ["COEFFICIENTS", "distort", "distortion", "undistort"]
 

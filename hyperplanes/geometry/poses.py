@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hyperplanes.axes import flip_camera_axes
+
 __all__ = ["fibonacci_sphere", "look_at", "opencv_from_opengl", "opengl_from_opencv", "orbit"]
 
 
@@ -19,12 +21,12 @@ def opencv_from_opengl(world_from_camera: Float[Tensor, "view 4 4"]) -> Float[Te
 
     OpenGL cameras look along -z with y up, so y and z of the camera axes change sign.
     """
-    return torch.linalg.inv(world_from_camera * world_from_camera.new_tensor([1.0, -1.0, -1.0, 1.0]))
+    return torch.linalg.inv(flip_camera_axes(world_from_camera))
 
 
 def opengl_from_opencv(camera_from_world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
     """OpenGL camera-to-world of poses in our convention: the inverse of `opencv_from_opengl`."""
-    return torch.linalg.inv(camera_from_world) * camera_from_world.new_tensor([1.0, -1.0, -1.0, 1.0])
+    return flip_camera_axes(torch.linalg.inv(camera_from_world))
 
 
 def look_at(

@@ -7,7 +7,7 @@ import base64
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.export import encode_png
+from hyperplanes.files import encode_png
 from hyperplanes.report.content import Pixels
 
 __all__ = ["ERROR_SCALE", "colour_scale", "error_map", "gradient", "inline", "inline_png"]
@@ -56,4 +56,4 @@ def inline(content: bytes, kind: str) -> str:
 
 def inline_png(pixels: Pixels) -> str:
     """A picture as a data URI."""
-    return inline(encode_png(pixels), "png")
+    return inline(encode_png(pixels, small=True), "png")

@@ -6,8 +6,9 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from data_gen import rigs
-from data_gen.rig import Rig
-from data_gen.rig_presets import RIG_PRESETS, preset
+from data_gen.rigs import RIG_PRESETS, Rig, make_rig
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.poses import look_at
 
 
 def _nearest(directions):
@@ -22,7 +23,7 @@ def _kornia_project(rig, points):
     intrinsics[:, :3, :3] = rig.intrinsics
     camera = PinholeCamera(
         torch.from_numpy(intrinsics),
-        torch.from_numpy(rig.camera_from_world),
+        torch.from_numpy(np.linalg.inv(rig.world_from_camera)),
         torch.full((views,), float(rig.height), dtype=torch.float64),
         torch.full((views,), float(rig.width), dtype=torch.float64),
     )
@@ -94,20 +95,24 @@ def test_random_rigs_follow_their_seed_and_cover_their_part_of_the_sphere():
 
 def test_presets():
     assert set(RIG_PRESETS) == {"paper-128", "paper-200"}
-    small, large = preset("paper-128", seed=5), preset("paper-200", seed=5)
-    assert (small.width, len(small)) == (128, 50)
-    assert (large.width, len(large)) == (200, 50)
-    assert not np.array_equal(small.world_from_camera, preset("paper-128", seed=6).world_from_camera)
-    assert np.array_equal(large.world_from_camera, preset("paper-200", seed=6).world_from_camera)
-    with pytest.raises(ValueError, match="paper-128, paper-200, received 'paper-64'"):
-        preset("paper-64")
+    assert [(preset.views, preset.resolution) for preset in RIG_PRESETS.values()] == [(50, 128), (50, 200)]
+    small, large = (
+        [make_rig(name, 50, 16, seed=seed).world_from_camera for seed in (5, 6)] for name in ("paper-128", "paper-200")
+    )
+    assert not np.array_equal(*small)
+    assert np.array_equal(*large)
+    with pytest.raises(ValueError, match="paper-128, paper-200, got 'paper-64'"):
+        make_rig("paper-64", 50, 16)
 
 
-def test_select_keeps_views_and_bounds():
+def test_poses_are_those_of_the_cameras_of_hyperplanes():
     rig = rigs.fixed(6, (20, 10))
-    part = rig.select([4, 0])
-    assert np.array_equal(part.world_from_camera, rig.world_from_camera[[4, 0]])
-    assert (part.width, part.height, part.near, part.far) == (20, 10, 2.0, 4.0)
+    part = rig.cameras([4, 0])
+    assert camera.image_size(part) == (10, 20)
+    expected = look_at(torch.from_numpy(rig.camera_centres[[4, 0]]))
+    assert torch.allclose(camera.camera_from_world(part), expected, atol=1e-12)
+    assert torch.equal(camera.intrinsics(part), torch.from_numpy(rig.intrinsics[[4, 0]]))
+    assert np.allclose(camera.centres(part).numpy(), rig.camera_centres[[4, 0]], atol=1e-12)
 
 
 def test_one_intrinsic_matrix_serves_all_views():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_gen.shapes import patterns
-from data_gen.shapes.materials import Material, plain, shade, tint
+from data_gen.shapes.materials import Material, brighten, plain, tint
 from data_gen.shapes.parts import Part, atlas, build_scene, corner_normals
 from data_gen.shapes.primitives import ball, box, cylinder
 
@@ -72,10 +72,10 @@ def test_scene_shows_each_part_in_its_material():
 def test_normals_are_flat_across_creases_and_smooth_within():
     """Closed forms: a box's corners take its faces' normals; a ball's approach the direction from its centre."""
     cube = box(1, 1, 1)
-    np.testing.assert_allclose(corner_normals(cube), np.repeat(cube.mesh().face_normals[:, None], 3, 1), atol=1e-12)
+    np.testing.assert_allclose(corner_normals([cube]), np.repeat(cube.mesh().face_normals[:, None], 3, 1), atol=1e-12)
     sphere = ball(1, 1, 1, 32, 16)
     outward = sphere.vertices[sphere.faces]
-    assert ((corner_normals(sphere) * outward).sum(-1) > 0.99).all()
+    assert ((corner_normals([sphere]) * outward).sum(-1) > 0.99).all()
 
 
 @pytest.mark.parametrize("pattern", [*patterns.PRINTS, patterns.print_of])
@@ -106,6 +106,6 @@ def test_textures_vary_and_stay_near_their_colour():
 
 def test_colours():
     """By hand."""
-    assert shade((100, 50, 250), 1.5) == (150, 75, 255)
+    assert brighten((100, 50, 250), 1.5) == (150, 75, 255)
     assert tint(np.random.default_rng(0), 0.0, 1.0, 1.0, spread=0.0) == (255, 0, 0)
     assert tint(np.random.default_rng(0), 1 / 3, 1.0, 0.5, spread=0.0) == (0, 128, 0)

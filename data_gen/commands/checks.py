@@ -1,0 +1,32 @@
+"""What data_gen adds to `hyperplanes doctor`: a probe of each renderer."""
+
+from __future__ import annotations
+
+from hyperplanes.doctor import Check
+
+__all__ = ["examine_renderers"]
+
+
+def examine_renderers() -> list[Check]:
+    """Draw a triangle with each renderer, each in a process of its own; any one that works will do.
+
+    Returns:
+        One outcome a renderer, and one for all of them.
+    """
+    from data_gen.rendering.renderers import probe_all
+
+    probes = probe_all()
+    working = [probe for probe in probes if probe.works]
+    best = f"{working[0].name} draws" if working else "none draws"
+    summary = Check("renderer", bool(working), True, best, probes[0].remedy)
+    return [
+        summary,
+        *(Check(f"renderer {each.name}", each.works, False, _reason(each.message), each.remedy) for each in probes),
+    ]
+
+
+def _reason(message: str) -> str:
+    """A message without the class of its exception and the remedy, which is printed separately."""
+    text = message.partition(" Remedy:")[0].rstrip(".")
+    kind, found, rest = text.partition(": ")
+    return rest if found and kind.endswith("Error") and " " not in kind else text

@@ -1,0 +1,146 @@
+"""Render meshes into a data set of posed images, as many cameras an object as you like.
+
+The meshes are procedural (--class, an endless supply) or yours (--meshes, a folder with GLB, glTF, OBJ, PLY, STL, OFF
+or DAE files at any depth). An object that cannot be drawn is skipped, named, and listed in the data set's manifest.
+Interrupted, the same command goes on where it stopped and ends with the same bytes.
+
+Example:
+    hyperplanes generate --class car --count 70 --resolution 64 --seed 0 --out data/cars
+    hyperplanes generate --meshes my-models --up z --resolution 128 --out data/mine
+    hyperplanes generate --meshes ShapeNetCore.v2 --split-file all.csv --rig paper-128 --out data/shapenet
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from data_gen import SUPERSAMPLE
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, optional
+from hyperplanes.words import duration
+
+if TYPE_CHECKING:
+    from data_gen.datasets.generate import GenerationReport, MeshFolder, Procedural
+
+__all__ = ["Arguments", "run", "source_of", "summary"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to render.
+
+    Attributes:
+        out: The folder to write: new, empty, or one in which the same command was interrupted.
+        class_name: Procedural objects of this class: car, chair, plane or lamp.
+        meshes: A folder of mesh files, instead of --class.
+        count: How many procedural objects, the held-out ones included.
+        seed: Of the procedural shapes and of random rigs and lights.
+        resolution: Pixels along a side of the square images; what the rig or the layout is made for, else 64, when not
+            given.
+        views: Cameras an object, alternately support and query; 50 when not given.
+        held_out: Objects for the test split: a count, or a fraction below 1. A seventh when not given; of mesh files
+            the split that their tree states, else a fifth.
+        rig: Where the cameras stand: the same places for all objects, random ones, a circle, or as in one of the two
+            data sets of the paper, with its distance, lens and resolution.
+        distance: Of the cameras from the object's centre, in radii of the object; what the rig or the layout is made
+            for, else 3, when not given.
+        field_of_view: Of the cameras in degrees; that of the rig or the layout, else the object just fits.
+        lighting: Where the light comes from.
+        layout: How the files lie: native, or as another project's loader reads them.
+        up: The axis that points up in the mesh files.
+        split_file: ShapeNet's official all.csv, which says what each model of the tree is for.
+        channels: What is written of every view; more than rgba needs the native layout.
+        workers: Processes; as many as there are cores when not given.
+        engine: Worker processes of this machine, or a Ray cluster.
+        supersample: Samples along a side of a pixel, each of them shaded.
+        renderer: pyrender-egl, pyrender-osmesa or embree; the best that works here when not given.
+        verify: Compare all files with their checksums; objects of an interrupted call whose files differ are made anew.
+    """
+
+    out: Path
+    class_name: Annotated[Literal["car", "chair", "plane", "lamp"] | None, optional("NAME", name="class")] = None
+    meshes: OptionalFolder = None
+    count: int = 70
+    seed: int = 0
+    resolution: OptionalInt = None
+    views: OptionalInt = None
+    held_out: OptionalNumber = None
+    rig: Literal["fixed", "random", "hemisphere", "orbit", "paper-128", "paper-200"] = "fixed"
+    distance: Annotated[float | None, optional("RADII")] = None
+    field_of_view: Annotated[float | None, optional("DEGREES")] = None
+    lighting: Literal["studio", "headlight", "random"] = "studio"
+    layout: Literal["native", "srn", "learnit-128", "hyperplanes-200"] = "native"
+    up: Literal["y", "z"] = "y"
+    split_file: Annotated[Path | None, optional("FILE")] = None
+    channels: tuple[Literal["rgba", "depth", "normals", "coordinates", "mesh"], ...] = ("rgba",)
+    workers: OptionalInt = None
+    engine: Literal["local", "ray"] = "local"
+    supersample: int = SUPERSAMPLE
+    renderer: OptionalName = None
+    verify: bool = False
+
+
+def source_of(arguments: Arguments) -> Procedural | MeshFolder:
+    """Where the objects come from.
+
+    Raises:
+        ValueError: both or none of --class and --meshes.
+    """
+    from data_gen.datasets.generate import MeshFolder, Procedural
+
+    if (arguments.class_name is None) == (arguments.meshes is None):
+        found = "none" if arguments.meshes is None else "both"
+        raise ValueError(f"expected --class NAME or --meshes FOLDER, found {found}; `hyperplanes generate --help`")
+    if arguments.meshes is not None:
+        return MeshFolder(arguments.meshes, arguments.up, arguments.split_file)
+    if arguments.split_file is not None:
+        raise ValueError("split_file: expected with --meshes and a ShapeNetCore tree, found with --class")
+    return Procedural(str(arguments.class_name), arguments.count, arguments.seed)
+
+
+def summary(report: GenerationReport, out: Path) -> str:
+    """One line about what was written."""
+    splits = ", ".join(f"{count} {split}" for split, count in report.splits.items() if count)
+    reused = f", {report.reused} of them from before" if report.reused else ""
+    speed = (
+        f" in {duration(report.seconds)}, {report.images_per_second:.0f} images/s" if report.images_per_second else ""
+    )
+    return f"{out}: {report.written} objects ({splits}{reused}){speed}"
+
+
+def unlisted(names: list[str]) -> str:
+    """One line about objects that the split file does not name."""
+    shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    return f"not in the split file, so trained on: {len(names)} objects ({shown}), listed in the manifest"
+
+
+def run(arguments: Arguments) -> int:
+    """Generate the data set and say what was skipped."""
+    from data_gen.datasets.generate import GenerationConfig, generate
+    from data_gen.datasets.manifest import verify
+    from data_gen.rendering.renderers import find_renderer
+
+    console = Console()
+    source = source_of(arguments)
+    renderer = find_renderer(arguments.renderer)
+    console.say(f"renderer: {renderer.name} ({renderer.detail})")
+    for line in renderer.advice:
+        console.say(f"a faster one: {line}")
+    names = {field.name for field in fields(GenerationConfig)} & {field.name for field in fields(Arguments)}
+    given: dict[str, Any] = {name: getattr(arguments, name) for name in names}
+    config = replace(GenerationConfig(**given), renderer=renderer.name)
+    with console.bar("rendering") as bar:
+        report = generate(source, arguments.out, config, progress=bar.show)
+    for name, reason in report.skipped:
+        console.warn(f"skipped {name}: {reason}")
+    if report.unlisted:
+        console.warn(unlisted(report.unlisted))
+    console.say(summary(report, arguments.out))
+    if not arguments.verify:
+        return 0
+    verification = verify(arguments.out)
+    for line in verification.lines():
+        console.say(line)
+    return int(not verification.intact)

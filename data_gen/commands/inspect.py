@@ -1,0 +1,102 @@
+"""Say what is in a data set or a checkpoint, and whether it is as it should be.
+
+Of a data set: counts, splits, bounds, what was skipped, whether the poses agree with the masks (OpenCV poses declared
+as OpenGL are recognised), and two pictures: a contact sheet, and the cameras around the object. Ends with exit code 1
+when something is wrong with it.
+
+Example:
+    hyperplanes inspect data/cars
+    hyperplanes inspect data/cars --checksums
+    hyperplanes inspect runs/demo/hyperplanes
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.options import OptionalFolder
+
+if TYPE_CHECKING:
+    from hyperplanes.adaptation.diagnostics import Diagnostics
+
+__all__ = ["Arguments", "checkpoint_lines", "recorded_diagnostics", "run"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to look at.
+
+    Attributes:
+        path: A data set in any layout, a folder of posed images, or a checkpoint.
+        out: Where the pictures go; runs/inspect/NAME when not given.
+        objects: How many objects to look at closely.
+        checksums: Compare every file with its checksum in the manifest, too.
+    """
+
+    path: tyro.conf.Positional[Path]
+    out: OptionalFolder = None
+    objects: int = 8
+    checksums: bool = False
+
+
+def checkpoint_lines(folder: Path) -> list[str]:
+    """What a checkpoint holds, a line a fact."""
+    from hyperplanes.adaptation.configuration import checkpoint_folder
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+    from hyperplanes.checkpoints import read_json
+
+    folder = checkpoint_folder(folder)
+    model = HyperPlanes.from_pretrained(folder)
+    config = model.config
+    lines = [
+        f"target: {config.target}, {config.network.depth} layers of {config.network.width}, "
+        f"{config.network.planes} planes, {sum(p.numel() for p in model.networks.parameters()):,} weights",
+        f"sampling: {config.sampling}",
+    ]
+    if config.hypernetwork is not None and model.hypernetwork is not None:
+        hyper = config.hypernetwork
+        lines.append(
+            f"hypernetwork: {hyper.encoder} reads {hyper.views} views, {hyper.update} update of "
+            f"{', '.join(hyper.layers)}, {sum(p.numel() for p in model.hypernetwork.parameters()):,} weights"
+        )
+        lines.append(f"diagnostics: {recorded_diagnostics(folder) or 'not recorded; `hyperplanes train` does'}")
+    else:
+        lines.append("hypernetwork: none, the same weights for every object")
+    if (folder / "training.json").exists():
+        state = read_json(folder / "training.json")
+        looked = [entry["psnr"] for entry in state["curve"] if "psnr" in entry]
+        quality = f", {looked[-1]:.2f} dB on held-out objects when last looked at" if looked else ""
+        lines.append(f"training: {state['step']:,} of {state['config']['steps']:,} steps{quality}")
+    return lines
+
+
+def recorded_diagnostics(folder: Path) -> Diagnostics | None:
+    """The diagnostics that the training of a checkpoint recorded last, beside its weights."""
+    from hyperplanes.adaptation.diagnostics import Diagnostics
+    from hyperplanes.checkpoints import read_json
+
+    if not (folder / "diagnostics.json").exists():
+        return None
+    return Diagnostics.of_json(read_json(folder / "diagnostics.json"), folder / "diagnostics.json")
+
+
+def run(arguments: Arguments) -> int:
+    """Describe it; 1 when a data set is not as it should be."""
+    console = Console()
+    packaged = len(arguments.path.parts) == 1 and not arguments.path.exists()
+    if packaged or (arguments.path / "model.json").exists():
+        for line in checkpoint_lines(arguments.path):
+            console.say(line)
+        return 0
+    from data_gen.datasets.inspect import inspect
+
+    out = arguments.out or Path("runs/inspect") / arguments.path.resolve().name
+    found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums)
+    for line in found.lines():
+        console.say(line)
+    return int(found.has_problems)

@@ -1,0 +1,199 @@
+"""The configuration of a generation, and what it resolves to for every object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+from data_gen import SUPERSAMPLE
+from data_gen.datasets.layouts import LAYOUTS
+from data_gen.datasets.sources import seed_of
+from data_gen.rigs import RIG_PRESETS, RIGS, Rig, make_rig
+
+__all__ = ["ENGINES", "GenerationConfig", "RenderConfig"]
+
+ENGINES = ("local", "ray")
+"""Where objects are rendered: worker processes of this machine, or a Ray cluster."""
+
+VIEWS, RESOLUTION = 50, 64
+MOST_VIEWS, MOST_SAMPLES, MOST_BYTES = 10_000, 16_384, 4 * 2**30  # an object; along a side; of all its pictures
+EXTRA_CHANNELS = {"depth": 4, "normals": 12, "coordinates": 12, "mesh": 0}  # bytes a pixel
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """What decides the pictures of an object: a `GenerationConfig` in which nothing is left open.
+
+    Attributes:
+        rig: a name in `data_gen.rigs.RIGS`.
+        views: cameras an object.
+        resolution: pixels along a side.
+        distance: of the cameras from the origin, in world units.
+        field_of_view: in degrees; None fits the unit sphere.
+        lighting: a name in `data_gen.rendering.lighting.LIGHTING_PRESETS`.
+        channels: "rgba", and further ones in alphabetical order.
+        layout: a name in `data_gen.datasets.layouts.LAYOUTS`.
+        seed: of random rigs and lights.
+        supersample: samples along a side of a pixel.
+        renderer: a name in `data_gen.rendering.renderers.RENDERERS`.
+        up: the axis that points up in mesh files, y or z.
+    """
+
+    rig: str
+    views: int
+    resolution: int
+    distance: float
+    field_of_view: float | None
+    lighting: str
+    channels: tuple[str, ...]
+    layout: str
+    seed: int
+    supersample: int
+    renderer: str
+    up: Literal["y", "z"]
+
+    def make_rig(self, name: str) -> Rig:
+        """The cameras of an object.
+
+        Args:
+            name: of the object, on which random rigs depend.
+
+        Returns:
+            The rig.
+        """
+        numbers = {"distance": self.distance, "field_of_view": self.field_of_view}
+        return make_rig(self.rig, self.views, self.resolution, seed=self.seed_for("rig", name), **numbers)
+
+    def seed_for(self, purpose: str, name: str) -> int:
+        """A 32-bit seed for one purpose and one object."""
+        return seed_of(self.seed, purpose, name) % 2**32
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields as JSON has them."""
+        return {**asdict(self), "channels": list(self.channels)}
+
+    @classmethod
+    def from_json(cls, fields: dict[str, Any]) -> RenderConfig:
+        """The inverse of `as_json`."""
+        return cls(**{**fields, "channels": tuple(fields["channels"])})
+
+
+@dataclass(frozen=True)
+class GenerationConfig:
+    """How objects are rendered into a data set.
+
+    Attributes:
+        rig: "fixed" (the same poses for all objects), "random" (on the sphere), "hemisphere", "orbit", or a name in
+            `data_gen.rigs.RIG_PRESETS`.
+        views: pictures an object, alternately support and query; the preset's when None, else 50.
+        resolution: pixels along a side; what the layout's loaders assume or the preset has when None, else 64.
+        lighting: "studio", "headlight" or "random".
+        channels: "rgba" and any of "depth", "normals", "coordinates", "mesh"; more than rgba needs the native layout.
+        held_out: objects for the test split, a count or a fraction below 1; see `data_gen.datasets.sources.list_items`.
+        workers: processes; as many as cores when None.
+        engine: "local", or "ray" for a Ray cluster.
+        layout: a name in `data_gen.datasets.layouts.LAYOUTS`.
+        seed: of random rigs and lights; shapes have their own in the source.
+        distance: of the cameras from the object's centre in object radii; what suits the layout or the preset when
+            None.
+        field_of_view: in degrees; the preset's when None, or the object just fits.
+        supersample: samples along a side of a pixel.
+        renderer: a name in `data_gen.rendering.renderers.RENDERERS`; the best that works here when None.
+        timeout: seconds an object may take.
+        recycle: objects after which a worker is replaced.
+        verify: compare files of an earlier call with their checksums, and make objects anew where they differ.
+    """
+
+    rig: str = "fixed"
+    views: int | None = None
+    resolution: int | None = None
+    lighting: str = "studio"
+    channels: Sequence[str] = ("rgba",)
+    held_out: float | int | None = None
+    workers: int | None = None
+    engine: str = "local"
+    layout: str = "native"
+    seed: int = 0
+    distance: float | None = None
+    field_of_view: float | None = None
+    supersample: int = SUPERSAMPLE
+    renderer: str | None = None
+    timeout: float = 300.0
+    recycle: int = 200
+    verify: bool = False
+
+    def resolve(self, up: Literal["y", "z"] = "y") -> RenderConfig:
+        """Check everything, and settle what was left open: by the layout, else by the preset, else by default.
+
+        Args:
+            up: the axis that points up in mesh files.
+
+        Returns:
+            What workers need to know.
+
+        Raises:
+            ValueError: if a name is unknown, a number makes no sense, or no renderer works.
+        """
+        from data_gen.rendering.renderers import find_renderer
+
+        self._check_names()
+        layout, preset = LAYOUTS[self.layout], RIG_PRESETS.get(self.rig)
+        if self.resolution is not None and layout.resolution not in (None, self.resolution):
+            raise ValueError(
+                f"resolution: the {self.layout} layout's loaders take {layout.resolution} for granted, "
+                f"got {self.resolution}"
+            )
+        distance, field_of_view = self.distance, self.field_of_view
+        if distance is None:
+            distance = preset.distance if preset and self.layout == "native" else layout.distance
+        if field_of_view is None and preset:
+            field_of_view = preset.field_of_view
+        views = self.views
+        resolution = layout.resolution if self.resolution is None else self.resolution
+        config = RenderConfig(
+            rig=self.rig,
+            views=(preset.views if preset else VIEWS) if views is None else views,
+            resolution=(preset.resolution if preset else RESOLUTION) if resolution is None else resolution,
+            distance=float(distance),
+            field_of_view=layout.field_of_view or field_of_view,
+            lighting=self.lighting,
+            channels=("rgba", *sorted(set(self.channels) - {"rgba"})),
+            layout=self.layout,
+            seed=self.seed,
+            supersample=self.supersample,
+            renderer="",
+            up=up,
+        )
+        _check_sizes(config)
+        config.make_rig("")  # numbers that make no sense show here, not in every worker
+        return replace(config, renderer=find_renderer(self.renderer).name)
+
+    def _check_names(self) -> None:
+        known = {"rig": RIGS, "engine": ENGINES, "layout": tuple(LAYOUTS)}
+        for name, values in known.items():
+            if getattr(self, name) not in values:
+                raise ValueError(f"{name}: expected one of {', '.join(values)}, got {getattr(self, name)!r}")
+        channels = tuple(self.channels)
+        if set(channels) - {"rgba", *EXTRA_CHANNELS} or "rgba" not in channels:
+            raise ValueError(f"channels: expected rgba and any of {', '.join(EXTRA_CHANNELS)}, got {channels}")
+        if self.layout != "native" and len(channels) > 1:
+            raise ValueError(f"channels: expected rgba alone in the {self.layout} layout, got {channels}")
+
+
+def _check_sizes(config: RenderConfig) -> None:
+    """Sizes are checked before anything is allocated; the pictures of one object are in memory at once."""
+    views, resolution, supersample = config.views, config.resolution, config.supersample
+    if views > MOST_VIEWS:
+        raise ValueError(f"views: expected at most {MOST_VIEWS:,} an object, got {views:,}")
+    if resolution * supersample > MOST_SAMPLES:
+        raise ValueError(
+            f"resolution: expected at most {MOST_SAMPLES:,} samples along a side, got {resolution:,} pixels of "
+            f"{supersample} each"
+        )
+    needed = views * resolution**2 * (4 + sum(EXTRA_CHANNELS.get(channel, 0) for channel in config.channels))
+    if needed > MOST_BYTES:
+        raise ValueError(
+            f"resolution: expected at most {MOST_BYTES >> 30} GiB of pictures an object, got {needed / 2**30:,.1f} GiB "
+            f"({views:,} views of {resolution:,} x {resolution:,} pixels); take fewer of either"
+        )

@@ -1,0 +1,163 @@
+"""Generate a data set: objects stream through worker processes into files; interrupted, it resumes."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from data_gen.datasets.config import GenerationConfig, RenderConfig
+from data_gen.datasets.layouts import LAYOUTS
+from data_gen.datasets.manifest import GenerationState, build_manifest
+from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
+from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
+from data_gen.rigs import OBJECT_RADIUS
+from hyperplanes.files import DataError, sha256
+
+__all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
+
+PICTURES = 2
+"""Raised whenever the same arguments come to give other bytes, so that no data set is made half of each."""
+
+TARGET = "data_gen.datasets.objects:open_renderer"
+
+
+@dataclass(frozen=True)
+class GenerationReport:
+    """The outcome of a generation.
+
+    Attributes:
+        written: objects in the data set, those of an earlier, interrupted call included.
+        skipped: names and reasons of objects that are not in it.
+        seconds: that this call took.
+        images_per_second: that this call wrote.
+        reused: objects that an earlier call had written.
+        splits: how many objects are in each split.
+        unlisted: objects that the split file does not name, and that are trained on.
+    """
+
+    written: int
+    skipped: list[tuple[str, str]]
+    seconds: float
+    images_per_second: float
+    reused: int = 0
+    splits: dict[str, int] = field(default_factory=dict)
+    unlisted: list[str] = field(default_factory=list)
+
+
+def generate(
+    source: Source,
+    out: str | Path,
+    config: GenerationConfig | None = None,
+    *,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> GenerationReport:
+    """Render objects into a data set.
+
+    The same arguments give the same bytes, however often the work was interrupted, on any number of workers. An
+    object that cannot be drawn, or whose worker crashes or hangs twice, is skipped and listed; the rest goes on.
+
+    Args:
+        source: procedural objects or mesh files.
+        out: the folder; new, empty, or one in which the same generation was interrupted.
+        config: how they are rendered; the defaults of `GenerationConfig` when None.
+        progress: called with (objects done, objects in all, name) after each object.
+
+    Returns:
+        What was written and what was skipped.
+
+    Raises:
+        ValueError: an argument that makes no sense, a renderer that does not work, no object that could be drawn.
+        DataError: the folder holds something else, or the disk is full.
+    """
+    begun = time.monotonic()
+    out, config = Path(out), config or GenerationConfig()
+    render = config.resolve(source.up if isinstance(source, MeshFolder) else "y")
+    items = list_items(source, config.held_out)
+    with GenerationState(out, _configuration(source, items, render, config.held_out)) as state:
+        done = state.done(verified=config.verify)
+        reused = sum(item.name in done for item in items)
+        pending = (asdict(item) for item in items if item.name not in done)
+        settings = {"out": str(out.resolve()), "render": render.as_json()}
+        count, skipped, images = reused, [], 0
+        try:
+            with closing(_outcomes(config, settings, pending)) as outcomes:
+                for outcome in outcomes:
+                    count += 1
+                    name = outcome.item["name"]
+                    if outcome.result is None:
+                        skipped.append((name, _without_path(str(outcome.reason), source)))
+                    else:
+                        done[name] = outcome.result
+                        images += outcome.result["record"]["views"]
+                    if progress is not None:
+                        progress(count, len(items), name)
+        except WorkerError as error:
+            raise DataError(str(error)) from error
+        kept = [item for item in items if item.name in done]
+        if not kept:
+            name, reason = skipped[0]
+            raise ValueError(f"{out}: none of {len(items)} objects could be drawn; {name}: {reason}")
+        manifest = build_manifest(state.configuration, items, done.values(), skipped, _facts(render))
+        state.finish(manifest, LAYOUTS[render.layout].splits(kept))
+    seconds = time.monotonic() - begun
+    splits = {split: len(names) for split, names in manifest["splits"].items()}
+    unlisted = manifest["not_in_split_file"]["names"]
+    return GenerationReport(len(kept), sorted(skipped), seconds, images / seconds, reused, splits, unlisted)
+
+
+def _configuration(
+    source: Source, items: list[Item], render: RenderConfig, held_out: float | int | None
+) -> dict[str, Any]:
+    """What decides the bytes, without a path of this machine."""
+    if isinstance(source, Procedural):
+        described = asdict(source)
+    else:
+        names = [[item.name, item.split] for item in items]
+        described = {
+            "folder": Path(source.path).resolve().name,
+            "meshes": len(items),
+            "names": sha256(repr(names).encode()),
+        }
+    generator = f"hyperplanes {version('hyperplanes')}, pictures {PICTURES}"
+    return render.as_json() | {"generator": generator, "source": described, "held_out": held_out}
+
+
+def _without_path(reason: str, source: Source) -> str:
+    """A reason in which mesh files are named from their folder on, so that no path of this machine is written."""
+    if isinstance(source, Procedural):
+        return reason
+    folder = Path(source.path)
+    for written in (folder, folder.resolve()):
+        reason = reason.replace(f"{written}/", "")
+    return reason
+
+
+def _facts(render: RenderConfig) -> dict[str, Any]:
+    """What readers of the data set want to know of all its objects."""
+    scale, rig = LAYOUTS[render.layout].scale, render.make_rig("")
+    return {
+        "layout": render.layout,
+        "renderer": render.renderer,
+        "scene_sphere": {"centre": [0.0, 0.0, 0.0], "radius": OBJECT_RADIUS * scale},
+        "near": rig.near * scale,
+        "far": rig.far * scale,
+    }
+
+
+def _outcomes(
+    config: GenerationConfig, settings: dict[str, Any], items: Iterator[dict[str, Any]]
+) -> Generator[Outcome, None, None]:
+    limits = {"timeout": config.timeout, "recycle": config.recycle}
+    if config.engine == "ray":
+        from data_gen.datasets.ray_cluster import run_on_ray
+
+        return run_on_ray(TARGET, settings, items, workers=config.workers, **limits)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = cores if config.workers is None else config.workers
+    return run_isolated(TARGET, settings, items, workers=workers, **limits)

@@ -1,0 +1,207 @@
+"""How a rendered object is laid out in files: the native layout, and what other projects' loaders read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from data_gen.datasets.sources import Item
+from data_gen.rigs import DEFAULT_DISTANCE, OBJECT_RADIUS, Rig
+from hyperplanes.axes import flip_camera_axes
+from hyperplanes.data.transforms_document import transforms_document
+from hyperplanes.files import encode_json, encode_npz, encode_png
+
+__all__ = ["LAYOUTS", "Layout", "RenderedObject"]
+
+_AUTHORS_FOCAL = 277.77
+
+
+@dataclass(frozen=True)
+class RenderedObject:
+    """An object with its pictures.
+
+    Attributes:
+        item: which object.
+        rig: its cameras.
+        rgba: uint8 (view, height, width, 4), straight alpha.
+        channels: float32 arrays by name (depth, normals, coordinates).
+        model: GLB bytes of the normalised mesh, or None.
+        mesh: the normalised mesh.
+    """
+
+    item: Item
+    rig: Rig
+    rgba: npt.NDArray[np.uint8]
+    channels: dict[str, npt.NDArray[np.float32]] = field(default_factory=dict)
+    model: bytes | None = None
+    mesh: Any = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One way to lay objects out.
+
+    Attributes:
+        files: from an object to its files, relative path to bytes.
+        splits: from the objects (in order) to the files that say which split they belong to.
+        distance: of the cameras from the origin, so that the near and far planes of the layout's loaders fit.
+        field_of_view: in degrees that the layout's loaders assume, or None.
+        resolution: in pixels that they assume, or None.
+        scale: their world units in one of ours.
+    """
+
+    files: Callable[[RenderedObject], dict[str, bytes]]
+    splits: Callable[[Sequence[Item]], dict[str, bytes]] = lambda _: {}
+    distance: float = DEFAULT_DISTANCE
+    field_of_view: float | None = None
+    resolution: int | None = None
+    scale: float = 1.0
+
+
+def native(rendered: RenderedObject) -> dict[str, bytes]:
+    """NAME/transforms.json with nerfstudio's fields, NAME/images/000.png (RGBA, straight alpha) and so on.
+
+    Other channels are NAME/depth.npz, normals.npz, coordinates.npz, one float32 array under the channel's name each,
+    and NAME/mesh.glb.
+
+    Args:
+        rendered: the object.
+
+    Returns:
+        The files.
+    """
+    name, rig = rendered.item.name, rendered.rig
+    names = [f"images/{index:03d}.png" for index in range(len(rig))]
+    files = {f"{name}/{path}": encode_png(pixels) for path, pixels in zip(names, rendered.rgba, strict=True)}
+    for channel, values in sorted(rendered.channels.items()):
+        files[f"{name}/{channel}.npz"] = encode_npz({channel: values})
+    if rendered.model is not None:
+        files[f"{name}/mesh.glb"] = rendered.model
+    document = transforms_document(
+        rig.world_from_camera,
+        rig.intrinsics,
+        (rig.height, rig.width),
+        names,
+        near_far=(rig.near, rig.far),
+        sphere=((0.0, 0.0, 0.0), OBJECT_RADIUS),
+    )
+    files[f"{name}/transforms.json"] = encode_json(document)
+    return files
+
+
+def learnit(rendered: RenderedObject) -> dict[str, bytes]:
+    """CLASSs/NAME/transforms.json and CLASSs/NAME/r_000.png and so on, as the learned initialisations' data are.
+
+    The JSON has camera_angle_x and the frames' OpenGL poses; pictures are RGBA with straight alpha beside it. Loaders
+    take near 2 and far 6. CLASS_splits.json beside the class folder lists the names (Tancik et al., 2021).
+
+    Args:
+        rendered: the object.
+
+    Returns:
+        The files.
+    """
+    item, rig = rendered.item, rendered.rig
+    folder = f"{_plural(item)}/{item.name}"
+    names = [f"./r_{index:03d}" for index in range(len(rig))]
+    full = transforms_document(rig.world_from_camera, rig.intrinsics, (rig.height, rig.width), names, alternating=False)
+    document = {"camera_angle_x": full["camera_angle_x"], "frames": full["frames"]}
+    files = {f"{folder}/r_{index:03d}.png": encode_png(pixels) for index, pixels in enumerate(rendered.rgba)}
+    files[f"{folder}/transforms.json"] = encode_json(document)
+    return files
+
+
+def learnit_splits(items: Sequence[Item]) -> dict[str, bytes]:
+    """CLASS_splits.json for every class: {"train": [names], "val": [...], "test": [...]}."""
+    files = {}
+    for singular in sorted({item.class_name or "mesh" for item in items}):
+        chosen = [item for item in items if (item.class_name or "mesh") == singular]
+        splits = {split: [item.name for item in chosen if item.split == split] for split in ("train", "val", "test")}
+        files[f"{singular}_splits.json"] = encode_json(splits)
+    return files
+
+
+def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
+    """CLASSs/sampled/VIEWS_NAME.npz as the HyperPlanes, MultiPlaneNeRF and points2nerf authors' loaders read it.
+
+    `images` float32 (view, 200, 200, 3) in [0, 1] over white, `cam_poses` float32 (view, 4, 4) OpenGL camera-to-world.
+    Their loaders take 277.77 pixels as the focal length, near 2 and far 6, and split the files sorted by name 80/20.
+    Read by `hyperplanes.data`, ignored by theirs: `rgba` uint8 with straight alpha, `focal` in pixels. Underscores in
+    names become hyphens, for their loaders take what follows the last underscore as the name.
+
+    Args:
+        rendered: the object.
+
+    Returns:
+        The file.
+    """
+    item, rig = rendered.item, rendered.rig
+    arrays = {
+        "images": over_white(rendered.rgba).astype(np.float32) / np.float32(255),
+        "cam_poses": (flip_camera_axes(rig.world_from_camera) + 0.0).astype(np.float32),
+        "rgba": rendered.rgba,
+        "focal": np.float64(rig.intrinsics[0, 0, 0]),
+    }
+    return {f"{_plural(item)}/sampled/{len(rig)}_{item.name.replace('_', '-')}.npz": encode_npz(arrays)}
+
+
+def srn(rendered: RenderedObject) -> dict[str, bytes]:
+    """CLASSs_SPLIT/NAME with intrinsics.txt, rgb/000000.png and pose/000000.txt (Sitzmann et al., 2019).
+
+    Poses are OpenCV camera-to-world, 16 numbers in a line, in a world half the size of ours, so that near 0.8 and far
+    1.8 of the usual loaders fit. intrinsics.txt: focal length and principal point (half-pixel centres); the centre of
+    the scene; near plane; scale; height and width. Pictures are RGB over white: the format has no alpha.
+
+    Args:
+        rendered: the object.
+
+    Returns:
+        The files.
+    """
+    item, rig = rendered.item, rendered.rig
+    folder = f"{_plural(item)}_{item.split}/{item.name}"
+    matrix = rig.intrinsics[0]
+    lines = [
+        f"{float(matrix[0, 0])!r} {float(matrix[0, 2]) + 0.5!r} {float(matrix[1, 2]) + 0.5!r} 0.",
+        "0. 0. 0.",
+        "0.",
+        "1.",
+        f"{rig.height} {rig.width}",
+    ]
+    files = {f"{folder}/intrinsics.txt": ("\n".join(lines) + "\n").encode()}
+    white = over_white(rendered.rgba)
+    for index, pixels in enumerate(white):
+        pose = rig.world_from_camera[index].copy()
+        pose[:3, 3] *= LAYOUTS["srn"].scale
+        files[f"{folder}/rgb/{index:06d}.png"] = encode_png(pixels)
+        files[f"{folder}/pose/{index:06d}.txt"] = (" ".join(repr(float(x)) for x in pose.ravel()) + "\n").encode()
+    return files
+
+
+def over_white(rgba: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Straight-alpha pixels (..., 4) over white, rounded to 8 bits.
+
+    >>> over_white(np.array([0, 255, 0, 51], np.uint8)).tolist()
+    [204, 255, 204]
+    """
+    alpha = rgba[..., 3:].astype(np.uint32)
+    return ((rgba[..., :3] * alpha + 255 * (255 - alpha) + 127) // 255).astype(np.uint8)
+
+
+def _plural(item: Item) -> str:
+    return f"{item.class_name or 'mesh'}s"
+
+
+LAYOUTS: dict[str, Layout] = {
+    "native": Layout(native),
+    "learnit-128": Layout(learnit, learnit_splits, distance=4.0),
+    "hyperplanes-200": Layout(
+        hyperplanes, distance=4.0, field_of_view=float(np.degrees(2 * np.arctan(100 / _AUTHORS_FOCAL))), resolution=200
+    ),
+    "srn": Layout(srn, distance=2.6, scale=0.5),
+}
+"""Layouts by the name under which the command line knows them."""

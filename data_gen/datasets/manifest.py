@@ -1,0 +1,227 @@
+"""The manifest of a data set: what was requested, written and skipped, and why; and its verification.
+
+Objects stay folders and files that other projects' loaders read, which the archives of WebDataset or Hugging Face
+datasets are not; so what exists, with its checksums, is kept here as one JSON.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import shutil
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from data_gen.datasets.sources import Item
+from hyperplanes.files import DataError, encode_json, inside, read_json, sha256, write_whole
+
+__all__ = ["FORMAT", "MANIFEST", "GenerationState", "Verification", "build_manifest", "verify"]
+
+MANIFEST = "manifest.json"
+FORMAT = "hyperplanes-dataset"
+VERSION = 1
+PROGRESS_FOLDER = ".progress"
+
+Entry = dict[str, Any]
+"""{"name", "record", "files": {relative path: sha256}} of a finished object."""
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What came of comparing files with their checksums.
+
+    Attributes:
+        files: how many were compared.
+        missing: relative paths that are not there.
+        changed: relative paths whose content is another.
+    """
+
+    files: int
+    missing: list[str] = field(default_factory=list)
+    changed: list[str] = field(default_factory=list)
+
+    @property
+    def intact(self) -> bool:
+        """Whether every file is there and as it was written."""
+        return not self.missing and not self.changed
+
+    def lines(self) -> list[str]:
+        """The outcome as text, a line a fact."""
+        if self.intact:
+            return [f"checksums: {self.files:,} files as they were written"]
+        return [f"checksums: {name} is missing" for name in self.missing] + [
+            f"checksums: {name} has changed since it was written" for name in self.changed
+        ]
+
+
+def build_manifest(
+    configuration: dict[str, Any],
+    items: Sequence[Item],
+    entries: Iterable[Entry],
+    skipped: Iterable[tuple[str, str]],
+    facts: dict[str, Any],
+) -> dict[str, Any]:
+    """The manifest of a finished data set; nothing in it depends on when or in which order things were done.
+
+    Args:
+        configuration: what decides the bytes.
+        items: all requested objects.
+        entries: the finished ones.
+        skipped: names and reasons of the others.
+        facts: what readers need: layout, scene_sphere, near, far, renderer.
+
+    Returns:
+        A JSON-able dictionary.
+    """
+    by_name = {entry["name"]: entry for entry in entries}
+    done = [item for item in items if item.name in by_name]
+    unlisted = [item.name for item in done if item.unlisted]
+    splits = {split: [item.name for item in done if item.split == split] for split in ("train", "val", "test")}
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        **facts,
+        "configuration": configuration,
+        "splits": splits,
+        "not_in_split_file": {"count": len(unlisted), "split": "train", "names": unlisted},
+        "objects": {item.name: {**by_name[item.name]["record"], "files": by_name[item.name]["files"]} for item in done},
+        "skipped": [{"name": name, "reason": reason} for name, reason in sorted(skipped)],
+    }
+
+
+def verify(folder: str | Path) -> Verification:
+    """Compare every file of a data set with its checksum in the manifest.
+
+    Args:
+        folder: the data set.
+
+    Returns:
+        What is missing or changed.
+
+    Raises:
+        DataError: no manifest, or one without checksums.
+    """
+    folder = Path(folder)
+    objects = read_json(folder / MANIFEST).get("objects")
+    if not isinstance(objects, dict):
+        raise DataError(folder / MANIFEST, "objects with checksums", "none", "it was not made by hyperplanes generate")
+    missing, changed, count = [], [], 0
+    for record in objects.values():
+        for name, checksum in record.get("files", {}).items():
+            count += 1
+            path = inside(folder, name, folder / MANIFEST)
+            if not path.is_file():
+                missing.append(name)
+            elif sha256(path.read_bytes()) != checksum:
+                changed.append(name)
+    return Verification(count, missing, changed)
+
+
+class GenerationState:
+    """What of a data set exists already: the basis of resuming. A context manager that holds the folder's lock.
+
+    Args:
+        out: the folder of the data set.
+        configuration: what decides the bytes of the data set.
+
+    Raises:
+        DataError: a folder with other content, made with another configuration, or in use by another process.
+    """
+
+    def __init__(self, out: Path, configuration: dict[str, Any]) -> None:
+        self.out = out
+        self.folder = out / PROGRESS_FOLDER
+        self.scratch = self.folder / "unfinished"
+        self.configuration = configuration
+        self._lock: IO[str] | None = None
+
+    def __enter__(self) -> GenerationState:
+        """Check the folder and lock it."""
+        if self.out.exists() and not self.out.is_dir():
+            raise DataError(self.out, "a folder to write into", "a file", "name another one")
+        existing = self._existing()
+        if existing is None and self.out.is_dir() and set(self.out.iterdir()) - {self.folder}:
+            found = ", ".join(sorted(child.name for child in self.out.iterdir())[:3])
+            raise DataError(self.out, "an empty folder or an unfinished data set", found, "name another one")
+        if existing is not None and existing != self.configuration:
+            changed = sorted(
+                key for key in existing | self.configuration if existing.get(key) != self.configuration.get(key)
+            )
+            was, now = (
+                ", ".join(f"{key} {source.get(key)}" for key in changed) for source in (existing, self.configuration)
+            )
+            raise DataError(self.out, f"the data set it holds ({was})", f"a request for {now}", "name another folder")
+        try:
+            self._acquire_lock()
+        except BlockingIOError as error:
+            self.__exit__()
+            raise DataError(self.out, "a folder of its own", "another generation at work", "wait for it") from error
+        except OSError as error:
+            self.__exit__()
+            found = error.strerror or str(error)
+            raise DataError(self.out, "a folder to write into", found, "name another one") from error
+        write_whole(self.folder / "configuration.json", encode_json(self.configuration), self.scratch)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release the lock; finished objects stay."""
+        if self._lock is not None:
+            self._lock.close()
+
+    def done(self, *, verified: bool = False) -> dict[str, Entry]:
+        """The finished objects, by name, of which all files are there.
+
+        Args:
+            verified: only those whose files are as they were written, by their checksums.
+
+        Returns:
+            What was noted of each when it was finished.
+        """
+
+        def is_intact(name: str, checksum: str) -> bool:
+            path = inside(self.out, name, self.out / MANIFEST)
+            return path.is_file() and (not verified or sha256(path.read_bytes()) == checksum)
+
+        entries = {}
+        manifest = self.out / MANIFEST
+        if manifest.is_file():
+            for name, record in read_json(manifest).get("objects", {}).items():
+                files = record.pop("files", {})
+                entries[name] = {"name": name, "record": record, "files": files}
+        for path in sorted((self.folder / "done").glob("*.json")):
+            entries[path.stem] = read_json(path)
+        return {
+            name: entry
+            for name, entry in entries.items()
+            if all(is_intact(path, checksum) for path, checksum in entry["files"].items())
+        }
+
+    def finish(self, manifest: dict[str, Any], others: dict[str, bytes]) -> None:
+        """Write what describes the whole, and remove the state of the work.
+
+        Args:
+            manifest: of the data set.
+            others: further files of the layout, relative path to content.
+        """
+        for name, content in others.items():
+            write_whole(self.out / name, content, self.scratch)
+        write_whole(self.out / MANIFEST, encode_json(manifest), self.scratch)
+        with suppress(OSError):
+            shutil.rmtree(self.folder)
+
+    def _acquire_lock(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock = open(self.folder / "lock", "w")
+        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        shutil.rmtree(self.scratch, ignore_errors=True)
+        self.scratch.mkdir(exist_ok=True)  # a worker of a killed run may still be at its last file
+        (self.folder / "done").mkdir(exist_ok=True)
+
+    def _existing(self) -> dict[str, Any] | None:
+        if (self.folder / "configuration.json").is_file():
+            return read_json(self.folder / "configuration.json")
+        if (self.out / MANIFEST).is_file():
+            return read_json(self.out / MANIFEST).get("configuration", {})
+        return None

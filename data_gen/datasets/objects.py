@@ -1,0 +1,89 @@
+"""Render one object and write its files: what a worker process does, again and again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from data_gen.datasets.config import RenderConfig
+from data_gen.datasets.layouts import LAYOUTS, RenderedObject
+from data_gen.datasets.sources import Item
+from hyperplanes.files import encode_json, sha256, write_folder, write_whole
+
+__all__ = ["open_renderer"]
+
+
+@contextmanager
+def open_renderer(settings: dict[str, Any]) -> Generator[Callable[[dict[str, Any]], dict[str, Any]], None, None]:
+    """A function from an `Item`'s fields to the record of the object it wrote; one renderer serves all calls.
+
+    Args:
+        settings: `out`, the folder of the data set, and `render`, a `RenderConfig` as JSON.
+
+    Yields:
+        The function. It raises ValueError, with the reason, for an object that cannot be drawn.
+    """
+    from data_gen.rendering.mesh_renderer import MeshRenderer
+
+    config, out = RenderConfig.from_json(settings["render"]), Path(settings["out"])
+    with MeshRenderer(config.renderer, config.supersample) as renderer:
+
+        def process(fields: dict[str, Any]) -> dict[str, Any]:
+            rendered = _render(renderer, Item(**fields), config)
+            return _write(rendered, LAYOUTS[config.layout].files(rendered), out)
+
+        yield process
+
+
+def _render(renderer: Any, item: Item, config: RenderConfig) -> RenderedObject:
+    from data_gen.meshes.mesh import load_mesh, mesh_parts, prepare_scene
+
+    if item.path is not None:
+        mesh = load_mesh(item.path, up=config.up, name=item.name)
+    else:
+        from data_gen.shapes import make
+
+        mesh = prepare_scene(make(str(item.class_name), int(item.seed or 0)), item.name, closed=True)
+    rig = config.make_rig(item.name)
+    channels = [channel for channel in config.channels if channel != "mesh"]
+    rendering = renderer.render(
+        mesh_parts(mesh),
+        rig,
+        lighting=config.lighting,
+        channels=channels,
+        name=item.name,
+        seed=config.seed_for("lighting", item.name),
+    )
+    extra = {channel: getattr(rendering, channel) for channel in channels if channel != "rgba"}
+    model: Any = mesh.scene.export(file_type="glb") if "mesh" in config.channels else None
+    return RenderedObject(item, rig, rendering.rgba, extra, model, mesh)
+
+
+def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict[str, Any]:
+    """Write an object's files, then the record that says that they are whole."""
+    scratch = out / ".progress" / "unfinished"
+    if len(files) > 1:
+        folder = os.path.commonpath(files)
+        write_folder(out / folder, {os.path.relpath(path, folder): data for path, data in files.items()}, scratch)
+    else:
+        for path, data in files.items():
+            write_whole(out / path, data, scratch, durable=False)
+    item, mesh = rendered.item, rendered.mesh
+    record: dict[str, Any] = {
+        "class": item.class_name,
+        "faces": mesh.face_count,
+        "split": item.split,
+        "views": len(rendered.rig),
+        "world_from_file": mesh.world_from_file.tolist(),
+    }
+    if item.seed is not None:
+        record["seed"] = item.seed
+    if mesh.warnings:
+        record["warnings"] = list(mesh.warnings)
+    checksums = {path: sha256(data) for path, data in files.items()}
+    done = {"name": item.name, "record": record, "files": checksums}
+    write_whole(out / ".progress" / "done" / f"{item.name}.json", encode_json(done), scratch, durable=False)
+    return done

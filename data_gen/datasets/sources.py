@@ -1,0 +1,151 @@
+"""Where objects come from: an endless supply of procedural ones, or a folder of mesh files."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+__all__ = ["Item", "MeshFolder", "Procedural", "Source", "list_items", "seed_of"]
+
+
+@dataclass(frozen=True)
+class Procedural:
+    """Objects of a class of `data_gen.shapes`.
+
+    Attributes:
+        class_name: car, chair, plane or lamp.
+        count: how many, the held-out ones included.
+        seed: the training objects are the first ones of one endless sequence, the held-out ones of another; both depend
+            on the seed alone, so data sets of different sizes and one seed share objects, and never mix the two.
+    """
+
+    class_name: str
+    count: int
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class MeshFolder:
+    """The mesh files under a folder, or a ShapeNetCore tree.
+
+    Attributes:
+        path: the folder.
+        up: which axis is up in the files, y or z.
+        split_file: ShapeNet's official all.csv; models that it does not list are trained on, and the manifest names
+            them.
+    """
+
+    path: str | Path
+    up: Literal["y", "z"] = "y"
+    split_file: str | Path | None = None
+
+
+Source = Procedural | MeshFolder
+
+
+@dataclass(frozen=True)
+class Item:
+    """One object that is to be rendered.
+
+    Attributes:
+        name: a plain file name, unique in the data set.
+        class_name: of the object, or None.
+        split: "train", "val" or "test".
+        seed: of the procedural shape, or None for a file.
+        path: of the mesh file, or None for a procedural shape.
+        unlisted: whether a split file decides and does not name it, so that it is trained on.
+    """
+
+    name: str
+    class_name: str | None
+    split: str
+    seed: int | None = None
+    path: str | None = None
+    unlisted: bool = False
+
+
+def list_items(source: Source, held_out: float | int | None) -> list[Item]:
+    """All objects of a source, with their splits.
+
+    Args:
+        source: what to list.
+        held_out: how many objects go into the test split: a count, a fraction below 1 of each class, or None for one
+            in seven of procedural objects, and for mesh files the split that the tree states, else the last 20 % of
+            each class by name (as the paper's 200x200 data were split).
+
+    Returns:
+        The objects, training ones first. A class that is unknown or a count that makes no sense is a ValueError.
+    """
+    items = _procedural(source, held_out) if isinstance(source, Procedural) else _meshes(source, held_out)
+    order = {"train": 0, "val": 1, "test": 2}
+    return sorted(items, key=lambda item: (order[item.split], item.name))
+
+
+def seed_of(seed: int, *parts: object) -> int:
+    """A 63-bit seed that depends on a seed and on what it is for, and on nothing else.
+
+    >>> seed_of(0, "rig", "car_0000") == seed_of(0, "rig", "car_0000") != seed_of(1, "rig", "car_0000")
+    True
+    """
+    digest = hashlib.sha256(repr((seed, *parts)).encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
+    from data_gen.shapes import CLASSES
+
+    if source.class_name not in CLASSES:
+        raise ValueError(f"class: expected one of {', '.join(CLASSES)}, got {source.class_name!r}")
+    if source.count < 1 or source.seed < 0:
+        raise ValueError(
+            f"count, seed: expected at least 1 object and a seed >= 0, got {source.count} and {source.seed}"
+        )
+    kept = _held_out(source.count, 1 / 7 if held_out is None else held_out)
+    items = []
+    for split, total in (("train", source.count - kept), ("test", kept)):
+        infix = "" if split == "train" else "test_"
+        for index in range(total):
+            sequence = np.random.SeedSequence([source.seed, split == "test", index])
+            seed = int(sequence.generate_state(1, np.uint32)[0])
+            items.append(Item(f"{source.class_name}_{infix}{index:05d}", source.class_name, split, seed=seed))
+    return items
+
+
+def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
+    from data_gen.meshes.find import find_meshes
+
+    if source.up not in ("y", "z"):
+        raise ValueError(f"up: expected y or z, got {source.up!r}")
+    if source.split_file is not None and held_out is not None:
+        raise ValueError(f"held_out: expected none, for {source.split_file} decides, got {held_out}")
+    found = find_meshes(source.path, split_file=source.split_file)
+    if source.split_file is not None and not any(mesh.split for mesh in found):
+        raise ValueError(f"{source.split_file}: expected models of {source.path}, found none of them; check both")
+    stated = held_out is None and any(mesh.split for mesh in found)
+    classes: dict[str | None, list[Any]] = defaultdict(list)
+    for mesh in sorted(found, key=lambda mesh: mesh.name):
+        classes[mesh.class_name].append(mesh)
+    items = []
+    for class_name, meshes in classes.items():
+        kept = _held_out(len(meshes), 0.2 if held_out is None else held_out)
+        for index, mesh in enumerate(meshes):
+            split = "test" if index >= len(meshes) - kept else "train"
+            if stated:
+                split = mesh.split or "train"
+            unlisted = stated and mesh.split is None
+            items.append(Item(mesh.name, class_name, split, path=str(mesh.path), unlisted=unlisted))
+    return items
+
+
+def _held_out(total: int, wanted: float | int) -> int:
+    if isinstance(wanted, float) and 0 <= wanted < 1:
+        return min(math.ceil(total * wanted - 1e-9), max(total - 1, 0))
+    if wanted != int(wanted) or not 0 <= wanted <= total:
+        raise ValueError(f"held_out: expected a fraction below 1 or a count up to {total}, got {wanted}")
+    return int(wanted)

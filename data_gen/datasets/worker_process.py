@@ -1,0 +1,65 @@
+"""The loop of a worker process: `python -m data_gen.datasets.worker_process MODULE:FUNCTION`.
+
+Standard input brings one JSON value a line: first the settings, then items. Standard output answers each item with one
+line: {"ok": result}, {"skip": reason} where the item is to blame, {"fatal": reason} where nothing could be done for any
+item. What libraries print goes to standard error. End of input, also when the parent has died, ends the process.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+from hyperplanes.files import DataError
+
+__all__ = ["main", "process_item"]
+
+
+def main() -> int:
+    """Serve until the input ends."""
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    module, _, function = sys.argv[1].partition(":")
+    settings = json.loads(sys.stdin.readline() or "{}")
+    try:
+        with getattr(import_module(module), function)(settings) as process:
+            answers.write(json.dumps({"ready": True}) + "\n")
+            for line in iter(sys.stdin.readline, ""):
+                answers.write(json.dumps(process_item(process, json.loads(line))) + "\n")
+    except BrokenPipeError:
+        return 1
+    except Exception as error:  # the renderer cannot be made: no item can be done
+        answers.write(json.dumps({"fatal": _one_line(error)}) + "\n")
+        return 1
+    return 0
+
+
+def process_item(process: Callable[[Any], dict[str, Any]], item: Any) -> dict[str, Any]:
+    """Process one item, and catch what it raises.
+
+    Args:
+        process: the function of an item.
+        item: the item.
+
+    Returns:
+        {"ok": result}, {"skip": reason} or {"fatal": reason}; nothing is raised.
+    """
+    try:
+        return {"ok": process(item)}
+    except DataError as error:
+        return {"fatal": str(error)}
+    except Exception as error:
+        return {"skip": _one_line(error)}
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split()) or "no message"
+    return text if isinstance(error, ValueError) else f"{type(error).__name__}: {text}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,270 @@
+"""A pool of worker processes that may crash, hang or be killed, each at the cost of one item.
+
+Workers are started as commands (`python -m data_gen.datasets.worker_process`), not forked and not spawned by
+multiprocessing: OpenGL does not survive a fork, and a script that calls us needs no `if __name__ == "__main__"`.
+concurrent.futures would also lose the other items with a process that crashes, and has no time limit an item.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Generator, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import IO, Any, Protocol
+
+__all__ = ["Outcome", "Worker", "WorkerError", "WorkerLost", "run_isolated", "run_workers", "worker_environment"]
+
+ATTEMPTS = 2
+"""How often an item is tried whose worker crashes or hangs."""
+
+START_SECONDS = 120.0
+"""Time that a worker has to start, above that of its first item."""
+
+
+class WorkerError(RuntimeError):
+    """No item can be processed: the workers do not start, or report an error that no item has caused."""
+
+
+class WorkerLost(Exception):
+    """A worker crashed, or was too slow; the message says which."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of an item.
+
+    Attributes:
+        item: the item.
+        result: what the worker answered, None when it was skipped.
+        reason: why it was skipped, None when it was not.
+    """
+
+    item: dict[str, Any]
+    result: dict[str, Any] | None
+    reason: str | None
+
+
+class Worker(Protocol):
+    """Processes one item after the other."""
+
+    def process(self, item: dict[str, Any]) -> dict[str, Any]:
+        """The answer of `worker_process.process_item`; WorkerLost when there is none."""
+        ...
+
+    def kill(self) -> None:
+        """End it at once; called from any thread, so that `process` raises WorkerLost."""
+        ...
+
+    def stop(self) -> None:
+        """End it after its last item, and free what it holds."""
+        ...
+
+
+def worker_environment() -> dict[str, str]:
+    """Environment variables of a worker: it imports this package from here, and uses one core."""
+    root = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {"PYTHONPATH": path, "LP_NUM_THREADS": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+def run_isolated(
+    target: str,
+    settings: dict[str, Any],
+    items: Iterable[dict[str, Any]],
+    *,
+    workers: int,
+    timeout: float = 300.0,
+    recycle: int = 200,
+) -> Generator[Outcome, None, None]:
+    """Process items in worker processes of this machine.
+
+    Args:
+        target: "module:function"; called with the settings, it gives a context manager around a function of an item.
+        settings: JSON-able.
+        items: JSON-able; taken one by one, when a worker is free.
+        workers: how many processes.
+        timeout: seconds that an item may take before its worker is killed.
+        recycle: items after which a worker is replaced by a new one.
+
+    Yields:
+        What `run_workers` yields.
+    """
+    yield from run_workers(lambda: _ProcessWorker(target, settings, timeout), items, workers, recycle)
+
+
+def run_workers(
+    make_worker: Callable[[], Worker], items: Iterable[dict[str, Any]], count: int, recycle: int
+) -> Generator[Outcome, None, None]:
+    """Process items in workers, each driven by a thread, whose errors are raised here.
+
+    Args:
+        make_worker: makes a worker.
+        items: taken one by one, when a worker is free.
+        count: how many workers.
+        recycle: items after which a worker is replaced by a new one.
+
+    Yields:
+        One outcome an item, in the order in which they end. Leaving the loop kills the workers. WorkerError comes
+        out of it when a worker reports that nothing can be done.
+
+    Raises:
+        ValueError: fewer than one worker.
+    """
+    if count < 1:
+        raise ValueError(f"workers: expected at least 1, got {count}")
+    pending, lock, stopping = iter(items), threading.Lock(), threading.Event()
+    free = threading.Semaphore(count)  # an item is taken only when the outcome of an earlier one has been handled
+    ended: SimpleQueue[Outcome | Exception | None] = SimpleQueue()
+    alive: set[Worker] = set()
+
+    def open_worker() -> Worker:
+        with lock:
+            if stopping.is_set():
+                raise WorkerLost("stopped")
+            worker = make_worker()
+            alive.add(worker)
+            return worker
+
+    def close_worker(worker: Worker, *, kill: bool) -> None:
+        if kill:
+            worker.kill()
+        worker.stop()
+        with lock:
+            alive.discard(worker)
+
+    def serve() -> None:
+        worker, left = None, 0
+        try:
+            while free.acquire() and not stopping.is_set():
+                with lock:
+                    item = next(pending, None)
+                if item is None:
+                    break
+                answer: dict[str, Any] = {}
+                for attempt in range(1, ATTEMPTS + 1):
+                    if worker is None:
+                        worker, left = open_worker(), recycle
+                    try:
+                        answer = worker.process(item)
+                        break
+                    except WorkerLost as error:
+                        close_worker(worker, kill=True)
+                        worker, answer = None, {"skip": f"failed {attempt} times: {error}"}
+                if "fatal" in answer:
+                    raise WorkerError(answer["fatal"])
+                left -= 1
+                if worker is not None and left <= 0:
+                    close_worker(worker, kill=False)
+                    worker = None
+                ended.put(Outcome(item, answer.get("ok"), answer.get("skip")))
+        except Exception as error:
+            ended.put(error)
+        finally:
+            free.release()  # for the other threads, which have to see the end of the items, too
+            if worker is not None:
+                close_worker(worker, kill=stopping.is_set())
+            ended.put(None)
+
+    threads = [threading.Thread(target=serve, daemon=True) for _ in range(count)]
+    try:
+        for thread in threads:
+            thread.start()
+        running = count
+        while running:
+            outcome = ended.get()
+            if outcome is None:
+                running -= 1
+            elif isinstance(outcome, Exception):
+                raise outcome
+            else:
+                yield outcome
+                free.release()
+    finally:
+        stopping.set()
+        with lock:
+            for worker in alive:
+                worker.kill()
+        free.release(count)
+        for thread in threads:
+            thread.join()
+
+
+class _ProcessWorker:
+    """A process that is sent one item at a time."""
+
+    def __init__(self, target: str, settings: dict[str, Any], timeout: float) -> None:
+        self._log: IO[bytes] = tempfile.TemporaryFile()
+        self._timeout, self._started, self._buffer = timeout, False, b""
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "data_gen.datasets.worker_process", target],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            env={**os.environ, **worker_environment()},
+            start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends its workers
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._items, self._answers = self._process.stdin, self._process.stdout
+        self._send(settings)
+
+    def process(self, item: dict[str, Any]) -> dict[str, Any]:
+        self._send(item)
+        deadline = time.monotonic() + self._timeout + (0.0 if self._started else START_SECONDS)
+        while True:
+            while b"\n" not in self._buffer:
+                if not select.select([self._answers], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                    raise WorkerLost(f"no answer within {self._timeout:g} s")
+                data = os.read(self._answers.fileno(), 1 << 20)
+                if not data:
+                    raise WorkerLost(f"its worker {self._end()}")
+                self._buffer += data
+            line, _, self._buffer = self._buffer.partition(b"\n")
+            answer = json.loads(line)
+            if "ready" not in answer:
+                return answer
+            self._started, deadline = True, time.monotonic() + self._timeout
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def stop(self) -> None:
+        for pipe in (self._items, self._answers):
+            try:
+                pipe.close()
+            except BrokenPipeError:
+                pass
+        try:
+            self._process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._log.close()
+
+    def _end(self) -> str:
+        try:
+            code = self._process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            return "closed its output"
+        if code < 0:
+            return f"was ended by {signal.Signals(-code).name}"
+        self._log.seek(0)
+        lines = self._log.read()[-2000:].decode(errors="replace").strip().splitlines()
+        return f"ended with exit code {code}{': ' + lines[-1] if lines else ''}"
+
+    def _send(self, value: dict[str, Any]) -> None:
+        try:
+            self._items.write(json.dumps(value).encode() + b"\n")
+            self._items.flush()
+        except BrokenPipeError:  # it has ended already, which shows when its answer is read
+            pass

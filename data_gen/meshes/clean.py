@@ -1,0 +1,196 @@
+"""Repairs the geometry of a mesh, saying what was wrong: faces that cannot be drawn, normals that cannot be used."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from trimesh.visual import ColorVisuals, TextureVisuals
+
+from data_gen.meshes.materials import visual_of
+
+__all__ = ["CREASE", "clean", "decimate", "is_smooth"]
+
+CREASE = 40.0
+"""Angle between two faces, in degrees, from which an edge counts as sharp where a file has no normals."""
+
+_MOSTLY = 0.1
+_MOST_FACES_TO_CLOSE = 500_000
+
+
+def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, list[str]]:
+    """Leave out faces that cannot be drawn and vertices without faces, and make normals agree with faces.
+
+    What changes no picture gives no warning unless it is so much that the file must be damaged: leaving out faces
+    without area, and turning single normals.
+
+    Args:
+        mesh: a mesh whose visual is canonical; it is not changed.
+        label: what to call it in a warning.
+
+    Returns:
+        The mesh, or None if no face is left; and warnings.
+
+    Raises:
+        ValueError: if a face refers to a vertex that is not there.
+    """
+    warnings: list[str] = []
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    if len(faces) and not (0 <= faces.min() and faces.max() < len(vertices)):
+        raise ValueError(f"{label}: expected faces on its {len(vertices)} vertices, found one on vertex {faces.max()}")
+    finite = np.isfinite(vertices[faces]).all(axis=(1, 2))
+    if not finite.all():
+        warnings.append(
+            f"{label}: {int((~finite).sum())} of {len(faces)} faces left out, on vertices that are not finite"
+        )
+    kept = np.flatnonzero(finite)
+    flat = _degenerate(vertices, faces[kept])
+    if flat.any() and flat.mean() > _MOSTLY:
+        warnings.append(f"{label}: {int(flat.sum())} of {len(faces)} faces without area left out")
+    kept = kept[~flat]
+    if not len(kept):
+        return None, warnings
+    kept_faces = faces[kept]
+    if _inside_out(vertices, kept_faces):
+        warnings.append(f"{label}: wound inside out, its faces are turned")
+        kept_faces = kept_faces[:, ::-1]
+    used, corners = np.unique(kept_faces, return_inverse=True)
+    normals = _normals(mesh, label, kept_faces, used, warnings)
+    return _part(mesh, used, kept, corners.reshape(-1, 3), normals), warnings
+
+
+def is_smooth(mesh: trimesh.Trimesh) -> bool:
+    """Whether a mesh looks as meant with interpolated normals.
+
+    A mesh with normals of its own does; one with face colours cannot. Otherwise the file decides (an OBJ's
+    smoothing groups), and last how many of its edges are sharper than CREASE: hard things stay hard.
+    """
+    if visual_of(mesh).kind == "face":
+        return False
+    if "vertex_normals" in mesh._cache.cache:
+        return True
+    if "smooth" in mesh.metadata:
+        return bool(mesh.metadata["smooth"])
+    angles = np.asarray(mesh.face_adjacency_angles)
+    return len(angles) > 0 and float((angles > np.radians(CREASE)).mean()) < _MOSTLY
+
+
+def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trimesh] | None:
+    """Simplify those parts whose looks survive it: of one colour, or coloured at the vertices.
+
+    Args:
+        parts: clean meshes.
+        max_faces: triangles at most, all together.
+
+    Returns:
+        The parts with at most that many triangles, or None where textures or face colours forbid it.
+    """
+    import fast_simplification
+    from scipy.spatial import KDTree
+
+    simple = [_is_simple(part) for part in parts]
+    fixed = sum(len(part.faces) for part, free in zip(parts, simple, strict=True) if not free)
+    free_faces = sum(len(part.faces) for part, free in zip(parts, simple, strict=True) if free)
+    if free_faces == 0 or max_faces - fixed < 4 * sum(simple):
+        return None
+    share = (max_faces - fixed) / free_faces
+    result = []
+    for part, free in zip(parts, simple, strict=True):
+        target = max(int(len(part.faces) * share), 4)
+        if not free or len(part.faces) <= target:
+            result.append(part)
+            continue
+        merged = trimesh.Trimesh(part.vertices, part.faces, process=True)
+        points, faces = fast_simplification.simplify(
+            np.asarray(merged.vertices, dtype=np.float64), np.asarray(merged.faces, dtype=np.int32), target_count=target
+        )[:2]
+        visual = visual_of(part).copy()
+        if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
+            nearest = KDTree(np.asarray(part.vertices)).query(points)[1]
+            visual = ColorVisuals(vertex_colors=np.asarray(visual.vertex_colors)[nearest])
+        small = trimesh.Trimesh(points, faces, visual=visual, process=False)
+        small.metadata["smooth"] = is_smooth(part)
+        result.append(small)
+    return result if sum(len(part.faces) for part in result) <= max_faces else None
+
+
+def _is_simple(mesh: trimesh.Trimesh) -> bool:
+    if visual_of(mesh).kind == "face":
+        return False
+    material = getattr(mesh.visual, "material", None)
+    return not any(
+        getattr(material, slot, None) is not None for slot in ("baseColorTexture", "emissiveTexture", "normalTexture")
+    )
+
+
+def _degenerate(vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    if not len(faces):
+        return np.zeros(0, dtype=bool)
+    corners = vertices[faces]
+    scale = float(np.abs(corners - corners[0, 0]).max()) or 1.0
+    edges = (corners - corners[:, :1]) / scale
+    return np.linalg.norm(np.cross(edges[:, 1], edges[:, 2]), axis=1) <= 1e-16
+
+
+def _normals(
+    mesh: trimesh.Trimesh, label: str, faces: npt.NDArray[Any], used: npt.NDArray[Any], warnings: list[str]
+) -> npt.NDArray[np.float64] | None:
+    """Unit normals of the used vertices that agree with the winding, or None if the file has none."""
+    if "vertex_normals" not in mesh._cache.cache:
+        return None
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    scale = float(np.abs(vertices[used]).max()) or 1.0
+    corners = vertices[faces] / scale
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    around = np.zeros_like(vertices)
+    for column in range(3):
+        np.add.at(around, faces[:, column], facing)
+    around = _unit(around[used])
+    given = np.asarray(mesh.vertex_normals, dtype=np.float64)[used]
+    given = _unit(np.where(np.isfinite(given), given, 0.0))
+    missing = ~given.any(axis=1)
+    if missing.any():
+        warnings.append(f"{label}: {int(missing.sum())} of {len(used)} normals missing; those of its faces taken")
+        given[missing] = around[missing]
+    against = (given * around).sum(axis=1) < -0.1
+    given[against] *= -1.0
+    if against.mean() > _MOSTLY:
+        warnings.append(f"{label}: {int(against.sum())} of {len(used)} normals point into the surface; turned")
+    return given
+
+
+def _unit(vectors: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors, dtype=np.float64), where=length > 1e-30)
+
+
+def _part(
+    mesh: trimesh.Trimesh,
+    used: npt.NDArray[Any],
+    kept: npt.NDArray[Any],
+    faces: npt.NDArray[Any],
+    normals: npt.NDArray[np.float64] | None,
+) -> trimesh.Trimesh:
+    visual = visual_of(mesh)
+    if isinstance(visual, TextureVisuals):
+        visual = TextureVisuals(uv=None if visual.uv is None else visual.uv[used], material=visual.material)
+    elif visual.kind == "face":
+        visual = ColorVisuals(face_colors=np.asarray(visual.face_colors)[kept])
+    else:
+        visual = ColorVisuals(vertex_colors=np.asarray(visual.vertex_colors)[used])
+    result = trimesh.Trimesh(mesh.vertices[used], faces, vertex_normals=normals, visual=visual, process=False)
+    result.metadata.update({key: mesh.metadata[key] for key in ("smooth",) if key in mesh.metadata})
+    return result
+
+
+def _inside_out(vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> bool:
+    """Whether the faces enclose a volume and are all wound inwards."""
+    if len(faces) > _MOST_FACES_TO_CLOSE:
+        return False
+    corners = vertices[faces] - vertices[faces[0, 0]]
+    if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) >= 0:
+        return False
+    closed = trimesh.Trimesh(vertices, faces, process=True)
+    return bool(closed.is_watertight and closed.is_winding_consistent)

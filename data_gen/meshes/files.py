@@ -1,0 +1,109 @@
+"""What may be read of a mesh's files: which kinds, how many bytes, how many pixels; and the error for what may not.
+
+Sizes are checked before a file is read, pixels before they are decoded.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+
+import PIL.Image
+
+__all__ = [
+    "IMAGE_FORMATS",
+    "MAX_FILE_BYTES",
+    "MAX_PIXELS",
+    "MAX_TEXT_BYTES",
+    "MESH_SUFFIXES",
+    "MeshError",
+    "check_image",
+    "read_bytes",
+]
+
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".dae")
+"""Endings of mesh files, lower case."""
+
+MAX_FILE_BYTES = 1 << 30
+"""Bytes of one file that are read at most."""
+
+MAX_TEXT_BYTES = 1 << 28
+"""Bytes of a file of text (OBJ, MTL, OFF, DAE) at most: it takes about twenty times as many in memory."""
+
+MAX_PIXELS = 1 << 26
+"""Pixels of all textures of a model that are decoded at most: one of 8192 x 8192."""
+
+IMAGE_FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "TGA", "WEBP", "PPM", "DDS", "JPEG2000")
+"""Formats of textures that are decoded, as pillow names them; none of them runs a program."""
+
+
+class MeshError(ValueError):
+    """A mesh that is refused. The message is one line: file, expected, found, remedy."""
+
+
+def read_bytes(path: Path, *, limit: int = MAX_FILE_BYTES) -> bytes:
+    """Read a file whose size is checked first.
+
+    Args:
+        path: the file.
+        limit: bytes at most.
+
+    Returns:
+        The content.
+
+    Raises:
+        MeshError: if the file is absent, unreadable, empty or larger than the limit.
+    """
+    try:
+        if not path.is_file():
+            raise MeshError(f"{path}: expected a mesh file, found {'a folder' if path.is_dir() else 'nothing'}")
+        size = path.stat().st_size
+        if size > limit:
+            raise MeshError(f"{path}: expected at most {limit} bytes, found {size}; reduce the mesh or its textures")
+        if size == 0:
+            raise MeshError(f"{path}: expected a mesh, found an empty file; fetch or export it again")
+        return path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"{path}: expected a readable file, found {error.strerror or error}") from error
+
+
+def check_image(data: bytes, name: str, *, limit: int = MAX_PIXELS) -> int:
+    """Decode an image, after its size was checked, to see that it is whole.
+
+    Args:
+        data: the bytes of an image file.
+        name: what it is called in a message.
+        limit: pixels at most.
+
+    Returns:
+        Its number of pixels.
+
+    Raises:
+        MeshError: if it has more pixels than allowed.
+        ValueError: if it is no image, or cut short.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
+            with PIL.Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
+                pixels = image.width * image.height
+                if pixels > limit:
+                    raise MeshError(
+                        f"{name}: expected textures of at most {limit} pixels together, found one of "
+                        f"{image.width} x {image.height}; make the texture smaller"
+                    )
+                image.load()
+    except MeshError:
+        raise
+    except PIL.Image.DecompressionBombError as error:
+        raise MeshError(f"{name}: expected at most {limit} pixels, found a decompression bomb: {error}") from error
+    except PIL.UnidentifiedImageError as error:
+        raise ValueError("not a whole image of a known format") from error
+    except Exception as error:
+        raise ValueError(f"not a whole image ({_one_line(error) or type(error).__name__})") from error
+    return pixels
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:160]

@@ -1,0 +1,196 @@
+"""Reads PLY, STL and COLLADA files with trimesh, after checks, and OFF files without it.
+
+Each check compares the length of the file with what its header declares. trimesh alone loads, without a warning, an
+ASCII PLY that was cut at 24 of 233 places, an ASCII STL at 5 of 440 and an OFF at 24 of 89, with faces missing, and
+drops the colours of an OFF file, of its vertices and faces alike.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from data_gen.meshes.files import MeshError
+from data_gen.meshes.model_folder import ModelFolder
+from data_gen.meshes.mtl import decode_text
+
+__all__ = ["declared_up", "read_dae", "read_off", "read_ply", "read_stl"]
+
+_CUT = "the last line does not end: the file may have been cut"
+_PLY_BYTES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
+
+
+def read_stl(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
+    """The geometry of an STL file, shaded flat, and warnings; a MeshError if it was cut or holds no triangles."""
+    warnings = _check_stl(data, folder)
+    scene = trimesh.load_scene(io.BytesIO(data), file_type="stl", resolver=folder, process=False)
+    for geometry in scene.geometry.values():
+        geometry.metadata["smooth"] = False
+    return scene, warnings
+
+
+def _check_stl(data: bytes, folder: ModelFolder) -> list[str]:
+    count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
+    if len(data) >= 84 and len(data) == 84 + 50 * count:
+        if count == 0:
+            raise MeshError(f"{folder.path}: expected triangles, found an STL with none; export the mesh again")
+        colours = np.frombuffer(data[84:], dtype=np.dtype([("numbers", "<f4", 12), ("colour", "<u2")]))["colour"]
+        return ["colours of its triangles (an extension of STL) left out"] if (colours & 0x8000).any() else []
+    text = data.lower()
+    if not text.lstrip().startswith(b"solid") or b"facet" not in text:
+        raise MeshError(
+            f"{folder.path}: expected {count} triangles in {84 + 50 * count} bytes, found {len(data)} bytes: the "
+            "file was cut or is no STL; fetch it again"
+        )
+    opened, closed = len(re.findall(rb"\bfacet\s", text)), text.count(b"endfacet")
+    if opened != closed or opened * 3 != len(re.findall(rb"\bvertex\s", text)) or b"endsolid" not in text:
+        raise MeshError(f"{folder.path}: expected {opened} whole facets and endsolid, found {closed}; fetch it again")
+    return []
+
+
+def _check_ply(data: bytes, folder: ModelFolder) -> tuple[int, int, list[str]]:
+    """Vertices and faces that the header declares and the file can hold, and warnings."""
+    head, mark, body = data.partition(b"end_header")
+    if not data.startswith(b"ply") or not mark:
+        raise MeshError(f"{folder.path}: expected a PLY header to end_header, found none; fetch it again")
+    header = decode_text(head)
+    body = body.lstrip(b"\r")[1:]
+    counts = {name: int(count) for name, count in re.findall(r"^element\s+(\w+)\s+(\d+)", header, re.MULTILINE)}
+    ascii_format = re.search(r"^format\s+ascii", header, re.MULTILINE) is not None
+    total = sum(counts.values())
+    held = body.count(b"\n") + (not body.endswith(b"\n")) if ascii_format else len(body)
+    if total > held:
+        what = "lines" if ascii_format else "bytes"
+        raise MeshError(
+            f"{folder.path}: expected {total} elements, found {held} {what}: the file was cut; fetch it again"
+        )
+    if not ascii_format and (need := _fixed_bytes(header, counts)) > len(body):
+        raise MeshError(f"{folder.path}: expected {need} bytes or more, found {len(body)}: it was cut; fetch it again")
+    warnings = [_CUT] if ascii_format and not body.endswith(b"\n") else []
+    left_out = sorted(set(counts) - {"vertex", "face"})
+    warnings += [f"{counts[name]} elements {name!r} left out" for name in left_out if counts[name]]
+    return counts.get("vertex", 0), counts.get("face", 0), warnings
+
+
+def _fixed_bytes(header: str, counts: dict[str, int]) -> int:
+    """The fewest bytes that the elements of a binary PLY file take, a list of three indices a face."""
+    need, element = 0, ""
+    for words in (line.split() for line in header.splitlines()):
+        if words[:1] == ["element"]:
+            element = words[1]
+        elif words[:1] == ["property"] and words[1] == "list":
+            least = 3 if element == "face" and words[-1].startswith("vertex_ind") else 0
+            need += counts[element] * (_PLY_BYTES.get(words[2], 4) + least * _PLY_BYTES.get(words[3], 4))
+        elif words[:1] == ["property"]:
+            need += counts[element] * (8 if words[1] in ("double", "float64") else _PLY_BYTES.get(words[1], 4))
+    return need
+
+
+def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
+    """The geometry of a PLY file, and warnings; a MeshError if it was cut or holds no faces."""
+    vertices, faces, warnings = _check_ply(data, folder)
+    if not faces:
+        raise MeshError(f"{folder.path}: expected faces, found {vertices} points only; make a surface of them first")
+    scene = trimesh.load_scene(io.BytesIO(data), file_type="ply", resolver=folder, process=False)
+    found = sum(len(mesh.faces) for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh))
+    if found < faces:
+        raise MeshError(f"{folder.path}: expected {faces} faces, found {found}: the file was cut; fetch it again")
+    texture = re.search(rb"^comment\s+TextureFile\s+(.+)$", data[:65536], re.MULTILINE | re.IGNORECASE)
+    if texture and folder.lost:
+        warnings.append(f"drawn without its texture {decode_text(texture.group(1)).strip()}")
+    return scene, warnings
+
+
+def read_off(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
+    """The geometry of an OFF file with the colours of its vertices (COFF) or faces, polygons as fans; and warnings."""
+    lines = [line.partition("#")[0].split() for line in decode_text(data).splitlines()]
+    lines = [line for line in lines if line]
+    if not lines or not re.fullmatch(r"(ST|C|N){0,3}OFF.*", lines[0][0]):
+        raise MeshError(
+            f"{folder.path}: expected OFF on the first line, found {' '.join(lines[0]) if lines else ''!r:.40}"
+        )
+    kind = lines[0][0].partition("OFF")[0]
+    first = [lines[0][0].partition("OFF")[2], *lines[0][1:]]
+    rest = ([numbers] if (numbers := [word for word in first if word]) else []) + lines[1:]
+    table, triangles, colours = _off_body(rest, folder)
+    keywords: dict[str, Any] = {}
+    skip = 6 if "N" in kind else 3
+    if "C" in kind and table.shape[1] >= skip + 3:
+        keywords["vertex_colors"] = _colours(table[:, skip : skip + 4])
+    elif colours is not None:
+        keywords["face_colors"] = _colours(colours)
+    if "N" in kind:
+        keywords["vertex_normals"] = table[:, 3:6]
+    mesh = trimesh.Trimesh(table[:, :3], triangles, process=False, **keywords)
+    return trimesh.Scene(mesh), [] if data.endswith((b"\n", b"\r")) else [_CUT]
+
+
+def _off_body(lines: list[list[str]], folder: ModelFolder) -> tuple[Any, Any, Any]:
+    """The table of vertices, the triangles and their colours or None."""
+    try:
+        vertex_count, face_count = int(lines[0][0]), int(lines[0][1])
+        last = vertex_count + face_count + 1
+        if min(vertex_count, face_count) < 0 or len(lines) < last:
+            raise ValueError(f"{vertex_count} vertices and {face_count} faces declared in {len(lines) - 1} lines")
+        table = np.array(lines[1 : vertex_count + 1], dtype=np.float64).reshape(vertex_count, -1)
+        return table, *_off_faces(lines[vertex_count + 1 : last], vertex_count)
+    except (ValueError, IndexError) as error:
+        raise MeshError(
+            f"{folder.path}: expected whole OFF vertices and faces, found {error}; the file is damaged or was cut"
+        ) from error
+
+
+def _off_faces(lines: list[list[str]], vertex_count: int) -> tuple[Any, Any]:
+    triangles: list[tuple[int, int, int]] = []
+    colours: list[list[float]] = []
+    for line in lines:
+        size = int(line[0])
+        corners = [int(word) for word in line[1 : size + 1]]
+        if len(corners) != size or not all(0 <= corner < vertex_count for corner in corners):
+            raise ValueError(" ".join(line)[:60])
+        colour = [float(word) for word in line[size + 1 : size + 5]]
+        for index in range(1, size - 1):
+            triangles.append((corners[0], corners[index], corners[index + 1]))
+            colours.append(colour)
+    widths = {len(colour) for colour in colours}
+    usable = widths in ({3}, {4})
+    return np.array(triangles, dtype=np.int64).reshape(-1, 3), np.array(colours) if usable else None
+
+
+def _colours(values: Any) -> Any:
+    values = np.asarray(values, dtype=np.float64)
+    return np.clip(np.round(values * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
+
+
+def read_dae(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
+    """The geometries of a COLLADA file, factors of materials as in the file (sRGB), and warnings.
+
+    Raises:
+        MeshError: if it declares a document type, which COLLADA needs for nothing, or a number is NaN.
+    """
+    if re.search(rb"<!\s*(DOCTYPE|ENTITY)", data, re.IGNORECASE):
+        raise MeshError(f"{folder.path}: expected plain COLLADA, found a document type or entity; export it again")
+    arrays = re.findall(rb"<(?:\w+:)?float_array[^>]*>([^<]*)<", data)
+    unknown = sum(len(re.findall(rb"nan", array, re.IGNORECASE)) for array in arrays)
+    if unknown:  # pycollada would read them as 0
+        raise MeshError(f"{folder.path}: expected numbers, found {unknown} times NaN; repair or export it again")
+    from trimesh.exchange.dae import load_collada
+
+    loaded = load_collada(io.BytesIO(data), resolver=folder)
+    for geometry in loaded["geometry"].values():
+        geometry["process"] = False
+    warnings = []
+    drawn = len(re.findall(rb"<(?:\w+:)?(?:lines|linestrips|trifans|tristrips)\b", data))
+    if drawn:
+        warnings.append(f"{drawn} sets of lines, strips or fans left out, only triangles and polygons are drawn")
+    return trimesh.load_scene(loaded), warnings
+
+
+def declared_up(data: bytes) -> str | None:
+    """The axis, `x`, `y` or `z`, that a COLLADA file declares as up; None if it declares none."""
+    found = re.search(rb"<(?:\w+:)?up_axis>\s*([XYZ])_UP", data)
+    return found.group(1).decode().lower() if found else None

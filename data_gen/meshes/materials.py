@@ -1,0 +1,230 @@
+"""Colours, textures and materials of a mesh, brought into the few forms that every renderer draws alike.
+
+After `canonical_visual` a mesh has vertex colours, face colours, or a `PBRMaterial` whose base texture is RGB or
+RGBA and has coordinates. Textures, vertex and face colours are sRGB, the factors of materials LINEAR.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import PIL.Image
+import trimesh
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
+
+from data_gen.meshes.files import IMAGE_FORMATS
+from hyperplanes.colour import convert_8bit, linear_from_srgb, srgb_from_linear
+
+__all__ = [
+    "DEFAULT_COLOUR",
+    "ColourSpace",
+    "Visual",
+    "canonical_visual",
+    "texture_of",
+    "visual_of",
+]
+
+ColourSpace = Literal["scene", "gltf", "srgb"]
+"""What plain colours are before: `scene` as they are after, `gltf` all linear, `srgb` all sRGB."""
+
+DEFAULT_COLOUR = (0.6, 0.6, 0.6, 1.0)
+"""Linear RGBA of a surface without a colour: a light grey."""
+
+_MAP_SLOTS = ("metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
+
+
+Visual = ColorVisuals | TextureVisuals
+
+
+def visual_of(mesh: trimesh.Trimesh) -> Visual:
+    """The colours or the texture of a mesh; colours that are not defined where it has neither.
+
+    >>> visual_of(trimesh.Trimesh()).defined
+    False
+    """
+    visual = mesh.visual
+    return ColorVisuals(mesh) if visual is None else visual
+
+
+def texture_of(mesh: trimesh.Trimesh) -> TextureVisuals | None:
+    """The texture of a mesh, if it has one."""
+    visual = mesh.visual
+    return visual if isinstance(visual, TextureVisuals) else None
+
+
+def canonical_visual(
+    mesh: trimesh.Trimesh, label: str, *, colours: ColourSpace = "scene", images: dict[Any, Any] | None = None
+) -> tuple[Any, list[str], bool]:
+    """Bring what colours a mesh into a form that every renderer draws alike.
+
+    Args:
+        mesh: the mesh, which is not changed.
+        label: what to call it in a warning.
+        colours: what its plain colours are.
+        images: converted textures, shared between the meshes of a scene.
+
+    Returns:
+        The visual, warnings that name what was lost, and whether the surface can be seen at all.
+    """
+    visual = visual_of(mesh)
+    images = {} if images is None else images
+    if isinstance(visual, TextureVisuals):
+        return _textured(visual, mesh, label, colours, images)
+    if not visual.defined:
+        return TextureVisuals(material=PBRMaterial(baseColorFactor=DEFAULT_COLOUR, metallicFactor=0.0)), [], True
+    kind = str(visual.kind)
+    return _coloured(visual.vertex_colors if kind == "vertex" else visual.face_colors, kind, label, colours)
+
+
+def _coloured(values: Any, kind: str, label: str, colours: ColourSpace) -> tuple[Any, list[str], bool]:
+    values = np.array(values, dtype=np.uint8)
+    warnings = []
+    if not values[:, 3].any():
+        values[:, 3] = 255
+        warnings.append(f"{label}: every colour has alpha 0; taken as opaque")
+    if colours == "gltf":
+        values = convert_8bit(values, srgb_from_linear)
+    keyword = "vertex_colors" if kind == "vertex" else "face_colors"
+    return ColorVisuals(**{keyword: values}), warnings, True
+
+
+def _textured(
+    visual: TextureVisuals, mesh: trimesh.Trimesh, label: str, colours: ColourSpace, images: dict[Any, Any]
+) -> tuple[Any, list[str], bool]:
+    warnings: list[str] = []
+    material = visual.material
+    if isinstance(material, MultiMaterial):
+        warnings.append(f"{label}: several materials on one surface; the first of {len(material.materials)} taken")
+        material = material.materials[0] if material.materials else SimpleMaterial()
+    is_gltf = isinstance(material, PBRMaterial)
+    data = _pbr_values(material, images) if is_gltf else _mtl_values(material, images)
+    if colours == "srgb" and is_gltf and data.get("baseColorFactor") is not None:
+        factor = np.round(np.asarray(data["baseColorFactor"]) * 255.0).astype(np.uint8)
+        data["baseColorFactor"] = convert_8bit(factor, linear_from_srgb) / 255.0
+    coordinates = _coordinates(visual, len(mesh.vertices), label, warnings)
+    if coordinates is None:
+        _drop_textures(data, label, warnings)
+    vertex_colours = _material_vertex_colours(visual, len(mesh.vertices))
+    if vertex_colours is not None and data.get("baseColorTexture") is None:
+        tint = convert_8bit(np.round(data["baseColorFactor"] * 255.0).astype(np.uint8), srgb_from_linear)
+        if colours == "gltf":
+            vertex_colours = convert_8bit(vertex_colours, srgb_from_linear)
+        if data["alphaMode"] == "OPAQUE":
+            vertex_colours[:, 3] = tint[3] = 255
+        return _coloured((vertex_colours * (tint / 255.0)).round(), "vertex", label, "scene")
+    if vertex_colours is not None and (vertex_colours[:, :3] < 255).any():
+        warnings.append(f"{label}: vertex colours left out, its texture counts")
+    data = {key: value for key, value in data.items() if value is not None}
+    if data["alphaMode"] == "OPAQUE":
+        data["baseColorFactor"][3] = 1.0
+        if "baseColorTexture" in data:
+            data["baseColorTexture"] = _converted(data["baseColorTexture"], "RGB", images)
+    return TextureVisuals(uv=coordinates, material=PBRMaterial(**data)), warnings, _visible(data)
+
+
+def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> None:
+    """A surface without coordinates takes the mean colour of its texture."""
+    image = data.get("baseColorTexture")
+    if image is not None:
+        mean = np.asarray(image.convert("RGB"), dtype=np.float64).reshape(-1, 3).mean(axis=0)
+        data["baseColorFactor"][:3] *= convert_8bit(mean.astype(np.uint8), linear_from_srgb) / 255.0
+        warnings.append(f"{label}: texture without texture coordinates; its mean colour taken")
+    for slot in ("baseColorTexture", *_MAP_SLOTS):
+        data.pop(slot, None)
+
+
+def _material_vertex_colours(visual: TextureVisuals, count: int) -> npt.NDArray[np.uint8] | None:
+    """RGBA of vertex colours that lie on top of a material, as they stand in the file."""
+    attribute = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
+    if attribute is None or len(attribute) != count:
+        return None
+    attribute = np.asarray(attribute)
+    top = 1.0 if attribute.dtype.kind == "f" else float(np.iinfo(attribute.dtype).max)
+    rgba = np.full((count, 4), 255, dtype=np.uint8)
+    rgba[:, : attribute.shape[1]] = np.clip(np.round(attribute * (255.0 / top)), 0, 255)
+    return rgba
+
+
+def _coordinates(visual: TextureVisuals, count: int, label: str, warnings: list[str]) -> npt.NDArray[np.float64] | None:
+    if visual.uv is None or not len(visual.uv):
+        return None
+    uv = np.array(visual.uv, dtype=np.float64)
+    if uv.ndim != 2 or uv.shape[0] != count or uv.shape[1] < 2:
+        warnings.append(f"{label}: texture coordinates of shape {uv.shape} for {count} vertices; left out")
+        return None
+    uv = uv[:, :2]
+    wrong = ~np.isfinite(uv).all(axis=1)
+    if wrong.any():
+        uv[wrong] = 0.0
+        warnings.append(f"{label}: {int(wrong.sum())} texture coordinates are not finite; set to 0")
+    return uv
+
+
+def _pbr_values(material: PBRMaterial, images: dict[Any, Any]) -> dict[str, Any]:
+    factor = material.baseColorFactor
+    emissive = material.emissiveFactor
+    cutoff = 0.5 if material.alphaCutoff is None else float(material.alphaCutoff)
+    return {
+        "name": material.name,
+        "alphaMode": material.alphaMode if material.alphaMode in ("MASK", "BLEND") else "OPAQUE",
+        "alphaCutoff": min(max(cutoff, 0.0), 1.0),
+        "baseColorFactor": np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64) / 255.0,
+        "baseColorTexture": _converted(material.baseColorTexture, "RGBA", images),
+        "metallicFactor": material.metallicFactor,
+        "roughnessFactor": material.roughnessFactor,
+        **{slot: _converted(getattr(material, slot), "RGB", images) for slot in _MAP_SLOTS},
+        "emissiveFactor": None if emissive is None else np.asarray(emissive, dtype=np.float64)[:3],
+        "doubleSided": bool(material.doubleSided),
+    }
+
+
+def _mtl_values(material: SimpleMaterial, images: dict[Any, Any]) -> dict[str, Any]:
+    image = _converted(material.image, "RGBA", images)
+    factor = convert_8bit(np.asarray(material.diffuse, dtype=np.uint8), linear_from_srgb) / 255.0
+    if image is not None:
+        factor[:3] = 1.0
+    shininess = max(float(material.glossiness or 1.0), 0.0)
+    return {
+        "name": material.name,
+        "alphaMode": "BLEND",
+        "baseColorFactor": factor,
+        "baseColorTexture": image,
+        "metallicFactor": 0.0,
+        "roughnessFactor": float((2.0 / (shininess + 2.0)) ** 0.25),
+    }
+
+
+def _converted(image: PIL.Image.Image | None, mode: str, images: dict[Any, Any]) -> PIL.Image.Image | None:
+    """An image of 8 bits a channel: RGB, or RGBA where alpha is wanted and there is some."""
+    if image is None:
+        return None
+    key = (id(image), mode)
+    if key not in images:
+        images[key] = (_convert(image, mode), image)  # the source too: its id must not be given to another
+    return images[key][0]
+
+
+def _convert(image: PIL.Image.Image, mode: str) -> PIL.Image.Image | None:
+    """The image converted; None for one that cannot be decoded, of which the reader of the file has warned."""
+    if image.format not in (None, *IMAGE_FORMATS):
+        return None
+    try:
+        image.load()
+    except (OSError, SyntaxError, ValueError):
+        return None
+    if image.mode.startswith(("I", "F")):
+        top = 65535.0 if image.mode.startswith("I") else 1.0
+        image = PIL.Image.fromarray(np.clip(np.asarray(image) / top * 255.0, 0, 255).astype(np.uint8))
+    return image.convert("RGBA" if mode == "RGBA" and image.has_transparency_data else "RGB")
+
+
+def _visible(data: dict[str, Any]) -> bool:
+    """Whether any point of a surface can have alpha above 0."""
+    alpha = float(data["baseColorFactor"][3])
+    image = data.get("baseColorTexture")
+    if image is not None and image.mode == "RGBA":
+        alpha *= image.getchannel("A").getextrema()[1] / 255.0
+    return alpha >= data["alphaCutoff"] if data["alphaMode"] == "MASK" else alpha > 0

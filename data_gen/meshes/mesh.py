@@ -1,0 +1,281 @@
+"""Loads any mesh file: read, checked, turned y up, and normalised.
+
+World convention: y up, the centre of the bounding box at the origin, the vertex farthest from it at distance 1
+(`fit="sphere"`), or the longest side of the bounding box 2 units long (`fit="cube"`). Nothing is lost silently:
+what cannot be drawn as the file states is named in `Mesh.warnings`, what cannot be drawn at all is a `MeshError`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from data_gen.meshes.clean import clean, decimate, is_smooth
+from data_gen.meshes.files import MAX_FILE_BYTES, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, read_bytes
+from data_gen.meshes.find import safe_name
+from data_gen.meshes.formats import declared_up
+from data_gen.meshes.materials import ColourSpace, canonical_visual
+from data_gen.meshes.model_folder import ModelFolder
+from data_gen.meshes.read import read_scene
+from data_gen.meshes.shapenet import model_root
+
+__all__ = [
+    "MAX_FACES",
+    "Mesh",
+    "MeshError",
+    "load_mesh",
+    "prepare_scene",
+    "mesh_parts",
+]
+
+MAX_FACES = 2_000_000
+"""Triangles of a mesh at most, unless said otherwise. More are decimated where the looks survive it, else refused."""
+
+_DECIMATED_FROM = 8
+_OUTLIER = 30.0
+_TEXT = (".obj", ".off", ".dae", ".gltf")
+_Y_FROM_Z = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A mesh that can be drawn.
+
+    Attributes:
+        name: its name, safe as the name of a file.
+        scene: its geometries in world coordinates (all node transforms are the identity), y up, normalised.
+        world_from_file: the similarity `(4, 4)` that took the file's coordinates here.
+        warnings: what was lost or repaired, one line each.
+        face_count: triangles.
+    """
+
+    name: str
+    scene: trimesh.Scene
+    world_from_file: npt.NDArray[np.float64]
+    warnings: tuple[str, ...]
+    face_count: int
+
+
+def load_mesh(
+    path: str | Path,
+    *,
+    up: Literal["y", "z"] = "y",
+    name: str | None = None,
+    max_faces: int = MAX_FACES,
+    fit: Literal["sphere", "cube"] = "sphere",
+) -> Mesh:
+    """Read a mesh file.
+
+    Args:
+        path: a GLB, glTF, OBJ, PLY, STL, OFF or DAE file. What it refers to is read from its own folder and those
+            inside; for `SYNSET/ID/models/model_normalized.obj` of ShapeNet v2 from the folder of the ID.
+        up: the axis that points up in the file. A COLLADA file that declares its own is turned accordingly.
+        name: what to call it; the file's name by default.
+        max_faces: triangles at most.
+        fit: what is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
+
+    Returns:
+        The mesh.
+
+    Raises:
+        MeshError: if it cannot be read, holds nothing to draw, or is refused.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise MeshError(
+            f"{path}: expected a file that ends in {', '.join(MESH_SUFFIXES)}, found {suffix!r}; convert it"
+        )
+    data = read_bytes(path, limit=MAX_TEXT_BYTES if suffix in _TEXT else MAX_FILE_BYTES)
+    folder = ModelFolder(path, model_root(path))
+    scene, colours, lines = read_scene(data, folder)
+    mentioned = "; ".join(lines)
+    lost = [f"{reference}: {reason}" for reference, reason in folder.lost.items() if reference not in mentioned]
+    axis = declared_up(data) if suffix == ".dae" else None
+    if axis == "x":
+        lines.append("declares x up; taken as y up")
+    return prepare_scene(
+        scene,
+        name or safe_name(path.stem),
+        up="z" if axis == "z" else up,
+        max_faces=max_faces,
+        fit=fit,
+        colours=colours,
+        warnings=(*lost, *lines, *folder.notes),
+        source=str(path),
+    )
+
+
+def prepare_scene(
+    scene: trimesh.Scene,
+    name: str,
+    *,
+    up: Literal["y", "z"] = "y",
+    max_faces: int = MAX_FACES,
+    fit: Literal["sphere", "cube"] = "sphere",
+    colours: ColourSpace = "scene",
+    warnings: tuple[str, ...] = (),
+    source: str | None = None,
+    closed: bool = False,
+) -> Mesh:
+    """Check a scene and bring it into world coordinates; the scene itself is not changed.
+
+    Args:
+        scene: geometries and node transforms.
+        name: what to call the mesh.
+        up: the axis that points up in the scene.
+        max_faces: triangles at most.
+        fit: what is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
+        colours: `scene`: vertex and face colours are sRGB, factors of materials linear; `gltf`: all are linear;
+            `srgb`: all are sRGB. Textures are always sRGB.
+        warnings: what is already known to be lost.
+        source: what messages begin with; the name by default.
+        closed: whether all of it is known to be watertight solids wound outwards, so that back faces are not
+            drawn.
+
+    Returns:
+        The mesh.
+
+    Raises:
+        MeshError: if there is nothing to draw, or too much.
+        ValueError: if `up` or `fit` is none of the two.
+    """
+    if up not in ("y", "z"):
+        raise ValueError(f"up: expected 'y' or 'z', received {up!r}")
+    if fit not in ("sphere", "cube"):
+        raise ValueError(f"fit: expected 'sphere' or 'cube', received {fit!r}")
+    source = source or name
+    found = list(warnings)
+    _refuse_too_many(scene, max_faces, source)
+    with np.errstate(all="ignore"):
+        parts = _clean_parts(scene, colours, found, source)
+    if not parts:
+        raise MeshError(f"{source}: expected triangles to draw, found none; {'; '.join(found) or 'export it again'}")
+    faces = sum(len(part.faces) for part in parts)
+    if faces > max_faces:
+        smaller = decimate(parts, max_faces)
+        if smaller is None:
+            raise MeshError(
+                f"{source}: expected at most {max_faces} triangles, found {faces}, whose texture or face colours would "
+                "not survive decimation; simplify the mesh or raise the limit"
+            )
+        parts, closed = smaller, False
+        found.append(f"decimated from {faces} to {sum(len(part.faces) for part in parts)} triangles")
+    world_from_file = _normalising_transform(parts, up, fit, source, found)
+    ready = trimesh.Scene()
+    for number, part in enumerate(parts):
+        key = f"part_{number:04d}"
+        smooth = is_smooth(part)
+        moved = _transformed(part, world_from_file)
+        moved.metadata = {"smooth": smooth, "closed": closed}
+        ready.add_geometry(moved, geom_name=key, node_name=key)
+    return Mesh(
+        name=name,
+        scene=ready,
+        world_from_file=world_from_file,
+        warnings=tuple(dict.fromkeys(found)),
+        face_count=sum(len(part.faces) for part in parts),
+    )
+
+
+def mesh_parts(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]]:
+    """The parts of a mesh as `MeshRenderer.render` takes them.
+
+    Args:
+        mesh: the mesh.
+
+    Returns:
+        Each geometry, its pose `world_from_geometry` `(4, 4)`, and whether to shade it smoothly.
+    """
+    ready = []
+    for node in sorted(mesh.scene.graph.nodes_geometry):
+        pose, key = mesh.scene.graph[node]
+        geometry = mesh.scene.geometry[key]
+        ready.append((geometry, np.asarray(pose), bool(geometry.metadata.get("smooth", True))))
+    return ready
+
+
+def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:
+    """Count the triangles of all instances before any is copied."""
+    faces = 0
+    for node in scene.graph.nodes_geometry:
+        faces += len(getattr(scene.geometry[scene.graph[node][1]], "faces", ()))
+    if faces > _DECIMATED_FROM * max_faces:
+        raise MeshError(
+            f"{source}: expected at most {_DECIMATED_FROM * max_faces} triangles before decimation, found {faces}; "
+            "simplify the mesh"
+        )
+
+
+def _clean_parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], source: str) -> list[trimesh.Trimesh]:
+    """Clean meshes in the file's axes, one a node that can be seen."""
+    parts = []
+    images: dict[Any, Any] = {}
+    for node in scene.graph.nodes_geometry:
+        transform, key = scene.graph[node]
+        geometry = scene.geometry[key]
+        if not isinstance(geometry, trimesh.Trimesh):
+            found.append(f"{key}: {type(geometry).__name__} left out, only triangles are drawn")
+            continue
+        if not len(geometry.faces):
+            continue
+        transform = np.asarray(transform, dtype=np.float64)
+        if not np.isfinite(transform).all():
+            found.append(f"{key}: left out, its transform is not finite")
+            continue
+        visual, lines, visible = canonical_visual(geometry, str(key), colours=colours, images=images)
+        found += lines
+        if not visible:
+            found.append(f"{key}: fully transparent, left out")
+            continue
+        try:
+            part, lines = clean(_transformed(geometry, transform, visual), str(key))
+        except ValueError as error:
+            raise MeshError(f"{source}: {error}; the file is damaged") from error
+        found += lines
+        if part is not None:
+            parts.append(part)
+    return parts
+
+
+def _transformed(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visual: Any = None) -> trimesh.Trimesh:
+    """A copy in the coordinates that the transform leads to; a mirroring one also turns the faces around."""
+    linear = transform[:3, :3]
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) @ linear.T + transform[:3, 3]
+    faces = np.asarray(mesh.faces)[:, ::-1] if np.linalg.det(linear) < 0 else np.asarray(mesh.faces)
+    keywords: dict[str, Any] = {}
+    if "vertex_normals" in mesh._cache.cache:
+        normals = np.asarray(mesh.vertex_normals, dtype=np.float64) @ np.linalg.pinv(linear)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        keywords["vertex_normals"] = normals / np.where(length > 0, length, 1.0)
+    result = trimesh.Trimesh(vertices, faces, visual=visual or mesh.visual, process=False, **keywords)
+    result.metadata.update({key: mesh.metadata[key] for key in ("smooth",) if key in mesh.metadata})
+    return result
+
+
+def _normalising_transform(
+    parts: list[trimesh.Trimesh], up: str, fit: str, source: str, found: list[str]
+) -> npt.NDArray[np.float64]:
+    turn = _Y_FROM_Z if up == "z" else np.eye(4)
+    points = np.concatenate([part.vertices for part in parts]) @ turn[:3, :3].T
+    largest = float(np.abs(points).max())
+    if largest > 1e30:
+        raise MeshError(f"{source}: expected coordinates below 1e30, found {largest:.3g}; export the mesh again")
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre = (low + high) / 2
+    distance = np.linalg.norm(points - centre, axis=1)
+    radius = float(distance.max() if fit == "sphere" else (high - low).max() / 2)
+    if not radius > 1e-12 * max(largest, 1e-12):
+        raise MeshError(f"{source}: expected a mesh with an extent, found all vertices in one point; export it again")
+    near = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    if near.max() > _OUTLIER * np.quantile(near, 0.9) > 0:
+        found.append("a few vertices lie far from all others, so the object is small in its views")
+    world_from_file = turn / radius
+    world_from_file[:3, 3] = -centre / radius
+    world_from_file[3, 3] = 1.0
+    return world_from_file

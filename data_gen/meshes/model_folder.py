@@ -1,0 +1,233 @@
+"""The folder of one model: gives a mesh loader its materials, textures and buffers, and nothing else.
+
+Every name in a mesh file is resolved here. Nothing outside the model's own folder is opened, and never the network.
+"""
+
+from __future__ import annotations
+
+import re
+import urllib.parse
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from trimesh.resolvers import Resolver
+
+from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PIXELS, MeshError, check_image, read_bytes
+
+__all__ = ["ModelFolder"]
+
+_MTL_OPTION = re.compile(
+    r"^\s*-(?:(?:blendu|blendv|cc|clamp|imfchan|type|texres|boost|bm)\s+\S+|(?:o|s|t)(?:\s+[-+.\deE]+){1,3}"
+    r"|mm\s+\S+\s+\S+)\s+"
+)
+
+
+class ModelFolder(Resolver):
+    """Gives a mesh loader the other files of its model, from one folder and no other place.
+
+    Names are accepted as files hold them: with backslashes, percent-encoded, in the wrong case, as `model://NAME/rest`
+    (the folder stands for NAME), behind MTL options (`-s 1 1 1 wood.png`), or with the absolute path of the machine
+    they were made on, of which only the last part is looked for.
+
+    Args:
+        path: the mesh file; its name is what messages begin with.
+        root: the folder that nothing may leave; the mesh file's own by default.
+        pixels: pixels that all textures together may have.
+
+    A file that is not there, and a texture that cannot be decoded, is a FileNotFoundError and noted in `lost`.
+
+    Attributes:
+        lost: why each requested name could not be opened.
+        notes: what a user should know about names that could be given.
+        refused: the first reason to refuse the whole model, if there was one: loaders swallow exceptions.
+    """
+
+    def __init__(self, path: Path, root: Path | None = None, *, pixels: int = MAX_PIXELS) -> None:
+        self.path = path
+        self.folder = path.parent.resolve()
+        self.root = (root or path.parent).resolve()
+        self.pixels_left = pixels
+        self.lost: dict[str, str] = {}
+        self.notes: list[str] = []
+        self.refused: MeshError | None = None
+        self.file_name = path.name
+        self._bytes: dict[Path, bytes] = {}
+        self._images: set[Path] = set()
+
+    def get(self, name: str) -> bytes:
+        """Give a file to a loader: one that was read before, or a texture.
+
+        Args:
+            name: how the mesh refers to it.
+
+        Returns:
+            Its content.
+        """
+        found = self._find(name)
+        return self._bytes[found] if found in self._bytes else self.get_image(name)
+
+    def read(self, name: str, *, limit: int = MAX_FILE_BYTES) -> bytes:
+        """Read a file of the model that is no texture.
+
+        Args:
+            name: how the mesh refers to it.
+            limit: bytes at most.
+
+        Returns:
+            Its content.
+
+        Raises:
+            FileNotFoundError: if there is no such file, or it is empty; noted in `lost`.
+            MeshError: if it lies outside the model's folder or is too large; noted in `refused`.
+        """
+        found = self._find(name)
+        try:
+            if found not in self._bytes:
+                if found.stat().st_size == 0:
+                    self.lost.setdefault(name, "an empty file")
+                    raise FileNotFoundError(name)
+                self._bytes[found] = read_bytes(found, limit=limit)
+        except MeshError as error:
+            self.refused = self.refused or error
+            raise
+        return self._bytes[found]
+
+    def get_image(self, name: str) -> bytes:
+        """Read a texture of the model, which is decoded once to see that it is whole.
+
+        Args:
+            name: how the mesh refers to it.
+
+        Returns:
+            Its content.
+        """
+        found = self._find(name)
+        if found not in self._images:
+            self.count_pixels(self.read(name), name)
+            self._images.add(found)
+        return self._bytes[found]
+
+    def _find(self, name: str) -> Path:
+        try:
+            found = self.locate(name)
+        except MeshError as error:
+            self.refused = self.refused or error
+            raise
+        if found is None:
+            self.lost.setdefault(name, "not found")
+            raise FileNotFoundError(name)
+        return found
+
+    def count_pixels(self, data: bytes, name: str) -> None:
+        """Check a texture and count its pixels.
+
+        Args:
+            data: the bytes of an image file.
+            name: what the mesh calls it.
+
+        Raises:
+            FileNotFoundError: if it cannot be decoded; noted in `lost`.
+            MeshError: if the textures are too large.
+        """
+        try:
+            self.pixels_left -= check_image(data, f"{self.path}: {name}", limit=self.pixels_left)
+        except MeshError as error:
+            self.refused = self.refused or error
+            raise
+        except ValueError as error:
+            self.lost.setdefault(name, str(error))
+            raise FileNotFoundError(f"{name}: {error}") from error
+
+    def locate(self, name: str) -> Path | None:
+        """Find a file of the model without reading it.
+
+        Args:
+            name: how the mesh refers to it.
+
+        Returns:
+            The file, or None if there is none.
+
+        Raises:
+            MeshError: if the name leaves the model's folder.
+        """
+        plain_name = name.strip().strip('"')
+        for candidate in _candidates(plain_name):
+            found = self._inside(candidate, name)
+            if found is not None:
+                return found
+        if _is_absolute(plain_name):
+            last = PurePosixPath(plain_name.replace("\\", "/")).name
+            found = self._inside(last, name) if last else None
+            if found is None:
+                raise MeshError(
+                    f"{self.path}: expected references inside {self.root.name}/, found the absolute path "
+                    f"{plain_name!r}; "
+                    "put the file beside the mesh and name it without a folder"
+                )
+            self._note(f"{plain_name}: absolute path not followed, {last} beside the mesh taken")
+            return found
+        return None
+
+    def _inside(self, relative: str, name: str) -> Path | None:
+        if not relative or _is_absolute(relative) or "\0" in relative:
+            return None
+        try:
+            candidate = self.folder / relative
+            path = candidate.resolve()
+            if not path.is_relative_to(self.root):
+                raise MeshError(
+                    f"{self.path}: expected references inside {self.root.name}/, found {name.strip()!r}, which leaves "
+                    "it; put the file beside the mesh"
+                )
+            if path.is_file():
+                return path
+            return self._other_case(path)
+        except (OSError, RuntimeError):
+            return None
+
+    def _other_case(self, path: Path) -> Path | None:
+        if path == self.root or not path.parent.is_dir():
+            return None
+        for entry in sorted(path.parent.iterdir()):
+            if entry.name.casefold() == path.name.casefold() and entry.is_file():
+                return entry if entry.resolve().is_relative_to(self.root) else None
+        return None
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def keys(self) -> Iterator[str]:
+        """Names of the files beside the mesh, as the interface of trimesh's resolvers requires."""
+        yield from sorted(entry.name for entry in self.folder.iterdir())
+
+    def write(self, name: str, data: str | bytes) -> None:
+        """Raise a PermissionError: a model is only read."""
+        raise PermissionError(f"{name}: the folder of a model is only read")
+
+    def namespaced(self, namespace: str) -> ModelFolder:
+        """The same folder: names keep their meaning."""
+        return self
+
+
+def _candidates(name: str) -> Iterator[str]:
+    """Relative paths that a name may stand for, likeliest first."""
+    uri = re.match(r"^(?:model|package|file)://(.*)$", name)
+    if uri:
+        parts = uri.group(1).split("/")
+        yield "/".join(parts[1:])
+        yield parts[-1]
+        return
+    plain = name.replace("\\", "/")
+    yield name
+    yield plain
+    yield urllib.parse.unquote(plain)
+    unprefixed = plain
+    while (option := _MTL_OPTION.match(unprefixed)) is not None:
+        unprefixed = unprefixed[option.end() :]
+    if unprefixed != plain:
+        yield unprefixed.strip()
+
+
+def _is_absolute(name: str) -> bool:
+    return name.startswith(("/", "\\", "~")) or re.match(r"^[A-Za-z]:[\\/]", name) is not None

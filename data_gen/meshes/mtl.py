@@ -1,0 +1,144 @@
+"""Reads the MTL files (materials and their textures) of an OBJ file.
+
+trimesh's reader drops opacity (`d`, `Tr`), emission, and textures behind options (`map_Kd -s 1 1 1 wood.png`).
+
+A texture takes the place of `Kd`, as in Blender and so in the pictures of ShapeNet: exporters write any Kd beside it.
+`d` is opacity; `Tr` is 1 - d where there is no d, but a lone `Tr 1` is what many programs write for opaque.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import PIL.Image
+from trimesh.visual.material import PBRMaterial
+
+from data_gen.meshes.files import MAX_TEXT_BYTES
+from data_gen.meshes.model_folder import ModelFolder
+from hyperplanes.colour import convert_8bit, linear_from_srgb
+
+__all__ = ["decode_text", "read_materials"]
+
+_LOST_MAPS = {"map_d": "its opacity map", "map_ke": "its glow map"}
+
+
+def decode_text(data: bytes) -> str:
+    """Text of a file that does not declare its encoding: UTF-8, else Latin-1."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str]) -> dict[str, PBRMaterial]:
+    """Read all material libraries of an OBJ file; the folder refuses what lies outside it.
+
+    Args:
+        libraries: what stands after each `mtllib`: one name, which may hold spaces, or several.
+        folder: gives the files.
+        warnings: receives what was lost, by name.
+
+    Returns:
+        Materials by name, colours linear.
+    """
+    materials: dict[str, PBRMaterial] = {}
+    for line in libraries:
+        whole = folder.locate(line) is not None or not line.lower().endswith(".mtl")
+        names = [line] if whole or len(line.split()) < 2 else line.split()
+        for name in names:
+            try:
+                text = decode_text(folder.read(name, limit=MAX_TEXT_BYTES))
+            except FileNotFoundError:
+                continue
+            for values in _statements(text, name, warnings):
+                materials.setdefault(values["name"], _material(values, folder, warnings))
+    return materials
+
+
+def _statements(text: str, library: str, warnings: list[str]) -> list[dict[str, Any]]:
+    """The statements of each material, keywords in lower case."""
+    found: list[dict[str, Any]] = []
+    orphans = 0
+    for line in text.splitlines():
+        keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
+        keyword, rest = keyword.lower(), rest.strip()
+        if not keyword or keyword.startswith("#"):
+            continue
+        if keyword == "newmtl":
+            found.append({"name": rest})
+        elif found:
+            found[-1][keyword] = rest
+        else:
+            orphans += 1
+    if orphans or not found:
+        warnings.append(f"{library}: expected materials, found {orphans} statements before the first newmtl")
+    return found
+
+
+def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) -> PBRMaterial:
+    label = f"material {values['name']!r}"
+    colour = np.array([*_floats(values.get("kd"), 3, (0.8, 0.8, 0.8), f"{label}: Kd", warnings), 1.0])
+    colour[:3] = convert_8bit(np.clip(np.round(colour[:3] * 255.0), 0, 255).astype(np.uint8), linear_from_srgb) / 255.0
+    colour[3] = _opacity(values, label, warnings)
+    image = _texture(values, label, folder, warnings)
+    if image is not None:
+        colour[:3] = 1.0
+    shininess = max(_floats(values.get("ns"), 1, (10.0,), f"{label}: Ns", warnings)[0], 0.0)
+    glow = np.clip(_floats(values.get("ke"), 3, (0.0, 0.0, 0.0), f"{label}: Ke", warnings), 0.0, 1.0)
+    for keyword, what in _LOST_MAPS.items():
+        if values.get(keyword):
+            warnings.append(f"{label}: {what} {values[keyword]} left out")
+    return PBRMaterial(
+        name=values["name"],
+        baseColorFactor=colour,
+        baseColorTexture=image,
+        alphaMode="BLEND",
+        metallicFactor=0.0,
+        roughnessFactor=float((2.0 / (shininess + 2.0)) ** 0.25),
+        emissiveFactor=glow if glow.any() else None,
+    )
+
+
+def _opacity(values: dict[str, Any], label: str, warnings: list[str]) -> float:
+    if "d" in values:
+        return float(
+            np.clip(_floats(values["d"].replace("-halo", ""), 1, (1.0,), f"{label}: d", warnings)[0], 0.0, 1.0)
+        )
+    transparency = _floats(values.get("tr"), 1, (0.0,), f"{label}: Tr", warnings)[0]
+    if transparency >= 1.0:
+        warnings.append(f"{label}: Tr 1 without d taken as opaque")
+        return 1.0
+    return float(np.clip(1.0 - transparency, 0.0, 1.0))
+
+
+def _texture(values: dict[str, Any], label: str, folder: ModelFolder, warnings: list[str]) -> PIL.Image.Image | None:
+    name = values.get("map_kd") or values.get("map_ka")
+    if not name:
+        return None
+    try:
+        image = PIL.Image.open(io.BytesIO(folder.get_image(name)))
+        image.load()
+    except FileNotFoundError:
+        warnings.append(f"{label}: drawn without its texture {name} ({folder.lost.get(name, 'not found')})")
+        return None
+    except (OSError, SyntaxError, ValueError) as error:
+        warnings.append(f"{label}: drawn without its texture {name}, which cannot be decoded: {error}")
+        return None
+    return image
+
+
+def _floats(text: str | None, count: int, default: tuple[float, ...], what: str, warnings: list[str]) -> Any:
+    if text is None:
+        return np.array(default)
+    try:
+        found = np.array([float(value) for value in text.split()[:count]])
+        if len(found) == 1 and count == 3:
+            found = found.repeat(3)
+        if len(found) == count and np.isfinite(found).all():
+            return found
+    except ValueError:
+        pass
+    warnings.append(f"{what}: expected {count} numbers, found {text!r}; {default} taken")
+    return np.array(default)

@@ -1,0 +1,73 @@
+"""Reads a mesh file of any format: the check that belongs to it, then its reader, and one kind of error from all."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import warnings as python_warnings
+from collections.abc import Generator
+
+import trimesh
+
+from data_gen.meshes.files import MeshError
+from data_gen.meshes.formats import read_dae, read_off, read_ply, read_stl
+from data_gen.meshes.gltf import read_gltf
+from data_gen.meshes.materials import ColourSpace
+from data_gen.meshes.model_folder import ModelFolder
+from data_gen.meshes.obj import read_obj
+
+__all__ = ["read_scene"]
+
+_READERS = {".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl, ".dae": read_dae}
+
+
+def read_scene(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
+    """Read a mesh file of any format.
+
+    Args:
+        data: the content of the file.
+        folder: names the file and gives the others of its model.
+
+    Returns:
+        A scene in the file's coordinates, what its plain colours are, and warnings.
+
+    Raises:
+        MeshError: if the file is damaged, was cut, or is refused.
+    """
+    try:
+        with _strict_loaders():
+            found = _read(data, folder.path.suffix.lower(), folder)
+    except MeshError as error:
+        raise folder.refused or error from error
+    except (Exception, MemoryError) as error:
+        if folder.refused is not None:
+            raise folder.refused from error
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise MeshError(
+            f"{folder.path}: expected a whole mesh, found {reason}; the file is damaged or was cut"
+        ) from error
+    if folder.refused is not None:
+        raise folder.refused
+    return found
+
+
+def _read(data: bytes, suffix: str, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
+    if suffix in (".glb", ".gltf"):
+        return read_gltf(data, folder)
+    scene, lines = _READERS[suffix](data, folder)
+    return scene, "srgb" if suffix == ".dae" else "scene", lines
+
+
+@contextlib.contextmanager
+def _strict_loaders() -> Generator[None, None, None]:
+    """Keep the loaders' log quiet, and turn numpy's remark that a text was not read to its end into an error."""
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        with python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore")
+            python_warnings.filterwarnings("error", message="string or file could not be read to its end")
+            yield
+    finally:
+        logger.setLevel(level)

@@ -1,0 +1,186 @@
+"""Renders meshes from the cameras of a rig into RGBA, depth, normals, coordinates and mask.
+
+Pictures are RGBA with straight (not premultiplied) alpha: `rgb * a + white * (1 - a)` composites over white without
+dark fringes. They are drawn over black at a multiple of the resolution, averaged while premultiplied, and divided by
+their alpha at the end. Depth, normals, coordinates and mask are not averaged: they are those of the pixel's centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from data_gen import SUPERSAMPLE
+from data_gen.rendering.lighting import Lighting, resolve_lighting
+from data_gen.rendering.renderers import REMEDIES, RENDERERS, RendererError, RendererInfo, find_renderer
+from data_gen.rendering.surfaces import RenderError, ShadedSurface, shaded_surfaces
+from data_gen.rigs import Rig
+
+__all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "PlacedMesh", "RenderError", "Rendering", "ViewRenderer"]
+
+PlacedMesh = tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]
+"""A mesh, its pose world_from_mesh (4, 4), and whether it is shaded smoothly."""
+
+CHANNELS = ("rgba", "depth", "normals", "coordinates", "mask")
+"""What render can return."""
+
+MAX_SUPERSAMPLE = 8
+"""Most samples along a side of a pixel."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Pictures of one object. Channels that were not requested are None; empty pixels are 0 in every channel.
+
+    Attributes:
+        rgba: colours uint8 `(view, height, width, 4)`, sRGB, straight alpha.
+        depth: distance along the camera's z axis float32 `(view, height, width)`, world units.
+        normals: unit normals towards the camera float32 `(view, height, width, 3)`, world axes, as they are shaded:
+            interpolated on what is smooth, the face's own elsewhere.
+        coordinates: points on the surface float32 `(view, height, width, 3)`, world units.
+        mask: whether the pixel's centre sees a surface that is at least half opaque, bool `(view, height, width)`.
+    """
+
+    rgba: npt.NDArray[np.uint8] | None = None
+    depth: npt.NDArray[np.float32] | None = None
+    normals: npt.NDArray[np.float32] | None = None
+    coordinates: npt.NDArray[np.float32] | None = None
+    mask: npt.NDArray[np.bool_] | None = None
+
+
+class ViewRenderer(Protocol):
+    """What `EmbreeRenderer` and `PyrenderRenderer` have in common; `detail` says what draws, one line."""
+
+    detail: str
+
+    def draw(
+        self, surfaces: Sequence[ShadedSurface], rig: Rig, lighting: Lighting, supersample: int
+    ) -> Iterator[npt.NDArray[np.uint8]]:
+        """Draw the surfaces from each camera of the rig, with supersample x supersample samples a pixel.
+
+        Yields:
+            sRGB with straight alpha `(height, width, 4)`, a view at a time.
+        """
+        ...
+
+
+class MeshRenderer:
+    """Draws meshes with the renderer that works here. A context manager.
+
+    All MeshRenderers of a process that draw with pyrender share its one renderer, so making another costs nothing; they
+    must all be used in the thread that made the first.
+
+    Args:
+        renderer: what `find_renderer` returned, the name of a renderer, or None for the best that works here.
+        supersample: samples along a side of a pixel, 1 to MAX_SUPERSAMPLE: 3 gives alpha ten values, 4 seventeen.
+
+    Raises:
+        RendererError: if no renderer works, or the one named does not.
+        ValueError: if supersample is out of range or the renderer has an unknown name.
+
+    Attributes:
+        name: name of the renderer, one of `data_gen.rendering.renderers.RENDERERS`.
+        detail: what draws, e.g. the OpenGL renderer and version.
+        supersample: samples along a side of a pixel.
+    """
+
+    def __init__(self, renderer: RendererInfo | str | None = None, supersample: int = SUPERSAMPLE) -> None:
+        if not 1 <= supersample <= MAX_SUPERSAMPLE:
+            raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, received {supersample}")
+        self.name = renderer if isinstance(renderer, str) else (renderer or find_renderer()).name
+        self.supersample = supersample
+        self._renderer: ViewRenderer | None = _make_renderer(self.name)
+        self.detail = self._renderer.detail
+
+    def __enter__(self) -> MeshRenderer:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close it."""
+        self.close()
+
+    def close(self) -> None:
+        """Release the renderer. The process keeps its OpenGL context for the next MeshRenderer."""
+        self._renderer = None
+
+    def render(
+        self,
+        parts: Sequence[PlacedMesh],
+        rig: Rig,
+        *,
+        lighting: str | Lighting = "studio",
+        channels: Sequence[str] = ("rgba",),
+        name: str = "object",
+        seed: int = 0,
+    ) -> Rendering:
+        """Draw an object from every camera of a rig.
+
+        Args:
+            parts: meshes with their poses and whether they are smooth.
+            rig: the cameras.
+            lighting: name of a preset or a Lighting.
+            channels: what to return, of CHANNELS.
+            name: what to call the object in errors.
+            seed: seed of random lighting.
+
+        Returns:
+            The requested channels.
+
+        Raises:
+            RenderError: if the parts cannot be drawn, or nothing of them is visible in any view.
+            ValueError: if the MeshRenderer is closed, or lighting or a channel has an unknown name.
+        """
+        if self._renderer is None:
+            raise ValueError("renderer: expected an open one, received one that was closed")
+        unknown = sorted(set(channels) - set(CHANNELS))
+        if unknown or not channels:
+            raise ValueError(
+                f"channels: expected some of {', '.join(CHANNELS)}, received {', '.join(channels) or 'none'}"
+            )
+        lights = resolve_lighting(lighting, seed=seed)
+        surfaces = shaded_surfaces(parts, name)
+        pictures: dict[str, npt.NDArray] = {}
+        if "rgba" in channels:
+            pictures["rgba"] = np.stack(list(self._renderer.draw(surfaces, rig, lights, self.supersample)))
+            visible = pictures["rgba"][..., 3].any()
+        if set(channels) - {"rgba"}:
+            from data_gen.rendering.embree import cast_geometry
+
+            views = list(cast_geometry(surfaces, rig))
+            for channel in CHANNELS[1:]:
+                if channel in channels:
+                    pictures[channel] = np.stack([getattr(view, channel) for view in views])
+            if "rgba" not in channels:
+                visible = any(view.mask.any() for view in views)
+        if not visible:
+            raise RenderError(f"{name}: expected some of it to be visible in {len(rig)} views, found every one blank")
+        return Rendering(**pictures)
+
+
+def _make_renderer(name: str) -> ViewRenderer:
+    if name not in RENDERERS:
+        raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}")
+    try:
+        if name == "embree":
+            from data_gen.rendering.embree import EmbreeRenderer
+
+            return EmbreeRenderer()
+        from data_gen.rendering.pyrender_renderer import PyrenderRenderer
+
+        return PyrenderRenderer(name.removeprefix("pyrender-"))
+    except RendererError:
+        raise
+    except Exception as error:  # missing libraries and drivers show as nearly any type
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise RendererError(
+            f"renderer {name!r}: expected it to start, found {reason}. Remedy: {REMEDIES[name]}"
+        ) from error

@@ -1,0 +1,52 @@
+"""The program that tries one renderer: `python -m data_gen.rendering.probe_process NAME` draws and checks a picture.
+
+It runs in a process of its own, since a renderer that does not work may take its process with it.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import trimesh
+from trimesh.visual import ColorVisuals
+
+from data_gen.rendering.mesh_renderer import MeshRenderer
+from data_gen.rendering.renderers import RendererError
+from data_gen.rigs import Rig, look_at_origin
+
+__all__ = ["draw_test_image"]
+
+
+def draw_test_image(name: str) -> str:
+    """Draw half a picture full of red triangle and check it.
+
+    Args:
+        name: which renderer.
+
+    Returns:
+        What drew it, one line.
+
+    Raises:
+        RendererError: if the picture is another one.
+    """
+    corners = [[-9.0, -9.0, 0.0], [0.0, -9.0, 0.0], [0.0, 9.0, 0.0], [-9.0, 9.0, 0.0]]
+    sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    sheet.visual = ColorVisuals(sheet, vertex_colors=[[255, 0, 0, 255]] * 4)
+    intrinsics = np.array([[16.0, 0.0, 7.5], [0.0, 16.0, 7.5], [0.0, 0.0, 1.0]])
+    rig = Rig(look_at_origin([[0.0, 0.0, 2.0]]), intrinsics, 16, 16, 1.0, 3.0)
+    with MeshRenderer(name) as renderer:
+        drawn = renderer.render([(sheet, np.eye(4), False)], rig)
+        picture = np.asarray(drawn.rgba)[0].astype(int)
+        detail = renderer.detail
+    left, right = picture[:, :8], picture[:, 8:]
+    red = (left[..., 3] == 255) & (left[..., 0] > 40) & (left[..., 0] > 2 * left[..., 1])
+    if not red.all() or right[..., 3].any():
+        raise RendererError(
+            f"expected a red left half, received {left[8, 4].tolist()} there, and alpha {right[..., 3].max()} outside"
+        )
+    return detail
+
+
+if __name__ == "__main__":
+    sys.stdout.write(draw_test_image(sys.argv[1]) + "\n")

@@ -1,0 +1,218 @@
+"""The OpenGL pass that draws surfaces inside a pyrender Renderer. Only pyrender_renderer imports it.
+
+pyrender keeps the context, the vertex buffers and the textures; the pass itself is our own, because pyrender's lights
+back faces with ambient light only, squares the alpha of what is translucent, multiplies vertex colours in after the
+light, and reads a depth buffer that is not needed. Every sample is shaded (supersampling, not multisampling).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from ctypes import c_void_p
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from OpenGL import GL
+from pyrender import Mesh, MetallicRoughnessMaterial, Node, Primitive, Renderer, RenderFlags, Scene, Texture
+
+from data_gen.rendering.framebuffers import SampleFramebuffers
+from data_gen.rendering.lighting import Lighting
+from data_gen.rendering.shader_program import (
+    OPAQUE_TEXELS,
+    TRANSLUCENT_TEXELS,
+    ShaderProgram,
+    constants_of_lighting,
+    constants_of_surface,
+)
+from data_gen.rendering.surfaces import ShadedSurface
+
+__all__ = ["Drawable", "SurfaceRenderer"]
+
+Floats = npt.NDArray[np.float64]
+
+_OUTER, _INNER = 1.0, -1.0
+# Drawn with flipped rows, so that glReadPixels, which starts at the bottom, returns the first row on top; the flip
+# reverses the winding of every triangle.
+_HIDDEN = {_OUTER: GL.GL_FRONT, _INNER: GL.GL_BACK}
+_FLIP_ROWS = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+class Drawable:
+    """A surface with the pyrender objects that hold its buffers and textures.
+
+    Args:
+        surface: what to draw.
+        textures: pyrender textures made so far, by the identity of their texels, so that surfaces share them.
+
+    Attributes:
+        defines: what its program needs to be compiled with.
+        constants: what of its material may be compiled in.
+    """
+
+    def __init__(self, surface: ShadedSurface, textures: dict[int, Texture]) -> None:
+        self.surface = surface
+        self.base_texture = _texture(surface.texture, textures)
+        self.emissive_texture = _texture(surface.emissive_texture, textures)
+        # pyrender uploads the textures of a primitive's material; nothing else of the material is used.
+        material = MetallicRoughnessMaterial(baseColorTexture=self.base_texture, emissiveTexture=self.emissive_texture)
+        self.primitive = Primitive(
+            positions=surface.positions,
+            normals=surface.normals,
+            texcoord_0=surface.uv,
+            color_0=surface.colours,
+            indices=surface.faces,
+            material=material,
+        )
+        self.defines: dict[str, int] = {}
+        if surface.uv is not None:
+            self.defines["UV"] = 2
+        if surface.colours is not None:
+            self.defines["COLOUR"] = 2 + len(self.defines)
+        needs = {
+            "TEXTURE": self.base_texture is not None,
+            "EMISSIVE_TEXTURE": self.emissive_texture is not None,
+            "TRANSLUCENT": not surface.opaque or surface.cutoff is not None,
+            "ALIGNED": _aligned(surface),
+        }
+        self.constants = constants_of_surface(surface)
+        self.defines |= {name: 1 for name, needed in needs.items() if needed}
+        self.centre = surface.positions[surface.faces].mean(axis=(0, 1))
+
+
+class SurfaceRenderer(Renderer):
+    """A pyrender Renderer that draws surfaces into RGBA with straight alpha."""
+
+    def load(self, surfaces: Sequence[ShadedSurface]) -> list[Drawable]:
+        """Put surfaces into the context, in place of those that were there.
+
+        Args:
+            surfaces: what to draw from now on; none empties the context.
+
+        Returns:
+            What `draw` takes: what is solid first, by the program that draws it.
+        """
+        textures: dict[int, Texture] = {}
+        drawables = [Drawable(surface, textures) for surface in surfaces]
+        scene = Scene()
+        if drawables:
+            scene.add_node(Node(mesh=Mesh([drawable.primitive for drawable in drawables])))
+        self._update_context(scene, RenderFlags.NONE)
+        return sorted(drawables, key=lambda drawable: (not drawable.surface.opaque, _program_key(drawable)))
+
+    def draw(
+        self,
+        drawables: Sequence[Drawable],
+        size: tuple[int, int, int],
+        clip_from_world: Floats,
+        camera: Floats,
+        lighting: Lighting,
+        light_directions: Floats,
+    ) -> npt.NDArray[np.uint8]:
+        """Draw one view.
+
+        Args:
+            drawables: what `load` returned.
+            size: pixels across, pixels down, and samples along a side of a pixel.
+            clip_from_world: OpenGL's view and projection `(4, 4)`.
+            camera: the camera's position `(3,)` in world axes.
+            lighting: the lights.
+            light_directions: unit vectors to the lights `(light, 3)` in world axes.
+
+        Returns:
+            sRGB with straight alpha `(height, width, 4)`, first row on top.
+        """
+        buffers = self._buffers(size)
+        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, buffers.drawn)
+        GL.glViewport(0, 0, size[0] * size[2], size[1] * size[2])
+        GL.glEnable(GL.GL_DEPTH_TEST)
+        GL.glDepthFunc(GL.GL_LESS)
+        GL.glDepthMask(GL.GL_TRUE)
+        GL.glPolygonMode(GL.GL_FRONT_AND_BACK, GL.GL_FILL)
+        GL.glDisable(GL.GL_BLEND)
+        GL.glEnable(GL.GL_CULL_FACE)
+        GL.glClearColor(0.0, 0.0, 0.0, 0.0)
+        GL.glClear(int(GL.GL_COLOR_BUFFER_BIT) | int(GL.GL_DEPTH_BUFFER_BIT))
+        view = (_FLIP_ROWS @ clip_from_world, camera, lighting, light_directions)
+        bound: ShaderProgram | None = None
+        # Outer sides first: what they hide is not shaded. The inner ones of what is closed cannot be seen.
+        for side in (_OUTER, _INNER):
+            for drawable in drawables:
+                if side == _OUTER or not drawable.surface.closed:
+                    bound = self._bind(drawable, bound, view)
+                    self._draw_triangles(drawable, bound, OPAQUE_TEXELS, side)
+        translucent = [drawable for drawable in drawables if not drawable.surface.opaque]
+        if translucent:
+            translucent.sort(key=lambda drawable: -float(np.linalg.norm(drawable.centre - camera)))
+            GL.glEnable(GL.GL_BLEND)
+            GL.glBlendFunc(GL.GL_ONE, GL.GL_ONE_MINUS_SRC_ALPHA)
+            GL.glDepthMask(GL.GL_FALSE)
+            for drawable in translucent:
+                bound = self._bind(drawable, bound, view)
+                for side in (_INNER, _OUTER):
+                    self._draw_triangles(drawable, bound, TRANSLUCENT_TEXELS, side)
+            GL.glDepthMask(GL.GL_TRUE)
+        picture = buffers.read()
+        GL.glUseProgram(0)
+        return picture
+
+    def delete(self) -> None:
+        """Free everything that OpenGL holds for this renderer."""
+        for program in self.__dict__.pop("_surface_programs", {}).values():
+            program.delete()
+        buffers: SampleFramebuffers | None = self.__dict__.pop("_sample_buffers", None)
+        if buffers is not None:
+            buffers.delete()
+        super().delete()
+
+    def _buffers(self, size: tuple[int, int, int]) -> SampleFramebuffers:
+        """The buffers of the last view where their size fits, else others in their place."""
+        buffers: SampleFramebuffers | None = self.__dict__.get("_sample_buffers")
+        if buffers is None or buffers.size != size:
+            if buffers is not None:
+                buffers.delete()
+            buffers = self.__dict__["_sample_buffers"] = SampleFramebuffers(*size)
+        return buffers
+
+    def _bind(self, drawable: Drawable, bound: ShaderProgram | None, view: Any) -> ShaderProgram:
+        programs: dict[tuple[Any, ...], ShaderProgram] = self.__dict__.setdefault("_surface_programs", {})
+        defines = drawable.defines | {"LIGHTS": len(view[-1])}
+        constants = drawable.constants | constants_of_lighting(view[2])
+        key = (*sorted(defines.items()), *sorted(constants.items()))
+        if key not in programs:
+            programs[key] = ShaderProgram(defines, constants)
+        program = programs[key]
+        if program is not bound:
+            GL.glUseProgram(program.handle)
+            program.set_view(*view)
+        return program
+
+    def _draw_triangles(self, drawable: Drawable, program: ShaderProgram, layer: int, side: float) -> None:
+        GL.glCullFace(_HIDDEN[side])
+        program.set_surface(drawable.surface, layer, side)
+        for unit, texture in enumerate((drawable.base_texture, drawable.emissive_texture)):
+            if texture is not None:
+                GL.glActiveTexture(int(GL.GL_TEXTURE0) + unit)
+                texture._bind()
+        drawable.primitive._bind()
+        GL.glDrawElements(GL.GL_TRIANGLES, drawable.surface.faces.size, GL.GL_UNSIGNED_INT, c_void_p(0))
+        drawable.primitive._unbind()
+
+
+def _program_key(drawable: Drawable) -> tuple[Any, ...]:
+    return (*sorted(drawable.defines.items()), *sorted(drawable.constants.items()))
+
+
+def _aligned(surface: ShadedSurface) -> bool:
+    """Whether all normals are on the outer side of their face, so that the face need not be looked at to turn them."""
+    corners = surface.positions[surface.faces]
+    facets = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    agreement = np.einsum("fi,fci->fc", facets, surface.normals[surface.faces])
+    return bool((agreement[facets.any(axis=1)] > 0.0).all())
+
+
+def _texture(texels: npt.NDArray[np.uint8] | None, textures: dict[int, Texture]) -> Texture | None:
+    if texels is None:
+        return None
+    # Always four channels: OpenGL expects rows of a multiple of four bytes.
+    return textures.setdefault(id(texels), Texture(source=texels, source_channels="RGBA"))

@@ -1,0 +1,118 @@
+"""Rays against the triangles of surfaces: Embree finds the face, double precision finds the point on it.
+
+Embree works in single precision. It only decides which face a ray meets first; where on the face is computed from the
+face's plane in double precision, so points are exact however far the camera is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from data_gen.rendering.surfaces import ShadedSurface
+
+__all__ = ["Hits", "RayCaster", "pixel_rays"]
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where rays first meet a face.
+
+    Attributes:
+        rays: index `(hit,)` of the ray.
+        faces: index `(hit,)` of the face among those of all surfaces.
+        distances: multiple `(hit,)` of the ray's direction at which it meets the face.
+        points: where they meet `(hit, 3)`, world axes.
+        corners: barycentric weights `(hit, 3)` of the face's corners.
+    """
+
+    rays: Indices
+    faces: Indices
+    distances: Floats
+    points: Floats
+    corners: Floats
+
+
+class RayCaster:
+    """Casts rays at surfaces.
+
+    Args:
+        surfaces: the surfaces; faces are numbered through them in order.
+
+    Attributes:
+        facets: face normals `(face, 3)`, not normalised, in the sense of the winding.
+        gradients: gradients `(face, 2, 3)` of the barycentric weights of each face's second and third corner.
+        owner: index `(face,)` of the surface that a face belongs to.
+        first_face: index `(surface,)` of each surface's first face.
+    """
+
+    def __init__(self, surfaces: Sequence[ShadedSurface]) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        triangles = np.concatenate([surface.positions[surface.faces] for surface in surfaces])
+        counts = [len(surface.faces) for surface in surfaces]
+        self.owner = np.repeat(np.arange(len(surfaces)), counts)
+        self.first_face = np.concatenate(([0], np.cumsum(counts)[:-1])).astype(np.int64)
+        self._start = triangles[:, 0]
+        edges = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+        self.facets = np.cross(*edges)
+        area = np.sum(self.facets**2, axis=1, keepdims=True)
+        gradients = np.stack((np.cross(edges[1], self.facets), np.cross(self.facets, edges[0])), axis=1)
+        self.gradients = np.divide(gradients, area[..., None], out=np.zeros_like(gradients), where=area[..., None] > 0)
+        self._scene = EmbreeScene(robust=True)
+        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
+
+    def cast(self, origin: Floats, directions: Floats, after: Floats | None = None) -> Hits:
+        """Find the first face on each ray.
+
+        Args:
+            origin: where all rays start `(3,)`.
+            directions: their directions `(ray, 3)`, of any length.
+            after: multiples of the directions `(ray,)` before which nothing counts, or None for 0.
+
+        Returns:
+            The hits, in the order of the rays; rays that meet nothing have none.
+        """
+        starts = np.broadcast_to(origin, directions.shape) if after is None else origin + after[:, None] * directions
+        found = self._scene.run(
+            np.ascontiguousarray(starts, dtype=np.float32), np.ascontiguousarray(directions, dtype=np.float32)
+        )
+        rays = np.flatnonzero(found >= 0)
+        faces = found[rays].astype(np.int64)
+        directions = directions[rays]
+        facets, start = self.facets[faces], self._start[faces]
+        height = np.einsum("ri,ri->r", facets, directions)
+        met = height != 0.0
+        if not met.all():
+            rays, faces, directions = rays[met], faces[met], directions[met]
+            start, height, facets = start[met], height[met], facets[met]
+        distances = np.einsum("ri,ri->r", start - origin, facets) / height
+        points = origin + distances[:, None] * directions
+        corners = np.einsum("rci,ri->rc", self.gradients[faces], points - start)
+        corners = np.clip(np.concatenate((1.0 - corners.sum(axis=1, keepdims=True), corners), axis=1), 0.0, 1.0)
+        return Hits(rays, faces, distances, points, corners)
+
+
+def pixel_rays(pose: Floats, intrinsics: Floats, columns: Floats, rows: Floats) -> Floats:
+    """Rays through points of the image, scaled so that their multiples are depths along the camera's z axis.
+
+    Args:
+        pose: world_from_camera `(4, 4)`, OpenCV axes.
+        intrinsics: pinhole matrix `(3, 3)` in pixels, integer pixel centres.
+        columns: x coordinates `(column,)` in pixels.
+        rows: y coordinates `(row,)` in pixels.
+
+    Returns:
+        Directions `(row x column, 3)` in world axes, rows first.
+    """
+    matrix = pose[:3, :3] @ np.linalg.inv(intrinsics)
+    down = np.asarray(rows, dtype=np.float64)[:, None] * matrix[:, 1] + matrix[:, 2]
+    across = np.asarray(columns, dtype=np.float64)[:, None] * matrix[:, 0]
+    return (down[:, None] + across).reshape(-1, 3)

@@ -1,0 +1,213 @@
+"""Which renderer works on this machine: each is probed by drawing a triangle in a subprocess.
+
+Order: what the caller or the environment names; pyrender on EGL; pyrender on OSMesa; Embree ray casting, which needs
+nothing beyond the installed packages. A library that is missing, a driver that crashes and a driver that draws nothing
+all show in the subprocess, and none of them can crash the calling process.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass
+
+__all__ = [
+    "CHOICE_VARIABLE",
+    "REMEDIES",
+    "RENDERERS",
+    "ProbeResult",
+    "RendererError",
+    "RendererInfo",
+    "find_renderer",
+    "probe",
+    "probe_all",
+]
+
+RENDERERS: tuple[str, ...] = ("pyrender-egl", "pyrender-osmesa", "embree")
+"""Names of the renderers, best first."""
+
+CHOICE_VARIABLE = "HYPERPLANES_RENDERER"
+"""Environment variable by which a user chooses a renderer."""
+
+REMEDIES = {
+    "pyrender-egl": "apt-get install -y libegl1 libgl1",
+    "pyrender-osmesa": "apt-get install -y libosmesa6 && pip install 'PyOpenGL>=3.1.7'",
+    "embree": "pip install embreex",
+}
+"""The command that should make a renderer work on Debian and Ubuntu."""
+
+_FOUND_VARIABLE = "HYPERPLANES_RENDERER_FOUND"
+_PROBE_SECONDS = 90.0
+_OPENGL_PLATFORMS = {"egl": "pyrender-egl", "osmesa": "pyrender-osmesa"}
+
+
+class RendererError(ValueError):
+    """No renderer works, or the one that was named does not."""
+
+
+@dataclass(frozen=True)
+class RendererInfo:
+    """A renderer that works here.
+
+    Attributes:
+        name: one of RENDERERS.
+        detail: what draws, e.g. the OpenGL renderer and version.
+        advice: what could be done to get a better one, one line each; empty when this is the best.
+    """
+
+    name: str
+    detail: str
+    advice: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ProbeResult:
+    """What came of trying one renderer.
+
+    Attributes:
+        name: one of RENDERERS.
+        works: whether it drew the test picture right.
+        seconds: how long the trial took, start of the subprocess included.
+        message: what draws, or what went wrong, one line.
+        remedy: the command that should fix it; empty when it works.
+    """
+
+    name: str
+    works: bool
+    seconds: float
+    message: str
+    remedy: str
+
+
+_cache: dict[str, ProbeResult] = {}
+
+
+def probe(name: str) -> ProbeResult:
+    """Try one renderer in a subprocess; a second call in this process answers from memory.
+
+    Args:
+        name: one of RENDERERS.
+
+    Returns:
+        The outcome. A renderer that does not work is an outcome, not an error.
+
+    Raises:
+        ValueError: if no renderer has that name.
+    """
+    if name not in RENDERERS:
+        raise ValueError(_unknown(name))
+    if name not in _cache:
+        _cache[name] = _run_probe(name)
+    return _cache[name]
+
+
+def probe_all() -> list[ProbeResult]:
+    """Try every renderer, best first, for a report of what works here.
+
+    Returns:
+        One outcome for each of RENDERERS.
+    """
+    return [probe(name) for name in RENDERERS]
+
+
+def find_renderer(prefer: str | None = None) -> RendererInfo:
+    """Find the best renderer that works here.
+
+    The answer is kept for this process and, through an environment variable, for those that it starts. Without
+    `prefer` the environment decides: HYPERPLANES_RENDERER names a renderer, which then must work; PYOPENGL_PLATFORM
+    (egl or osmesa) only puts one in front.
+
+    Args:
+        prefer: one of RENDERERS, which then must work, or None for the best that does.
+
+    Returns:
+        The renderer, with advice when a better one could be had.
+
+    Raises:
+        RendererError: if the renderer named, or every renderer, does not work; the message holds the remedy.
+        ValueError: if no renderer has that name.
+    """
+    chosen = prefer or os.environ.get(CHOICE_VARIABLE) or None
+    if chosen is not None and chosen not in RENDERERS:
+        raise ValueError(_unknown(chosen))
+    known = _found_before()
+    if known is not None and chosen in {None, known.name}:
+        return known
+    if chosen is not None:
+        outcome = probe(chosen)
+        if not outcome.works:
+            raise RendererError(
+                f"renderer {chosen!r}: expected it to draw a triangle, found: {outcome.message}. "
+                f"Remedy: {outcome.remedy}, or choose another of {', '.join(RENDERERS)}"
+            )
+        return _remember(RendererInfo(chosen, outcome.message))
+    names = list(RENDERERS)
+    first = _OPENGL_PLATFORMS.get(os.environ.get("PYOPENGL_PLATFORM", ""))
+    if first is not None:
+        names.remove(first)
+        names.insert(0, first)
+    failures: list[ProbeResult] = []
+    for name in names:
+        outcome = probe(name)
+        if outcome.works:
+            advice = () if name.startswith("pyrender") else tuple(_advice(failure) for failure in failures)
+            return _remember(RendererInfo(name, outcome.message, advice))
+        failures.append(outcome)
+    raise RendererError(
+        f"no renderer works here ({'; '.join(f'{f.name}: {f.message}' for f in failures)}). "
+        f"Remedy: {REMEDIES['pyrender-egl']}, or without root: {REMEDIES['embree']}"
+    )
+
+
+def _unknown(name: str) -> str:
+    return f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}"
+
+
+def _advice(failure: ProbeResult) -> str:
+    return f"{failure.name} does not work here ({failure.message}); to get it: {failure.remedy}"
+
+
+def _found_before() -> RendererInfo | None:
+    """What an earlier call, here or in a parent process, has found."""
+    text = os.environ.get(_FOUND_VARIABLE)
+    if not text:
+        return None
+    try:
+        record = json.loads(text)
+        found = RendererInfo(str(record["name"]), str(record["detail"]), tuple(map(str, record["advice"])))
+    except (ValueError, KeyError, TypeError):
+        return None
+    return found if found.name in RENDERERS else None
+
+
+def _remember(found: RendererInfo) -> RendererInfo:
+    os.environ[_FOUND_VARIABLE] = json.dumps(asdict(found))
+    return found
+
+
+def _run_probe(name: str) -> ProbeResult:
+    environment = {key: value for key, value in os.environ.items() if key != _FOUND_VARIABLE}
+    command = [sys.executable, "-m", "data_gen.rendering.probe_process", name]
+    start = time.monotonic()
+    try:
+        # The package may be imported from a folder that a fresh interpreter does not look in.
+        environment["PYTHONPATH"] = os.pathsep.join(entry for entry in sys.path if entry)
+        done = subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=_PROBE_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        message = f"no picture within {_PROBE_SECONDS:g} s"
+        return ProbeResult(name, False, time.monotonic() - start, message, REMEDIES[name])
+    seconds = time.monotonic() - start
+    lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
+    if done.returncode == 0 and lines:
+        return ProbeResult(name, True, seconds, lines[-1], "")
+    errors = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    if done.returncode < 0:
+        message = f"crashed with signal {-done.returncode}"
+    else:
+        message = errors[-1] if errors else f"exit code {done.returncode}"
+    return ProbeResult(name, False, seconds, message, REMEDIES[name])

@@ -1,0 +1,275 @@
+"""What both renderers draw: triangles in world coordinates, with a small material model.
+
+Colours. Textures, vertex colours, face colours and the Kd of an MTL file are sRGB; a
+glTF `baseColorFactor` and `emissiveFactor` are linear, as glTF specifies. Everything is linear in a ShadedSurface.
+
+Material. Lambertian plus a soft GGX highlight. There is no environment to be mirrored, so metal would be black:
+metalness counts for at most MAX_METALLIC, and is 0 where a file states none. Roughness counts for at least
+MIN_ROUGHNESS, and is DEFAULT_ROUGHNESS where a file states none; a texture of both counts with its mean. Normal and
+occlusion maps are not drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from PIL import Image
+from trimesh.visual import ColorVisuals
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from data_gen.meshes.materials import texture_of, visual_of
+from hyperplanes.colour import linear_from_srgb
+
+__all__ = [
+    "DEFAULT_ROUGHNESS",
+    "MAX_METALLIC",
+    "MAX_TEXTURE_SIDE",
+    "MIN_ROUGHNESS",
+    "RenderError",
+    "ShadedSurface",
+    "shaded_surfaces",
+]
+
+MAX_METALLIC = 0.3
+"""Metalness above this is drawn as this."""
+
+MIN_ROUGHNESS = 0.35
+"""Roughness below this is drawn as this."""
+
+DEFAULT_ROUGHNESS = 0.8
+"""Roughness of a material that has none."""
+
+MAX_TEXTURE_SIDE = 2048
+"""Larger textures are reduced to this many texels a side before they are drawn."""
+
+_DEFAULT_KD = (102, 102, 102, 255)
+_PLAIN = 0.72
+
+Floats = npt.NDArray[np.float64]
+
+
+class RenderError(ValueError):
+    """An object could not be drawn, or nothing of it can be seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShadedSurface:
+    """Triangles of one material, in world axes.
+
+    Attributes:
+        positions: vertices `(vertex, 3)`.
+        faces: vertex indices `(face, 3)`.
+        normals: unit vertex normals `(vertex, 3)`; zero where there is none, which stands for the face's own.
+        uv: texture coordinates `(vertex, 2)`, v upwards, repeating outside [0, 1]; None without textures.
+        colours: linear RGBA `(vertex, 4)` that multiplies the base colour, or None.
+        base_colour: linear RGBA `(4,)`.
+        texture: base colour texture uint8 `(height, width, 4)`, sRGB, first row on top, PREMULTIPLIED so that
+            filtering does not mix in what is transparent; None without.
+        emissive: linear RGB `(3,)` that is added to the reflected light.
+        emissive_texture: like texture, multiplies emissive.
+        roughness: in [MIN_ROUGHNESS, 1].
+        metallic: in [0, MAX_METALLIC].
+        cutoff: alpha below this is transparent, from it on opaque (glTF MASK); None for alpha that blends.
+        opaque: whether all of it hides what is behind.
+        closed: whether it is known to be made of watertight solids wound outwards, of which no inner side is seen.
+    """
+
+    positions: Floats
+    faces: npt.NDArray[np.int64]
+    normals: Floats
+    uv: Floats | None
+    colours: Floats | None
+    base_colour: Floats
+    texture: npt.NDArray[np.uint8] | None
+    emissive: Floats
+    emissive_texture: npt.NDArray[np.uint8] | None
+    roughness: float
+    metallic: float
+    cutoff: float | None
+    opaque: bool
+    closed: bool = False
+
+
+def shaded_surfaces(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: str = "object") -> list[ShadedSurface]:
+    """Bring the parts of an object into the form that the renderers draw.
+
+    Args:
+        parts: meshes, their poses `world_from_mesh` `(4, 4)` (any affine map, mirroring included) and whether each
+            is shaded smoothly. Face colours are drawn flat in any case. A mesh whose `metadata["closed"]` is true
+            is taken for closed.
+        name: what to call the object in errors.
+
+    Returns:
+        One surface a part, in order; parts without faces are left out.
+
+    Raises:
+        RenderError: if a part is no Trimesh, a pose is no finite affine map, a face's vertex is not finite, a
+            texture has no coordinates, a material is of an unknown kind, or no part has a face.
+    """
+    images: dict[Any, npt.NDArray[np.uint8]] = {}
+    surfaces = []
+    for number, (mesh, pose, smooth) in enumerate(parts):
+        where = f"{name}, part {number}"
+        if not isinstance(mesh, trimesh.Trimesh):
+            raise RenderError(f"{where}: expected a trimesh.Trimesh, received {type(mesh).__name__}")
+        if len(mesh.faces):
+            surfaces.append(_surface(mesh, pose, smooth, where, images))
+    if not surfaces:
+        raise RenderError(f"{name}: expected at least one face, received {len(parts)} parts without any")
+    return surfaces
+
+
+def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images: dict[Any, Any]) -> ShadedSurface:
+    matrix = np.asarray(pose, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise RenderError(f"{where}: expected a finite affine pose (4, 4), received {matrix.tolist()}")
+    faces = np.asarray(mesh.faces, dtype=np.int64)
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(vertices).all(axis=1))
+    if not finite[faces].all():
+        bad = int((~finite[faces]).any(axis=1).sum())
+        raise RenderError(f"{where}: expected finite vertices, received {bad} faces on NaN or infinity")
+    positions = np.where(finite[:, None], vertices, 0.0) @ matrix[:3, :3].T + matrix[:3, 3]
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    visual, texture = visual_of(mesh), texture_of(mesh)
+    kind = visual.kind if visual.defined else None
+    material = _material(None if texture is None else texture.material, images, where)
+    uv = _texture_coordinates(mesh, material, where)
+    colours = None
+    if isinstance(visual, ColorVisuals) and kind == "vertex":
+        colours = _linear_colours(visual.vertex_colors)
+    if smooth and kind != "face":
+        normals = _unit(np.asarray(mesh.vertex_normals, dtype=np.float64) @ np.linalg.pinv(matrix[:3, :3]))
+    else:
+        corners = faces.reshape(-1)
+        positions = positions[corners]
+        uv = None if uv is None else uv[corners]
+        colours = None if colours is None else colours[corners]
+        if isinstance(visual, ColorVisuals) and kind == "face":
+            colours = np.repeat(_linear_colours(visual.face_colors), 3, axis=0)
+        faces = np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
+        edges = positions[1::3] - positions[0::3], positions[2::3] - positions[0::3]
+        normals = np.repeat(_unit(np.cross(*edges)), 3, axis=0)
+    if colours is not None:
+        material["base_colour"] = np.ones(4)
+        material["opaque"] = bool((colours[:, 3] >= 1.0).all())
+    closed = bool(mesh.metadata.get("closed")) and material["opaque"] and material["cutoff"] is None
+    return ShadedSurface(
+        positions=positions, faces=faces, normals=normals, uv=uv, colours=colours, closed=closed, **material
+    )
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Vectors of length 1; zero where the input has no direction."""
+    vectors = np.where(np.isfinite(vectors).all(axis=1, keepdims=True), vectors, 0.0)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 1e-12)
+
+
+def _linear_colours(colours: Any) -> Floats:
+    rgba = np.asarray(colours, dtype=np.float64) / 255.0
+    return np.concatenate((linear_from_srgb(rgba[:, :3]), rgba[:, 3:4]), axis=1)
+
+
+def _texture_coordinates(mesh: trimesh.Trimesh, material: dict[str, Any], where: str) -> Floats | None:
+    if material["texture"] is None and material["emissive_texture"] is None:
+        return None
+    texture = texture_of(mesh)
+    given = None if texture is None else texture.uv
+    if given is None or len(given) != len(mesh.vertices):
+        found = "none" if given is None else str(len(given))
+        raise RenderError(
+            f"{where}: expected texture coordinates for its {len(mesh.vertices)} textured vertices, received {found}"
+        )
+    uv = np.asarray(given, dtype=np.float64)[:, :2]
+    return np.where(np.isfinite(uv), uv, 0.0)
+
+
+def _material(material: Any, images: dict[Any, Any], where: str) -> dict[str, Any]:
+    """The fields of a ShadedSurface that come from a trimesh material."""
+    fields: dict[str, Any] = {
+        "base_colour": np.array([_PLAIN, _PLAIN, _PLAIN, 1.0]) if material is None else np.ones(4),
+        "texture": None,
+        "emissive": np.zeros(3),
+        "emissive_texture": None,
+        "roughness": DEFAULT_ROUGHNESS,
+        "metallic": 0.0,
+        "cutoff": None,
+        "opaque": True,
+    }
+    if isinstance(material, PBRMaterial):
+        _fill_from_gltf(fields, material, images)
+    elif isinstance(material, SimpleMaterial):
+        _fill_from_mtl(fields, material, images)
+    elif material is not None:
+        raise RenderError(f"{where}: expected a PBRMaterial or a SimpleMaterial, received {type(material).__name__}")
+    return fields
+
+
+def _fill_from_gltf(fields: dict[str, Any], material: Any, images: dict[Any, Any]) -> None:
+    if material.baseColorFactor is not None:
+        fields["base_colour"] = np.asarray(material.baseColorFactor, dtype=np.float64) / 255.0
+    blends = material.alphaMode in {"BLEND", "MASK"}
+    fields["texture"] = _texels(material.baseColorTexture, images, keep_alpha=blends)
+    if material.emissiveFactor is not None:
+        fields["emissive"] = np.asarray(material.emissiveFactor, dtype=np.float64)[:3]
+        fields["emissive_texture"] = _texels(material.emissiveTexture, images, keep_alpha=False)
+    roughness, metallic = material.roughnessFactor, material.metallicFactor
+    fine = material.metallicRoughnessTexture
+    if fine is not None:
+        mean = np.asarray(fine.convert("RGB"), dtype=np.float64).mean(axis=(0, 1)) / 255.0
+        roughness = mean[1] * (1.0 if roughness is None else roughness)
+        metallic = mean[2] * (1.0 if metallic is None else metallic)
+    if roughness is not None:
+        fields["roughness"] = float(np.clip(roughness, MIN_ROUGHNESS, 1.0))
+    if metallic is not None:
+        fields["metallic"] = float(np.clip(metallic, 0.0, MAX_METALLIC))
+    if material.alphaMode == "MASK":
+        fields["cutoff"] = 0.5 if material.alphaCutoff is None else float(material.alphaCutoff)
+    if material.alphaMode == "BLEND":
+        fields["opaque"] = fields["base_colour"][3] >= 1.0 and _is_opaque(fields["texture"])
+    elif material.alphaMode != "MASK":
+        fields["base_colour"] = np.append(fields["base_colour"][:3], 1.0)
+
+
+def _fill_from_mtl(fields: dict[str, Any], material: Any, images: dict[Any, Any]) -> None:
+    diffuse = np.asarray(material.diffuse, dtype=np.float64)
+    fields["texture"] = _texels(material.image, images, keep_alpha=True)
+    # A texture is written with a Kd of black by some programs, and trimesh fills a Kd in where there is none.
+    unset = tuple(material.diffuse) == _DEFAULT_KD or not diffuse[:3].any()
+    if fields["texture"] is not None and unset:
+        diffuse = np.array([255.0, 255.0, 255.0, diffuse[3]])
+    fields["base_colour"] = np.append(linear_from_srgb(diffuse[:3] / 255.0), diffuse[3] / 255.0)
+    fields["opaque"] = fields["base_colour"][3] >= 1.0 and _is_opaque(fields["texture"])
+
+
+def _is_opaque(texture: npt.NDArray[np.uint8] | None) -> bool:
+    return texture is None or bool((texture[..., 3] == 255).all())
+
+
+def _texels(image: Any, images: dict[Any, Any], *, keep_alpha: bool) -> npt.NDArray[np.uint8] | None:
+    """Premultiplied RGBA of a PIL image; equal images of an object share one array."""
+    if image is None:
+        return None
+    rgba = image.convert("RGBA" if keep_alpha else "RGB").convert("RGBA")
+    if max(rgba.size) > MAX_TEXTURE_SIDE:
+        scale = MAX_TEXTURE_SIDE / max(rgba.size)
+        rgba = _premultiplied(rgba).resize([max(1, round(side * scale)) for side in rgba.size], Image.Resampling.BOX)
+    else:
+        rgba = _premultiplied(rgba)
+    key = (rgba.size, rgba.tobytes())
+    return images.setdefault(key, np.asarray(rgba))
+
+
+def _premultiplied(image: Image.Image) -> Image.Image:
+    texels = np.asarray(image, dtype=np.uint16)
+    if (texels[..., 3] == 255).all():
+        return image
+    colour = (texels[..., :3] * texels[..., 3:] + 127) // 255
+    return Image.fromarray(np.concatenate((colour, texels[..., 3:]), axis=-1).astype(np.uint8))

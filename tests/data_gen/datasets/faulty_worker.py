@@ -1,0 +1,38 @@
+"""What a worker may do to us, on request: a target for `data_gen.datasets.workers` in tests."""
+
+import os
+import signal
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+from hyperplanes.files import DataError
+
+
+@contextmanager
+def serve(settings):
+    if settings.get("broken"):
+        raise RuntimeError("no renderer here")
+    yield lambda item: perform(item, Path(settings["folder"]))
+
+
+def perform(item, folder):
+    print("a library that prints to standard output")
+    kind = item["kind"]
+    if kind == "once":  # fails the first time only
+        marker = folder / "tried"
+        kind = "fine" if marker.exists() else "crash"
+        marker.touch()
+    if kind == "crash":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if kind == "exit":
+        os._exit(3)
+    if kind == "hang":
+        time.sleep(600)
+    if kind == "wrong":
+        raise ValueError("nothing to draw\nin it")
+    if kind == "bug":
+        raise KeyError("colour")
+    if kind == "full":
+        raise DataError("disk is full")
+    return {"name": item["name"], "process": os.getpid()}

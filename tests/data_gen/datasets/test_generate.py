@@ -1,0 +1,316 @@
+"""Source of truth: an uninterrupted run of the same generation, byte for byte; the cameras that were asked for."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from data_gen import SUPERSAMPLE
+from data_gen.datasets import objects
+from data_gen.datasets.generate import PICTURES, GenerationConfig, MeshFolder, Procedural, generate
+from data_gen.datasets.inspect import inspect
+from data_gen.datasets.manifest import verify
+from data_gen.datasets.sources import list_items
+from data_gen.rigs import RIG_PRESETS, fixed, make_rig
+from hyperplanes.data import DataError, Dataset
+from hyperplanes.data.describe import describe
+from hyperplanes.geometry import cameras as camera
+
+SMALL = {"views": 4, "resolution": 16, "workers": 1}
+CARS = Procedural("car", 5, seed=3)
+SPLITS = ("test", "train", "val")
+SCRIPT = """
+from data_gen.datasets.generate import *
+config = GenerationConfig(views=4, resolution=16, workers=1, held_out=2)
+print(generate(Procedural("car", 5, seed=3), {out!r}, config,
+    progress=lambda *state: print(*state, flush=True)))
+"""
+
+
+def tree(folder):
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    out = tmp_path_factory.mktemp("whole") / "cars"
+    report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
+    return out, report
+
+
+def test_a_data_set_is_what_was_asked_for(whole):
+    out, report = whole
+    assert (report.written, report.reused, report.skipped) == (5, 0, [])
+    data = Dataset(out)
+    assert data.names("train") == ["car_00000", "car_00001", "car_00002"]
+    assert data.names("test") == ["car_test_00000", "car_test_00001"]
+    task = data.task("car_00000")
+    rig = fixed(4, 16)
+    assert task.support.images.shape == (2, 3, 16, 16)
+    assert torch.allclose(
+        camera.camera_from_world(task.support.cameras),
+        camera.camera_from_world(rig.cameras(slice(0, None, 2))).float(),
+        atol=1e-6,
+    )
+    assert torch.allclose(camera.intrinsics(task.query.cameras), torch.tensor(rig.intrinsics[1::2]).float(), atol=1e-5)
+    assert (task.support.bounds.centre, task.support.bounds.radius) == ((0.0, 0.0, 0.0), 1.0)
+    assert 0.02 < float(task.support.masks.mean()) < 0.8
+    assert not (out / ".progress").exists()
+
+
+def test_the_manifest_tells_how_it_was_made_and_holds_no_path_of_this_machine(whole):
+    text = (whole[0] / "manifest.json").read_text()
+    manifest = json.loads(text)
+    assert manifest["configuration"]["source"] == {"class_name": "car", "count": 5, "seed": 3}
+    assert manifest["configuration"]["generator"].startswith("hyperplanes")
+    assert manifest["renderer"]
+    assert manifest["skipped"] == []
+    assert str(whole[0].parent) not in text
+    assert manifest["objects"]["car_00000"]["files"].keys() == {
+        "car_00000/transforms.json",
+        *(f"car_00000/images/{index:03d}.png" for index in range(4)),
+    }
+
+
+def test_verify_finds_what_is_missing_and_what_has_changed(whole, tmp_path):
+    out = tmp_path / "copy"
+    subprocess.run(["cp", "-r", whole[0], out], check=True)
+    assert verify(out).intact
+    assert verify(out).files == 25
+    (out / "car_00000/images/000.png").unlink()
+    (out / "car_00001/images/001.png").write_bytes(b"other")
+    found = verify(out)
+    assert found.missing == ["car_00000/images/000.png"]
+    assert found.changed == ["car_00001/images/001.png"]
+    lines = inspect(out, tmp_path / "pictures", 1, checksums=True).lines()
+    assert "checksums: car_00000/images/000.png is missing" in lines
+    assert "checksums: car_00001/images/001.png has changed since it was written" in lines
+    report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
+    assert (report.written, report.reused) == (5, 4), "what is missing is made again"
+
+
+@pytest.mark.parametrize(("ending", "after"), [(signal.SIGKILL, 1), (signal.SIGINT, 2)])
+def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whole, tmp_path, ending, after):
+    out = tmp_path / "cars"
+    root = str(Path(objects.__file__).parents[2])
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT.format(out=str(out))],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": root},
+    )
+    for _ in range(after):
+        process.stdout.readline()
+    process.send_signal(ending)
+    process.stdout.close()
+    process.wait()
+    assert not (out / "manifest.json").exists(), "the end of the run was not awaited"
+    unfinished = out / ".progress/unfinished/.junk.part"
+    unfinished.write_bytes(b"half a file")
+    report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
+    assert report.written == 5
+    assert report.reused >= after
+    assert tree(out) == tree(whole[0])
+
+
+def test_the_number_of_workers_changes_nothing(whole, tmp_path):
+    generate(CARS, tmp_path / "cars", GenerationConfig(held_out=2, views=4, resolution=16, workers=2, recycle=2))
+    assert tree(tmp_path / "cars") == tree(whole[0])
+
+
+def test_another_configuration_in_the_same_folder_is_refused(whole):
+    with pytest.raises(DataError, match=r"cars: expected the data set it holds \(views 4\), found a request for"):
+        generate(CARS, whole[0], GenerationConfig(held_out=2, views=6, resolution=16))
+
+
+def test_a_folder_with_other_things_in_it_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(DataError, match=r"found thesis\.tex; name another one"):
+        generate(CARS, tmp_path, GenerationConfig(**SMALL))
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="found a file"):
+        generate(CARS, tmp_path / "file", GenerationConfig(**SMALL))
+
+
+def test_two_generations_do_not_write_into_one_folder(tmp_path):
+    import fcntl
+
+    (tmp_path / ".progress").mkdir()
+    with open(tmp_path / ".progress/lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(DataError, match="found another generation at work"):
+            generate(CARS, tmp_path, GenerationConfig(**SMALL))
+
+
+def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    trimesh.creation.box().export(meshes / "box.ply")
+    trimesh.creation.icosphere(subdivisions=1).export(meshes / "ball.obj")
+    (meshes / "broken.glb").write_bytes(b"glTF but not really")
+    (meshes / "empty.obj").write_text("")
+    report = generate(MeshFolder(meshes), tmp_path / "out", GenerationConfig(held_out=0, **SMALL))
+    assert report.written == 2
+    assert [name for name, _ in report.skipped] == ["broken", "empty"]
+    assert all(reason.startswith(f"{name}.") for name, reason in report.skipped), "no path of this machine"
+    manifest = json.loads((tmp_path / "out/manifest.json").read_text())
+    assert [(entry["name"], entry["reason"]) for entry in manifest["skipped"]] == report.skipped
+    assert Dataset(tmp_path / "out").names() == ["ball", "box"]
+
+
+def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypatch):
+    """A worker whose files may not grow beyond 1 kB stands for a disk that is full."""
+    monkeypatch.setattr("data_gen.datasets.generate.TARGET", "limited_worker:open_renderer")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    with pytest.raises(DataError, match=r"expected room to write \d+ bytes, found .*; ") as caught:
+        generate(CARS, tmp_path / "out", GenerationConfig(held_out=2, views=4, resolution=64, workers=1))
+    assert "\n" not in str(caught.value)
+    assert not list((tmp_path / "out").rglob("*.part"))
+    assert not (tmp_path / "out/manifest.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"rig": "circle"}, "rig: expected one of fixed, random, hemisphere, orbit, .*, got 'circle'"),
+        ({"layout": "tar"}, "layout: expected one of native, .*, got 'tar'"),
+        ({"engine": "slurm"}, "engine: expected one of local, ray, got 'slurm'"),
+        ({"channels": ("depth",)}, "channels: expected rgba and any of"),
+        ({"channels": ("rgba", "depth"), "layout": "srn"}, "channels: expected rgba alone in the srn layout"),
+        ({"layout": "hyperplanes-200", "resolution": 64}, "resolution: the hyperplanes-200 layout's loaders take 200"),
+        ({"resolution": 100_000}, "resolution: expected at most 16,384 samples along a side, got 100,000 pixels of 3"),
+        ({"resolution": 5000}, "resolution: expected at most 4 GiB of pictures an object, got 4.7 GiB"),
+        ({"views": 10**9}, "views: expected at most 10,000 an object, got 1,000,000,000"),
+        ({"views": 0}, "views: expected at least 1, received 0"),
+        ({"held_out": 9}, "held_out: expected a fraction below 1 or a count up to 5, got 9"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_named(tmp_path, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        generate(CARS, tmp_path / "out", GenerationConfig(**arguments))
+    assert not (tmp_path / "out").exists()
+
+
+def test_data_sets_of_one_seed_share_objects_and_never_mix_training_and_held_out():
+    small = {item.name: item.seed for item in list_items(Procedural("car", 20, 1), 5)}
+    large = {item.name: item.seed for item in list_items(Procedural("car", 100, 1), 10)}
+    assert small.items() <= large.items()
+    assert len(set(large.values())) == len(large)
+
+
+def test_mesh_files_are_split_by_name_four_to_one(tmp_path):
+    for index in range(10):
+        trimesh.creation.box().export(tmp_path / f"mesh{index}.ply")
+    splits = [item.split for item in list_items(MeshFolder(tmp_path), None)]
+    assert splits == ["train"] * 8 + ["test"] * 2
+
+
+def test_random_rigs_differ_between_objects_and_agree_between_runs():
+    config = GenerationConfig(rig="random", views=3, resolution=8, seed=5).resolve()
+    first, again, other = (config.make_rig(name).world_from_camera for name in ("a", "a", "b"))
+    assert np.array_equal(first, again)
+    assert not np.allclose(first, other)
+
+
+def test_progress_is_told(tmp_path):
+    told = []
+    generate(Procedural("car", 2), tmp_path, GenerationConfig(**SMALL), progress=lambda *state: told.append(state))
+    assert [state[:2] for state in told] == [(1, 2), (2, 2)]
+
+
+def test_the_manifest_names_the_version_that_made_it(whole):
+    manifest = json.loads((whole[0] / "manifest.json").read_text())
+    assert manifest["configuration"]["generator"] == f"hyperplanes {version('hyperplanes')}, pictures {PICTURES}"
+    assert manifest["configuration"]["supersample"] == SUPERSAMPLE
+
+
+def test_files_that_have_changed_are_made_again_when_asked(tmp_path, whole):
+    out = tmp_path / "cars"
+    generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
+    for name in ("car_00001/images/002.png", "car_test_00000/transforms.json"):
+        (out / name).write_bytes(b"worm")
+    assert generate(CARS, out, GenerationConfig(held_out=2, **SMALL)).reused == 5
+    assert not verify(out).intact
+    assert generate(CARS, out, GenerationConfig(held_out=2, verify=True, **SMALL)).reused == 3
+    assert tree(out) == tree(whole[0])
+
+
+def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
+    car = Procedural("car", 1, seed=3)
+    generate(car, tmp_path / "200", GenerationConfig(rig="paper-200", resolution=8, held_out=0, workers=1))
+    task = Dataset(tmp_path / "200").task("car_00000")
+    expected = make_rig("paper-200", 50, 8)
+    assert len(task.support) + len(task.query) == len(expected) == 50
+    poses = camera.camera_from_world(expected.cameras(slice(0, None, 2))).float()
+    assert torch.allclose(camera.camera_from_world(task.support.cameras), poses, atol=1e-6)
+
+    generate(car, tmp_path / "128", GenerationConfig(rig="paper-128", views=2, held_out=0, workers=1))
+    support = Dataset(tmp_path / "128").task("car_00000").support
+    expected = make_rig("paper-128", 2, 128, distance=4.0, field_of_view=RIG_PRESETS["paper-128"].field_of_view)
+    assert support.size == (128, 128)
+    assert torch.allclose(camera.intrinsics(support.cameras)[0], torch.tensor(expected.intrinsics[0]).float())
+    assert float(camera.centres(support.cameras).norm(dim=-1)) == pytest.approx(4.0, abs=1e-5)
+    manifest = json.loads((tmp_path / "128" / "manifest.json").read_text())
+    assert (manifest["near"], manifest["far"]) == (3.0, 5.0)
+    with pytest.raises(ValueError, match="rig: expected one of .*paper-200, got 'paper-64'"):
+        generate(car, tmp_path / "64", GenerationConfig(rig="paper-64"))
+
+
+def test_a_class_that_the_split_file_leaves_out_whole_is_trained_on_and_named(tmp_path):
+    for synset, name in (("02958343", "a"), ("03001627", "x"), ("03001627", "y")):
+        path = tmp_path / "tree" / synset / name / "model.obj"
+        path.parent.mkdir(parents=True)
+        trimesh.creation.box().export(path)
+    official = tmp_path / "tree" / "all.csv"
+    official.write_text("id,synsetId,subSynsetId,modelId,split\n0,02958343,02958343,a,test")
+    items = list_items(MeshFolder(tmp_path / "tree"), None)
+    assert [(item.name, item.split, item.unlisted) for item in items] == [
+        ("chair_x", "train", True),
+        ("chair_y", "train", True),
+        ("car_a", "test", False),
+    ]
+    assert not any(item.unlisted for item in list_items(MeshFolder(tmp_path / "tree"), 1))
+
+
+def test_an_official_split_file_decides(tmp_path):
+    tree_of_cars = tmp_path / "ShapeNetCore.v1"
+    for name in "abcd":
+        path = tree_of_cars / "02958343" / name / "model.obj"
+        path.parent.mkdir(parents=True)
+        trimesh.creation.box().export(path)
+    official = tmp_path / "all.csv"
+    rows = [f"{i},02958343,02958343,{name},{split}" for i, (name, split) in enumerate(zip("abc", SPLITS, strict=True))]
+    official.write_text("\n".join(["id,synsetId,subSynsetId,modelId,split", *rows]))
+    items = list_items(MeshFolder(tree_of_cars, split_file=official), None)
+    assert [(item.name, item.split) for item in items] == [
+        ("car_b", "train"),
+        ("car_d", "train"),  # not listed
+        ("car_c", "val"),
+        ("car_a", "test"),
+    ]
+    assert [item.name for item in items if item.unlisted] == ["car_d"]
+    out = tmp_path / "out"
+    report = generate(MeshFolder(tree_of_cars, split_file=official), out, GenerationConfig(**SMALL))
+    assert report.unlisted == ["car_d"]
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["not_in_split_file"] == {"count": 1, "split": "train", "names": ["car_d"]}
+    assert manifest["splits"]["train"] == ["car_b", "car_d"]
+    assert "not in the split file, so trained on: 1, named in the manifest" in describe(out, 1).lines()
+    with pytest.raises(ValueError, match="held_out: expected none, for .*all.csv decides, got 0.5"):
+        list_items(MeshFolder(tree_of_cars, split_file=official), 0.5)
+    official.write_text("id,synsetId,subSynsetId,modelId,split\n0,03001627,03001627,a,test")
+    with pytest.raises(ValueError, match="all.csv: expected models of .*, found none of them"):
+        list_items(MeshFolder(tree_of_cars, split_file=official), None)

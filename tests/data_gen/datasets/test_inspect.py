@@ -1,0 +1,94 @@
+"""Source of truth: a ball drawn in closed form, written as it should be and with poses mistaken for others."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_gen.datasets.inspect import inspect
+from hyperplanes.data import DataError
+from hyperplanes.geometry import cameras as camera
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+CENTRE, RADIUS, SIZE, ANGLE = np.array([0.2, 0.1, 0.0]), 0.5, 32, 0.8
+
+
+def write(folder, change=lambda pose: pose, alpha=True):
+    """Views of a ball; `change` gets each OpenGL camera-to-world pose and returns what is written."""
+    (folder / "images").mkdir(parents=True)
+    focal = SIZE / 2 / math.tan(ANGLE / 2)
+    rows, columns = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
+    rays = np.stack([columns / focal, rows / focal, np.ones_like(rows)], -1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    frames = []
+    for index, pose in enumerate(camera.fibonacci_sphere(12, 3.0, lowest=-0.5).double().numpy()):
+        to_centre = pose[:3, :3] @ CENTRE + pose[:3, 3]
+        hit = (rays @ to_centre) ** 2 - to_centre @ to_centre + RADIUS**2 > 0
+        picture = np.where(hit[..., None], np.array([200, 50, 50, 255]), 0).astype(np.uint8)
+        name = f"images/{index:02d}.png"
+        Image.fromarray(picture if alpha else picture[..., :3]).save(folder / name)
+        frames.append({"file_path": name, "transform_matrix": change(np.linalg.inv(pose) @ FLIP).tolist()})
+    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": ANGLE, "frames": frames}))
+    return folder
+
+
+def test_a_right_data_set_is_described_and_drawn(tmp_path):
+    found = inspect(write(tmp_path / "ball"), tmp_path / "out")
+    (one,) = found.description.objects
+    assert (one.name, one.support, one.query, one.size) == ("ball", 6, 6, (SIZE, SIZE))
+    assert one.field_of_view == pytest.approx(math.degrees(ANGLE), rel=1e-5)
+    assert one.distance == (pytest.approx(3.0, abs=0.35), pytest.approx(3.0, abs=0.35))
+    assert np.allclose(one.extent, 2 * RADIUS, atol=0.35), "the hull is the ball, voxels and pixels rounded up"
+    assert one.conventions.consistent
+    assert one.conventions.scores["as declared"] > 0.5
+    assert not found.has_problems
+    sheet = np.array(Image.open(found.files[0]))
+    assert sheet.shape[1] > 6 * SIZE
+    assert [path.name for path in found.files] == ["contact_sheet.png", "cameras.png"]
+    text = "\n".join(found.lines())
+    assert "objects: 1 (1 test)" in text
+    assert "conventions: masks agree with the poses" in text
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (lambda pose: pose @ FLIP, "in OpenCV axes (y down, z forward), not OpenGL's"),
+        (np.linalg.inv, "camera-from-world in OpenGL axes, not its inverse"),
+        (lambda pose: np.linalg.inv(pose @ FLIP), "camera-from-world in OpenCV axes, not OpenGL camera-to-world"),
+    ],
+)
+def test_poses_that_are_mistaken_are_recognised_and_named(tmp_path, change, name):
+    found = inspect(write(tmp_path / "ball", change), tmp_path / "out")
+    assert found.has_problems
+    assert found.description.objects[0].conventions.best == name
+    assert f"if the poses are {name}" in "\n".join(found.lines())
+
+
+def test_without_masks_it_says_that_nothing_was_checked(tmp_path):
+    found = inspect(write(tmp_path / "ball", alpha=False), tmp_path / "out")
+    assert not found.has_problems
+    assert "conventions: not checked, the images have no masks" in found.lines()
+
+
+def test_an_object_that_cannot_be_read_is_listed_and_the_rest_is_looked_at(tmp_path):
+    for name in ("a", "b"):
+        write(tmp_path / "set" / name)
+    (tmp_path / "set/a/images/03.png").write_bytes(b"")
+    found = inspect(tmp_path / "set", tmp_path / "out")
+    assert [one.name for one in found.description.objects] == ["b"]
+    assert found.description.broken[0][0] == "a"
+    assert found.has_problems
+    with pytest.raises(DataError):
+        inspect(tmp_path / "nothing", tmp_path / "out")
+
+
+def test_without_matplotlib_the_rest_is_still_done(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    found = inspect(write(tmp_path / "ball"), tmp_path / "out")
+    assert [path.name for path in found.files] == ["contact_sheet.png"]
+    assert found.notes == ("cameras.png: not drawn, matplotlib is not installed; pip install matplotlib",)

@@ -1,0 +1,328 @@
+"""Source of truth: files written byte by byte (mesh_writers.py), whose geometry and colours are known."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pytest
+import trimesh
+from mesh_writers import (
+    OBJ_FACES,
+    OBJ_SOLID,
+    SQUARE_UV,
+    TETRAHEDRON,
+    TETRAHEDRON_FACES,
+    dae_text,
+    glb_bytes,
+    gltf,
+    off_text,
+    picture,
+    ply_bytes,
+    stl_bytes,
+    write_glb,
+    write_gltf,
+    write_obj,
+)
+
+from data_gen.meshes.find import find_meshes, safe_name
+from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts, prepare_scene
+
+SHARED = Path(__file__).parents[2] / ".." / "shared" / "meshes"
+
+# Bounding box of the tetrahedron: the unit cube; its centre (.5, .5, .5), and all four vertices sqrt(3)/2 from it.
+RADIUS = np.sqrt(3) / 2
+
+
+def write_any(folder, kind):
+    path = folder / f"mesh.{kind}"
+    if kind == "glb":
+        path.write_bytes(glb_bytes(*gltf()))
+    elif kind == "gltf":
+        return write_gltf(folder)
+    elif kind == "obj":
+        return write_obj(folder, mtl="newmtl paint\nKd 1 0 0\n")
+    elif kind in ("ply", "stl"):
+        path.write_bytes({"ply": ply_bytes, "stl": stl_bytes}[kind]())
+    else:
+        path.write_text(off_text() if kind == "off" else dae_text())
+    return path
+
+
+def corners(mesh):
+    """Corners of all faces in the world, in the order of the file."""
+    return np.concatenate([part.vertices[part.faces] for part, _, _ in mesh_parts(mesh)])
+
+
+def colour(part):
+    """The base colour of a part, linear RGBA from 0 to 255."""
+    return np.asarray(part.visual.material.baseColorFactor).tolist()
+
+
+@pytest.mark.parametrize("kind", ["glb", "gltf", "obj", "ply", "stl", "off", "dae"])
+def test_each_format_gives_the_same_normalised_solid(tmp_path, kind):
+    mesh = load_mesh(write_any(tmp_path, kind))
+    expected = (TETRAHEDRON[TETRAHEDRON_FACES] - 0.5) / RADIUS
+    assert mesh.warnings == ()
+    assert mesh.name == "mesh"
+    assert mesh.face_count == 4
+    assert np.allclose(corners(mesh), expected, atol=1e-6)
+    assert np.isclose(np.linalg.norm(corners(mesh), axis=-1).max(), 1.0)
+
+
+def test_both_encodings_of_ply_and_stl_agree(tmp_path):
+    for kind, writer in (("ply", ply_bytes), ("stl", stl_bytes)):
+        (tmp_path / f"a.{kind}").write_bytes(writer(binary=True))
+        (tmp_path / f"b.{kind}").write_bytes(writer(binary=False))
+        first, second = load_mesh(tmp_path / f"a.{kind}"), load_mesh(tmp_path / f"b.{kind}")
+        assert first.warnings == second.warnings == ()
+        assert np.allclose(corners(first), corners(second))
+
+
+def test_the_normalising_transform_is_recorded(tmp_path):
+    moved = TETRAHEDRON * 250 + np.array([1e4, -3.0, 7.0], dtype=np.float32)
+    mesh = load_mesh(write_glb(tmp_path / "a.glb", positions=moved))
+    again = trimesh.transform_points(moved[TETRAHEDRON_FACES].reshape(-1, 3), mesh.world_from_file)
+    assert np.allclose(again, corners(mesh).reshape(-1, 3), atol=1e-6)
+    linear = mesh.world_from_file[:3, :3] * 250 * RADIUS
+    assert np.allclose(linear @ linear.T, np.eye(3), atol=1e-6)
+
+
+def test_z_up_is_turned_to_y_up(tmp_path):
+    tall = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 9]], dtype=np.float32)
+    path = write_glb(tmp_path / "a.glb", positions=tall)
+    upright = load_mesh(path, up="z")
+    assert np.argmax(np.ptp(corners(load_mesh(path)).reshape(-1, 3), axis=0)) == 2
+    assert np.argmax(np.ptp(corners(upright).reshape(-1, 3), axis=0)) == 1
+    assert np.linalg.det(upright.world_from_file[:3, :3]) > 0
+    turned = upright.world_from_file[:3, :3] @ [0, 0, 1]
+    assert turned[1] > 0
+    assert np.allclose(turned[[0, 2]], 0)
+    with pytest.raises(ValueError, match="up: expected 'y' or 'z', received 'x'"):
+        load_mesh(path, up="x")
+
+
+def test_the_cube_fit_makes_the_longest_side_2(tmp_path):
+    long = TETRAHEDRON * np.array([6, 1, 2], dtype=np.float32)
+    mesh = load_mesh(write_glb(tmp_path / "a.glb", positions=long), fit="cube")
+    points = corners(mesh).reshape(-1, 3)
+    assert np.allclose(points.max(axis=0), [1, 1 / 6, 1 / 3], atol=1e-6)
+    assert np.allclose(points.min(axis=0), [-1, -1 / 6, -1 / 3], atol=1e-6)
+    with pytest.raises(ValueError, match="fit: expected"):
+        load_mesh(tmp_path / "a.glb", fit="box")
+
+
+def test_node_transforms_and_instances_are_baked(tmp_path):
+    nodes = [{"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0], "scale": [2, 2, 2]}]
+    mesh = load_mesh(write_glb(tmp_path / "a.glb", nodes=nodes))
+    parts = sorted(mesh_parts(mesh), key=lambda part: part[0].scale)
+    assert [len(part.faces) for part, _, _ in parts] == [4, 4]
+    assert all(np.array_equal(pose, np.eye(4)) for _, pose, _ in parts)
+    in_file = trimesh.transform_points(parts[1][0].vertices, np.linalg.inv(mesh.world_from_file))
+    assert np.allclose(in_file, TETRAHEDRON * 2 + [3, 0, 0], atol=1e-5)
+
+
+def test_normals_follow_a_stretching_transform(tmp_path):
+    # A plane x + y = const stretched by 4 along x has the normal (1/4, 1, 0).
+    points = [[1, 0, 0], [0, 1, 0], [0, 1, 1], [1, 0, 1]]
+    normal = np.array([[np.sqrt(0.5), np.sqrt(0.5), 0]] * 4)
+    nodes = [{"mesh": 0, "scale": [4, 1, 1]}]
+    path = write_glb(tmp_path / "a.glb", positions=points, faces=[[0, 1, 2], [0, 2, 3]], normals=normal, nodes=nodes)
+    part, _, smooth = mesh_parts(load_mesh(path))[0]
+    assert smooth
+    assert np.allclose(part.vertex_normals, np.array([0.25, 1, 0]) / np.hypot(0.25, 1), atol=1e-6)
+
+
+def test_obj_colours_are_made_linear_and_a_texture_takes_their_place(tmp_path):
+    # sRGB 188 / 255 is linear 128 / 255.
+    plain = load_mesh(write_obj(tmp_path, mtl="newmtl paint\nKd 0.737255 0 1\n"))
+    assert colour(mesh_parts(plain)[0][0]) == [128, 0, 255, 255]
+    path = write_obj(tmp_path, mtl="newmtl paint\nKd 0 0 0\nmap_Kd wood.png\n", texture=picture(colour=(9, 8, 7)))
+    part = mesh_parts(load_mesh(path))[0][0]
+    assert colour(part) == [255] * 4
+    assert part.visual.material.baseColorTexture.getpixel((0, 0)) == (9, 8, 7)
+    assert np.allclose(part.visual.uv[part.faces[3]], [[1, 0], [0, 1], [1, 1]])
+
+
+def test_obj_polygons_relative_indices_tabs_and_several_libraries(tmp_path):
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    (tmp_path / "b c.mtl").write_text("newmtl blue\nKd 0 0 1\nd 0.5\n")
+    body = (
+        "mtllib a.mtl\nmtllib b c.mtl\n# a square and a pentagon\n"
+        "v 0 0 0 # a corner\nv 1 0 0\nv 1 1 0\nv 0 1 0\nusemtl red\nf\t-4 -3 -2 -1\n"
+        "v 0 0 1\nv 1 0 1\nv 2 1 1\nv 1 2 1\nv 0 1 1\nusemtl blue\n  f 5 6 \\\n 7 8 9\r\n"
+    )
+    mesh = load_mesh(write_obj(tmp_path, body=body))
+    assert mesh.warnings == ()
+    (red, _, _), (blue, _, _) = mesh_parts(mesh)
+    assert (len(red.faces), len(blue.faces)) == (2, 3)
+    assert colour(red) == [255, 0, 0, 255]
+    assert colour(blue) == [0, 0, 255, 128]
+
+
+def test_obj_smoothing_groups_count_where_there_are_no_normals(tmp_path):
+    solid = OBJ_SOLID + "{}\n" + OBJ_FACES
+    smooth = [mesh_parts(load_mesh(write_obj(tmp_path, body=solid.format(line))))[0][2] for line in ("s 1", "s off")]
+    assert smooth == [True, False]
+
+
+def test_without_normals_round_things_are_smooth_and_hard_things_flat():
+    shapes = {"ball": trimesh.creation.icosphere(subdivisions=3), "box": trimesh.creation.box()}
+    smooth = {name: mesh_parts(prepare_scene(trimesh.Scene(shape), name))[0][2] for name, shape in shapes.items()}
+    assert smooth == {"ball": True, "box": False}
+
+
+def test_vertex_colours_stay_srgb(tmp_path):
+    seen = np.array([[255, 0, 0, 255], [0, 128, 0, 255], [0, 0, 64, 255], [7, 7, 7, 255]], dtype=np.uint8)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(colours=seen))
+    (tmp_path / "a.off").write_text(off_text(head="COFF", vertex_tail=" 0.5 0 1 1"))
+    ply, off = (mesh_parts(load_mesh(tmp_path / name))[0] for name in ("a.ply", "a.off"))
+    assert np.array_equal(ply[0].visual.vertex_colors, seen)
+    assert np.array_equal(off[0].visual.vertex_colors, [[128, 0, 255, 255]] * 4)
+    obj = write_obj(tmp_path, body="v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 0 0 1\nf 1 2 3\n")
+    part = mesh_parts(load_mesh(obj))[0][0]
+    assert np.array_equal(part.visual.vertex_colors[:, :3], [[255, 0, 0], [255, 0, 0], [0, 0, 255]])
+
+
+def test_gltf_vertex_colours_are_linear_and_tinted_by_the_material(tmp_path):
+    # 0.5 linear (128) is 188 in sRGB.
+    painted = np.array([[0.50196, 0.50196, 1, 1]] * 4)
+    material = {"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 1, 1]}}
+    mesh = load_mesh(write_glb(tmp_path / "a.glb", colours=painted, material=material))
+    part = mesh_parts(mesh)[0][0]
+    assert mesh.warnings == ()
+    assert np.array_equal(part.visual.vertex_colors, [[188, 0, 255, 255]] * 4)
+
+
+def test_colours_of_ply_faces_are_kept(tmp_path):
+    head, _, _ = ply_bytes(binary=False).partition(b"end_header")
+    head += b"".join(b"property uchar " + name + b"\n" for name in (b"red", b"green", b"blue")) + b"end_header\n"
+    points = "".join(" ".join(str(float(value)) for value in point) + "\n" for point in TETRAHEDRON)
+    faces = "".join(f"3 {a} {b} {c} {10 * a} {10 * b} {10 * c}\n" for a, b, c in TETRAHEDRON_FACES)
+    (tmp_path / "a.ply").write_bytes(head + (points + faces).encode())
+    part, _, smooth = mesh_parts(load_mesh(tmp_path / "a.ply"))[0]
+    assert not smooth
+    assert np.array_equal(part.visual.face_colors[:, :3], 10 * TETRAHEDRON_FACES)
+
+
+def test_a_prepared_scene_survives_its_own_export(tmp_path):
+    painted = np.array([[0.50196, 0.25, 1, 1]] * 4)
+    mesh = load_mesh(
+        write_glb(tmp_path / "a.glb", colours=painted, nodes=[{"mesh": 0}, {"mesh": 0, "scale": [-2, 2, 2]}])
+    )
+    mesh.scene.export(tmp_path / "b.glb")
+    again = load_mesh(tmp_path / "b.glb")
+    assert again.warnings == ()
+    assert np.allclose(again.world_from_file, np.eye(4), atol=1e-6)
+    before, after = (
+        sorted((part for part, _, _ in mesh_parts(each)), key=lambda part: part.scale) for each in (mesh, again)
+    )
+    for first, second in zip(before, after, strict=True):
+        assert np.allclose(first.vertices[first.faces], second.vertices[second.faces], atol=1e-6)
+        assert np.array_equal(first.visual.vertex_colors, second.visual.vertex_colors)
+
+
+def test_face_colours_are_shaded_flat(tmp_path):
+    tails = (" 255 0 0", " 0 255 0", " 0 0 255", " 9 9 9")
+    (tmp_path / "a.off").write_text(off_text(face_tails=tails))
+    part, _, smooth = mesh_parts(load_mesh(tmp_path / "a.off"))[0]
+    assert not smooth
+    assert np.array_equal(part.visual.face_colors[:, :3], [[255, 0, 0], [0, 255, 0], [0, 0, 255], [9, 9, 9]])
+
+
+def test_gltf_materials_keep_their_factors_textures_and_alpha_mode(tmp_path):
+    material = {
+        "alphaMode": "MASK",
+        "alphaCutoff": 0.25,
+        "doubleSided": True,
+        "emissiveFactor": [0, 0.5, 0],
+        "pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1], "metallicFactor": 0.25, "roughnessFactor": 0.75},
+    }
+    image = picture("RGBA", colour=(1, 2, 3, 200))
+    mesh = load_mesh(write_glb(tmp_path / "a.glb", uv=SQUARE_UV, material=material, image=image))
+    kept = mesh_parts(mesh)[0][0].visual.material
+    assert mesh.warnings == ()
+    assert (kept.alphaMode, kept.alphaCutoff, kept.doubleSided) == ("MASK", 0.25, True)
+    assert (kept.metallicFactor, kept.roughnessFactor) == (0.25, 0.75)
+    assert np.allclose(kept.emissiveFactor, [0, 0.5, 0])
+    assert kept.baseColorTexture.getpixel((0, 0)) == (1, 2, 3, 200)
+
+
+def test_collada_turns_as_it_declares_and_finds_its_texture(tmp_path):
+    path = tmp_path / "a.dae"
+    path.write_text(dae_text(up="Z_UP"))
+    mesh = load_mesh(path)
+    assert mesh.warnings == ()
+    assert np.allclose(mesh.world_from_file[:3, :3] @ [0, 0, 1] * RADIUS, [0, 1, 0])
+    # Its 0.5 is sRGB 128, linear 55.
+    assert colour(mesh_parts(mesh)[0][0]) == [255, 55, 0, 255]
+
+
+def test_a_prepared_scene_leaves_the_given_one_alone():
+    box = trimesh.creation.box(extents=(4, 4, 4))
+    box.visual = trimesh.visual.TextureVisuals(
+        material=trimesh.visual.material.PBRMaterial(baseColorFactor=[10, 20, 30, 255], metallicFactor=0.0)
+    )
+    scene = trimesh.Scene(box)
+    mesh = prepare_scene(scene, "box")
+    assert np.allclose(box.extents, 4)
+    assert np.allclose(mesh.scene.extents, 2 / np.sqrt(3))
+    assert colour(mesh_parts(mesh)[0][0]) == [10, 20, 30, 255]
+    assert mesh.world_from_file[0, 0] == pytest.approx(1 / np.sqrt(12))
+
+
+def test_loading_twice_gives_the_same_bytes(tmp_path):
+    path = write_glb(tmp_path / "a.glb", nodes=[{"mesh": 0}, {"mesh": 0, "translation": [2, 0, 0]}])
+    first, second = load_mesh(path), load_mesh(path)
+    assert corners(first).tobytes() == corners(second).tobytes()
+    assert first.world_from_file.tobytes() == second.world_from_file.tobytes()
+
+
+def test_find_meshes_names_are_unique_sorted_and_safe(tmp_path):
+    for name in ("b/Stuhl Nr. 1.glb", "B/stuhl nr. 1.obj", "a.ply", "a.stl", ".hidden.glb", "notes.txt", "日本.off"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("x")
+    found = find_meshes(tmp_path)
+    names = [mesh.name for mesh in found]
+    assert names == sorted(names)
+    assert sorted(names) == ["B_stuhl_nr._1", "a", "a_2", "b_Stuhl_Nr._1_2", "mesh"]
+    assert {mesh.class_name for mesh in found} == {None}
+    for folder in (tmp_path / "absent", tmp_path / "a.ply", tmp_path / "empty"):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        with pytest.raises(MeshError, match="expected"):
+            find_meshes(folder)
+
+
+def test_safe_names_are_never_empty_or_long():
+    assert safe_name("../../etc/passwd") == "etc_passwd"
+    assert safe_name("椅子") == "mesh"
+    assert len(safe_name("x" * 500)) == 100
+
+
+def test_importing_the_package_loads_no_mesh_library():
+    code = "import sys, data_gen; sys.exit(int(bool({'trimesh', 'PIL', 'pyrender', 'torch'} & set(sys.modules))))"
+    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[2]).returncode == 0
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the real meshes of ../shared/meshes are not here")
+def test_all_real_meshes_load_with_their_losses_named():
+    outcomes = {}
+    for file in find_meshes(SHARED):
+        try:
+            mesh = load_mesh(file.path, name=file.name)
+        except MeshError as error:
+            outcomes[file.name] = str(error)
+            continue
+        assert np.isclose(np.linalg.norm(corners(mesh), axis=-1).max(), 1.0)
+        for part, _, _ in mesh_parts(mesh):
+            assert isinstance(part.visual, trimesh.visual.ColorVisuals) or isinstance(
+                part.visual.material.baseColorTexture, PIL.Image.Image | None
+            )
+        if "messy" in file.name:
+            outcomes[file.name] = "; ".join(mesh.warnings)
+    assert len(outcomes) == 4
+    assert "export it without Draco" in outcomes["messy_pmndrs_hatchback_draco"]
+    assert "wheels_01.png (not found)" in outcomes["messy_gazebo_ambulance_model_uri_ambulance"]
+    assert "Textures/colormap.png (not found)" in outcomes["messy_kenney_truck_missing_texture"]
+    assert outcomes["messy_teapot_quads_no_mtl"] == ""

@@ -1,0 +1,415 @@
+"""Pictures of known shapes against closed forms, for every renderer that works here, and the renderers compared.
+
+Only one OpenGL platform can be used in a process, so OSMesa, where EGL is the first, draws in a subprocess.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+
+import drawn_parts
+import numpy as np
+import pytest
+import torch
+import trimesh
+from drawn_parts import draw_tricky, sheet
+from PIL import Image
+
+from data_gen import rigs
+from data_gen.meshes.mesh import mesh_parts, prepare_scene
+from data_gen.rendering.lighting import Lighting
+from data_gen.rendering.mesh_renderer import CHANNELS, MeshRenderer, RenderError
+from data_gen.rendering.renderers import RENDERERS, RendererError, probe
+from data_gen.rendering.surfaces import shaded_surfaces
+from data_gen.shapes import CLASSES, make
+
+DARK = Lighting((), sky=(0.0,) * 3, ground=(0.0,) * 3)
+EYE = np.eye(4)
+HERE = [name for name in RENDERERS if name != "pyrender-osmesa"]
+
+
+def _skip_unless_working(name):
+    outcome = probe(name)
+    if not outcome.works:
+        pytest.skip(f"{name} does not work here: {outcome.message}")
+
+
+@pytest.fixture(params=HERE)
+def backend(request):
+    _skip_unless_working(request.param)
+    return request.param
+
+
+def _closest(mesh, points):
+    """The nearest face and the distance to it, by trying every face."""
+    count = len(mesh.faces)
+    nearest = trimesh.triangles.closest_point(
+        np.tile(mesh.triangles, (len(points), 1, 1)), np.repeat(points, count, axis=0)
+    )
+    distances = np.linalg.norm(nearest.reshape(-1, count, 3) - points[:, None], axis=-1)
+    return distances.argmin(axis=1), distances.min(axis=1)
+
+
+def _emissive(mesh, colour=(255, 255, 255)):
+    """The mesh as a lamp: its picture is flat, so that only coverage matters."""
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=[0, 0, 0, 255], emissiveFactor=[c / 255 for c in colour], metallicFactor=0.0
+    )
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(mesh.vertices), 2)), material=material)
+    return mesh
+
+
+def _front_rig(resolution, distance=3.0):
+    return rigs.orbit(1, resolution, elevation=0.0, distance=distance)
+
+
+def _kornia_pixels(rig, points):
+    """Where Kornia's camera sees points: (view, point, 2)."""
+    return rig.cameras().project(torch.from_numpy(np.tile(points, (len(rig), 1, 1)))).numpy()
+
+
+def _over_white(rgba):
+    alpha = rgba[..., 3:] / 255.0
+    return rgba[..., :3] * alpha + 255.0 * (1.0 - alpha)
+
+
+@pytest.mark.parametrize("resolution", [64, (200, 120)])
+def test_convention_spheres_are_where_kornia_projects_them(backend, resolution):
+    # The image of a small sphere is an ellipse whose centroid differs from the centre's projection by O(radius^2).
+    rig = rigs.fixed(5, resolution)
+    centres = np.array([[0.0, 0.0, 0.0], [0.5, 0.3, -0.2], [-0.4, -0.5, 0.4], [0.1, 0.6, 0.5]])
+    expected = _kornia_pixels(rig, centres)
+    with MeshRenderer(backend, supersample=8) as renderer:
+        for number, centre in enumerate(centres):
+            ball = _emissive(trimesh.creation.icosphere(3, radius=0.08))
+            alpha = renderer.render([(ball, trimesh.transformations.translation_matrix(centre), True)], rig).rgba[
+                ..., 3
+            ]
+            weights = alpha / alpha.sum(axis=(1, 2), keepdims=True, dtype=float)
+            x = (weights * np.arange(rig.width)).sum(axis=(1, 2))
+            y = (weights * np.arange(rig.height)[:, None]).sum(axis=(1, 2))
+            np.testing.assert_allclose(np.stack((x, y), axis=-1), expected[:, number], atol=0.05)
+
+
+def test_alpha_is_the_covered_area_of_the_pixel(backend):
+    # A square whose image reaches from u0 to u1 covers of pixel i the overlap of [u0, u1] and [i - 1/2, i + 1/2].
+    rig = _front_rig(48)
+    size = 0.613
+    (u0, v1), (u1, v0) = _kornia_pixels(rig, np.array([[-size, -size, 0.0], [size, size, 0.0]]))[0]
+    pixel = np.arange(48)
+    across = np.clip(np.minimum(u1, pixel + 0.5) - np.maximum(u0, pixel - 0.5), 0.0, 1.0)
+    down = np.clip(np.minimum(v1, pixel + 0.5) - np.maximum(v0, pixel - 0.5), 0.0, 1.0)
+    for supersample in (1, 3, 8):
+        with MeshRenderer(backend, supersample=supersample) as renderer:
+            alpha = renderer.render([(sheet(size), EYE, False)], rig).rgba[0, ..., 3] / 255.0
+        # Samples stand 1 / supersample apart, so an edge is off by at most half of that.
+        np.testing.assert_allclose(alpha, down[:, None] * across, atol=1.01 / supersample / 2 + 0.004)
+
+
+def test_sphere_silhouette_has_the_area_of_its_cone(backend):
+    rig = _front_rig(100)
+    ball = trimesh.creation.icosphere(5, radius=0.8)
+    with MeshRenderer(backend, supersample=4) as renderer:
+        alpha = renderer.render([(ball, EYE, True)], rig).rgba[0, ..., 3] / 255.0
+    radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(0.8 / 3.0))
+    # 0.05 pixels of the radius: icospheres are inscribed.
+    assert abs(np.sqrt(alpha.sum() / np.pi) - radius) < 0.05
+    # 4 x 4 samples: sixteenths, and many of them.
+    np.testing.assert_allclose(alpha * 16, np.rint(alpha * 16), atol=16 / 510 + 1e-9)
+    assert len(np.unique(alpha)) > 12
+
+
+def test_no_dark_fringe_over_white(backend):
+    # An emissive off-white sphere over white: every pixel, edge or not, lies between the two colours.
+    ball = _emissive(trimesh.creation.icosphere(4, radius=0.8), (240, 240, 240))
+    with MeshRenderer(backend) as renderer:
+        rgba = renderer.render([(ball, EYE, True)], rigs.fixed(2, 64), lighting=DARK).rgba
+    inside = rgba[rgba[..., 3] == 255]
+    flat = inside[0, 0]
+    assert (inside[:, :3] == flat).all()
+    partial = rgba[(rgba[..., 3] > 0) & (rgba[..., 3] < 255)]
+    assert len(partial) > 100
+    np.testing.assert_allclose(partial[:, :3], flat, atol=1)
+    assert _over_white(rgba).min() >= flat - 1
+    assert not rgba[rgba[..., 3] == 0].any()
+
+
+def _assert_agree(one, other):
+    """Silhouettes to half a pixel and colours to 1 of 255 on average, 99 of 100 pixels to 4."""
+    a, b = one.astype(float), other.astype(float)
+    # An edge that is half a pixel off changes alpha by a half.
+    assert np.abs(a[..., 3] - b[..., 3]).max() < 128
+    # And the area by far less.
+    np.testing.assert_allclose(a[..., 3].sum(axis=(1, 2)), b[..., 3].sum(axis=(1, 2)), rtol=2e-3)
+    difference = np.abs(_over_white(a) - _over_white(b)).max(axis=-1)[a[..., 3] > 0]
+    assert difference.mean() < 1.0
+    assert np.quantile(difference, 0.99) < 4.0
+
+
+@pytest.fixture(scope="module")
+def tricky_by_embree():
+    return draw_tricky("embree")
+
+
+def test_egl_and_embree_agree(tricky_by_embree):
+    _skip_unless_working("pyrender-egl")
+    _assert_agree(draw_tricky("pyrender-egl"), tricky_by_embree)
+
+
+def _drawn_elsewhere(name, path):
+    """The tricky parts drawn in another process."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    subprocess.run([sys.executable, drawn_parts.__file__, name, str(path)], check=True, env=environment)
+    return np.load(path)
+
+
+def test_osmesa_and_embree_agree(tricky_by_embree, tmp_path):
+    _skip_unless_working("pyrender-osmesa")
+    _assert_agree(_drawn_elsewhere("pyrender-osmesa", tmp_path / "osmesa.npy"), tricky_by_embree)
+
+
+def test_same_bytes_in_every_run_and_process(backend, tmp_path):
+    first = draw_tricky(backend)
+    with MeshRenderer(backend) as renderer:
+        renderer.render([(sheet(), EYE, False)], _front_rig((31, 17)))
+    assert np.array_equal(first, draw_tricky(backend))
+    assert np.array_equal(first, _drawn_elsewhere(backend, tmp_path / "again.npy"))
+
+
+def test_reversed_faces_look_like_any_others(backend):
+    ball = trimesh.creation.icosphere(3, radius=0.7)
+    inside_out = ball.copy()
+    inside_out.invert()
+    with MeshRenderer(backend) as renderer:
+        right = renderer.render([(ball, EYE, True)], rigs.fixed(2, 48)).rgba
+        wrong = renderer.render([(inside_out, EYE, True)], rigs.fixed(2, 48)).rgba
+    assert np.abs(right.astype(int) - wrong).max() <= 2
+
+
+@pytest.mark.parametrize("class_name", CLASSES)
+def test_inner_sides_of_generated_objects_are_never_seen(class_name):
+    """Property: what is closed covers the same samples without its inner sides, and looks the same.
+
+    But for a sample here and there on an outline itself, where both sides have one depth.
+    """
+    _skip_unless_working("pyrender-egl")
+    with MeshRenderer("pyrender-egl") as renderer:
+        for seed in range(4):
+            whole, outer = (
+                renderer.render(
+                    mesh_parts(prepare_scene(make(class_name, seed), "it", closed=closed)), rigs.fixed(6, 64)
+                ).rgba
+                for closed in (False, True)
+            )
+            assert np.array_equal(whole[..., 3], outer[..., 3])
+            assert (whole != outer).any(axis=-1).sum() < 0.002 * (whole[..., 3] > 0).sum()
+
+
+def test_a_sheet_is_seen_from_both_sides(backend):
+    rig = rigs.orbit(2, 32, elevation=0.0)
+    with MeshRenderer(backend) as renderer:
+        rgba = renderer.render([(sheet(), EYE, False)], rig).rgba
+    assert (rgba[:, 16, 16, 3] == 255).all()
+    assert rgba[:, 16, 16, :3].min() > 60
+
+
+def test_glass_over_black_and_white_closed_form(backend):
+    # Emissive glass of alpha 0.4 before an emissive wall: out = 0.4 glass + 0.6 wall, alpha 1; alone, alpha 0.4.
+    glass, wall = _emissive(sheet(0.9), (255, 0, 0)), _emissive(sheet(0.5), (0, 0, 255))
+    glass.visual.material.baseColorFactor = [0, 0, 0, 102]
+    glass.visual.material.alphaMode = "BLEND"
+    behind = trimesh.transformations.translation_matrix([0, 0, -0.5])
+    with MeshRenderer(backend) as renderer:
+        rgba = renderer.render([(glass, EYE, False), (wall, behind, False)], _front_rig(33), lighting=DARK).rgba[0]
+    np.testing.assert_allclose(rgba[16, 16], [102, 0, 153, 255], atol=2)
+    np.testing.assert_allclose(rgba[16, 5], [255, 0, 0, 102], atol=2)
+
+
+def test_transparent_texels_do_not_bleed(backend):
+    # Green leaves on transparent black: wherever anything is seen, it is as green as the leaf.
+    texels = np.zeros((64, 64, 4), np.uint8)
+    texels[::8, :, :] = texels[1::8] = texels[2::8] = (40, 220, 40, 255)
+    square = sheet(0.9)
+    square.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(texels))
+    flat = Lighting((), sky=(0.7,) * 3, ground=(0.7,) * 3)
+    with MeshRenderer(backend) as renderer:
+        rgba = renderer.render([(square, EYE, False)], _front_rig(40), lighting=flat).rgba[0]
+    seen = rgba[rgba[..., 3] > 40].astype(int)
+    assert len(seen) > 100
+    assert (seen[:, 1] > seen[:, 1].max() - 12).all()
+
+
+def test_texture_is_the_right_way_up(backend):
+    quarters = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
+    square = sheet(0.9)
+    square.visual.material = trimesh.visual.material.SimpleMaterial(
+        image=Image.fromarray(quarters).resize((64, 64), Image.Resampling.NEAREST)
+    )
+    with MeshRenderer(backend) as renderer:
+        rgb = renderer.render([(square, EYE, False)], _front_rig(40)).rgba[0, ..., :3]
+    bright = rgb > 100
+    assert bright[12, 12].tolist() == [True, False, False]
+    assert bright[12, 28].tolist() == [False, True, False]
+    assert bright[28, 12].tolist() == [False, False, True]
+    assert bright[28, 28].tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("kind", ["vertex", "face", "texture", "kd"])
+def test_srgb_colours_come_out_alike_however_they_are_given(backend, kind):
+    colour = (180, 90, 60)
+    square = sheet(0.9)
+    if kind == "texture":
+        square.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), colour))
+    elif kind == "kd":
+        square.visual.material = trimesh.visual.material.SimpleMaterial(diffuse=[*colour, 255])
+    else:
+        colours = np.tile([*colour, 255], (4 if kind == "vertex" else 2, 1)).astype(np.uint8)
+        square.visual = trimesh.visual.ColorVisuals(square, **{f"{kind}_colors": colours})
+    # Ambient light of 0.8 on a diffuse surface: linear(colour) x 0.8.
+    flat = Lighting((), sky=(0.8,) * 3, ground=(0.8,) * 3)
+    expected = 255 * (0.8 * ((np.array(colour) / 255 + 0.055) / 1.055) ** 2.4)
+    expected = 255 * (1.055 * (expected / 255) ** (1 / 2.4) - 0.055)
+    with MeshRenderer(backend) as renderer:
+        rgba = renderer.render([(square, EYE, False)], _front_rig(16), lighting=flat).rgba[0, 8, 8]
+    np.testing.assert_allclose(rgba, [*expected, 255], atol=1.5)
+
+
+def test_geometry_lies_on_the_mesh_to_a_hundredth_of_a_pixel():
+    mesh = trimesh.creation.icosphere(2, radius=0.6)
+    pose = trimesh.transformations.translation_matrix([0.1, -0.2, 0.3]) @ np.diag([1.0, 1.3, 0.7, 1.0])
+    rig = rigs.fixed(3, (50, 40))
+    with MeshRenderer("embree", supersample=1) as renderer:
+        out = renderer.render([(mesh, pose, False)], rig, channels=CHANNELS)
+    placed = mesh.copy().apply_transform(pose)
+    x, y = np.meshgrid(np.arange(50), np.arange(40))
+    rays = np.stack((x, y, np.ones_like(x)), axis=-1) @ np.linalg.inv(rig.intrinsics[0]).T
+    for view, world_from_camera in enumerate(rig.world_from_camera):
+        mask, depth = out.mask[view], out.depth[view]
+        assert np.array_equal(mask, depth > 0)
+        points = (rays * depth[..., None])[mask] @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+        footprint = depth[mask].max() / rig.intrinsics[0, 0, 0]
+        face, distance = _closest(placed, points)
+        assert distance.max() < 0.01 * footprint
+        np.testing.assert_allclose(out.coordinates[view][mask], points, atol=1e-5)
+        normals = out.normals[view][mask]
+        aligned = np.abs(np.einsum("pi,pi->p", normals, placed.face_normals[face]))
+        assert np.quantile(aligned, 0.02) > 0.999
+        towards = world_from_camera[:3, 3] - points
+        assert (np.einsum("pi,pi->p", normals, towards) > 0).all()
+        assert not depth[~mask].any()
+        assert not out.coordinates[view][~mask].any()
+        # With one sample a pixel, colour and geometry see the same.
+        assert np.array_equal(mask, out.rgba[view, ..., 3] > 0)
+
+
+def test_geometry_looks_through_what_is_mostly_clear():
+    glass = _emissive(sheet(0.9))
+    glass.visual.material.alphaMode = "BLEND"
+    wall, behind = sheet(0.9), trimesh.transformations.translation_matrix([0, 0, -0.5])
+    with MeshRenderer("embree") as renderer:
+        for alpha, depth in ((100, 3.5), (200, 3.0)):
+            glass.visual.material.baseColorFactor = [0, 0, 0, alpha]
+            out = renderer.render([(glass, EYE, False), (wall, behind, False)], _front_rig(9), channels=("depth",))
+            assert out.rgba is None
+            np.testing.assert_allclose(out.depth[0, 4, 4], depth, atol=1e-6)
+
+
+def test_blank_and_impossible_objects_are_named(backend):
+    away = trimesh.transformations.translation_matrix([50.0, 0, 0])
+    empty = trimesh.Trimesh()
+    broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], process=False)
+    untextured = sheet(uv=False)
+    untextured.visual = trimesh.visual.TextureVisuals(image=Image.new("RGB", (2, 2)))
+    several = sheet()
+    several.visual.material = trimesh.visual.material.MultiMaterial()
+    rig = _front_rig(8)
+    with MeshRenderer(backend) as renderer:
+        for parts, message in (
+            ([(sheet(), away, False)], "teapot: expected some of it to be visible in 1 views"),
+            ([], "teapot: expected at least one face, received 0 parts"),
+            ([(empty, EYE, False)], "teapot: expected at least one face, received 1 parts"),
+            ([(broken, EYE, False)], "teapot, part 0: expected finite vertices, received 1 faces"),
+            (
+                [(sheet(), EYE, False), ("cube", EYE, False)],
+                "teapot, part 1: expected a trimesh.Trimesh, received str",
+            ),
+            ([(sheet(), np.eye(3), False)], "teapot, part 0: expected a finite affine pose"),
+            ([(several, EYE, False)], "part 0: expected a PBRMaterial or a SimpleMaterial, received MultiMaterial"),
+            ([(untextured, EYE, False)], "texture coordinates for its 4 textured vertices, received none"),
+        ):
+            with pytest.raises(RenderError, match=message):
+                renderer.render(parts, rig, name="teapot")
+        assert renderer.render([(sheet(), EYE, False)], rig).rgba.any()
+
+
+def test_wrong_arguments_say_what_was_received():
+    with pytest.raises(ValueError, match="expected 1 to 8, received 9"):
+        MeshRenderer("embree", supersample=9)
+    with pytest.raises(ValueError, match="received 'vulkan'"):
+        MeshRenderer("vulkan")
+    renderer = MeshRenderer("embree")
+    with pytest.raises(ValueError, match="rgba, depth, normals, coordinates, mask, received rgb"):
+        renderer.render([(sheet(), EYE, False)], _front_rig(8), channels=("rgb",))
+    renderer.close()
+    with pytest.raises(ValueError, match="received one that was closed"):
+        renderer.render([(sheet(), EYE, False)], _front_rig(8))
+
+
+def test_rasterisers_share_the_context_and_other_threads_are_refused():
+    _skip_unless_working("pyrender-egl")
+    parts, rig = [(sheet(), EYE, False)], _front_rig(8)
+    caught = []
+
+    def elsewhere():
+        try:
+            MeshRenderer("pyrender-egl")
+        except RendererError as error:
+            caught.append(str(error))
+
+    with MeshRenderer("pyrender-egl") as outer:
+        with MeshRenderer("pyrender-egl") as inner:
+            assert inner.render(parts, rig).rgba.any()
+        thread = threading.Thread(target=elsewhere)
+        thread.start()
+        thread.join()
+        assert outer.render(parts, rig).rgba.any()
+    assert "spawn" in caught[0]
+    with pytest.raises(RendererError, match="pyrender-egl, which this process uses, received pyrender-osmesa"):
+        MeshRenderer("pyrender-osmesa")
+
+
+def test_renderer_that_cannot_start_says_what_to_do(monkeypatch):
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    with pytest.raises(RendererError, match="'embree': expected it to start, found .*Remedy: pip install embreex"):
+        MeshRenderer("embree")
+
+
+def test_unreferenced_bad_vertices_and_vanished_normals_do_no_harm():
+    corners = [[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [np.nan, 0, 0]]
+    mesh = trimesh.Trimesh(corners, [[0, 1, 2]], vertex_normals=np.zeros((4, 3)), process=False, validate=False)
+    with MeshRenderer("embree") as renderer:
+        out = renderer.render([(mesh, EYE, True)], _front_rig(9), channels=("rgba", "normals"))
+    assert out.rgba[0, 4, 4, :3].min() > 80
+    np.testing.assert_allclose(out.normals[0, 4, 4], [0, 0, 1], atol=1e-6)
+
+
+def test_metal_is_not_black_and_unset_metal_is_no_metal():
+    def shade(**material):
+        square = sheet(0.9)
+        square.visual.material = trimesh.visual.material.PBRMaterial(baseColorFactor=[128, 128, 128, 255], **material)
+        with MeshRenderer("embree") as renderer:
+            return int(renderer.render([(square, EYE, False)], _front_rig(8)).rgba[0, 4, 4, 0])
+
+    assert shade() == shade(metallicFactor=0.0)
+    assert shade(metallicFactor=1.0) > 0.8 * shade()
+
+
+def test_equal_textures_of_parts_share_their_texels():
+    def part():
+        square = sheet()
+        square.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), (9, 8, 7)))
+        return square, EYE, False
+
+    one, other = shaded_surfaces([part(), part()])
+    assert one.texture is other.texture

@@ -1,0 +1,145 @@
+"""Finding a renderer: what is tried, remembered and said. Fakes stand for the subprocess where needed."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from data_gen.rendering import renderers
+from data_gen.rendering.renderers import ProbeResult, RendererError, RendererInfo
+
+
+@pytest.fixture
+def fresh(monkeypatch):
+    """No choice in the environment and nothing remembered."""
+    for variable in (renderers.CHOICE_VARIABLE, "HYPERPLANES_RENDERER_FOUND", "PYOPENGL_PLATFORM"):
+        monkeypatch.setenv(variable, "")
+    monkeypatch.setattr(renderers, "_cache", {})
+    return monkeypatch
+
+
+@pytest.fixture
+def pretend(fresh):
+    """Let only some renderers work; returns the list of those tried."""
+    tried = []
+
+    def arrange(*working):
+        def attempt(name):
+            tried.append(name)
+            works = name in working
+            return ProbeResult(
+                name, works, 0.1, "fine" if works else "no library", "" if works else renderers.REMEDIES[name]
+            )
+
+        fresh.setattr(renderers, "_run_probe", attempt)
+        return tried
+
+    return arrange
+
+
+def test_embree_works_in_a_real_subprocess(fresh):
+    outcome = renderers.probe("embree")
+    assert outcome.works, outcome
+    assert "Embree" in outcome.message
+    assert outcome.remedy == ""
+    assert renderers.probe("embree") is outcome
+
+
+@pytest.mark.parametrize("name", renderers.RENDERERS)
+def test_outcome_is_complete(name):
+    outcome = renderers.probe(name)
+    assert outcome.works == (outcome.remedy == "")
+    assert outcome.message
+    assert "\n" not in outcome.message
+
+
+def test_order_is_egl_osmesa_embree(pretend):
+    tried = pretend("embree")
+    renderer = renderers.find_renderer()
+    assert tried == ["pyrender-egl", "pyrender-osmesa", "embree"]
+    assert renderer.name == "embree"
+    assert len(renderer.advice) == 2
+    assert "apt-get install -y libegl1 libgl1" in renderer.advice[0]
+
+
+def test_best_is_taken_without_trying_the_rest(pretend):
+    tried = pretend("pyrender-egl", "embree")
+    assert renderers.find_renderer() == RendererInfo("pyrender-egl", "fine")
+    assert tried == ["pyrender-egl"]
+
+
+def test_opengl_platform_of_the_user_comes_first(pretend, monkeypatch):
+    tried = pretend("pyrender-egl", "pyrender-osmesa")
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "osmesa")
+    assert renderers.find_renderer().name == "pyrender-osmesa"
+    assert tried == ["pyrender-osmesa"]
+
+
+@pytest.mark.parametrize("by_environment", [False, True])
+def test_choice_must_work(pretend, monkeypatch, by_environment):
+    pretend("embree")
+    monkeypatch.setenv(renderers.CHOICE_VARIABLE, "pyrender-osmesa" if by_environment else "")
+    with pytest.raises(RendererError, match="'pyrender-osmesa': .* no library. Remedy: apt-get install -y libosmesa6"):
+        renderers.find_renderer(None if by_environment else "pyrender-osmesa")
+
+
+def test_nothing_works(pretend):
+    pretend()
+    with pytest.raises(RendererError, match="no renderer works here .* apt-get install -y libegl1 libgl1"):
+        renderers.find_renderer()
+
+
+def test_answer_is_remembered_and_inherited(pretend):
+    tried = pretend("embree")
+    first = renderers.find_renderer()
+    renderers._cache.clear()
+    assert renderers.find_renderer() == first
+    assert renderers.find_renderer("embree") == first
+    assert len(tried) == 3
+
+
+@pytest.mark.parametrize("record", ["{", "[]", json.dumps({"name": "vulkan", "detail": "", "advice": []})])
+def test_damaged_memory_is_ignored(pretend, monkeypatch, record):
+    pretend("embree")
+    monkeypatch.setenv("HYPERPLANES_RENDERER_FOUND", record)
+    assert renderers.find_renderer().name == "embree"
+
+
+def test_unknown_name():
+    with pytest.raises(ValueError, match="pyrender-egl, pyrender-osmesa, embree, received 'vulkan'"):
+        renderers.find_renderer("vulkan")
+    with pytest.raises(ValueError, match="received 'vulkan'"):
+        renderers.probe("vulkan")
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "crashed with signal 11"),
+        ("import sys; print('long story', file=sys.stderr); sys.exit('last word')", "last word"),
+        ("import sys; sys.exit(3)", "exit code 3"),
+        ("pass", "exit code 0"),
+    ],
+)
+def test_trouble_in_the_subprocess_becomes_one_line(fresh, code, message):
+    real = subprocess.run
+    fresh.setattr(renderers.subprocess, "run", lambda command, **options: real([sys.executable, "-c", code], **options))
+    outcome = renderers.probe("embree")
+    assert (outcome.works, outcome.message, outcome.remedy) == (False, message, "pip install embreex")
+
+
+def test_hanging_renderer_is_given_up(fresh):
+    real = subprocess.run
+    sleep = [sys.executable, "-c", "import time; time.sleep(60)"]
+    fresh.setattr(renderers, "_PROBE_SECONDS", 0.5)
+    fresh.setattr(renderers.subprocess, "run", lambda command, **options: real(sleep, **options))
+    assert renderers.probe("embree").message == "no picture within 0.5 s"
+
+
+def test_importing_rigs_and_backends_is_light():
+    code = (
+        "import sys, data_gen, data_gen.rigs, data_gen.rendering.renderers, data_gen.rendering.lighting;"
+        "sys.exit(','.join({'pyrender', 'OpenGL', 'trimesh', 'torch', 'embreex', 'scipy'} & set(sys.modules)) or 0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
