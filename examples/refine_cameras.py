@@ -1,6 +1,6 @@
 """Find wrong cameras again by gradient descent on the pictures, through the renderer.
 
-A scene of coloured blobs, known exactly, is photographed by cameras around it. Then every camera is turned by up to 10
+A scene of coloured blobs, known exactly, is rendered from cameras around it. Then every camera is turned by up to 10
 degrees and moved by up to 5 % of its distance, and all of them are found again from the pictures alone: the error
 between what a camera should see and what the renderer says it sees has a gradient with respect to the camera.
 
@@ -52,8 +52,8 @@ class Blobs:
         return colour, 12 * near.sum(-1)
 
 
-def photograph(scene: Blobs, cameras: PinholeCamera) -> Tensor:
-    """What the cameras see, (view, pixel, 3), with gradients to the cameras."""
+def render_pixels(scene: Blobs, cameras: PinholeCamera) -> Tensor:
+    """The pixels (view, pixel, 3) of the cameras, with gradients to these."""
     height, width = camera.image_size(cameras)
     views = cameras.batch_size
     pixels = pixel_grid(height, width).repeat(views, 1)
@@ -140,9 +140,9 @@ def refine(scene: Blobs, pose: Tensor, true: Tensor, size: int, steps: int) -> R
         intrinsics = camera.symmetric_intrinsics(now, now, math.radians(50))
         if now != shown:
             with torch.no_grad():
-                pictures = photograph(scene, camera.pinhole(intrinsics, true, now, now))
+                pictures = render_pixels(scene, camera.pinhole(intrinsics, true, now, now))
             shown = now
-        seen = photograph(scene, camera.pinhole(intrinsics, turned(pose, change), now, now))
+        seen = render_pixels(scene, camera.pinhole(intrinsics, turned(pose, change), now, now))
         loss = (seen - pictures).square().mean((1, 2)).sum()
         optimiser.zero_grad()
         loss.backward()
@@ -173,7 +173,7 @@ def plot(scene: Blobs, true: Tensor, start: Tensor, result: Refined, path: Path)
     rows = {"start": start, "found": result.pose, "truth": true}
     for row, (name, pose) in enumerate(rows.items()):
         with torch.no_grad():
-            pictures = photograph(scene, camera.pinhole(intrinsics, pose[:4], 96, 96)).reshape(-1, 96, 96, 3)
+            pictures = render_pixels(scene, camera.pinhole(intrinsics, pose[:4], 96, 96)).reshape(-1, 96, 96, 3)
         for column, picture in enumerate(pictures):
             axes = figure.add_subplot(grid[row, column])
             axes.imshow(picture.clamp(0, 1).numpy())

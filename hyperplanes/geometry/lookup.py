@@ -127,11 +127,11 @@ def lookup(
         return Lookup(*lookup_torch.lookup(points, matrices, images, views, background))
     if backend is not None:
         _check(backend, points.device)
-    from hyperplanes.geometry.kernels import lookup_operator
+    from hyperplanes.geometry.kernels import operators
 
     fits = packed is not None and points.dtype == torch.float32 and not images.requires_grad
     words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
-    return Lookup(*lookup_operator.lookup(points, matrices, images, words, bits, views, background))
+    return Lookup(*operators.lookup(points, matrices, images, words, bits, views, background))
 
 
 def sample(
@@ -185,11 +185,11 @@ def sample(
         raise ValueError(
             f"backend: expected {'torch' if fastest != 'cpu' else 'torch or cpu'} for {taken}, got {name!r}"
         )
-    from hyperplanes.geometry.kernels import sample_operator
+    from hyperplanes.geometry.kernels import operators
 
     fits = packed is not None and coordinates.element_size() == 4 and not images.requires_grad
     words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
-    return sample_operator.sample(images, coordinates, words, bits, background)
+    return operators.sample(images, coordinates, words, bits, background)
 
 
 def _check(name: str, device: torch.device) -> None:

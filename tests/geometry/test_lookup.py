@@ -206,26 +206,26 @@ def test_directions_and_distances_match_centres():
 
 def test_the_operator_passes_torchs_own_checks():
     """Schema, fake tensor and autograd registration, by torch.library.opcheck."""
-    from hyperplanes.geometry.kernels import lookup_operator
+    from hyperplanes.geometry.kernels import operators
 
     points, ours, images = scene(points=7)
     matrices = cameras.projection_matrices(ours)
     leaves = (points.requires_grad_(), matrices.requires_grad_(), images.requires_grad_())
     tests = ("test_schema", "test_autograd_registration", "test_faketensor")
     for views in (None, torch.zeros(7, 2, dtype=torch.long)):
-        torch.library.opcheck(lookup_operator.lookup, (*leaves, None, 0, views, 1.0), test_utils=tests)
+        torch.library.opcheck(operators.lookup, (*leaves, None, 0, views, 1.0), test_utils=tests)
 
 
 def test_compiled_code_gives_the_same():
     """Another implementation: eager mode. One graph with gradients; shape checks would not
     trace."""
-    from hyperplanes.geometry.kernels import lookup_operator
+    from hyperplanes.geometry.kernels import operators
 
     points, ours, images = scene(points=50)
     matrices = cameras.projection_matrices(ours)
 
     def loss(points, images):
-        colours, coordinates, _ = lookup_operator.lookup(2 * points, matrices, images, None, 0, None, 1.0)
+        colours, coordinates, _ = operators.lookup(2 * points, matrices, images, None, 0, None, 1.0)
         return colours.square().sum() + coordinates.sin().sum()
 
     values = []

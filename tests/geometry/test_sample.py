@@ -199,9 +199,9 @@ def test_no_point_no_view_no_channel(backend):
         found = sample(*leaves, backend=backend)
         assert found.shape == (len(where), len(ours), ours.shape[1])
     assert sample(images, coordinates[:1], backend=backend).shape == (1, 4, 3)
-    from hyperplanes.geometry.kernels import sample_operator
+    from hyperplanes.geometry.kernels import operators
 
-    for value in sample_operator.sample_backward(images, coordinates[:0], None, 0, torch.zeros(0, 4, 3), True, True):
+    for value in operators.sample_backward(images, coordinates[:0], None, 0, torch.zeros(0, 4, 3), True, True):
         assert not value.any()
 
 
@@ -224,27 +224,27 @@ def test_the_result_does_not_depend_on_the_threads():
 
 def test_the_operator_passes_torchs_own_checks():
     """Schema, fake tensor and autograd registration, by torch.library.opcheck."""
-    from hyperplanes.geometry.kernels import sample_operator
+    from hyperplanes.geometry.kernels import operators
 
     images, coordinates = scene(points=7)
     tests = ("test_schema", "test_autograd_registration", "test_faketensor")
     leaves = images.requires_grad_(), coordinates.requires_grad_()
-    torch.library.opcheck(sample_operator.sample, (*leaves, None, 0, 1.0), test_utils=tests)
+    torch.library.opcheck(operators.sample, (*leaves, None, 0, 1.0), test_utils=tests)
     bare = images.detach(), coordinates.detach()
     pull = torch.ones(7, 4, 3)
     for geometry, pixels in ((True, True), (True, False), (False, True)):
         arguments = (*bare, None, 0, pull, geometry, pixels)
-        torch.library.opcheck(sample_operator.sample_backward, arguments, test_utils=("test_schema", "test_faketensor"))
+        torch.library.opcheck(operators.sample_backward, arguments, test_utils=("test_schema", "test_faketensor"))
 
 
 def test_compiled_code_gives_the_same():
     """Another implementation: eager mode. One graph with gradients; shape checks would not trace."""
-    from hyperplanes.geometry.kernels import sample_operator
+    from hyperplanes.geometry.kernels import operators
 
     images, coordinates = scene(points=50)
 
     def loss(images, coordinates):
-        return sample_operator.sample(images, 0.9 * coordinates, None, 0, 1.0).square().sum()
+        return operators.sample(images, 0.9 * coordinates, None, 0, 1.0).square().sum()
 
     values = []
     for function in (loss, torch.compile(loss, backend="aot_eager", fullgraph=True)):

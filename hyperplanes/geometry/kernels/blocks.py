@@ -1,14 +1,15 @@
-"""Where one block of points falls on one plane, and back, as numba functions that LLVM vectorises over the block.
+"""Projection of a block of points onto one plane, and its gradient, as numba functions vectorised over the block.
 
-A block is BLOCK lookups that share a view. Its numbers live in one scratch array, one row of BLOCK values a quantity
-(the constants below), small enough for the first-level cache. All functions work in the dtype of the scratch. What is
-read from the plane there is in `interpolation`.
+A block is BLOCK points on one plane. Its numbers lie in one scratch array, one row of BLOCK values a quantity (the
+constants below), small enough for the first-level cache. All functions compute in the dtype of the scratch. Reading the
+plane is the matter of `interpolation`.
 """
 
 from __future__ import annotations
 
 from typing import no_type_check
 
+import numpy as np
 from numba import njit
 
 from hyperplanes.geometry.kernels.compiling import FASTMATH
@@ -19,36 +20,41 @@ __all__ = [
     "CHANNELS",
     "back_project",
     "copy",
-    "copy_pairs",
     "inlined",
     "inner",
-    "locate",
     "place",
     "project",
+    "scratch",
     "start_pull",
-]  # fmt: skip
+    "unnormalize",
+]
 
 BLOCK = 128
-# Rows of the scratch: a point, where points do not come as rows; its pixel before and after clamping; 1 / depth,
-# zero behind the camera; whether it is inside the image; the gradients with respect to the pixel and to the point;
-# coordinates in [-1, 1], or going back the gradients with respect to them; the upper left one of the four pixels to
-# interpolate, and the fractions of a pixel beyond it.
-X, Y, Z, RAW_U, RAW_V, RECIPROCAL, U, V, INSIDE, GRAD_U, GRAD_V, GRAD_X, GRAD_Y, GRAD_Z, COLUMN, ROW = (
-    BLOCK * row for row in range(16)
+# Rows of the scratch: pixel before clamping; 1 / z, zero behind the camera; clamped pixel; whether it is inside the
+# image; gradients with respect to the pixel; coordinates in [-1, 1], or in the backward pass their gradients; the upper
+# left one of the four pixels to interpolate, and the fractions of a pixel beyond it.
+RAW_U, RAW_V, RECIPROCAL, U, V, INSIDE, GRAD_U, GRAD_V, COLUMN, ROW, CORNER, ACROSS, DOWN = (
+    BLOCK * row for row in range(13)
 )
-CORNER, ACROSS, DOWN = (BLOCK * row for row in range(16, 19))
-# Two rows of four numbers a lookup; three channels' slopes across and down; the channels, one row each.
-TILE, SLOPES, CHANNELS = BLOCK * 19, BLOCK * 27, BLOCK * 33
+# Two rows of four numbers a point; three channels' slopes across and down; the channels, one row each.
+TILE, SLOPES, CHANNELS = BLOCK * 13, BLOCK * 21, BLOCK * 27
 
-# Everything of fast maths but the assumption that there are no NaN and no infinities. What runs once a lookup is
-# forced inline; LLVM calls it otherwise, which costs more than its work.
+# Functions of a block, and functions of a point, which are forced inline: LLVM calls them otherwise, which takes longer
+# than their work.
 inner = njit(fastmath=FASTMATH, error_model="numpy", nogil=True)
 inlined = njit(fastmath=FASTMATH, error_model="numpy", nogil=True, forceinline=True)
 
 
 @inner
 @no_type_check
-def project(s, points, at, pitch, matrices, view, nearest):
+def scratch(dtype, channels):
+    """The scratch of a block."""
+    return np.zeros(CHANNELS + BLOCK * channels, dtype)
+
+
+@inlined
+@no_type_check
+def project(s, points, at, pitch, matrices, view, min_z):
     """Points -> RAW_U, RAW_V, RECIPROCAL by the view's 3 x 4 matrix.
 
     The coordinates x, y, z lie in `points` from `at` on, `pitch` apart.
@@ -59,20 +65,20 @@ def project(s, points, at, pitch, matrices, view, nearest):
     m20, m21, m22, m23 = matrices[view, 2, 0], matrices[view, 2, 1], matrices[view, 2, 2], matrices[view, 2, 3]
     for i in range(BLOCK):
         x, y, z = load(points, at + i), load(points, at + pitch + i), load(points, at + 2 * pitch + i)
-        depth = m20 * x + m21 * y + m22 * z + m23
-        front = depth > nearest
-        reciprocal = one / (depth if front else one)
+        camera_z = m20 * x + m21 * y + m22 * z + m23
+        front = camera_z > min_z
+        reciprocal = one / (camera_z if front else one)
         store(s, RAW_U + i, (m00 * x + m01 * y + m02 * z + m03) * reciprocal)
         store(s, RAW_V + i, (m10 * x + m11 * y + m12 * z + m13) * reciprocal)
         store(s, RECIPROCAL + i, reciprocal if front else zero)
 
 
-@inner
+@inlined
 @no_type_check
 def place(s, out, column, row, height, width):
     """RAW_U, RAW_V, RECIPROCAL -> clamped U, V; INSIDE; coordinates, into `out` at `column` and `row`.
 
-    Comparisons are written so that NaN falls to 0.
+    Comparisons are written so that NaN becomes 0.
     """
     one, zero = s.dtype.type(1), s.dtype.type(0)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
@@ -96,40 +102,26 @@ def place(s, out, column, row, height, width):
 @inner
 @no_type_check
 def copy(s, row, count, values, at, stride):
-    """Every `stride`-th number of `values` -> a row of the scratch; where they lie side by side as whole vectors."""
+    """Every `stride`-th of `count` numbers -> a row of the scratch, zeros after them; whole vectors where adjacent."""
     if stride == 1 and count == BLOCK:
         for i in range(BLOCK):
             store(s, row + i, read(values, at, i))
     else:
         for i in range(count):
             store(s, row + i, read(values, at, i * stride))
+        for i in range(count, BLOCK):
+            store(s, row + i, s.dtype.type(0))
 
 
-@inner
+@inlined
 @no_type_check
-def copy_pairs(s, count, values, at, by):
-    """Columns and rows from `at` on, `by` (point, view, column and row) apart -> COLUMN, ROW; as whole vectors too."""
-    if by[0] == 2 and by[2] == 1 and count == BLOCK:
-        for i in range(BLOCK):
-            store(s, COLUMN + i, read(values, at, 2 * i))
-            store(s, ROW + i, read(values, at, 2 * i + 1))
-    else:
-        copy(s, COLUMN, count, values, at, by[0])
-        copy(s, ROW, count, values, at + by[2], by[0])
-
-
-@inner
-@no_type_check
-def locate(s, height, width):
-    """Coordinates in COLUMN, ROW -> clamped U, V; INSIDE.
-
-    Comparisons are written so that NaN falls to 0.
-    """
+def _unnormalize(s, count, values, at, step, apart, height, width):
     one, zero = s.dtype.type(1), s.dtype.type(0)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
     per_column, per_row = s.dtype.type(0.5) * right, s.dtype.type(0.5) * bottom
-    for i in range(BLOCK):
-        u, v = (load(s, COLUMN + i) + one) * per_column, (load(s, ROW + i) + one) * per_row
+    for i in range(count):
+        u = (read(values, at, i * step) + one) * per_column
+        v = (read(values, at, i * step + apart) + one) * per_row
         inside = (u >= zero) & (u <= right) & (v >= zero) & (v <= bottom)
         u = u if u > zero else zero
         u = u if u < right else right
@@ -140,10 +132,23 @@ def locate(s, height, width):
         store(s, INSIDE + i, one if inside else zero)
 
 
+@inlined
+@no_type_check
+def unnormalize(s, count, values, at, by, height, width):
+    """Coordinates in [-1, 1] from `at` on, `by` (point, view, axis) apart -> clamped U, V; INSIDE.
+
+    Lanes without a point keep what they held. Comparisons are written so that NaN becomes 0.
+    """
+    if by[0] == 2 and by[2] == 1 and count == BLOCK:  # pairs of adjacent numbers: strides known to the compiler
+        _unnormalize(s, BLOCK, values, at, 2, 1, height, width)
+    else:
+        _unnormalize(s, count, values, at, by[0], by[2], height, width)
+
+
 @inner
 @no_type_check
 def start_pull(s, height, width):
-    """GRAD_U, GRAD_V from the gradient of the coordinates in COLUMN, ROW; none passes where they were clamped."""
+    """Gradients of coordinates in COLUMN, ROW -> GRAD_U, GRAD_V; zero where the coordinates were clamped."""
     zero = s.dtype.type(0)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
     per_column = s.dtype.type(2) / s.dtype.type(max(width - 1, 1))
@@ -159,8 +164,8 @@ def start_pull(s, height, width):
 
 @inner
 @no_type_check
-def back_project(s, points, at, pitch, matrices, view, gradients, into, sums):
-    """GRAD_U, GRAD_V -> added to `gradients` of points, from `into` on, and to the view's row of `sums`.
+def back_project(s, points, at, pitch, matrices, view, gradients, sums):
+    """GRAD_U, GRAD_V -> added to the `gradients` of points, laid out like these, and to the view's row of `sums`.
 
     With h = M (x, 1) and (u, v) = (h0, h1) / h2: dL/dh = (g_u, g_v, -(g_u u + g_v v)) / h2.
     """
@@ -177,9 +182,9 @@ def back_project(s, points, at, pitch, matrices, view, gradients, into, sums):
         raw_u = load(s, RAW_U + i) if reciprocal > zero else zero
         raw_v = load(s, RAW_V + i) if reciprocal > zero else zero
         h2 = -(h0 * raw_u + h1 * raw_v)
-        store(gradients, into + i, load(gradients, into + i) + m00 * h0 + m10 * h1 + m20 * h2)
-        store(gradients, into + pitch + i, load(gradients, into + pitch + i) + m01 * h0 + m11 * h1 + m21 * h2)
-        store(gradients, into + 2 * pitch + i, load(gradients, into + 2 * pitch + i) + m02 * h0 + m12 * h1 + m22 * h2)
+        store(gradients, at + i, load(gradients, at + i) + m00 * h0 + m10 * h1 + m20 * h2)
+        store(gradients, at + pitch + i, load(gradients, at + pitch + i) + m01 * h0 + m11 * h1 + m21 * h2)
+        store(gradients, at + 2 * pitch + i, load(gradients, at + 2 * pitch + i) + m02 * h0 + m12 * h1 + m22 * h2)
         s00 += h0 * x
         s01 += h0 * y
         s02 += h0 * z

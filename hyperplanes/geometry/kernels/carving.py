@@ -1,4 +1,4 @@
-"""The CPU kernel of the visual hull: a few voxels in a row at once, view after view, until masks have ruled them out.
+"""The CPU kernel of the visual hull: LANES voxels at once, view after view, until masks have ruled all of them out.
 
 The arithmetic is that of `occupancy._carve_torch` on LANES voxels along z, as loops that LLVM vectorises.
 """
@@ -19,49 +19,52 @@ LANES = 16
 
 @inner
 @no_type_check
-def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius, nearest):
-    """Clears the lanes of `alive` that one view rules out; how many are left."""
+def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius, min_z):
+    """Clears the lanes of `alive` that one view rules out; returns how many are left."""
     rows, stride = np.int32(tables.shape[1]), np.int32(tables.shape[2])
     number = alive.dtype.type
     zero, half, one = number(0), number(0.5), number(1)
     right_most, lowest = number(stride - 1.5), number(rows - 1.5)  # the picture's borders, from pixel centres
     u0 = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 3]
     v0 = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 3]
-    depth0 = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 3]
-    u1, v1, depth1 = matrix[0, 2], matrix[1, 2], matrix[2, 2]
+    z0 = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 3]
+    u1, v1, z1 = matrix[0, 2], matrix[1, 2], matrix[2, 2]
     per_column, skew, middle_u = calibration[0, 0], calibration[0, 1], calibration[0, 2]
     per_row, middle_v = calibration[1, 1], calibration[1, 2]
     table, left_over = np.int64(view) * rows * stride, zero
     for k in range(LANES):
+        # Project the voxel's centre.
         z = bottom + (number(np.int32(k)) + half) * voxel
-        depth = depth0 + depth1 * z
-        front = depth > nearest
-        depth = depth if front else radius + one
-        u, v = (u0 + u1 * z) / depth, (v0 + v1 * z) / depth
+        camera_z = z0 + z1 * z
+        front = camera_z > min_z
+        camera_z = camera_z if front else radius + one
+        u, v = (u0 + u1 * z) / camera_z, (v0 + v1 * z) / camera_z
+        # Extent of its bounding ball in pixels, as `occupancy.ball_extent` computes it.
         down = (v - middle_v) / per_row
         across = (u - middle_u - skew * down) / per_column
-        share = radius / (depth - radius)
-        reach_down = share * np.sqrt(one + down * down)
-        reach_u = per_column * (share * np.sqrt(one + across * across)) + abs(skew) * reach_down + half
-        reach_v = per_row * reach_down + half
-        left, right, top, low = u - reach_u, u + reach_u, v - reach_v, v + reach_v
-        seen = front & (left >= -half) & (top >= -half) & (right <= right_most) & (low <= lowest)
+        slope = radius / (camera_z - radius)
+        extent_down = slope * np.sqrt(one + down * down)
+        extent_u = per_column * (slope * np.sqrt(one + across * across)) + abs(skew) * extent_down + half
+        extent_v = per_row * extent_down + half
+        left, right, top, low = u - extent_u, u + extent_u, v - extent_v, v + extent_v
+        judged = front & (left >= -half) & (top >= -half) & (right <= right_most) & (low <= lowest)
         # The box of pixels, with its first row and column left out; nothing where the picture does not hold it.
-        first, last = np.int32(left + half if seen else zero), np.int32(right + half if seen else zero)
-        upper, lower = np.int32(top + half if seen else zero), np.int32(low + half if seen else zero)
+        first, last = np.int32(left + half if judged else zero), np.int32(right + half if judged else zero)
+        upper, lower = np.int32(top + half if judged else zero), np.int32(low + half if judged else zero)
         last, lower = np.int32(min(last, stride - 2) + 1), np.int32(min(lower, rows - 2) + 1)
+        # Mask pixels in the box, by the summed-area table.
         above, below = np.int32(upper * stride), np.int32(lower * stride)
         count = read(tables, table, np.int32(below + last)) - read(tables, table, np.int32(below + first))
         count = np.int32(count - read(tables, table, np.int32(above + last)))
         count = np.int32(count + read(tables, table, np.int32(above + first)))
-        kept = zero if seen & (count == 0) else load(alive, k)
+        kept = zero if judged & (count == 0) else load(alive, k)
         store(alive, k, kept)
         left_over += kept
     return left_over
 
 
 @no_type_check
-def carve(matrices, calibrations, tables, corner, voxel, radius, nearest, occupied, start, stop):
+def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, occupied, start, stop):
     """Clears the voxels in layers start..stop of `occupied` that `occupancy.carve` describes as ruled out.
 
     `tables` (view, row + 1, column + 1) count the set pixels above and left; `corner` is where voxel (0, 0, 0) starts.
@@ -79,7 +82,7 @@ def carve(matrices, calibrations, tables, corner, voxel, radius, nearest, occupi
                 for turn in range(planes):  # the view that ruled out the last voxels often rules out their neighbours
                     view = last + turn if last + turn < planes else last + turn - planes
                     m, c = matrices[view], calibrations[view]
-                    if _judge(alive, tables, view, m, c, x, y, bottom, voxel, radius, nearest) == 0:
+                    if _judge(alive, tables, view, m, c, x, y, bottom, voxel, radius, min_z) == 0:
                         last = view
                         break
                 for k in range(count):

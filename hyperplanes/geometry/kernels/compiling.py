@@ -17,35 +17,33 @@ __all__ = ["FASTMATH", "compile_function", "compile_kernel"]
 
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}  # all flags but those that assume neither NaN nor infinity
 
+_STRIDED = "T[::1], UniTuple(int64, 3)"  # a tensor of three dimensions as its memory and strides
+_POINTS = "T[::1], int64, T[:, :, ::1], none, none"  # points, their pitch, matrices
+_COORDINATES = f"none, int64, none, {_STRIDED}"  # nothing, their pitch, nothing, coordinates
 _IMAGES = "T[:, :, :, ::1], uint32[::1], int64, int64, int64"  # planes, the same packed, bits, height, width
-_LOOKUP = "T[::1], int64, {views}T[:, :, ::1], {images}, "
-_FLAT = "T[::1], UniTuple(int64, 3)"  # a tensor of three dimensions as its memory and strides
-_SIGNATURES = {  # by module and function; T is the dtype
-    "lookup_forward.forward": _LOOKUP + "T, T, T[::1], T[::1], uint8[::1], int64, int64",
-    "lookup_backward.backward": _LOOKUP + "T, {flat}, {flat}, T[::1], float64[:, ::1], int64, int64, int64",
-    "lookup_backward.image_backward": "T[::1], int64, {views}T[:, :, ::1], int64, int64, T, {flat}, int64, int64, "
-    "T[::1], int64, int64, int64",
-    "sample.sample": "{images}, T, {flat}, T[::1], int64, int64, int64, int64, int64",
-    "sample.sample_backward": "{images}, {flat}, {flat}, T[::1], int64, T[::1], int64, int64, int64, int64, int64",
+_SIGNATURES = {  # by module and function, without those of points; T is the dtype
+    "lookup_forward.forward": f"{_IMAGES}, T, T, T[::1], T[::1], uint8[::1], boolean, int64[:, ::1]",
+    "lookup_backward.backward": f"{_IMAGES}, T, {_STRIDED}, {_STRIDED}, T[::1], float64[:, ::1], int64[:, ::1]",
+    "lookup_backward.image_backward": f"int64, int64, T, {_STRIDED}, int64, int64, T[::1], int64[:, ::1]",
     "carving.carve": "T[:, :, ::1], T[:, :, ::1], int32[:, :, ::1], T[::1], T, T, T, uint8[:, :, ::1], int64, int64",
 }
 
 
 @functools.cache
-def compile_kernel(name: str, dtype: torch.dtype, chosen: bool = False) -> Callable[..., None]:
+def compile_kernel(name: str, dtype: torch.dtype, points: str = "") -> Callable[..., None]:
     """A kernel of this folder, compiled ahead of its first call.
 
     Args:
         name: module and function, one of the keys of `_SIGNATURES`.
         dtype: float32 or float64.
-        chosen: the variant in which each point has its own planes.
+        points: "projected" or "given" for the kernels of lookup and sampling.
     """
     module, function = name.split(".")
     kernels = importlib.import_module(f"hyperplanes.geometry.kernels.{module}")
-    signature = _SIGNATURES[name].format(views="int64[:, ::1], " if chosen else "", flat=_FLAT, images=_IMAGES)
     number = str(dtype).removeprefix("torch.")
+    signature = {"": "", "projected": f"{_POINTS}, ", "given": f"{_COORDINATES}, "}[points] + _SIGNATURES[name]
     signature = signature.replace("T[", f"{number}[").replace("T,", f"{number},")
-    compiled = compile_function(getattr(kernels, f"{function}_chosen" if chosen else function), f"void({signature})")
+    compiled = compile_function(getattr(kernels, function), f"void({signature})")
     assert compiled is not None
     return compiled
 

@@ -158,10 +158,13 @@ def pull_packed(s, packed, offset, height, width, bits):
 
 @inner
 @no_type_check
-def room(images, bits, points):
-    """Memory for an interleaved plane, or none where making it costs more than reading it for so many points saves."""
+def room(images, bits, segments):
+    """Memory for an interleaved plane, or none where segments have too few points for interleaving to pay off."""
     channels, height, width = images.shape[1:]
-    pays = bits == 0 and channels == 3 and 2 * points >= height * width
+    points = 0
+    for index in range(len(segments)):
+        points = max(points, segments[index, 2] - segments[index, 1])
+    pays = bits == 0 and channels == 3 and len(images) > 1 and 2 * points >= height * width
     return np.zeros(4 * (height * width + 1) if pays else 0, images.dtype)
 
 

@@ -1,7 +1,8 @@
-"""The CPU kernels of the fused lookup's gradient; see `lookup_forward` for how they are arranged.
+"""The backward loops of lookup and sampling on the CPU; see `lookup_forward` for how work and memory are laid out.
 
-Incoming gradients have whatever strides autograd gives them. They come flat, with the strides of (point, view, channel)
-as a tuple; where a stride over points is 1, as for gradients laid out like the results, LLVM reads whole vectors.
+Incoming gradients have whatever strides autograd gives them. They come as flat memory with the strides of (point, view,
+channel) as a tuple; where the stride of points is 1, as for gradients laid out like the results, LLVM reads whole
+vectors.
 """
 
 from __future__ import annotations
@@ -14,114 +15,99 @@ from hyperplanes.geometry.kernels.blocks import (
     BLOCK,
     CHANNELS,
     COLUMN,
-    GRAD_X,
-    GRAD_Y,
-    GRAD_Z,
+    GRAD_U,
+    GRAD_V,
     INSIDE,
     ROW,
     U,
     V,
-    X,
     back_project,
     copy,
-    copy_pairs,
     inlined,
-    inner,
-    place,
-    project,
+    scratch,
     start_pull,
 )
 from hyperplanes.geometry.kernels.interpolation import interleave, pull_packed, pull_pixels, pull_plane, room
-from hyperplanes.geometry.kernels.llvm import add_pixels, load
-from hyperplanes.geometry.kernels.lookup_forward import grouped, scratch, take
+from hyperplanes.geometry.kernels.llvm import add_pixels, load, store
+from hyperplanes.geometry.kernels.lookup_forward import locate
 
-__all__ = ["backward", "backward_chosen", "clear", "image_backward", "image_backward_chosen", "splat"]
-
-
-@inlined
-@no_type_check
-def clear(s, count, channels):
-    """Zero gradients in the lanes from `count` on, which hold no lookup."""
-    for i in range(count, BLOCK):
-        s[COLUMN + i] = 0
-        s[ROW + i] = 0
-        for c in range(channels):
-            s[CHANNELS + c * BLOCK + i] = 0
-
-
-@inner
-@no_type_check
-def _pull(s, points, at, pitch, view, matrices, images, packed, bits, pixels, height, width, nearest, gradients, into,
-          sums):  # fmt: skip
-    """The gradients in COLUMN, ROW and the channels' rows -> the points' gradients and the matrix sums."""
-    project(s, points, at, pitch, matrices, view, nearest)
-    start_pull(s, height, width)
-    place(s, s, COLUMN, ROW, height, width)
-    size, channels = height * width, images.shape[1]
-    if bits:
-        pull_packed(s, packed, view * size, height, width, bits)
-    elif len(pixels):
-        pull_pixels(s, pixels, height, width)
-    else:
-        for c in range(channels):
-            pull_plane(s, images, (view * channels + c) * size, height, width, c)
-    back_project(s, points, at, pitch, matrices, view, gradients, into, sums)
+__all__ = ["backward", "image_backward"]
 
 
 @no_type_check
-def backward(points, pitch, matrices, images, packed, bits, height, width, nearest, grad_colours, per,
-             grad_coordinates, by, grad_points, sums, total, start, stop):  # fmt: skip
-    """Gradients with respect to points start..stop, and their share of the matrices' gradient, added to `sums`."""
-    planes, channels = images.shape[0], images.shape[1]
-    s, pixels = scratch(points.dtype, channels), room(images, bits, stop - start if planes > 1 else 0)
-    for view in range(planes):
+def backward(points, pitch, matrices, given, by, images, packed, bits, height, width, min_z, grad_colours, per,
+             grad_coordinates, per_coordinate, grad_points, sums, segments):  # fmt: skip
+    """Gradients with respect to points and matrices, or to the given coordinates.
+
+    Those of points are added to `grad_points`, rows of x, y and z; those of matrices to `sums` (view, 12). Those of
+    coordinates are written to `grad_points` as (view, column and row, point).
+    """
+    channels, size = images.shape[1], height * width
+    s, pixels = scratch(images.dtype, channels), room(images, bits, segments)
+    half = s.dtype.type(0.5)
+    per_column, per_row = half * s.dtype.type(width - 1), half * s.dtype.type(height - 1)
+    for index in range(len(segments)):
+        view, begin, end = segments[index, 0], segments[index, 1], segments[index, 2]
         if len(pixels):
             interleave(images, view, pixels)
-        for p in range(start, stop, BLOCK):
-            count = min(BLOCK, total - p)
-            copy_pairs(s, count, grad_coordinates, p * by[0] + view * by[1], by)
+        for p in range(begin, end, BLOCK):
+            count = min(BLOCK, end - p)
+            locate(s, points, pitch, matrices, given, by, view, p, count, height, width, min_z, s, COLUMN, ROW)
+            # Incoming gradients, zero in the lanes without a point.
             for c in range(channels):
                 at = p * per[0] + view * per[1] + c * per[2]
                 copy(s, CHANNELS + c * BLOCK, count, grad_colours, at, per[0])
-            clear(s, count, channels)
-            _pull(s, points, p, pitch, view, matrices, images, packed, bits, pixels, height, width, nearest,
-                  grad_points, p, sums)  # fmt: skip
+            # Gradients with respect to pixels: of the coordinates, then of the interpolation.
+            if points is not None:
+                at = p * per_coordinate[0] + view * per_coordinate[1]
+                copy(s, COLUMN, count, grad_coordinates, at, per_coordinate[0])
+                copy(s, ROW, count, grad_coordinates, at + per_coordinate[2], per_coordinate[0])
+                start_pull(s, height, width)
+            if given is not None:
+                s[GRAD_U : GRAD_V + BLOCK] = 0
+            if bits:
+                pull_packed(s, packed, view * size, height, width, bits)
+            elif len(pixels):
+                pull_pixels(s, pixels, height, width)
+            else:
+                for c in range(channels):
+                    pull_plane(s, images, (view * channels + c) * size, height, width, c)
+            # From pixels to points and matrices, or to the coordinates.
+            if points is not None:
+                back_project(s, points, p, pitch, matrices, view, grad_points, sums)
+            if given is not None:
+                at = 2 * view * pitch + p
+                for i in range(BLOCK):
+                    store(grad_points, at + i, load(s, GRAD_U + i) * per_column)
+                    store(grad_points, at + pitch + i, load(s, GRAD_V + i) * per_row)
 
 
 @no_type_check
-def backward_chosen(points, pitch, views, matrices, images, packed, bits, height, width, nearest, grad_colours,
-                    per, grad_coordinates, by, grad_points, sums, total, start, stop):  # fmt: skip
-    """As `backward`, for chosen planes; `grad_points` starts at zero."""
-    planes, channels, m = images.shape[0], images.shape[1], views.shape[1]
-    s = scratch(points.dtype, channels)
-    first = np.empty(planes + 1, np.int64)
-    order = np.empty((stop - start) * m, np.int64)
-    grouped(views, start, stop, planes, first, order)
-    for view in range(planes):
-        for begin in range(first[view], first[view + 1], BLOCK):
-            count = min(BLOCK, first[view + 1] - begin)
-            s[GRAD_X : GRAD_Z + BLOCK] = 0
+def image_backward(points, pitch, matrices, given, by, height, width, min_z, grad_colours, per, channels, pixel,
+                   grad_images, segments):  # fmt: skip
+    """Gradients with respect to the planes of the segments, of which no two threads may share one.
+
+    `grad_images` is flat (view, row, column, channel), `pixel` numbers a pixel, with one spare pixel at the end, since
+    an image one pixel wide has zero weight on a neighbour that it lacks.
+    """
+    s = scratch(grad_images.dtype, 0)
+    for index in range(len(segments)):
+        view, begin, end = segments[index, 0], segments[index, 1], segments[index, 2]
+        plane = view * height * width * pixel
+        for p in range(begin, end, BLOCK):
+            count = min(BLOCK, end - p)
+            locate(s, points, pitch, matrices, given, by, view, p, count, height, width, min_z, s, COLUMN, ROW)
             for i in range(count):
-                p, j = order[begin + i] // m, order[begin + i] % m
-                take(s, i, points, pitch, p)
-                at = p * by[0] + j * by[1]
-                s[COLUMN + i] = grad_coordinates[at]
-                s[ROW + i] = grad_coordinates[at + by[2]]
-                for c in range(channels):
-                    s[CHANNELS + c * BLOCK + i] = grad_colours[p * per[0] + j * per[1] + c * per[2]]
-            clear(s, count, channels)
-            _pull(s, s, X, BLOCK, view, matrices, images, packed, bits, s[:0], height, width, nearest, s, GRAD_X, sums)
-            for i in range(count):
-                p = order[begin + i] // m
-                grad_points[p] += s[GRAD_X + i]
-                grad_points[pitch + p] += s[GRAD_Y + i]
-                grad_points[2 * pitch + p] += s[GRAD_Z + i]
+                if load(s, INSIDE + i) > 0:
+                    at = (p + i) * per[0] + view * per[1]
+                    _scatter(s, i, at, per[2], grad_colours, height, width, channels, pixel, plane, grad_images)
 
 
 @inlined
 @no_type_check
-def splat(s, i, at, step, grad_colours, height, width, channels, pitch, start, plane):
-    """Adds one lookup's gradient to the four pixels it was interpolated from; pixels lie `pitch` numbers apart."""
+def _scatter(s, i, at, step, grad_colours, height, width, channels, pitch, start, plane):
+    """Adds one point's gradient to the four pixels it was interpolated from; pixels lie `pitch` numbers apart."""
+    # The upper left pixel and the bilinear weights of all four.
     u, v = load(s, U + i), load(s, V + i)
     x, y = min(np.int64(u), max(width - 2, 0)), min(np.int64(v), max(height - 2, 0))
     fx, fy = u - s.dtype.type(x), v - s.dtype.type(y)
@@ -142,53 +128,3 @@ def splat(s, i, at, step, grad_colours, height, width, channels, pitch, start, p
             plane[top + pitch + c] += wb * gradient
             plane[low + c] += wc * gradient
             plane[low + pitch + c] += wd * gradient
-
-
-@no_type_check
-def image_backward(points, pitch, matrices, height, width, nearest, grad_colours, per, channels, pixel, grad_images,
-                   total, start, stop):  # fmt: skip
-    """The gradient with respect to planes start..stop.
-
-    `grad_images` is flat (view, row, column, channel), `pixel` numbers a pixel, with one spare pixel at the end, since
-    an image one pixel wide has zero weight on a neighbour that it lacks.
-    """
-    s = scratch(points.dtype, 0)
-    for view in range(start, stop):
-        plane = view * height * width * pixel
-        for p in range(0, total, BLOCK):
-            project(s, points, p, pitch, matrices, view, nearest)
-            place(s, s, COLUMN, ROW, height, width)
-            for i in range(min(BLOCK, total - p)):
-                if load(s, INSIDE + i) > 0:
-                    at = (p + i) * per[0] + view * per[1]
-                    splat(s, i, at, per[2], grad_colours, height, width, channels, pixel, plane, grad_images)
-
-
-@no_type_check
-def image_backward_chosen(points, pitch, views, matrices, height, width, nearest, grad_colours, per, channels, pixel,
-                          grad_images, total, start, stop):  # fmt: skip
-    """As `image_backward`, for chosen planes: only lookups in planes start..stop are followed."""
-    s = scratch(points.dtype, 0)
-    m, planes = views.shape[1], matrices.shape[0]
-    order = np.empty((planes, BLOCK), np.int64)
-    filled = np.zeros(planes, np.int64)
-    lookups = total * m
-    for k in range(lookups + planes):  # the last rounds empty the half-full blocks
-        view = views[k // m, k % m] if k < lookups else k - lookups
-        if view < start or view >= stop:
-            continue
-        if k < lookups:
-            order[view, filled[view]] = k
-            filled[view] += 1
-        if filled[view] < BLOCK and k < lookups:
-            continue
-        for i in range(filled[view]):
-            take(s, i, points, pitch, order[view, i] // m)
-        project(s, s, X, BLOCK, matrices, view, nearest)
-        place(s, s, COLUMN, ROW, height, width)
-        plane = view * height * width * pixel
-        for i in range(filled[view]):
-            if load(s, INSIDE + i) > 0:
-                at = order[view, i] // m * per[0] + order[view, i] % m * per[1]
-                splat(s, i, at, per[2], grad_colours, height, width, channels, pixel, plane, grad_images)
-        filled[view] = 0

@@ -23,17 +23,17 @@ _BLOCK = 128
 
 @triton.jit
 @no_type_check
-def _project(matrices, view, x, y, z, inside_block, nearest):
-    """(u, v, 1 / depth, in front) of points under one plane's matrix, or one matrix a point."""
+def _project(matrices, view, x, y, z, inside_block, min_z):
+    """(u, v, 1 / z, in front) of points under one plane's matrix, or one matrix a point."""
     m = matrices + view * 12
-    depth = (
+    camera_z = (
         tl.load(m + 8, inside_block) * x
         + tl.load(m + 9, inside_block) * y
         + tl.load(m + 10, inside_block) * z
         + tl.load(m + 11, inside_block)
     )
-    front = (depth > nearest) & (depth < float("inf"))
-    reciprocal = tl.where(front, 1.0 / tl.where(front, depth, 1.0), 0.0)
+    front = (camera_z > min_z) & (camera_z < float("inf"))
+    reciprocal = tl.where(front, 1.0 / tl.where(front, camera_z, 1.0), 0.0)
     u = (
         tl.load(m, inside_block) * x
         + tl.load(m + 1, inside_block) * y
@@ -64,7 +64,7 @@ def _place(u, v, front, height, width):
 @triton.jit
 @no_type_check
 def _forward(points, matrices, images, views, colours, coordinates, valid, count, planes, height, width, background,
-             nearest, CHANNELS: tl.constexpr, CHOSEN: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
+             min_z, CHANNELS: tl.constexpr, CHOSEN: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = point < count
     x = tl.load(points + point * 3, here, 0.0)
@@ -75,7 +75,8 @@ def _forward(points, matrices, images, views, colours, coordinates, valid, count
         view = tl.full((BLOCK,), slot, tl.int64)
         if CHOSEN:
             view = tl.load(views + point.to(tl.int64) * planes + slot, here, 0)
-        u, v, _, front = _project(matrices, view, x, y, z, here, nearest)
+        # Project and clamp; write coordinates and validity.
+        u, v, _, front = _project(matrices, view, x, y, z, here, min_z)
         u, v, column, row, inside = _place(u, v, front, height, width)
         fx, fy = u - column, v - row
         plane = tl.full((BLOCK,), slot, tl.int64)
@@ -83,6 +84,7 @@ def _forward(points, matrices, images, views, colours, coordinates, valid, count
         tl.store(coordinates + at, tl.where(front, 2 * u / tl.maximum(width - 1, 1) - 1, 0.0), here)
         tl.store(coordinates + at + count, tl.where(front, 2 * v / tl.maximum(height - 1, 1) - 1, 0.0), here)
         tl.store(valid + plane * count + point, inside.to(tl.uint8), here)
+        # Interpolate and write colours.
         for channel in tl.static_range(CHANNELS):
             tap = images + (view * CHANNELS + channel) * height * width + row * width + column
             seen = here & inside
@@ -99,7 +101,7 @@ def _forward(points, matrices, images, views, colours, coordinates, valid, count
 @triton.jit
 @no_type_check
 def _backward(points, matrices, images, views, grad_colours, grad_coordinates, grad_points, grad_matrices, grad_images,
-              c0, c1, c2, q0, q1, q2, count, planes, height, width, nearest, CHANNELS: tl.constexpr,
+              c0, c1, c2, q0, q1, q2, count, planes, height, width, min_z, CHANNELS: tl.constexpr,
               CHOSEN: tl.constexpr, GEOMETRY: tl.constexpr, PIXELS: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = point < count
@@ -113,11 +115,12 @@ def _backward(points, matrices, images, views, grad_colours, grad_coordinates, g
         view = tl.full((BLOCK,), slot, tl.int64)
         if CHOSEN:
             view = tl.load(views + wide * planes + slot, here, 0)
-        raw_u, raw_v, reciprocal, front = _project(matrices, view, x, y, z, here, nearest)
+        raw_u, raw_v, reciprocal, front = _project(matrices, view, x, y, z, here, min_z)
         u, v, column, row, inside = _place(raw_u, raw_v, front, height, width)
         fx, fy = u - column, v - row
         seen = here & inside
         gu, gv = x * 0.0, y * 0.0
+        # Gradients with respect to the pixel: of the coordinates, then of the interpolation.
         if GEOMETRY:
             at = wide * q0 + slot * q1
             free_u = here & front & (raw_u >= 0) & (raw_u <= width - 1)
@@ -140,6 +143,7 @@ def _backward(points, matrices, images, views, grad_colours, grad_coordinates, g
                 tl.atomic_add(grad_images + offset + right, gradient * fx * (1 - fy), seen)
                 tl.atomic_add(grad_images + offset + below, gradient * (1 - fx) * fy, seen)
                 tl.atomic_add(grad_images + offset + below + right, gradient * fx * fy, seen)
+        # From the pixel to point and matrix: dL/dh = (g_u, g_v, -(g_u u + g_v v)) / h2.
         if GEOMETRY:
             h0, h1 = gu * reciprocal, gv * reciprocal
             h2 = -(h0 * tl.where(front, raw_u, 0.0) + h1 * tl.where(front, raw_v, 0.0))

@@ -1,0 +1,333 @@
+"""Lookup and sampling as PyTorch operators, `hyperplanes::lookup` and `hyperplanes::sample`, with their gradients.
+
+Registered with `torch.library`, so that autograd, `torch.compile` and fake tensors know them. This file holds shapes
+and autograd for all device types, and how the CPU calls its kernels; `lookup_triton` has those for CUDA, which has no
+kernel of sampling alone. Second derivatives need the plain torch backend.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyperplanes.geometry.kernels import memory
+from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.threads import parallel_for
+from hyperplanes.geometry.lookup_torch import MIN_Z
+
+__all__ = ["lookup", "lookup_backward", "sample", "sample_backward"]
+
+_CHUNK = 64 * memory.BLOCK  # points in one call of a kernel
+_PLANES = "Tensor points, Tensor matrices, Tensor images, Tensor? packed, int bits, Tensor? views"
+_SAMPLED = "Tensor images, Tensor coordinates, Tensor? packed, int bits"
+_GRADIENTS = "Tensor? grad_colours, Tensor? grad_coordinates, bool geometry, bool pixels"
+_CPU: dict[str, Any] = {"mutates_args": (), "device_types": "cpu"}
+
+
+@dataclass(frozen=True)
+class _Points:
+    """The points of a kernel's call, and which of them fall on which plane.
+
+    Attributes:
+        kind: "projected" or "given".
+        arguments: points as rows of x, y and z, the length of a row, matrices; coordinates and their strides.
+        like: a tensor of the dtype to compute in.
+        total: number of points on each plane, or, where every point has planes of its own, length of a row.
+        groups: segments (view, begin, end) of the points grouped by plane; None where all points fall on all planes.
+        position: place of each (point, slot) among the grouped points.
+    """
+
+    kind: str
+    arguments: tuple[Any, ...]
+    like: Tensor
+    total: int
+    groups: np.ndarray | None = None
+    position: np.ndarray | None = None
+
+    @classmethod
+    def projected(cls, points: Tensor, matrices: Tensor, views: Tensor | None) -> _Points:
+        """World points and projection matrices."""
+        if views is None:
+            rows, groups, position = _rows(points, memory.pitch(points)), None, None
+        else:
+            groups, position, pitch = _grouped(memory.array(views).reshape(-1), len(matrices))
+            rows = np.zeros((3, pitch), memory.number(points))
+            rows[:, position] = points.detach().numpy().T.repeat(views.shape[1], 1)
+        arguments = (rows.reshape(-1), rows.shape[1], memory.array(matrices), None, None)
+        return cls("projected", arguments, points, len(points) if views is None else rows.shape[1], groups, position)
+
+    @classmethod
+    def given(cls, coordinates: Tensor) -> _Points:
+        """Coordinates in [-1, 1]."""
+        arguments = (None, memory.pitch(coordinates), None, *memory.strided(coordinates))
+        return cls("given", arguments, coordinates, len(coordinates))
+
+    def run(self, kernel: Callable[[np.ndarray], Any], planes: int, whole_planes: bool, packed: bool = False) -> list:
+        """The kernel on all segments, by all threads; `whole_planes` where no two may write to one plane."""
+        if (groups := self.groups) is not None:
+            step = -(-max(1, len(groups)) // (torch.get_num_threads() * (1 if whole_planes else 4)))
+            return parallel_for(lambda start, stop: kernel(groups[start:stop]), len(groups), step)
+        if whole_planes:
+            return parallel_for(lambda start, stop: kernel(_segments(start, stop, 0, self.total)), planes, 1)
+        # An equal part for each thread gains from planes interleaved for it; packed planes are never interleaved.
+        equal = -(-self.total // (torch.get_num_threads() * memory.BLOCK)) * memory.BLOCK
+        chunk = _CHUNK if packed else max(_CHUNK, equal)
+        return parallel_for(lambda start, stop: kernel(_segments(0, planes, start, stop)), self.total, chunk)
+
+    def incoming(self, gradient: Tensor) -> tuple[np.ndarray, tuple[int, ...]]:
+        """A gradient (point, view, channel) as the kernels read it: memory and strides."""
+        if self.position is None:
+            return memory.strided(gradient)
+        flat = np.zeros((gradient.shape[2], self.total), memory.number(gradient))
+        flat[:, self.position] = gradient.detach().numpy().transpose(2, 0, 1).reshape(len(flat), -1)
+        return flat.reshape(-1), (1, 0, self.total)
+
+
+def _rows(points: Tensor, pitch: int) -> np.ndarray:
+    """Points as rows of x, y and z; by NumPy, since PyTorch's threads take longer to start than this."""
+    rows = np.zeros((3, pitch), memory.number(points))
+    rows[:, : len(points)] = points.detach().numpy().T
+    return rows
+
+
+def _segments(first: int, last: int, begin: int, end: int) -> np.ndarray:
+    """Points begin..end on each of the planes first..last."""
+    views = np.arange(first, last)
+    return np.stack([views, np.full_like(views, begin), np.full_like(views, end)], 1)
+
+
+def _grouped(views: np.ndarray, planes: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Segments of points sorted by plane, each from a whole block on; the place of each point; the length of a row."""
+    order, count = np.argsort(views, kind="stable"), np.bincount(views, minlength=planes)
+    padded = -(-count // memory.BLOCK) * memory.BLOCK
+    begin = padded.cumsum() - padded
+    position = np.empty(len(views), np.int64)
+    position[order] = np.arange(len(views)) + (begin - (count.cumsum() - count))[views[order]]
+    segments = np.stack([np.arange(planes), begin, begin + count], 1)
+    return np.ascontiguousarray(segments[count > 0]), position, int(padded.sum())
+
+
+@torch.library.custom_op(
+    "hyperplanes::lookup", schema=f"({_PLANES}, float background) -> (Tensor, Tensor, Tensor)", **_CPU
+)
+def lookup(
+    points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
+    background: float,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Colours (point, view, channel), coordinates (point, view, 2) and validity (point, view), planar in memory."""
+    results = _empty(points, images, views)
+    if not results[2].numel():
+        return results
+    where, number = _Points.projected(points, matrices, views), memory.number(points)
+    if views is None:
+        outputs = [memory.flat(value) for value in (*results[:2], results[2].view(torch.uint8))]
+    else:
+        sizes, kinds = (images.shape[1], 2, 1), (number, number, np.uint8)
+        outputs = [np.empty(size * where.total, kind) for size, kind in zip(sizes, kinds, strict=True)]
+    kernel = compile_kernel("lookup_forward.forward", points.dtype, "projected")
+    fixed = (*where.arguments, *memory.planes(images, packed, bits), number(background), number(MIN_Z), *outputs)
+    where.run(lambda part: kernel(*fixed, views is not None, part), len(images), False, packed is not None)
+    if views is not None:
+        for result, output in zip(results, outputs, strict=True):
+            found = output.reshape(-1, where.total)[:, where.position].reshape(-1, *views.shape)
+            result.copy_(torch.from_numpy(found).permute(1, 2, 0).reshape(result.shape))
+    return results
+
+
+@torch.library.custom_op(
+    "hyperplanes::lookup_backward", schema=f"({_PLANES}, {_GRADIENTS}) -> (Tensor, Tensor, Tensor)", **_CPU
+)
+def lookup_backward(
+    points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
+    grad_colours: Tensor | None, grad_coordinates: Tensor | None, geometry: bool, pixels: bool,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Gradients with respect to points, matrices and images; empty where not asked for."""
+    shape = (len(points), len(images) if views is None else views.shape[1])
+    grad_points, grad_matrices = (value.new_zeros(value.shape if geometry else 0) for value in (points, matrices))
+    memory_, grad_images = memory.pixel_gradient(images) if pixels else (None, points.new_empty(0))
+    if not (shape[0] and shape[1]):
+        return grad_points, grad_matrices, grad_images
+    zero = points.new_zeros(())
+    where = _Points.projected(points, matrices, views)
+    colour = where.incoming(zero.expand(*shape, images.shape[1]) if grad_colours is None else grad_colours)
+    if geometry:
+        coordinate = where.incoming(zero.expand(*shape, 2) if grad_coordinates is None else grad_coordinates)
+        rows = np.zeros_like(where.arguments[0])
+        planes = memory.planes(images, packed, bits)
+        sums = _backward(where, planes, colour, coordinate, rows, len(matrices), packed is not None)
+        rows = rows.reshape(3, -1)
+        if where.position is not None:
+            rows = rows[:, where.position].reshape(3, *shape).sum(2)
+        grad_points = torch.from_numpy(np.ascontiguousarray(rows[:, : len(points)].T))
+        grad_matrices = torch.from_numpy(sums).to(matrices).reshape(matrices.shape)
+    if memory_ is not None:
+        _image_backward(where, images, colour, memory_)
+    return grad_points, grad_matrices, grad_images
+
+
+@torch.library.custom_op("hyperplanes::sample", schema=f"({_SAMPLED}, float background) -> Tensor", **_CPU)
+def sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bits: int, background: float) -> Tensor:
+    """Colours (point, view, channel), planar in memory."""
+    colours = _planar(coordinates, coordinates.shape[1], images.shape[1])
+    if colours.numel():
+        where, number = _Points.given(coordinates), memory.number(coordinates)
+        kernel = compile_kernel("lookup_forward.forward", coordinates.dtype, "given")
+        fixed = (*where.arguments, *memory.planes(images, packed, bits), number(background), number(MIN_Z))
+        fixed += (memory.flat(colours), np.zeros(0, number), np.zeros(0, np.uint8), False)
+        where.run(lambda part: kernel(*fixed, part), len(images), False, packed is not None)
+    return colours
+
+
+@torch.library.custom_op(
+    "hyperplanes::sample_backward",
+    schema=f"({_SAMPLED}, Tensor grad_colours, bool geometry, bool pixels) -> (Tensor, Tensor)",
+    **_CPU,
+)
+def sample_backward(
+    images: Tensor, coordinates: Tensor, packed: Tensor | None, bits: int, grad_colours: Tensor, geometry: bool,
+    pixels: bool,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Gradients with respect to images and coordinates; empty where not asked for."""
+    memory_, grad_images = memory.pixel_gradient(images) if pixels else (None, images.new_empty(0))
+    if not grad_colours.numel():
+        return grad_images, coordinates.new_zeros(coordinates.shape if geometry else 0)
+    where = _Points.given(coordinates)
+    colour = where.incoming(grad_colours)
+    grad_coordinates = _planar(coordinates, len(images), 2) if geometry else coordinates.new_empty(0)
+    if geometry:
+        none = where.incoming(coordinates.new_zeros(()).expand(coordinates.shape))
+        planes = memory.planes(images, packed, bits)
+        _backward(where, planes, colour, none, memory.flat(grad_coordinates), 0, packed is not None)
+    if memory_ is not None:
+        _image_backward(where, images, colour, memory_)
+    return grad_images, grad_coordinates
+
+
+def _backward(
+    where: _Points, planes: tuple[Any, ...], colour: Any, coordinate: Any, result: np.ndarray, matrices: int,
+    packed: bool,
+) -> np.ndarray:  # fmt: skip
+    """Fills the gradient of points or coordinates; returns that of the matrices, (view, 12)."""
+    kernel = compile_kernel("lookup_backward.backward", where.like.dtype, where.kind)
+    fixed = (*where.arguments, *planes, memory.number(where.like)(MIN_Z), *colour, *coordinate, result)
+
+    def work(part: np.ndarray) -> np.ndarray:
+        sums = np.zeros((matrices, 12))
+        kernel(*fixed, sums, part)
+        return sums
+
+    return sum(where.run(work, len(planes[0]), False, packed), np.zeros((matrices, 12)))
+
+
+def _image_backward(where: _Points, images: Tensor, colour: Any, result: np.ndarray) -> None:
+    """Fills the memory of the gradient of images."""
+    kernel = compile_kernel("lookup_backward.image_backward", where.like.dtype, where.kind)
+    fixed = (*where.arguments, *images.shape[2:], memory.number(where.like)(MIN_Z), *colour)
+    fixed += (images.shape[1], memory.pixel_pitch(images.shape[1]), result)
+    where.run(lambda part: kernel(*fixed, part), len(images), True)
+
+
+def _empty(points: Tensor, images: Tensor, views: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Outputs of a lookup."""
+    slots = len(images) if views is None else views.shape[1]
+    valid = memory.uninitialised(points, (slots, memory.pitch(points)), torch.bool).T[: len(points)]
+    return _planar(points, slots, images.shape[1]), _planar(points, slots, 2), valid
+
+
+def _planar(points: Tensor, slots: int, numbers: int) -> Tensor:
+    """Memory (view, number, point) in rows of whole blocks, as a tensor (point, view, number)."""
+    shape = (slots, numbers, memory.pitch(points))
+    return memory.uninitialised(points, shape, points.dtype).permute(2, 0, 1)[: len(points)]
+
+
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    points, matrices, images, packed, bits, views, _ = inputs
+    ctx.set_materialize_grads(False)
+    ctx.mark_non_differentiable(output[-1])
+    ctx.save_for_backward(points, matrices, images, packed, views)
+    ctx.bits = bits
+
+
+def _gradients(
+    ctx: Any, grad_colours: Tensor | None, grad_coordinates: Tensor | None, _: None
+) -> tuple[Tensor | None, ...]:
+    points, matrices, images, packed, views = ctx.saved_tensors
+    geometry, pixels = ctx.needs_input_grad[0] or ctx.needs_input_grad[1], ctx.needs_input_grad[2]
+    if grad_colours is None and grad_coordinates is None:
+        return (None,) * 7
+    found = lookup_backward(
+        points, matrices, images, packed, ctx.bits, views, grad_colours, grad_coordinates, geometry, pixels
+    )
+    wanted = ctx.needs_input_grad[:3]
+    return *(value if needed else None for value, needed in zip(found, wanted, strict=True)), *(None,) * 4
+
+
+def _sample_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    images, coordinates, packed, bits, _ = inputs
+    ctx.save_for_backward(images, coordinates, packed)
+    ctx.bits = bits
+
+
+def _sample_gradients(ctx: Any, grad_colours: Tensor) -> tuple[Tensor | None, ...]:
+    images, coordinates, packed = ctx.saved_tensors
+    pixels, geometry = ctx.needs_input_grad[:2]
+    found = sample_backward(images, coordinates, packed, ctx.bits, grad_colours, geometry, pixels)
+    return found[0] if pixels else None, found[1] if geometry else None, None, None, None
+
+
+def _fake_image_gradient(images: Tensor, like: Tensor, pixels: bool) -> Tensor:
+    """The gradient of images as `memory.pixel_gradient` lays it out."""
+    count, channels, height, width = images.shape
+    if not pixels:
+        return like.new_empty(0)
+    if like.device.type != "cpu":
+        return like.new_empty(images.shape)
+    pixel = like.new_empty(count, height, width, memory.pixel_pitch(channels))
+    return pixel[..., :channels].permute(0, 3, 1, 2)
+
+
+@lookup.register_fake
+def _(points, matrices, images, packed, bits, views, background):
+    return _empty(points, images, views)
+
+
+@lookup_backward.register_fake
+def _(points, matrices, images, packed, bits, views, grad_colours, grad_coordinates, geometry, pixels):
+    last = _fake_image_gradient(images, points, pixels)
+    return *(value.new_empty(value.shape if geometry else 0) for value in (points, matrices)), last
+
+
+@sample.register_fake
+def _(images, coordinates, packed, bits, background):
+    return _planar(coordinates, coordinates.shape[1], images.shape[1])
+
+
+@sample_backward.register_fake
+def _(images, coordinates, packed, bits, grad_colours, geometry, pixels):
+    grad_coordinates = _planar(coordinates, len(images), 2) if geometry else coordinates.new_empty(0)
+    return _fake_image_gradient(images, coordinates, pixels), grad_coordinates
+
+
+lookup.register_autograd(_gradients, setup_context=_setup)
+sample.register_autograd(_sample_gradients, setup_context=_sample_setup)
+
+
+@lookup.register_kernel("cuda")
+def _(points, matrices, images, packed, bits, views, background):
+    from hyperplanes.geometry.kernels import lookup_triton
+
+    return lookup_triton.lookup(points, matrices, images, views, background)
+
+
+@lookup_backward.register_kernel("cuda")
+def _(points, matrices, images, packed, bits, views, grad_colours, grad_coordinates, geometry, pixels):
+    from hyperplanes.geometry.kernels import lookup_triton
+
+    return lookup_triton.lookup_backward(
+        points, matrices, images, views, grad_colours, grad_coordinates, geometry, pixels
+    )
