@@ -25,9 +25,10 @@ from hyperplanes.data.dataset import open_datasets
 from hyperplanes.episodes import prepare_episode
 from hyperplanes.metrics import psnr
 from hyperplanes.presets import Preset, preset
-from hyperplanes.training import Tasks, Trainer
+from hyperplanes.training import Trainer
+from hyperplanes.views import Tasks
 
-__all__ = ["VARIANTS", "main", "measure", "recipe"]
+__all__ = ["VARIANTS", "main", "measure", "variant"]
 
 NONE: dict[str, Any] = {"none": True}
 PAPER_UPDATE = {"layers": ("colour", "density"), "update": "full", "activation": "relu", "weights_seen": "updated"}
@@ -73,7 +74,7 @@ def main(arguments: list[str]) -> int:
     rows = []
     for name in chosen.variant:
         for seed in chosen.seeds:
-            made = recipe(name, planes=chosen.planes, optimiser=chosen.optimiser, tasks=chosen.tasks, steps=steps)
+            made = variant(name, planes=chosen.planes, optimiser=chosen.optimiser, tasks=chosen.tasks, steps=steps)
             made = replace(made, training=replace(made.training, seed=seed))
             folder = chosen.out and chosen.out / f"{name}-{chosen.planes}-{chosen.optimiser}-{seed}"
             rows.append({"name": name, "planes": chosen.planes, "seed": seed, **measure(made, data, folder)})
@@ -81,7 +82,7 @@ def main(arguments: list[str]) -> int:
     return finish("hypernetwork", rows, chosen.json)
 
 
-def recipe(name: str, *, planes: int = 25, optimiser: str = "muon", tasks: int = 4, steps: int = 1200) -> Preset:
+def variant(name: str, *, planes: int = 25, optimiser: str = "muon", tasks: int = 4, steps: int = 1200) -> Preset:
     """The preset "quick" with a variant of its hypernetwork.
 
     Args:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
 from hyperplanes.adaptation.base import Adapter, Pictures
-from hyperplanes.episodes import naming
+from hyperplanes.errors import prefix_errors
 from hyperplanes.metrics import psnr, ssim
-from hyperplanes.training import Tasks
-from hyperplanes.views import Task
+from hyperplanes.views import Task, Tasks
 
-__all__ = ["ObjectScore", "Score", "evaluate"]
+__all__ = ["ObjectScore", "Score", "evaluate", "evaluate_all"]
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def evaluate(
         if not len(task.query):
             raise ValueError(f"{name}: expected at least one query view to compare with, got none")
         start = time.perf_counter()
-        with naming(name):
+        with prefix_errors(name):
             adapted = adapter.adapt(task.support)
         adapted_at = time.perf_counter()
         pictures = adapted.render(task.query.cameras)
@@ -104,3 +103,32 @@ def evaluate(
         if on_object is not None:
             on_object(score, task, pictures)
     return Score(method, tuple(scores))
+
+
+def evaluate_all(
+    methods: Mapping[str, Adapter],
+    data: Tasks,
+    names: Sequence[str],
+    report: Callable[[int, int, str], None],
+) -> list[Score]:
+    """Every method on every object.
+
+    Args:
+        methods: by the names of their rows.
+        data: where the objects are.
+        names: the objects.
+        report: called with (evaluations done, evaluations in all, what has just been found) after each.
+
+    Returns:
+        The rows in the order of the methods.
+    """
+    done, scores = 0, []
+
+    def count(method: str, score: ObjectScore) -> None:
+        nonlocal done
+        done += 1
+        report(done, len(methods) * len(names), f"{method} on {score.name}: {score.psnr:.2f} dB")
+
+    for method, adapter in methods.items():
+        scores.append(evaluate(method, adapter, data, names, lambda score, *_, method=method: count(method, score)))
+    return scores

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from hyperplanes.adaptation.base import Adapter
+from hyperplanes.adaptation.base import AdaptedField, Adapter, Renderable
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.rendering.samplers import Sampler
 from hyperplanes.views import Views
 
-__all__ = ["METHODS", "at_steps", "describe_method", "make_method"]
+__all__ = ["METHODS", "at_steps", "WithSampler", "describe_method", "make_method"]
 
 METHODS: dict[str, str] = {
     "nearest_view": "the nearest support view, copied",
@@ -121,3 +123,23 @@ def make_method(
         assert steps is not None
         return FromScratch(model, steps, settings)
     return model if steps is None else FineTuned(model, steps, settings)
+
+
+@dataclass(frozen=True)
+class WithSampler:
+    """A method whose fields are rendered by another protocol than the one they were trained by.
+
+    Attributes:
+        adapter: the method.
+        sampling: the protocol; None leaves all as it is. What is no field is not sampled, and stays as it is.
+    """
+
+    adapter: Adapter
+    sampling: Sampler | None
+
+    def adapt(self, support: Views) -> Renderable:
+        """What the method makes of one object."""
+        made = self.adapter.adapt(support)
+        if self.sampling is None or not isinstance(made, AdaptedField):
+            return made
+        return replace(made, sampling=self.sampling)

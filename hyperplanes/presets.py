@@ -10,7 +10,7 @@ from hyperplanes.hypernetwork.hypernetwork import HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import TrainingConfig
 
-__all__ = ["PRESETS", "PROTOCOLS", "Preset", "preset"]
+__all__ = ["PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]
 
 
 PROTOCOLS: dict[str, Hierarchical | None] = {"default": None, "paper": Hierarchical(64, 128)}
@@ -142,3 +142,39 @@ def preset(name: str) -> Preset:
     if name not in PRESETS:
         raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {name!r}")
     return PRESETS[name]
+
+
+TRAINABLE = ("hyperplanes", "point_multiplane", "multiplane", "nerf")
+"""Methods that `train` knows; all but the first are one set of weights for all objects."""
+
+
+def configure(
+    name: str, method: str = "hyperplanes", *, steps: int | None = None, seed: int = 0, protocol: str = "default"
+) -> Preset:
+    """The configuration of a method at the scale of a preset.
+
+    Args:
+        name: of the preset.
+        method: one of TRAINABLE.
+        steps: other than the preset's.
+        seed: of the training.
+        protocol: a name in PROTOCOLS: how rays are sampled.
+
+    Returns:
+        Model and training.
+
+    Raises:
+        ValueError: an unknown preset, method or protocol, or no step.
+    """
+    if method not in TRAINABLE:
+        raise ValueError(f"method: expected one of {', '.join(TRAINABLE)}, got {method!r}")
+    if steps is not None and steps < 1:
+        raise ValueError(f"steps: expected at least 1, got {steps}")
+    chosen = preset(name).by_protocol(protocol)
+    if method != "hyperplanes":
+        chosen = chosen.without_hypernetwork()
+    return replace(
+        chosen,
+        model=chosen.model if method == "hyperplanes" else replace(chosen.model, target=method),
+        training=replace(chosen.training, steps=steps or chosen.training.steps, seed=seed),
+    )

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -16,32 +15,22 @@ from torch.profiler import record_function
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
 from hyperplanes.adaptation.fine_tuning import ray_loss
-from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
+from hyperplanes.devices import TasksOnDevice
+from hyperplanes.episodes import Episode, prepare_episode
+from hyperplanes.errors import prefix_errors
 from hyperplanes.files import write_json
-from hyperplanes.episodes import Episode, Kept, naming, prepare_episode
+from hyperplanes.lru_cache import LRUCache
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
 from hyperplanes.training_state import Curve, check_model, load_state, save_state
-from hyperplanes.views import Task
+from hyperplanes.views import Tasks
 
-__all__ = ["Progress", "Tasks", "Trainer", "TrainingConfig", "train"]
+__all__ = ["Progress", "Trainer", "TrainingConfig", "start_training", "train"]
 
 
 EMPTINESS = 0.01  # weight of the opacity of empty space beside the squared error of pixels
 FREE = ("steps", "evaluate_every", "held_out", "checkpoint_every", "memory")  # may differ in a training that is resumed
-
-
-@runtime_checkable
-class Tasks(Protocol):
-    """Where tasks come from: a data set."""
-
-    def names(self, split: str) -> Sequence[str]:
-        """The objects of a split."""
-        ...
-
-    def task(self, name: str) -> Task:
-        """One object."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -136,7 +125,7 @@ class Trainer:
         self.names = sorted(data.names("train"))
         if not self.names:
             raise ValueError("data: expected at least one training object, got none")
-        self._kept = Kept(config.memory)
+        self._episodes: LRUCache[Episode] = LRUCache(config.memory, keep_last=True)
         self._held_out: dict[str, Episode] = {}
         theta = list(model.networks.parameters())
         self.optimisers = make_optimisers(theta, config.optimiser, config.learning_rate, config.muon_learning_rate)
@@ -149,7 +138,7 @@ class Trainer:
         if folder is not None and (folder / "training.json").exists():
             self.step, self.curve = load_state(folder, model, self.optimisers, asdict(config), FREE)
         else:
-            with naming(self.names[0]):
+            with prefix_errors(self.names[0]):
                 model.set_rig(data.task(self.names[0]).support)
 
     def run(self) -> Iterator[Progress]:
@@ -194,7 +183,7 @@ class Trainer:
         for name, episode, update in zip(drawn, episodes, updates, strict=True):
             field = self.model.field(episode.prepared, self.model.theta + update)
             span = field.sampling.span
-            with record_function("step:rays"), naming(name):
+            with record_function("step:rays"), prefix_errors(name):
                 rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
             with record_function("step:rendering"):
                 seen = field.trace(rays, generator)
@@ -285,10 +274,10 @@ class Trainer:
         return self.model.config.sampling.needs_occupancy or self.config.empty_points > 0
 
     def _episode(self, name: str) -> Episode:
-        episode = self._kept.get(name)
+        episode = self._episodes.get(name)
         if episode is None:
             episode = prepare_episode(self.model, self.data.task(name), carved=self._reads_hull)
-            self._kept.add(name, episode)
+            self._episodes.add(name, episode)
         return episode
 
 
@@ -316,3 +305,22 @@ def train(
         if report is not None:
             report(progress)
     return trainer
+
+
+def start_training(
+    config: ModelConfig, training: TrainingConfig, data: Tasks, folder: Path, device: torch.device | str = "cpu"
+) -> Trainer:
+    """A new training, or the one that was interrupted in `folder`.
+
+    Args:
+        config: of the model.
+        training: how it is trained; its seed is that of the first weights, too.
+        data: tasks with a "train" split.
+        folder: for checkpoints.
+        device: where to compute.
+
+    Returns:
+        A trainer; its `step` says how far it is. CheckpointError where the folder holds another model or training.
+    """
+    model = HyperPlanes(config, training.seed).to(device)
+    return Trainer(model, TasksOnDevice(data, torch.device(device)), training, folder)

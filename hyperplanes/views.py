@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -12,7 +14,7 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 
-__all__ = ["Task", "Views"]
+__all__ = ["Task", "Tasks", "Views"]
 
 
 @dataclass(frozen=True)
@@ -135,3 +137,16 @@ class Task:
     support: Views
     query: Views
     name: str = ""
+
+
+@runtime_checkable
+class Tasks(Protocol):
+    """Where tasks come from: a data set."""
+
+    def names(self, split: str) -> Sequence[str]:
+        """The objects of a split."""
+        ...
+
+    def task(self, name: str) -> Task:
+        """One object."""
+        ...

@@ -16,14 +16,14 @@ from PIL import Image
 from small_demo import demo_folder, first_object
 
 from data_gen.rendering.renderers import RendererError
+from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
 from hyperplanes.commands import find_verbs
 from hyperplanes.data import read_task
-from hyperplanes.demo import DemoSettings, recipes
+from hyperplanes.demo.pipeline import DemoSettings, configurations
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.metrics import psnr
-from hyperplanes.models import load_model
 from hyperplanes.presets import PRESETS
 from hyperplanes.rendering.renderer import Hierarchical
 
@@ -264,7 +264,7 @@ def test_the_paper_protocol_is_rendered_and_evaluated_when_asked_for(tmp_path, c
 
 
 def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(PRESETS, "tiny", recipes(DemoSettings.quick_check())["hyperplanes"])
+    monkeypatch.setitem(PRESETS, "tiny", configurations(DemoSettings.quick_check())["hyperplanes"])
     data, run = str(demo_folder() / "data"), tmp_path / "run"
     command = ["train", "--data", data, "--preset", "tiny", "--steps", "2", "--out", str(run)]
     assert main([*command, "--method", "nerf", "--protocol", "paper"]) == 0
@@ -302,14 +302,14 @@ def test_the_demonstration_does_nothing_twice(capsys):
 
 
 def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_path, monkeypatch, capsys):
-    tiny = recipes(DemoSettings.quick_check())["hyperplanes"]
+    tiny = configurations(DemoSettings.quick_check())["hyperplanes"]
     monkeypatch.setitem(PRESETS, "tiny", tiny)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     command = ["train", "--data", str(demo_folder() / "data"), "--preset", "tiny", "--steps", "400", "--out"]
     script = (
-        "import sys; from hyperplanes.cli import main; from hyperplanes.demo import DemoSettings, recipes; "
-        "from hyperplanes.presets import PRESETS; "
-        "PRESETS['tiny'] = recipes(DemoSettings.quick_check())['hyperplanes']; sys.exit(main(sys.argv[1:]))"
+        "import sys; from hyperplanes.cli import main; from hyperplanes.presets import PRESETS; "
+        "from hyperplanes.demo.pipeline import DemoSettings, configurations; "
+        "PRESETS['tiny'] = configurations(DemoSettings.quick_check())['hyperplanes']; sys.exit(main(sys.argv[1:]))"
     )
     start = [sys.executable, "-c", script, *command, str(parts)]
     one_thread = os.environ | {"OMP_NUM_THREADS": "1"}  # as the tests: sums depend on how many threads share them

@@ -1,37 +1,34 @@
-"""Source of truth: the floors of CONTRIBUTING.md, held against every import statement in the packages."""
+"""Source of truth: the layers of CONTRIBUTING.md, held against every import statement in the packages."""
 
 import ast
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-FLOORS = {
-    "hyperplanes": 6,
-    "hyperplanes.cli": 6,
-    "hyperplanes.commands": 6,
-    "benchmarks": 5,
-    "hyperplanes.presets": 5,
-    "hyperplanes.recipes": 5,
-    "hyperplanes.demo": 5,
-    "hyperplanes.demo_report": 5,
-    "hyperplanes.doctor": 5,
-    "data_gen": 4,
-    "data_gen.shapes": 4.1,
-    "data_gen.meshes": 4.1,
-    "data_gen.rigs": 4.2,
-    "data_gen.rendering": 4.3,
-    "data_gen.datasets": 4.4,
-    "data_gen.commands": 6.5,
+LAYERS = {
+    "hyperplanes": 7,
+    "hyperplanes.cli": 7,
+    "hyperplanes.commands": 7,
+    "data_gen.commands": 7.5,
+    "benchmarks": 6,
+    "data_gen": 5,
+    "data_gen.shapes": 5.1,
+    "data_gen.meshes": 5.1,
+    "data_gen.rigs": 5.2,
+    "data_gen.rendering": 5.3,
+    "data_gen.datasets": 5.4,
     "hyperplanes.training": 4,
     "hyperplanes.training_state": 4,
     "hyperplanes.episodes": 4,
     "hyperplanes.evaluation": 4,
     "hyperplanes.methods": 4,
-    "hyperplanes.models": 4,
+    "hyperplanes.presets": 4,
+    "hyperplanes.devices": 4,
+    "hyperplanes.doctor": 4,
+    "hyperplanes.demo": 4,
     "hyperplanes.adaptation": 3,
     "hyperplanes.data": 3,
     "hyperplanes.baking": 3,
     "hyperplanes.export": 3,
-    "hyperplanes.report": 3,
     "hyperplanes.fields": 2,
     "hyperplanes.rendering": 2,
     "hyperplanes.views": 2,
@@ -40,22 +37,23 @@ FLOORS = {
     "hyperplanes.metrics": 1,
     "hyperplanes.checkpoints": 1,
     "hyperplanes.optimisers": 1,
+    "hyperplanes.parameters": 1,
     "hyperplanes.files": 1,
     "hyperplanes.colour": 1,
     "hyperplanes.axes": 1,
-    "hyperplanes.parameters": 1,
-    "hyperplanes.stages": 1,
-    "hyperplanes.words": 1,
+    "hyperplanes.errors": 1,
+    "hyperplanes.formatting": 1,
+    "hyperplanes.lru_cache": 1,
 }
 OURS = ("hyperplanes", "data_gen", "benchmarks")
 
 
 def unit(module):
-    """The entry of FLOORS that a module belongs to: its own name or that of its package."""
+    """The entry of LAYERS that a module belongs to: its own name or that of its package."""
     parts = module.split(".")
     while parts:
         name = ".".join(parts)
-        if name in FLOORS and (name != "hyperplanes" or module == "hyperplanes"):
+        if name in LAYERS and (name != "hyperplanes" or module == "hyperplanes"):
             return name
         parts.pop()
     return None
@@ -84,7 +82,7 @@ def is_package(name):
     return (ROOT / Path(*name.split("."))).is_dir()
 
 
-def test_every_module_has_a_floor():
+def test_every_module_has_a_layer():
     assert [name for name, _ in modules() if unit(name) is None] == []
 
 
@@ -99,8 +97,8 @@ def test_imports_run_down():
             if there is None or there == here:
                 continue
             siblings = is_package(there) and is_package(here)
-            if FLOORS[there] > FLOORS[here] or (FLOORS[there] == FLOORS[here] and siblings):
-                wrong.append(f"{name} (floor {FLOORS[here]}) imports {target} (floor {FLOORS[there]})")
+            if LAYERS[there] > LAYERS[here] or (LAYERS[there] == LAYERS[here] and siblings):
+                wrong.append(f"{name} (layer {LAYERS[here]}) imports {target} (layer {LAYERS[there]})")
     assert wrong == []
 
 

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 from small_demo import demo_folder
 
-from hyperplanes.report import Exhibit, Look, Report, Row, render_page
-from hyperplanes.report.charts import line_chart, ticks
-from hyperplanes.report.pictures import ERROR_SCALE, colour_scale, error_map
+from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
+from hyperplanes.demo.charts import line_chart, ticks
+from hyperplanes.demo.pictures import ERROR_SCALE, colour_scale, error_map
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 

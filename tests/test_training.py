@@ -285,7 +285,7 @@ def test_a_state_of_another_shape_is_a_checkpoint_error(tmp_path):
 def test_memory_is_bounded_in_bytes():
     whole = Trainer(small_model(), Balls(), FAST)
     whole.warm("train0")
-    one = whole._kept.nbytes
+    one = whole._episodes.nbytes
     # 4 support and 4 query views of 16 x 16 pixels, 4 floats each, a third of the colours again for lookups, a hull
     # of 16^3 bytes, and 8 bytes a pixel that sees it
     least = 8 * 16 * 16 * 4 * 4 + 4 * 16 * 16 * 4 + 16**3
@@ -293,10 +293,10 @@ def test_memory_is_bounded_in_bytes():
     tight = Trainer(small_model(), Balls(), with_(memory=int(2.5 * one)))
     for name in ("train0", "train1", "train2", "train1"):
         tight.warm(name)
-        assert tight._kept.nbytes <= 2.5 * one
-    assert len(tight._kept) == 2
-    assert tight._kept.get("train0") is None
-    assert tight._kept.get("train1") is not None
+        assert tight._episodes.nbytes <= 2.5 * one
+    assert len(tight._episodes) == 2
+    assert tight._episodes.get("train0") is None
+    assert tight._episodes.get("train1") is not None
 
 
 def test_the_papers_protocol_carves_no_hull_unless_empty_space_is_asked_for(monkeypatch):

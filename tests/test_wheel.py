@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("hyperplanes", "data_gen", "benchmarks")
+PACKAGES = ("hyperplanes", "data_gen")
 PACKAGED = ("hyperplanes/pretrained/tiny/model.json", "hyperplanes/pretrained/tiny/model.safetensors")
 
 
@@ -40,7 +40,7 @@ def test_it_holds_the_packages_and_nothing_else(wheel):
         if path.suffix == ".py" and (path.parent / "__init__.py").exists()
     }
     models = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/pretrained").glob("*/model.*")}
-    assert found == there | {"hyperplanes/report/style.css", *PACKAGED} | models
+    assert found == there | {"hyperplanes/demo/style.css", *PACKAGED} | models
 
 
 def test_its_metadata(wheel):

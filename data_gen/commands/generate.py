@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from data_gen import SUPERSAMPLE
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, optional
-from hyperplanes.words import duration
+from hyperplanes.formatting import format_duration
 
 if TYPE_CHECKING:
     from data_gen.datasets.generate import GenerationReport, MeshFolder, Procedural
@@ -105,7 +105,9 @@ def summary(report: GenerationReport, out: Path) -> str:
     splits = ", ".join(f"{count} {split}" for split, count in report.splits.items() if count)
     reused = f", {report.reused} of them from before" if report.reused else ""
     speed = (
-        f" in {duration(report.seconds)}, {report.images_per_second:.0f} images/s" if report.images_per_second else ""
+        f" in {format_duration(report.seconds)}, {report.images_per_second:.0f} images/s"
+        if report.images_per_second
+        else ""
     )
     return f"{out}: {report.written} objects ({splits}{reused}){speed}"
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import Free, Steps, Up
 from hyperplanes.commands.render import after_steps, read_scene
-from hyperplanes.words import duration
+from hyperplanes.formatting import format_duration
 
 __all__ = ["Arguments", "run"]
 
@@ -51,17 +51,18 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Adapt and write the weights."""
     from hyperplanes.adaptation.fine_tuning import FineTuning
-    from hyperplanes.models import adapt, adapted_model, choose_device, load_model
+    from hyperplanes.adaptation.pretrained import adapted_model, load_model
+    from hyperplanes.devices import choose_device
 
     console, device = Console(), choose_device(arguments.device)
     model = load_model(arguments.checkpoint).to(device)
     task = read_scene(arguments.views, arguments.all_views, arguments.up)
     started = time.perf_counter()
     settings, taken = FineTuning(free=arguments.fine_tune), []
-    field = adapt(model, task.support.to(device), arguments.steps, settings, taken.append)
+    field = model.fine_tune(task.support.to(device), arguments.steps, settings, on_step=taken.append)
     seconds = time.perf_counter() - started
     adapted_model(model, field).save(arguments.out)
-    how = f"in {duration(seconds)}{after_steps(taken)}"
+    how = f"in {format_duration(seconds)}{after_steps(taken)}"
     console.say(f"{arguments.out}: adapted to {len(task.support)} views of {task.name} {how}")
     up = "" if arguments.up == "y" else f" --up {arguments.up}"
     console.say(f"next: hyperplanes render --checkpoint {arguments.out} --views {arguments.views}{up} --out new-views")

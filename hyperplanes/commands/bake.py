@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalInt, Up, optional
 from hyperplanes.commands.render import read_scene
-from hyperplanes.words import duration
+from hyperplanes.formatting import format_duration
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -67,18 +67,19 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
 
 def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
+    from hyperplanes.adaptation.pretrained import load_model
     from hyperplanes.baking import BakedScene, bake
+    from hyperplanes.devices import choose_device
     from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
     from hyperplanes.files import write_whole
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.metrics import psnr
-    from hyperplanes.models import adapt, choose_device, load_model
 
     console, device = Console(), choose_device(arguments.device)
     model = load_model(arguments.checkpoint).to(device)
     task = read_scene(arguments.views, arguments.all_views, arguments.up)
     shown, query = task.support.to(device), task.query
-    field = adapt(model, shown, arguments.steps)
+    field = model.fine_tune(shown, arguments.steps)
     console.say(f"adapted to {len(shown)} views of {task.name}")
     started = time.perf_counter()
     baked = bake(field, side=arguments.voxels)
@@ -86,7 +87,7 @@ def run(arguments: Arguments) -> int:
     size = arguments.out.stat().st_size / 2**20
     console.say(
         f"{arguments.out}: {len(baked.values):,} voxels of {arguments.voxels}^3, {size:.1f} MiB, "
-        f"in {duration(time.perf_counter() - started)}"
+        f"in {format_duration(time.perf_counter() - started)}"
     )
     scene = BakedScene(baked)
     first = camera.select(query.cameras, [0])
@@ -95,7 +96,8 @@ def run(arguments: Arguments) -> int:
     slow, before = _timed(lambda: field.render(query.cameras).images.clamp(0, 1).cpu())
     fast, after = _timed(lambda: scene.render(query.cameras).images.clamp(0, 1))
     console.say(
-        f"{len(query)} query views: {duration(fast / len(query))} each, {slow / fast:.0f} times the field's speed; "
+        f"{len(query)} query views: {format_duration(fast / len(query))} each, "
+        f"{slow / fast:.0f} times the field's speed; "
         f"{float(psnr(after, query.images).mean()):.2f} dB, the field {float(psnr(before, query.images).mean()):.2f} dB"
     )
     if arguments.orbit is not None:

@@ -19,11 +19,11 @@ import tyro
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalInt
-from hyperplanes.words import duration
+from hyperplanes.formatting import format_duration
 
 if TYPE_CHECKING:
-    from hyperplanes.demo import DemoSettings
-    from hyperplanes.stages import Stage, Stages
+    from hyperplanes.demo.pipeline import DemoSettings
+    from hyperplanes.demo.stages import Stage, Stages
 
 __all__ = ["Arguments", "run", "settings_of"]
 
@@ -63,7 +63,7 @@ def settings_of(arguments: Arguments) -> DemoSettings:
     Raises:
         ValueError: too few objects or pixels.
     """
-    from hyperplanes.demo import DemoSettings
+    from hyperplanes.demo.pipeline import DemoSettings
 
     if arguments.quick_check:
         return DemoSettings.quick_check(arguments.seed)
@@ -87,8 +87,8 @@ def settings_of(arguments: Arguments) -> DemoSettings:
 
 def run(arguments: Arguments) -> int:
     """All stages, each skipped when it is done."""
-    from hyperplanes.demo import stages
-    from hyperplanes.stages import Stages
+    from hyperplanes.demo.pipeline import stages
+    from hyperplanes.demo.stages import Stages
 
     console, settings = Console(), settings_of(arguments)
     todo, record = stages(settings), Stages(arguments.out)
@@ -106,7 +106,7 @@ def run(arguments: Arguments) -> int:
 
 def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: Console, record: Stages) -> None:
     from hyperplanes.data import open_dataset
-    from hyperplanes.demo import MODELS, recipes
+    from hyperplanes.demo.pipeline import MODELS, configurations
 
     out = arguments.out
     if stage.name == "data":
@@ -114,19 +114,19 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
         return
     data = open_dataset(out / ("unseen" if ":" in stage.name else "data"))
     if stage.name in MODELS:
-        _train(stage.name, recipes(settings)[stage.name], arguments, console)
+        _train(stage.name, configurations(settings)[stage.name], arguments, console)
     elif stage.name == "report":
-        from hyperplanes.demo import write_metrics
-        from hyperplanes.demo_report import how_it_was_made, write_report
+        from hyperplanes.demo.pipeline import write_metrics
+        from hyperplanes.demo.report import how_it_was_made, write_report
 
         facts = how_it_was_made(settings, out, data.manifest)
         write_report(out, data, settings, write_metrics(out, settings), facts)
     elif stage.name == "fine-tuning":
-        from hyperplanes.demo import measure_tuning
+        from hyperplanes.demo.pipeline import measure_tuning
 
         measure_tuning(settings, data, out, lambda name, psnr: console.say(f"{name}: {psnr:.2f} dB"), arguments.device)
     else:
-        from hyperplanes.demo import score_method
+        from hyperplanes.demo.pipeline import score_method
 
         method, names = stage.name.removeprefix("evaluate "), data.names("test")
         with console.bar(method) as bar:
@@ -158,11 +158,11 @@ def _generate(settings: DemoSettings, out: Path) -> None:
 def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:
     from hyperplanes.commands.train import follow
     from hyperplanes.data import open_dataset
-    from hyperplanes.models import choose_device
-    from hyperplanes.recipes import start_training
+    from hyperplanes.devices import choose_device
+    from hyperplanes.training import start_training
 
     data = open_dataset(arguments.out / "data")
-    trainer = start_training(chosen, data, arguments.out / name, choose_device(arguments.device))
+    trainer = start_training(chosen.model, chosen.training, data, arguments.out / name, choose_device(arguments.device))
     if trainer.step:
         console.say(f"going on from step {trainer.step}")
     with console.bar(name) as bar:
@@ -171,11 +171,11 @@ def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:
 
 def _finish(out: Path, console: Console) -> None:
     from hyperplanes.checkpoints import read_json
-    from hyperplanes.demo import describe_row
+    from hyperplanes.demo.pipeline import describe_row
 
     metrics = read_json(out / "metrics.json")
     rows = [
-        (describe_row(name), f"{each['psnr']:.2f} dB", f"{each['ssim']:.3f}", duration(each["adapt_seconds"]))
+        (describe_row(name), f"{each['psnr']:.2f} dB", f"{each['ssim']:.3f}", format_duration(each["adapt_seconds"]))
         for name, each in sorted(metrics.items(), key=lambda pair: pair[1]["psnr"])
     ]
     console.table(("held-out objects, new views", "PSNR", "SSIM", "to adapt"), rows)

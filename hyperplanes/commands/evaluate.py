@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, Up, optional
-from hyperplanes.words import duration
+from hyperplanes.formatting import format_duration
 
 if TYPE_CHECKING:
     from hyperplanes.evaluation import Score
@@ -73,8 +73,8 @@ def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
             score.method,
             f"{score.mean('psnr'):.2f} dB",
             f"{score.mean('ssim'):.3f}",
-            duration(score.mean("adapt_seconds")),
-            duration(score.mean("render_seconds")),
+            format_duration(score.mean("adapt_seconds")),
+            format_duration(score.mean("render_seconds")),
         )
         for score in scores
     ]
@@ -83,31 +83,32 @@ def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
 def run(arguments: Arguments) -> int:
     """Evaluate all methods and print the table."""
     from hyperplanes.adaptation.fine_tuning import FineTuning
+    from hyperplanes.adaptation.pretrained import find_checkpoints
     from hyperplanes.data import open_dataset
+    from hyperplanes.devices import TasksOnDevice, choose_device
+    from hyperplanes.evaluation import evaluate_all
     from hyperplanes.files import write_json
-    from hyperplanes.methods import at_steps, make_method
-    from hyperplanes.models import ByProtocol, OnDevice, choose_device, find_checkpoints
+    from hyperplanes.methods import WithSampler, at_steps, make_method
     from hyperplanes.presets import PROTOCOLS
-    from hyperplanes.recipes import score_all
 
     if arguments.curve is not None and len(arguments.steps) < 2:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
     console, device = Console(), choose_device(arguments.device)
     checkpoints = find_checkpoints(arguments.checkpoint)
-    data = OnDevice(open_dataset(arguments.data), device, arguments.up)
+    data = TasksOnDevice(open_dataset(arguments.data), device, arguments.up)
     names = data.names(arguments.split)[: arguments.objects]
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
     sampling, settings = PROTOCOLS[arguments.protocol], FineTuning(free=arguments.fine_tune)
 
-    def make(name: str) -> ByProtocol:
+    def make(name: str) -> WithSampler:
         objects = (data.task(each).support for each in names)
-        return ByProtocol(make_method(name, checkpoints, device=device, settings=settings, objects=objects), sampling)
+        return WithSampler(make_method(name, checkpoints, device=device, settings=settings, objects=objects), sampling)
 
     chosen = [each for name in arguments.method for each in at_steps(name, arguments.steps)]
     methods = {name: make(name) for name in dict.fromkeys(chosen)}
     with console.bar("evaluating") as bar:
-        scores = score_all(methods, data, names, bar.show)
+        scores = evaluate_all(methods, data, names, bar.show)
     if arguments.json is not None:
         write_json(arguments.json, {score.method: score.as_json() for score in scores})
     if arguments.curve is not None:
@@ -120,9 +121,9 @@ def run(arguments: Arguments) -> int:
 
 def _draw(scores: Sequence[Score], methods: Sequence[str], steps: Sequence[int], path: Path) -> None:
     """PSNR over fine-tuning steps of every method that was evaluated at several."""
+    from hyperplanes.demo.charts import line_chart, standalone
     from hyperplanes.files import write_whole
     from hyperplanes.methods import at_steps
-    from hyperplanes.report.charts import line_chart, standalone
 
     quality = {score.method: score.mean("psnr") for score in scores}
     curves = {}

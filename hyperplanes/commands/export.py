@@ -61,14 +61,15 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Adapt and write what was asked for."""
+    from hyperplanes.adaptation.pretrained import load_model
+    from hyperplanes.devices import choose_device
     from hyperplanes.export import extract_mesh, save_images, save_mesh, save_turntable
-    from hyperplanes.models import adapt, choose_device, load_model
 
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     model = load_model(arguments.checkpoint).to(device)
     task = read_scene(arguments.views, arguments.all_views, arguments.up)
     shown = task.support.to(device)
-    field = adapt(model, shown, arguments.steps)
+    field = model.fine_tune(shown, arguments.steps)
     console.say(f"adapted to {len(shown)} views of {task.name}")
     if "images" in arguments.what:
         query = task.query.to(device)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, Up, optional
-from hyperplanes.words import duration
+from hyperplanes.formatting import format_duration
 
 if TYPE_CHECKING:
     from hyperplanes.views import Task
@@ -84,16 +84,17 @@ def read_scene(path: Path, all_views: bool, up: str = "y") -> Task:
 
 def after_steps(taken: Sequence[int]) -> str:
     """How many fine-tuning steps were taken, as the end of a sentence; nothing where there were none to take."""
-    return f", {taken[-1]} fine-tuning steps" if taken else ""
+    return f", {taken[-1]} fine-tuning steps" if any(taken) else ""
 
 
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
     from hyperplanes.adaptation.fine_tuning import FineTuning
+    from hyperplanes.adaptation.pretrained import load_model
+    from hyperplanes.devices import choose_device
     from hyperplanes.export import encode_animation, orbit_cameras, save_images, to_pixels
     from hyperplanes.files import write_whole
     from hyperplanes.metrics import psnr, ssim
-    from hyperplanes.models import adapt, choose_device, load_model
     from hyperplanes.presets import PROTOCOLS
 
     console, device = Console(), choose_device(arguments.device)
@@ -102,9 +103,9 @@ def run(arguments: Arguments) -> int:
     shown, asked = task.support.to(device), task.query.to(device)
     started = time.perf_counter()
     settings, taken = FineTuning(free=arguments.fine_tune), []
-    field = adapt(model, shown, arguments.steps, settings, taken.append)
+    field = model.fine_tune(shown, arguments.steps, settings, on_step=taken.append)
     seconds = time.perf_counter() - started
-    console.say(f"adapted to {len(shown)} views of {task.name} in {duration(seconds)}{after_steps(taken)}")
+    console.say(f"adapted to {len(shown)} views of {task.name} in {format_duration(seconds)}{after_steps(taken)}")
     cameras = asked.cameras
     if arguments.orbit is not None:
         cameras = orbit_cameras(shown, arguments.orbit, size=arguments.size)
@@ -124,5 +125,5 @@ def run(arguments: Arguments) -> int:
         animation = arguments.out / f"turntable.{arguments.turntable}"
         write_whole(animation, encode_animation(to_pixels(pictures.images), arguments.turntable))
         console.say(f"{animation}: the turntable")
-    console.say(f"{arguments.out}: {len(paths)} pictures, {duration(seconds)} each")
+    console.say(f"{arguments.out}: {len(paths)} pictures, {format_duration(seconds)} each")
     return 0

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Literal
 
 from hyperplanes.commands.console import Bar, Console
 from hyperplanes.commands.options import OptionalInt, Protocol
-from hyperplanes.words import duration, rate
+from hyperplanes.formatting import format_duration, format_rate
 
 if TYPE_CHECKING:
     from hyperplanes.training import Progress, Trainer
@@ -62,8 +62,8 @@ def progress_line(progress: Progress, best: float | None = None) -> str:
     quality = progress.psnr if progress.psnr is not None else best
     held_out = f"held-out {quality:5.2f} dB" if quality is not None else "held-out    -    "
     return (
-        f"loss {progress.loss:.4f}  {held_out}  {rate(progress.rays_per_second):>6} rays/s  "
-        f"{duration(progress.seconds_left)} left"
+        f"loss {progress.loss:.4f}  {held_out}  {format_rate(progress.rays_per_second):>6} rays/s  "
+        f"{format_duration(progress.seconds_left)} left"
     )
 
 
@@ -116,11 +116,12 @@ def follow(trainer: Trainer, bar: Bar) -> None:
 def run(arguments: Arguments) -> int:
     """Train, from the start or from where it was interrupted."""
     from hyperplanes.data.dataset import open_datasets
-    from hyperplanes.models import choose_device
-    from hyperplanes.recipes import recipe, start_training
+    from hyperplanes.devices import choose_device
+    from hyperplanes.presets import configure
+    from hyperplanes.training import start_training
 
     console = Console()
-    chosen = recipe(
+    chosen = configure(
         arguments.preset, arguments.method, steps=arguments.steps, seed=arguments.seed, protocol=arguments.protocol
     )
     data, shown = open_datasets(arguments.data), " ".join(map(str, arguments.data))
@@ -129,7 +130,7 @@ def run(arguments: Arguments) -> int:
             f"{shown}: expected objects to train on, found none in its train split; "
             "a single scene can only be rendered or evaluated"
         )
-    trainer = start_training(chosen, data, arguments.out, choose_device(arguments.device))
+    trainer = start_training(chosen.model, chosen.training, data, arguments.out, choose_device(arguments.device))
     held_out = len(data.names("test"))
     console.say(
         f"{arguments.method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from hyperplanes.data.posed import PosedTask
 from hyperplanes.data.recognise import find_catalogue, posed_folder, read_posed_task
 from hyperplanes.data.transforms_json import find_transforms, read_transforms
 from hyperplanes.files import DataError
+from hyperplanes.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
 
 __all__ = ["Dataset", "Datasets", "open_dataset", "open_datasets", "read_task", "read_views"]
@@ -35,9 +35,7 @@ class Dataset:
     def __init__(self, folder: str | Path, budget: int = DEFAULT_BUDGET) -> None:
         self.folder = Path(folder)
         self._catalogue = find_catalogue(self.folder)
-        self._budget = budget
-        self._kept: OrderedDict[str, PosedTask] = OrderedDict()
-        self._bytes = 0
+        self._cache: LRUCache[PosedTask] = LRUCache(budget)
         self._lock = threading.Lock()
 
     @property
@@ -92,20 +90,15 @@ class Dataset:
             DataError: no such object, or anything wrong with its files.
         """
         with self._lock:
-            if name in self._kept:
-                self._kept.move_to_end(name)
-                return self._kept[name]
+            if (cached := self._cache.get(name)) is not None:
+                return cached
         if not any(name in names for names in self._catalogue.splits.values()):
             known = self.names()
             some = ", ".join(known[:3]) + (", ..." if len(known) > 3 else "")
             raise DataError(self.folder, f"one of its {len(known)} objects ({some})", repr(name), "check the name")
         task = self._catalogue.read(name)
         with self._lock:
-            if name not in self._kept and task.nbytes <= self._budget:
-                self._kept[name] = task
-                self._bytes += task.nbytes
-                while self._bytes > self._budget:
-                    self._bytes -= self._kept.popitem(last=False)[1].nbytes
+            self._cache.add(name, task)
         return task
 
     def __len__(self) -> int:

@@ -119,11 +119,10 @@ class HyperNetwork(nn.Module):
         read = config.views * (config.code + 3) if config.join == "concatenate" else config.code
         sizes = [read + config.code] + [config.width] * config.depth
         self.head = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
-        self.updates = nn.ModuleList(UPDATES[config.update](shape, config.rank) for shape in self.shapes.values())
+        updates = [UPDATES[config.update](shape, config.rank) for shape in self.shapes.values()]
+        self.updates = nn.ModuleList(updates)
         self.standardise = RunningStandardisation((config.width,)) if config.centre else nn.Identity()
-        self.outputs = nn.ModuleList(
-            nn.Linear(config.width, update.size, bias=not config.centre) for update in self.updates
-        )
+        self.outputs = nn.ModuleList(nn.Linear(config.width, update.size, bias=not config.centre) for update in updates)
         for parameter in self.outputs.parameters():
             nn.init.zeros_(parameter)
 
@@ -173,7 +172,7 @@ class HyperNetwork(nn.Module):
 
     def encode(
         self, images: Float[Tensor, "object view 3 height width"], directions: Float[Tensor, "object view 3"]
-    ) -> Float[Tensor, object * code]:
+    ) -> Float[Tensor, "object ..."]:
         """The codes of the images before their activation: (object, view, code), or (object, code) of their mean."""
         codes = self.encoder(images.flatten(0, 1)).unflatten(0, images.shape[:2])
         if self.config.join == "mean":

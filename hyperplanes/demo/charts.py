@@ -112,7 +112,7 @@ def line_chart(
 
 def standalone(chart: str) -> str:
     """A chart as an SVG file of its own, with the page's colours."""
-    style = files("hyperplanes.report").joinpath("style.css").read_text(encoding="utf-8")
+    style = files("hyperplanes.demo").joinpath("style.css").read_text(encoding="utf-8")
     head = '<svg xmlns="http://www.w3.org/2000/svg" '
     return chart.replace("<svg ", head, 1).replace(">", f"><style>{style}</style>", 1) + "\n"
 

@@ -1,14 +1,14 @@
-"""Numbers as people say them."""
+"""Durations and rates as text."""
 
 from __future__ import annotations
 
-__all__ = ["duration", "rate"]
+__all__ = ["format_duration", "format_rate"]
 
 
-def duration(seconds: float) -> str:
-    """A length of time for people.
+def format_duration(seconds: float) -> str:
+    """A length of time with its unit.
 
-    >>> duration(0.034), duration(8.25), duration(75), duration(7322)
+    >>> format_duration(0.034), format_duration(8.25), format_duration(75), format_duration(7322)
     ('34 ms', '8.2 s', '1 min 15 s', '2 h 02 min')
     """
     if seconds < 1:
@@ -20,10 +20,10 @@ def duration(seconds: float) -> str:
     return f"{int(seconds) // 3600} h {int(seconds) % 3600 // 60:02d} min"
 
 
-def rate(value: float) -> str:
+def format_rate(value: float) -> str:
     """A large number in thousands or millions.
 
-    >>> rate(950), rate(12345), rate(2.5e6)
+    >>> format_rate(950), format_rate(12345), format_rate(2.5e6)
     ('950', '12.3k', '2.5M')
     """
     for size, letter in ((1e6, "M"), (1e3, "k")):

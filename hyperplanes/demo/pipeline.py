@@ -12,17 +12,15 @@ import torch
 
 from hyperplanes.adaptation.base import Adapter, Pictures
 from hyperplanes.checkpoints import read_json
+from hyperplanes.demo.stages import Stage
+from hyperplanes.devices import TasksOnDevice, choose_device
 from hyperplanes.evaluation import ObjectScore, evaluate
 from hyperplanes.export import save_images
 from hyperplanes.files import write_json
 from hyperplanes.methods import at_steps, describe_method, make_method
-from hyperplanes.models import OnDevice, choose_device
-from hyperplanes.presets import Preset
-from hyperplanes.recipes import recipe
+from hyperplanes.presets import Preset, configure
 from hyperplanes.rendering.renderer import Marched
-from hyperplanes.stages import Stage
-from hyperplanes.training import Tasks
-from hyperplanes.views import Task
+from hyperplanes.views import Task, Tasks
 
 __all__ = [
     "METHODS",
@@ -33,7 +31,7 @@ __all__ = [
     "describe_row",
     "file_name",
     "measure_tuning",
-    "recipes",
+    "configurations",
     "score_method",
     "stages",
     "write_metrics",
@@ -109,13 +107,25 @@ class DemoSettings:
     @classmethod
     def quick_check(cls, seed: int = 0) -> DemoSettings:
         """A demonstration of seconds that shows nothing but that it runs."""
-        sizes = {"objects": 4, "held_out": 2, "resolution": 24, "views": 12, "steps": 20, "exhibits": 1, "frames": 6}
-        return cls(**sizes, unseen_objects=1, tuning=(0, 2, 5), tuned_objects=1, seed=seed, tiny=True)
+        return cls(
+            objects=4,
+            held_out=2,
+            resolution=24,
+            views=12,
+            steps=20,
+            seed=seed,
+            exhibits=1,
+            frames=6,
+            unseen_objects=1,
+            tuning=(0, 2, 5),
+            tuned_objects=1,
+            tiny=True,
+        )
 
 
-def recipes(settings: DemoSettings) -> dict[str, Preset]:
+def configurations(settings: DemoSettings) -> dict[str, Preset]:
     """Model and training of each of MODELS."""
-    chosen = {name: recipe(settings.preset, name, steps=settings.steps, seed=settings.seed) for name in MODELS}
+    chosen = {name: configure(settings.preset, name, steps=settings.steps, seed=settings.seed) for name in MODELS}
     return {name: _tiny(one, settings.views) for name, one in chosen.items()} if settings.tiny else chosen
 
 
@@ -142,7 +152,7 @@ def stages(settings: DemoSettings) -> list[Stage]:
     data = {key: described[key] for key in deciding}
     result = [Stage("data", data, ["data", "unseen"])]
     models: dict[str, Any] = {}
-    for name, chosen in recipes(settings).items():
+    for name, chosen in configurations(settings).items():
         models[name] = {"model": chosen.model.as_json(), "training": asdict(chosen.training)}
         own = json.loads(json.dumps({"data": data, **models[name]}))
         result.append(Stage(name, own, [name]))
@@ -181,7 +191,7 @@ def score_method(
         device: where to compute.
     """
     where = choose_device(device)
-    tasks, names, file = OnDevice(data, where), data.names("test"), file_name(row)
+    tasks, names, file = TasksOnDevice(data, where), data.names("test"), file_name(row)
     adapter = _adapter(row.partition(":")[0], tasks, folder, where)
 
     def keep(score: ObjectScore, task: Task, pictures: Pictures) -> None:
@@ -210,7 +220,7 @@ def measure_tuning(
         device: where to compute.
     """
     where = choose_device(device)
-    tasks, names = OnDevice(data, where), data.names("test")[: settings.tuned_objects]
+    tasks, names = TasksOnDevice(data, where), data.names("test")[: settings.tuned_objects]
     found: dict[str, dict[str, float]] = {method: {} for method in TUNED}
     for method in TUNED:
         for steps in settings.tuning:

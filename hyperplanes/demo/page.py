@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 
-from hyperplanes.report.charts import Points, line_chart
-from hyperplanes.report.content import Exhibit, Look, Report, Row
-from hyperplanes.report.pictures import ERROR_SCALE, error_map, gradient, inline, inline_png
+from hyperplanes.demo.charts import Points, line_chart
+from hyperplanes.demo.content import Exhibit, Look, Report, Row
+from hyperplanes.demo.pictures import ERROR_SCALE, error_map, gradient, inline, inline_png
 
 __all__ = ["render_page"]
 
@@ -22,7 +22,7 @@ def render_page(report: Report) -> str:
     if not report.exhibits or any(report.method not in look.predictions for e in report.exhibits for look in e.looks):
         raise ValueError(f"report: expected exhibits that show {report.method}, got {len(report.exhibits)} exhibits")
     methods = [row for row in report.table if row.method in report.exhibits[0].looks[0].predictions]
-    style = files("hyperplanes.report").joinpath("style.css").read_text(encoding="utf-8")
+    style = files("hyperplanes.demo").joinpath("style.css").read_text(encoding="utf-8")
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'

@@ -14,16 +14,16 @@ import torch
 from PIL import Image
 
 from hyperplanes.adaptation.diagnostics import Diagnostics
+from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.checkpoints import read_json
-from hyperplanes.demo import METHODS, MODELS, DemoSettings, describe_row
+from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
+from hyperplanes.demo.content import Pixels
+from hyperplanes.demo.pipeline import METHODS, MODELS, DemoSettings, describe_row
+from hyperplanes.demo.stages import Stages
 from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.files import encode_png, write_whole
-from hyperplanes.models import load_model
-from hyperplanes.report import Exhibit, Look, Report, Row, render_page
-from hyperplanes.report.content import Pixels
-from hyperplanes.stages import Stages
-from hyperplanes.training import Tasks
-from hyperplanes.words import duration
+from hyperplanes.formatting import format_duration
+from hyperplanes.views import Tasks
 
 __all__ = ["describe", "how_it_was_made", "overview", "write_report"]
 
@@ -99,8 +99,8 @@ def describe(
             found["psnr"],
             statistics.pstdev(each["psnr"] for each in found["objects"].values()),
             found["ssim"],
-            duration(found["adapt_seconds"]),
-            duration(found["render_seconds"]),
+            format_duration(found["adapt_seconds"]),
+            format_duration(found["render_seconds"]),
         )
         for row, found in metrics.items()
     ]
@@ -118,8 +118,11 @@ def describe(
         figures=[
             (f"{one_step['psnr']:.2f} dB", "PSNR on held-out objects after a single step"),
             (f"{one_step['ssim']:.3f}", "SSIM of the same views"),
-            (duration(one_step["adapt_seconds"]), f"from {shown} images to a field"),
-            (duration(one_step["render_seconds"]), f"a view of {settings.resolution} x {settings.resolution} pixels"),
+            (format_duration(one_step["adapt_seconds"]), f"from {shown} images to a field"),
+            (
+                format_duration(one_step["render_seconds"]),
+                f"a view of {settings.resolution} x {settings.resolution} pixels",
+            ),
         ],
         method="hyperplanes",
         exhibits=exhibits,
@@ -148,7 +151,9 @@ def how_it_was_made(settings: DemoSettings, folder: Path, manifest: Mapping[str,
     done = Stages(folder)
     steps = read_json(folder / "hyperplanes" / "training.json")["step"]
     trained = settings.objects - settings.held_out
-    times = ", ".join(f"{name} {duration(done.seconds(name))}" for name in ("data", *MODELS) if done.seconds(name))
+    times = ", ".join(
+        f"{name} {format_duration(done.seconds(name))}" for name in ("data", *MODELS) if done.seconds(name)
+    )
     return [
         ("objects", f"{trained} procedural {settings.class_name}s to train on, {settings.held_out} held out"),
         (

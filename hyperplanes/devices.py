@@ -1,0 +1,54 @@
+"""Where to compute: the choice of a device, and tasks that lie on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from hyperplanes.data.upright import upright_task
+from hyperplanes.views import Task, Tasks
+
+__all__ = ["TasksOnDevice", "choose_device"]
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of that name; "auto" is a GPU where there is one.
+
+    Raises:
+        ValueError: a device that torch does not have here.
+    """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device: expected auto, cpu or one that torch has here, got {name!r} ({reason})") from None
+    return device
+
+
+@dataclass(frozen=True)
+class TasksOnDevice:
+    """Tasks whose views lie on a device, in a world with y up.
+
+    Attributes:
+        data: where they come from.
+        device: where they go.
+        up: the axis that points up in the data's world.
+    """
+
+    data: Tasks
+    device: torch.device
+    up: str = "y"
+
+    def names(self, split: str) -> Sequence[str]:
+        """The objects of a split."""
+        return self.data.names(split)
+
+    def task(self, name: str) -> Task:
+        """One object."""
+        task = upright_task(self.data.task(name), self.up)
+        return Task(task.support.to(self.device), task.query.to(self.device), task.name)

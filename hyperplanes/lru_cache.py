@@ -1,0 +1,53 @@
+"""A least-recently-used cache that is bounded in bytes."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+__all__ = ["LRUCache"]
+
+
+@runtime_checkable
+class _Sized(Protocol):
+    @property
+    def nbytes(self) -> int: ...
+
+
+Value = TypeVar("Value", bound=_Sized)
+
+
+class LRUCache(Generic[Value]):
+    """Values by name; the least recently used are dropped when they take more than some bytes.
+
+    Args:
+        budget: bytes.
+        keep_last: the newest value stays even where it alone takes more than the budget; otherwise it is not kept.
+    """
+
+    def __init__(self, budget: int, *, keep_last: bool = False) -> None:
+        self.budget = budget
+        self.keep_last = keep_last
+        self.nbytes = 0
+        self._values: OrderedDict[str, Value] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def get(self, name: str) -> Value | None:
+        """The value of that name, where it is still there."""
+        if name in self._values:
+            self._values.move_to_end(name)
+        return self._values.get(name)
+
+    def add(self, name: str, value: Value) -> None:
+        """Keep one more."""
+        if name in self._values:
+            self.nbytes -= self._values.pop(name).nbytes
+        self._values[name] = value
+        self.nbytes += value.nbytes
+        while self.nbytes > self.budget and len(self._values) > int(self.keep_last):
+            self.nbytes -= self._values.popitem(last=False)[1].nbytes
