@@ -39,7 +39,7 @@ def test_it_holds_the_packages_and_nothing_else(wheel):
         for path in (ROOT / package).rglob("*")
         if path.suffix == ".py" and (path.parent / "__init__.py").exists()
     }
-    models = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/pretrained").glob("*/model.*")}
+    models = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/pretrained").glob("*/*.*")}
     assert found == there | {"hyperplanes/demo/style.css", *PACKAGED} | models
 
 
