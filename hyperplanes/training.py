@@ -191,6 +191,12 @@ class Trainer:
                 with record_function("step:emptiness"):
                     total = total + self._emptiness(field, generator)
             total = total + ray_loss(seen, truth)
+        loss = float(total.detach()) / config.tasks
+        if not math.isfinite(loss):
+            raise ValueError(
+                f"step {self.step + 1}, on {', '.join(drawn)}: expected a finite loss, got {loss}; the last checkpoint is "
+                "kept; check the images of these objects, or train with lower rates"
+            )
         for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
             optimiser.param_groups[0]["lr"] = rate * self._schedule()
             optimiser.zero_grad(set_to_none=True)
@@ -200,7 +206,7 @@ class Trainer:
             for optimiser in self.optimisers:
                 optimiser.step()
         self.step += 1
-        return float(total.detach()) / config.tasks
+        return loss
 
     def _draw(self, generator: torch.Generator) -> list[int]:
         """Indices of the objects of a step, different ones while there are enough."""

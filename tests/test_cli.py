@@ -3,12 +3,14 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -220,7 +222,41 @@ def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
     assert main(["render", "--checkpoint", str(demo), "--views", scene, "--out", reference]) == 0
     for path in Path(out).iterdir():
         assert path.read_bytes() == (Path(reference) / path.name).read_bytes()
-    assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, "--steps", "2"]) == 2
+    assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, "--steps", "2"]) == 0
+    assert any(path.read_bytes() != (Path(reference) / path.name).read_bytes() for path in Path(out).iterdir())
+    frozen = ["--steps", "2", "--fine-tune", "hypernetwork"]  # there is none any more
+    assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, *frozen]) == 2
+
+
+def test_steps_chosen_on_left_out_views_are_reported(tmp_path, capsys):
+    demo, scene = demo_folder(), str(first_object(demo_folder()))
+    command = ["adapt", "--checkpoint", str(demo), "--views", scene, "--out", str(tmp_path / "weights")]
+    assert main([*command, "--steps", "auto"]) == 0
+    assert re.search(r"adapted to 6 views of .* in .*, \d+ fine-tuning steps", capsys.readouterr().out)
+    assert main([*command, "--steps", "some"]) == 2
+
+
+def test_psnr_over_fine_tuning_steps_is_a_table_and_a_chart(tmp_path, capsys):
+    demo, chart = demo_folder(), tmp_path / "curve.svg"
+    command = ["evaluate", "--data", str(demo / "data"), "--checkpoint", str(demo), "--curve", str(chart)]
+    methods = ["--method", "nearest_view", "hyperplanes", "scratch", "--steps"]
+    assert main([*command, *methods, "0", "1", "3", "--objects", "1"]) == 0
+    shown = capsys.readouterr().out
+    for name in ("nearest_view", "hyperplanes", "hyperplanes_1", "hyperplanes_3", "scratch_1", "scratch_3"):
+        assert re.search(rf"^{name}  ", shown, re.MULTILINE), name
+    root = ElementTree.fromstring(chart.read_text())
+    assert len(root.findall("{http://www.w3.org/2000/svg}polyline")) == 2 + 1  # nearest_view is a flat line
+    assert main([*command, *methods, "3"]) == 2
+    assert "at least two numbers of --steps" in complaint(capsys)
+
+
+def test_inspect_tells_what_the_hypernetwork_does(capsys):
+    assert main(["inspect", str(demo_folder() / "hyperplanes")]) == 0
+    assert re.search(r"diagnostics: updates differ by [\d.]+% of their norm", capsys.readouterr().out)
+    assert main(["inspect", "cars-64"]) == 0
+    shown = capsys.readouterr().out
+    assert "low_rank update of all" in shown
+    assert re.search(r"another object's update costs [\d.]+ dB", shown)
 
 
 def test_an_orbit_is_pictures_and_a_turntable(tmp_path):

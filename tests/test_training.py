@@ -5,14 +5,16 @@ import pytest
 import torch
 
 from hyperplanes import checkpoints, files
-from hyperplanes.adaptation import HyperPlanes, base
-from hyperplanes.checkpoints import CheckpointError
+from hyperplanes.adaptation import Diagnostics, HyperPlanes, base, diagnose
+from hyperplanes.checkpoints import CheckpointError, read_json
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.train import follow
 from hyperplanes.geometry import occupancy
 from hyperplanes.hypernetwork import HyperNetworkConfig
 from hyperplanes.metrics import psnr
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer, TrainingConfig, train
-from tests.reference_rendering import Balls, small_model
+from tests.reference_rendering import Balls, awaken, small_model
 
 FAST = TrainingConfig(steps=6, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
 
@@ -342,3 +344,50 @@ def test_an_object_that_cannot_be_trained_on_is_named():
 
     with pytest.raises(ValueError, match="train[0-2]: masks of the support views: expected an object"):
         Trainer(small_model(), Blank(), FAST).take_step()
+
+
+def test_a_look_tells_what_the_updates_have_in_common(tmp_path):
+    """Diagnostics of the objects that are looked at, recorded in the curve and beside the weights."""
+    model = awaken(small_model())
+    trainer = Trainer(model, Balls(test=3), with_(steps=2, evaluate_every=2), tmp_path)
+    (progress,) = list(trainer.run())
+    found = progress.diagnostics
+    prepared = [model.prepare(Balls(test=3).task(name).support) for name in ("test0", "test1", "test2")]
+    assert found.spread == pytest.approx(diagnose(model, prepared).spread, rel=1e-4)
+    assert trainer.curve[-1]["spread"] == found.spread
+    assert trainer.curve[-1]["swap_gap"] == found.swap_gap
+    assert Diagnostics.of_json(read_json(tmp_path / "diagnostics.json")) == found
+
+
+def test_training_warns_once_when_every_object_gets_the_same_update(capsys):
+    model = awaken(small_model())
+    model.hypernetwork.encoder.register_forward_hook(lambda module, given, codes: torch.zeros_like(codes))
+    trainer = Trainer(model, Balls(test=2), with_(steps=4, evaluate_every=2))
+    with Console().bar("training") as bar:
+        follow(trainer, bar)
+    assert capsys.readouterr().err.count("the hypernetwork writes the same update for every object") == 1
+
+
+def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stays(tmp_path):
+    class Poisoned(Balls):
+        broken = False
+
+        def task(self, name):
+            task = super().task(name)
+            images = torch.full_like(task.query.images, float("nan")) if self.broken else task.query.images
+            return replace(task, query=replace(task.query, images=images))
+
+    data = Poisoned(test=0)
+    trainer = Trainer(small_model(), data, with_(steps=4, checkpoint_every=2, memory=0), tmp_path)
+    trainer.take_step()
+    trainer.take_step()
+    trainer.save()
+    before = (tmp_path / "model.safetensors").read_bytes()
+    data.broken = True
+    with pytest.raises(
+        ValueError, match="step 3, on train[0-2].*: expected a finite loss, got nan; the last checkpoint"
+    ):
+        for _ in range(3):
+            trainer.take_step()
+    assert (tmp_path / "model.safetensors").read_bytes() == before
+    assert all(value.isfinite().all() for value in trainer.model.parameters())

@@ -80,18 +80,18 @@ class DemoSettings:
     """
 
     class_name: str = "car"
-    objects: int = 210
-    held_out: int = 10
+    objects: int = 156
+    held_out: int = 6
     resolution: int = 64
     views: int = 50
     preset: str = "quick"
-    steps: int | None = None
+    steps: int | None = 800
     seed: int = 0
     exhibits: int = 6
     frames: int = 36
     unseen_objects: int = 3
     tuning: tuple[int, ...] = (0, 1, 3, 10, 30, 100, 300)
-    tuned_objects: int = 2
+    tuned_objects: int = 1
     tiny: bool = False
 
     @property
