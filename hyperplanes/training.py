@@ -194,8 +194,8 @@ class Trainer:
         loss = float(total.detach()) / config.tasks
         if not math.isfinite(loss):
             raise ValueError(
-                f"step {self.step + 1}, on {', '.join(drawn)}: expected a finite loss, got {loss}; the last checkpoint is "
-                "kept; check the images of these objects, or train with lower rates"
+                f"step {self.step + 1}, on {', '.join(drawn)}: expected a finite loss, got {loss}; the last checkpoint "
+                "is kept; check the images of these objects, or train with lower rates"
             )
         for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
             optimiser.param_groups[0]["lr"] = rate * self._schedule()
