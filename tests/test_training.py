@@ -384,10 +384,7 @@ def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stay
     trainer.save()
     before = (tmp_path / "model.safetensors").read_bytes()
     data.broken = True
-    with pytest.raises(
-        ValueError, match="step 3, on train[0-2].*: expected a finite loss, got nan; the last checkpoint"
-    ):
-        for _ in range(3):
-            trainer.take_step()
+    with pytest.raises(ValueError, match=r"step 3, on train[0-2].*: expected a finite loss, got nan; the last"):
+        trainer.take_step()
     assert (tmp_path / "model.safetensors").read_bytes() == before
     assert all(value.isfinite().all() for value in trainer.model.parameters())
