@@ -46,8 +46,8 @@ class Arguments:
 
     out: Path = Path("runs/demo")
     class_name: Annotated[Literal["car", "chair", "plane", "lamp"], tyro.conf.arg(name="class")] = "car"
-    objects: int = 156
-    held_out: int = 6
+    objects: int = 155
+    held_out: int = 5
     resolution: int = 64
     preset: str = "quick"
     steps: int = 800

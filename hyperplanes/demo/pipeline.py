@@ -80,16 +80,16 @@ class DemoSettings:
     """
 
     class_name: str = "car"
-    objects: int = 156
-    held_out: int = 6
+    objects: int = 155
+    held_out: int = 5
     resolution: int = 64
     views: int = 50
     preset: str = "quick"
     steps: int | None = 800
     seed: int = 0
-    exhibits: int = 6
+    exhibits: int = 5
     frames: int = 36
-    unseen_objects: int = 3
+    unseen_objects: int = 2
     tuning: tuple[int, ...] = (0, 1, 3, 10, 30, 100, 300)
     tuned_objects: int = 1
     tiny: bool = False
