@@ -100,7 +100,7 @@ def test_version(capsys):
             ["OUT/none", "hyperplanes train"],
         ),
         (["export", "--checkpoint", "RUN", "--views", "OUT/none", "--out", "OUT/x"], ["OUT/none", "nothing"]),
-        (["demo", "--held-out", "80", "--out", "OUT/demo"], ["--held-out", "80"]),
+        (["demo", "--held-out", "500", "--out", "OUT/demo"], ["--held-out", "500"]),
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, capsys):
