@@ -59,10 +59,17 @@ def test_every_step_draws_anew():
     assert len(set(losses(small_model(), still, 6))) == 6
 
 
-@pytest.mark.parametrize("normalisation", ["batch", "group"])
-def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, normalisation):
-    shape = HyperNetworkConfig(views=2, normalisation=normalisation, code=8, depth=2, width=16)
-    config = with_(steps=5, warmup=2, final=0.1)
+ALL_LAYERS = {"layers": ("all",), "update": "low_rank", "weights_seen": "all"}
+
+
+@pytest.mark.parametrize(
+    ("optimiser", "parts"),
+    [("adam", {"normalisation": "batch"}), ("muon", {"normalisation": "group"}), ("muon", ALL_LAYERS)],
+    ids=str,
+)
+def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, optimiser, parts):
+    shape = HyperNetworkConfig(**{"views": 2, "code": 8, "depth": 2, "width": 16, **parts})
+    config = with_(steps=5, warmup=2, final=0.1, optimiser=optimiser)
     whole = train(small_model(hypernetwork=shape), Balls(), config, tmp_path / "whole")
 
     first = Trainer(small_model(hypernetwork=shape), Balls(), config, tmp_path / "parts")
@@ -126,6 +133,15 @@ def test_a_rate_of_zero_freezes_its_part_alone(frozen):
     losses(model, with_(**rates), 2)
     moved = {name.split(".")[0] for name, value in model.named_parameters() if not torch.equal(value, before[name])}
     assert moved == ({"hypernetwork"} if frozen == "theta" else {"networks"})
+
+
+def test_muon_moves_the_hidden_matrices_by_its_own_rate():
+    model = small_model()
+    before = state_of(model)
+    config = with_(optimiser="muon", learning_rate=0.0, hypernetwork_learning_rate=0.0, muon_learning_rate=0.01)
+    losses(model, config, 2)
+    moved = {name for name, value in model.named_parameters() if not torch.equal(value, before[name])}
+    assert moved == {f"networks.fine.{name}.weight" for name in ("layers.0", "layers.1", "feature")}
 
 
 def test_without_a_hypernetwork_theta_alone_is_trained():

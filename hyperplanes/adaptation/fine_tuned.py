@@ -10,7 +10,10 @@ from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.views import Views
 
-__all__ = ["FineTuned", "FromScratch"]
+__all__ = ["SCRATCH_RATES", "FineTuned", "FromScratch"]
+
+SCRATCH_RATES = {"learning_rate": 4e-3, "muon_learning_rate": 0.05}
+"""Of Adam and of Muon from random weights: higher than those of fine-tuning, docs/adaptation.md."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,8 @@ class FromScratch:
     Attributes:
         model: whose architecture and rig are used; its weights are not.
         steps: of optimising an object, or "auto".
-        settings: of the optimisation; what is free is "scratch".
+        settings: of the optimisation; rates that it does not state are those of SCRATCH_RATES. Its seed is that of the
+            random weights, too, and all weights are free.
     """
 
     model: HyperPlanes
@@ -52,5 +56,9 @@ class FromScratch:
         """The field after so many steps from random weights."""
         fresh = HyperPlanes(replace(self.model.config, hypernetwork=None), seed=self.settings.seed)
         fresh.rig.copy_(self.model.rig)
-        settings = replace(self.settings, free="scratch")
+        settings = replace(
+            self.settings,
+            free="weights",
+            **{name: rate for name, rate in SCRATCH_RATES.items() if getattr(self.settings, name) is None},
+        )
         return fresh.to(self.model.rig.device).fine_tune(support, self.steps, settings, on_step=on_step)

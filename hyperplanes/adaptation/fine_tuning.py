@@ -26,7 +26,6 @@ CHECKS = 10  # times that it compares them
 RATES: dict[str, tuple[str, float, float]] = {
     "weights": ("muon", 2e-3, 0.04),
     "hypernetwork": ("adam", 3e-4, 0.0),
-    "scratch": ("muon", 4e-3, 0.05),
 }
 """What is optimised: by which optimiser, the learning rate of Adam, that of Muon. Chosen by measurement, see
 docs/adaptation.md."""
@@ -37,8 +36,8 @@ class FineTuning:
     """How a field is fine-tuned.
 
     Attributes:
-        free: what is optimised: "weights", theta + delta itself; "hypernetwork", a copy of the hypernetwork while theta
-            is frozen, as in the paper; or "scratch", weights that begin at random, the control of both.
+        free: what is optimised: "weights", theta + delta itself, or "hypernetwork", a copy of the hypernetwork while
+            theta is frozen, as in the paper.
         rays: a step, drawn from all support views.
         optimiser: "muon" or "adam"; the best for what is free, see RATES, where None.
         learning_rate: of Adam at the first step; that of RATES where None.
@@ -46,10 +45,10 @@ class FineTuning:
         final: what the rates fall to along half a cosine, as a fraction.
         longest: the most steps that "auto" may choose.
         left_out: every so many-th support view is left out of the planes and of the rays while "auto" chooses.
-        seed: of rays and samples, and of random weights.
+        seed: of rays and samples.
     """
 
-    free: Literal["weights", "hypernetwork", "scratch"] = "weights"
+    free: Literal["weights", "hypernetwork"] = "weights"
     rays: int = 1024
     optimiser: Literal["adam", "muon"] | None = None
     learning_rate: float | None = None

@@ -11,8 +11,9 @@ import pytest
 import torch
 from PIL import Image
 
-from hyperplanes.data import DataError, Dataset
+from hyperplanes.data import DataError, Dataset, open_dataset
 from hyperplanes.data.catalogue import FORMAT
+from hyperplanes.data.dataset import open_datasets
 from hyperplanes.files import encode_npz, encode_png, read_json, write_folder, write_whole
 
 
@@ -46,6 +47,23 @@ def test_pictures_are_kept_and_callers_cannot_spoil_them(folder, scene):
     again = data.task("a")
     assert torch.allclose(again.support.images, scene.over_white()[::2], atol=1e-6)
     assert float(again.support.masks.max()) == 1.0
+
+
+def test_several_data_sets_are_one_whose_names_say_which(tmp_path, folder):
+    copies = [tmp_path / "copies" / name for name in ("a", "b")]
+    for copy in copies:
+        shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("copies"))
+    both, one = open_datasets(copies), open_dataset(folder)
+    for split in ("train", "test", "all"):
+        assert both.names(split) == [f"{part}/{name}" for part in "ab" for name in one.names(split)]
+    name = one.names("all")[0]
+    task = both.task(f"b/{name}")
+    assert task.name == f"b/{name}"
+    assert torch.equal(task.support.images, one.task(name).support.images)
+    with pytest.raises(DataError, match="one of the data sets a, b"):
+        both.task(f"c/{name}")
+    with pytest.raises(ValueError, match="data: expected folders of different names, got a, a"):
+        open_datasets([copies[0], tmp_path / "a"])
 
 
 def test_the_budget_is_kept_and_the_least_recently_used_goes_first(folder):

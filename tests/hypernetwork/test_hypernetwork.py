@@ -146,6 +146,30 @@ def test_updates_against_their_formulas(update):
         torch.testing.assert_close(found[name], expected)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [{"code_normalisation": "layer"}, {"code_normalisation": "none"}, {"code_activation": "relu"}]
+    + [{"activation": "silu"}, {"centre": False}, {"gain": 2.0}, {"join": "mean"}, {"update": "scaling"}],
+    ids=str,
+)
+@torch.no_grad()
+def test_every_option_changes_the_update(change):
+    shown = [torch.stack(parts) for parts in zip(*(inputs(seed)[:2] for seed in (1, 2, 3)), strict=True)]
+    updates = []
+    for config in (CONFIG, replace(CONFIG, **change)):
+        network = make(config).train()
+        network(*shown, inputs()[2])  # fresh statistics, mean 0 and variance 1, standardise nothing
+        updates.append(network.eval()(*inputs()))
+    assert differs(*updates)
+
+
+@torch.no_grad()
+def test_directions_are_no_input_of_a_mean_that_is_told_so():
+    images, directions, theta = inputs()
+    blind = make(replace(CONFIG, join="mean", see_directions=False))
+    assert not differs(blind(images, directions, theta), blind(images, directions.flip(0), theta))
+
+
 @torch.no_grad()
 def test_the_mean_of_codes_knows_no_order_of_the_views():
     network = make(replace(CONFIG, join="mean"))
