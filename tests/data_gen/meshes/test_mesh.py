@@ -29,7 +29,7 @@ from mesh_writers import (
 from data_gen.meshes.find import find_meshes, safe_name
 from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts, prepare_scene
 
-SHARED = Path(__file__).parents[2] / ".." / "shared" / "meshes"
+SHARED = Path(__file__).parents[3] / ".." / "shared" / "meshes"
 
 # Bounding box of the tetrahedron: the unit cube; its centre (.5, .5, .5), and all four vertices sqrt(3)/2 from it.
 RADIUS = np.sqrt(3) / 2
@@ -302,7 +302,7 @@ def test_safe_names_are_never_empty_or_long():
 
 def test_importing_the_package_loads_no_mesh_library():
     code = "import sys, data_gen; sys.exit(int(bool({'trimesh', 'PIL', 'pyrender', 'torch'} & set(sys.modules))))"
-    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[2]).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[3]).returncode == 0
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real meshes of ../shared/meshes are not here")
