@@ -47,8 +47,15 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
                     PAPER_UPDATE),
     "published": ("the same with ReLU on the codes and nothing standardised", {**PAPER_UPDATE, **UNSTANDARDISED}),
     "gain_4": ("outputs multiplied with 4", {"gain": 4.0}),
+    "last_layers_low_rank": ("low-rank update of colour and density layers only", {"layers": ("colour", "density")}),
+    "no_warmup": ("full rates from the first step", {}),
+    "paper_rates": ("1e-4 for theta and the hypernetwork by Adam, no warm-up, no schedule", {}),
 }  # fmt: skip
 """Names, what they change, and the entries of HyperNetworkConfig that differ from the preset's."""
+
+PAPER_RATES = {"learning_rate": 1e-4, "hypernetwork_learning_rate": 1e-4, "warmup": 0, "final": 1.0}
+TRAINING: dict[str, dict[str, Any]] = {"no_warmup": {"warmup": 0}, "paper_rates": {"optimiser": "adam", **PAPER_RATES}}
+"""The entries of TrainingConfig that a variant changes."""
 
 
 def main(arguments: list[str]) -> int:
@@ -77,7 +84,9 @@ def main(arguments: list[str]) -> int:
             made = variant(name, planes=chosen.planes, optimiser=chosen.optimiser, tasks=chosen.tasks, steps=steps)
             made = replace(made, training=replace(made.training, seed=seed))
             folder = chosen.out and chosen.out / f"{name}-{chosen.planes}-{chosen.optimiser}-{seed}"
-            rows.append({"name": name, "planes": chosen.planes, "seed": seed, **measure(made, data, folder)})
+            classes = len(chosen.data)
+            setting = {"planes": chosen.planes, "classes": classes, "tasks": chosen.tasks, "seed": seed}
+            rows.append({"name": name, **setting, **measure(made, data, folder)})
             print(rows[-1], flush=True)
     return finish("hypernetwork", rows, chosen.json)
 
@@ -93,13 +102,14 @@ def variant(name: str, *, planes: int = 25, optimiser: str = "muon", tasks: int 
         steps: of training.
     """
     made, changes = preset("quick"), VARIANTS[name][1]
+    trained = {"optimiser": optimiser, **TRAINING.get(name, {})}
     hyper = made.model.hypernetwork
     assert hyper is not None
     hyper = None if changes is NONE else replace(hyper, views=min(hyper.views, planes), **changes)
     return replace(
         made,
         model=replace(made.model, hypernetwork=hyper, network=replace(made.model.network, planes=planes)),
-        training=replace(made.training, optimiser=optimiser, tasks=tasks, rays=768 // tasks, steps=steps, held_out=0),
+        training=replace(made.training, tasks=tasks, rays=768 // tasks, steps=steps, held_out=0, **trained),
     )
 
 
