@@ -21,7 +21,7 @@ from hyperplanes.files import DataError, sha256
 
 __all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
 
-PICTURES = 2
+PICTURES = 3
 """Raised whenever the same arguments come to give other bytes, so that no data set is made half of each."""
 
 TARGET = "data_gen.datasets.objects:open_renderer"

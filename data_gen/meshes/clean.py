@@ -24,7 +24,9 @@ def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, li
     """Leave out faces that cannot be drawn and vertices without faces, and make normals agree with faces.
 
     What changes no picture gives no warning unless it is so much that the file must be damaged: leaving out faces
-    without area, and turning single normals.
+    without area, and turning single normals. Where more than a tenth of the faces lie on the three corners of an
+    earlier one, whichever way round, those are left out: what is left is seen from both sides, and the normals of two
+    faces that are turned against each other would cancel.
 
     Args:
         mesh: a mesh whose visual is canonical; it is not changed.
@@ -50,6 +52,9 @@ def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, li
     if flat.any() and flat.mean() > _MOSTLY:
         warnings.append(f"{label}: {int(flat.sum())} of {len(faces)} faces without area left out")
     kept = kept[~flat]
+    first = _first_of_their_corners(faces[kept])
+    if len(first) < (1.0 - _MOSTLY) * len(kept) and visual_of(mesh).kind != "face":
+        kept = kept[first]
     if not len(kept):
         return None, warnings
     kept_faces = faces[kept]
@@ -132,6 +137,16 @@ def _degenerate(vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> npt.NDAr
     scale = float(np.abs(corners - corners[0, 0]).max()) or 1.0
     edges = (corners - corners[:, :1]) / scale
     return np.linalg.norm(np.cross(edges[:, 1], edges[:, 2]), axis=1) <= 1e-16
+
+
+def _first_of_their_corners(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The faces, in order, but for those that have the three vertices of an earlier one."""
+    low, high = faces.min(axis=1, initial=0), faces.max(axis=1, initial=0)
+    middle = faces.sum(axis=1) - low - high
+    base = int(high.max(initial=0)) + 1
+    if base < 2**21:  # three of them fit into one integer
+        return np.sort(np.unique((low * base + middle) * base + high, return_index=True)[1])
+    return np.sort(np.unique(np.stack((low, middle, high), axis=1), axis=0, return_index=True)[1])
 
 
 def _normals(

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from data_gen.rendering.lighting import Lighting
 from data_gen.rendering.ray_casting import Hits, RayCaster, pixel_rays
 from data_gen.rendering.shading import facing, shade
-from data_gen.rendering.surfaces import ShadedSurface
+from data_gen.rendering.surfaces import COINCIDENT, ShadedSurface
 from data_gen.rendering.textures import MipmappedTexture
 from data_gen.rigs import Rig
 from hyperplanes.colour import linear_from_srgb
@@ -27,7 +27,6 @@ __all__ = ["EmbreeRenderer", "Geometry", "cast_geometry"]
 Floats = npt.NDArray[np.float64]
 
 _MAX_LAYERS = 8
-_STEP = 2e-5
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ def cast_geometry(surfaces: Sequence[ShadedSurface], rig: Rig) -> Iterator[Geome
             depth[seen] = hits.distances[solid]
             coordinates[seen] = hits.points[solid]
             normals[seen] = scene.normals(hits, -rays[active[hits.rays]])[solid]
-            active, after = active[hits.rays[~solid]], hits.distances[~solid] + _STEP
+            active, after = active[hits.rays[~solid]], hits.distances[~solid] + COINCIDENT
             if len(active) == 0:
                 break
         shape = (rig.height, rig.width)
@@ -160,7 +159,7 @@ class _Scene:
             colours[seen] += transmittance[seen, None] * alpha * np.concatenate((shaded, np.ones_like(alpha)), axis=1)
             transmittance[seen] *= 1.0 - alpha[:, 0]
             through = transmittance[seen] > 0.002
-            active, after = seen[through], hits.distances[through] + _STEP
+            active, after = seen[through], hits.distances[through] + COINCIDENT
             if len(active) == 0:
                 break
         return colours

@@ -25,7 +25,7 @@ from data_gen.rendering.shader_program import (
     constants_of_lighting,
     constants_of_surface,
 )
-from data_gen.rendering.surfaces import ShadedSurface
+from data_gen.rendering.surfaces import COINCIDENT, ShadedSurface
 
 __all__ = ["Drawable", "SurfaceRenderer"]
 
@@ -35,6 +35,9 @@ _OUTER, _INNER = 1.0, -1.0
 # Drawn with flipped rows, so that glReadPixels, which starts at the bottom, returns the first row on top; the flip
 # reverses the winding of every triangle.
 _HIDDEN = {_OUTER: GL.GL_FRONT, _INNER: GL.GL_BACK}
+# COINCIDENT in the least steps of 24 bits of depth: 0.44 of it is one of depth from a camera at distance 3. None for a
+# face's slope, which would push inner sides behind outer ones at an outline.
+_OFFSET = 0.44 * COINCIDENT * 2**24
 _FLIP_ROWS = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
@@ -135,12 +138,14 @@ class SurfaceRenderer(Renderer):
         GL.glClear(int(GL.GL_COLOR_BUFFER_BIT) | int(GL.GL_DEPTH_BUFFER_BIT))
         view = (_FLIP_ROWS @ clip_from_world, camera, lighting, light_directions)
         bound: ShaderProgram | None = None
-        # Outer sides first: what they hide is not shaded. The inner ones of what is closed cannot be seen.
+        # Outer sides first: what they hide is not shaded. Inner ones are drawn a little farther away than they are, so
+        # that an outer side in the same place, whether of a face with the same corners or not, is the one seen.
+        GL.glPolygonOffset(0.0, _OFFSET)
         for side in (_OUTER, _INNER):
             for drawable in drawables:
-                if side == _OUTER or not drawable.surface.closed:
-                    bound = self._bind(drawable, bound, view)
-                    self._draw_triangles(drawable, bound, OPAQUE_TEXELS, side)
+                bound = self._draw_side(drawable, bound, view, OPAQUE_TEXELS, side)
+            GL.glEnable(GL.GL_POLYGON_OFFSET_FILL)
+        GL.glDisable(GL.GL_POLYGON_OFFSET_FILL)
         translucent = [drawable for drawable in drawables if not drawable.surface.opaque]
         if translucent:
             translucent.sort(key=lambda drawable: -float(np.linalg.norm(drawable.centre - camera)))
@@ -148,9 +153,8 @@ class SurfaceRenderer(Renderer):
             GL.glBlendFunc(GL.GL_ONE, GL.GL_ONE_MINUS_SRC_ALPHA)
             GL.glDepthMask(GL.GL_FALSE)
             for drawable in translucent:
-                bound = self._bind(drawable, bound, view)
                 for side in (_INNER, _OUTER):
-                    self._draw_triangles(drawable, bound, TRANSLUCENT_TEXELS, side)
+                    bound = self._draw_side(drawable, bound, view, TRANSLUCENT_TEXELS, side)
             GL.glDepthMask(GL.GL_TRUE)
         picture = buffers.read()
         GL.glUseProgram(0)
@@ -187,7 +191,14 @@ class SurfaceRenderer(Renderer):
             program.set_view(*view)
         return program
 
-    def _draw_triangles(self, drawable: Drawable, program: ShaderProgram, layer: int, side: float) -> None:
+    def _draw_side(
+        self, drawable: Drawable, bound: ShaderProgram | None, view: Any, layer: int, side: float
+    ) -> ShaderProgram | None:
+        """Draw the faces that can be seen from a side, and return the program that is then bound."""
+        count = len(drawable.surface.faces) if side == _OUTER else drawable.surface.two_sided
+        if count == 0:
+            return bound
+        program = self._bind(drawable, bound, view)
         GL.glCullFace(_HIDDEN[side])
         program.set_surface(drawable.surface, layer, side)
         for unit, texture in enumerate((drawable.base_texture, drawable.emissive_texture)):
@@ -195,8 +206,9 @@ class SurfaceRenderer(Renderer):
                 GL.glActiveTexture(int(GL.GL_TEXTURE0) + unit)
                 texture._bind()
         drawable.primitive._bind()
-        GL.glDrawElements(GL.GL_TRIANGLES, drawable.surface.faces.size, GL.GL_UNSIGNED_INT, c_void_p(0))
+        GL.glDrawElements(GL.GL_TRIANGLES, 3 * count, GL.GL_UNSIGNED_INT, c_void_p(0))
         drawable.primitive._unbind()
+        return program
 
 
 def _program_key(drawable: Drawable) -> tuple[Any, ...]:

@@ -1,7 +1,8 @@
 """Rays against the triangles of surfaces: Embree finds the face, double precision finds the point on it.
 
 Embree works in single precision. It only decides which face a ray meets first; where on the face is computed from the
-face's plane in double precision, so points are exact however far the camera is.
+face's plane in double precision, so points are exact however far the camera is. Where an inner and an outer side lie
+in the same place, the outer one is met.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from data_gen.rendering.surfaces import ShadedSurface
+from data_gen.rendering.surfaces import COINCIDENT, ShadedSurface
 
 __all__ = ["Hits", "RayCaster", "pixel_rays"]
 
@@ -53,9 +54,6 @@ class RayCaster:
     """
 
     def __init__(self, surfaces: Sequence[ShadedSurface]) -> None:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
         triangles = np.concatenate([surface.positions[surface.faces] for surface in surfaces])
         counts = [len(surface.faces) for surface in surfaces]
         self.owner = np.repeat(np.arange(len(surfaces)), counts)
@@ -66,8 +64,9 @@ class RayCaster:
         area = np.sum(self.facets**2, axis=1, keepdims=True)
         gradients = np.stack((np.cross(edges[1], self.facets), np.cross(self.facets, edges[0])), axis=1)
         self.gradients = np.divide(gradients, area[..., None], out=np.zeros_like(gradients), where=area[..., None] > 0)
-        self._scene = EmbreeScene(robust=True)
-        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
+        self._triangles = np.ascontiguousarray(triangles, dtype=np.float32)
+        self._all = _EmbreeFaces(self._triangles)
+        self._outer: tuple[bytes, _EmbreeFaces, Indices] | None = None
 
     def cast(self, origin: Floats, directions: Floats, after: Floats | None = None) -> Hits:
         """Find the first face on each ray.
@@ -81,23 +80,64 @@ class RayCaster:
             The hits, in the order of the rays; rays that meet nothing have none.
         """
         starts = np.broadcast_to(origin, directions.shape) if after is None else origin + after[:, None] * directions
+        faces = self._all.first(starts, directions)
+        rays = np.flatnonzero(faces >= 0)
+        faces = faces[rays]
+        faces, distances = self._outer_where_coincident(origin, starts[rays], directions[rays], faces)
+        met = np.isfinite(distances)
+        if not met.all():
+            rays, faces, distances = rays[met], faces[met], distances[met]
+        points = origin + distances[:, None] * directions[rays]
+        corners = np.einsum("rci,ri->rc", self.gradients[faces], points - self._start[faces])
+        corners = np.clip(np.concatenate((1.0 - corners.sum(axis=1, keepdims=True), corners), axis=1), 0.0, 1.0)
+        return Hits(rays, faces, distances, points, corners)
+
+    def _outer_where_coincident(
+        self, origin: Floats, starts: Floats, directions: Floats, faces: Indices
+    ) -> tuple[Indices, Floats]:
+        """The faces, with an outer side in place of an inner one that lies on it; and their distances."""
+        distances = self._distances(origin, directions, faces)
+        inner = np.flatnonzero(np.einsum("ri,ri->r", self.facets[faces], directions) > 0.0)
+        if len(inner) == 0:
+            return faces, distances
+        if self._outer is None or self._outer[0] != origin.tobytes():  # all rays of a view have one origin
+            towards = np.einsum("fi,fi->f", self.facets, origin - self._start)
+            numbers = np.flatnonzero(towards > 0.0)
+            self._outer = origin.tobytes(), _EmbreeFaces(self._triangles[numbers]), numbers
+        _, scene, numbers = self._outer
+        if len(numbers) == 0:
+            return faces, distances
+        found = scene.first(starts[inner], directions[inner])
+        inner, found = inner[found >= 0], numbers[found[found >= 0]]
+        beyond = self._distances(origin, directions[inner], found)
+        near = beyond <= distances[inner] + COINCIDENT
+        faces[inner[near]], distances[inner[near]] = found[near], beyond[near]
+        return faces, distances
+
+    def _distances(self, origin: Floats, directions: Floats, faces: Indices) -> Floats:
+        """Multiples of the directions at which they meet the planes of faces; infinite where they are parallel."""
+        facets = self.facets[faces]
+        height = np.einsum("ri,ri->r", facets, directions)
+        start = np.einsum("ri,ri->r", self._start[faces] - origin, facets)
+        return np.divide(start, height, out=np.full(len(faces), np.inf), where=height != 0.0)
+
+
+class _EmbreeFaces:
+    """Triangles (face, 3, 3) in an Embree scene."""
+
+    def __init__(self, triangles: npt.NDArray[np.float32]) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self._scene = EmbreeScene(robust=True)
+        self._mesh = TriangleMesh(self._scene, triangles)
+
+    def first(self, starts: Floats, directions: Floats) -> Indices:
+        """The first face (ray,) on each ray, -1 where there is none."""
         found = self._scene.run(
             np.ascontiguousarray(starts, dtype=np.float32), np.ascontiguousarray(directions, dtype=np.float32)
         )
-        rays = np.flatnonzero(found >= 0)
-        faces = found[rays].astype(np.int64)
-        directions = directions[rays]
-        facets, start = self.facets[faces], self._start[faces]
-        height = np.einsum("ri,ri->r", facets, directions)
-        met = height != 0.0
-        if not met.all():
-            rays, faces, directions = rays[met], faces[met], directions[met]
-            start, height, facets = start[met], height[met], facets[met]
-        distances = np.einsum("ri,ri->r", start - origin, facets) / height
-        points = origin + distances[:, None] * directions
-        corners = np.einsum("rci,ri->rc", self.gradients[faces], points - start)
-        corners = np.clip(np.concatenate((1.0 - corners.sum(axis=1, keepdims=True), corners), axis=1), 0.0, 1.0)
-        return Hits(rays, faces, distances, points, corners)
+        return found.astype(np.int64)
 
 
 def pixel_rays(pose: Floats, intrinsics: Floats, columns: Floats, rows: Floats) -> Floats:

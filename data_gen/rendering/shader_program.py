@@ -181,7 +181,7 @@ def constants_of_surface(surface: ShadedSurface) -> dict[str, str]:
         constants["metallic"] = "0.0"
     if surface.roughness in _COMMON_ROUGHNESS:
         constants |= {name: f"{value:.9g}" for name, value in _roughness_constants(surface.roughness).items()}
-    if surface.closed:
+    if surface.two_sided == 0:
         constants["side"] = "1.0"
     return constants
 

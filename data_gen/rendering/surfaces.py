@@ -12,7 +12,7 @@ occlusion maps are not drawn.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from data_gen.meshes.materials import texture_of, visual_of
 from hyperplanes.colour import linear_from_srgb
 
 __all__ = [
+    "COINCIDENT",
     "DEFAULT_ROUGHNESS",
     "MAX_METALLIC",
     "MAX_TEXTURE_SIDE",
@@ -46,6 +47,9 @@ DEFAULT_ROUGHNESS = 0.8
 
 MAX_TEXTURE_SIDE = 2048
 """Larger textures are reduced to this many texels a side before they are drawn."""
+
+COINCIDENT = 1e-4
+"""Distance, in radii of the object, up to which an outer side behind an inner one counts as in the same place."""
 
 _DEFAULT_KD = (102, 102, 102, 255)
 _PLAIN = 0.72
@@ -76,7 +80,8 @@ class ShadedSurface:
         metallic: in [0, MAX_METALLIC].
         cutoff: alpha below this is transparent, from it on opaque (glTF MASK); None for alpha that blends.
         opaque: whether all of it hides what is behind.
-        closed: whether it is known to be made of watertight solids wound outwards, of which no inner side is seen.
+        two_sided: how many of its faces, the first ones, may be seen from both sides. Of the others only the outer side
+            is: none of a closed solid, and none of a face that another one, turned the other way, lies on.
     """
 
     positions: Floats
@@ -92,7 +97,7 @@ class ShadedSurface:
     metallic: float
     cutoff: float | None
     opaque: bool
-    closed: bool = False
+    two_sided: int
 
 
 def shaded_surfaces(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: str = "object") -> list[ShadedSurface]:
@@ -121,7 +126,43 @@ def shaded_surfaces(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: st
             surfaces.append(_surface(mesh, pose, smooth, where, images))
     if not surfaces:
         raise RenderError(f"{name}: expected at least one face, received {len(parts)} parts without any")
-    return surfaces
+    return _one_side_where_doubled(surfaces)
+
+
+def _one_side_where_doubled(surfaces: list[ShadedSurface]) -> list[ShadedSurface]:
+    """Surfaces in which faces that lie on another one, wound the other way round, come last and count as one-sided.
+
+    Nearly every face of ShapeNet's models is there twice, often with two materials: the side that faces the camera is
+    the one that is meant. Faces count as the same where their corners agree to a tenth of COINCIDENT.
+    """
+    if not any(surface.two_sided for surface in surfaces):
+        return surfaces
+    keys, turns = zip(*(_identified(surface.positions, surface.faces) for surface in surfaces), strict=True)
+    key, turn = np.concatenate(keys), np.concatenate(turns)
+    both = np.intersect1d(key[turn], key[~turn])
+    if not len(both):
+        return surfaces
+    doubled = np.isin(key, both)
+    result = []
+    for surface, there in zip(surfaces, np.split(doubled, np.cumsum([len(each) for each in keys])[:-1]), strict=True):
+        two_sided = min(int((~there).sum()), surface.two_sided)
+        order = np.argsort(there, kind="stable")
+        result.append(replace(surface, faces=surface.faces[order], two_sided=two_sided))
+    return result
+
+
+def _identified(
+    positions: Floats, faces: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
+    """A number a face that depends on the places of its corners alone, and in which sense it goes through them."""
+    cells = np.rint(positions * (10.0 / COINCIDENT)).astype(np.int64).astype(np.uint64)
+    mixed = cells[:, 0] * np.uint64(0x9E3779B97F4A7C15)
+    for column in (1, 2):  # multiply and shift: near places get unrelated numbers
+        mixed = ((mixed ^ (mixed >> np.uint64(29))) + cells[:, column]) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed ^= mixed >> np.uint64(32)
+    a, b, c = mixed[faces].T
+    rising = (a < b).astype(np.int8) + (b < c) + (c < a)
+    return a + b + c, rising == 2
 
 
 def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images: dict[Any, Any]) -> ShadedSurface:
@@ -161,7 +202,13 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
         material["opaque"] = bool((colours[:, 3] >= 1.0).all())
     closed = bool(mesh.metadata.get("closed")) and material["opaque"] and material["cutoff"] is None
     return ShadedSurface(
-        positions=positions, faces=faces, normals=normals, uv=uv, colours=colours, closed=closed, **material
+        positions=positions,
+        faces=faces,
+        normals=normals,
+        uv=uv,
+        colours=colours,
+        two_sided=0 if closed else len(faces),
+        **material,
     )
 
 

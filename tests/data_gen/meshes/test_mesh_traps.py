@@ -445,9 +445,9 @@ def test_too_many_faces_are_refused_where_it_would_not(tmp_path):
         prepare_scene(trimesh.Scene(ball), "ball", max_faces=100)
 
 
-def test_a_million_faces_are_drawn_as_they_are(tmp_path):
+def test_a_quarter_of_a_million_faces_are_drawn_as_they_are(tmp_path):
     """Source of truth: the silhouette of a sphere that just fits."""
-    rows, columns = 513, 1024
+    rows, columns = 257, 512
     polar, around = np.meshgrid(np.linspace(1e-3, np.pi - 1e-3, rows), np.arange(columns) * 2 * np.pi / columns)
     points = np.stack([np.sin(polar) * np.cos(around), np.cos(polar), np.sin(polar) * np.sin(around)], -1)
     corner = np.arange(columns)[:, None] * rows + np.arange(rows - 1)
@@ -456,7 +456,7 @@ def test_a_million_faces_are_drawn_as_they_are(tmp_path):
     path = tmp_path / "ball.ply"
     path.write_bytes(trimesh.Trimesh(points.reshape(-1, 3), faces, process=False).export(file_type="ply"))
     mesh = load_mesh(path)
-    assert (mesh.face_count, mesh.warnings) == (2**20, ())
+    assert (mesh.face_count, mesh.warnings) == (2**18, ())
     rig = fixed(1, 64)
     with MeshRenderer() as renderer:
         alpha = renderer.render(mesh_parts(mesh), rig).rgba[0, ..., 3] / 255
