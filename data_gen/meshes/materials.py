@@ -23,6 +23,7 @@ __all__ = [
     "ColourSpace",
     "Visual",
     "canonical_visual",
+    "convert_image",
     "texture_of",
     "visual_of",
 ]
@@ -203,12 +204,20 @@ def _converted(image: PIL.Image.Image | None, mode: str, images: dict[Any, Any])
         return None
     key = (id(image), mode)
     if key not in images:
-        images[key] = (_convert(image, mode), image)  # the source too: its id must not be given to another
+        images[key] = (convert_image(image, mode), image)  # the source too: its id must not be given to another
     return images[key][0]
 
 
-def _convert(image: PIL.Image.Image, mode: str) -> PIL.Image.Image | None:
-    """The image converted; None for one that cannot be decoded, of which the reader of the file has warned."""
+def convert_image(image: PIL.Image.Image, mode: str) -> PIL.Image.Image | None:
+    """An image of 8 bits a channel.
+
+    Args:
+        image: as pillow opened it.
+        mode: RGB, or RGBA for RGB with alpha where the image has any.
+
+    Returns:
+        The image; None for one that cannot be decoded, of which the reader of the file has warned.
+    """
     if image.format not in (None, *IMAGE_FORMATS):
         return None
     try:

@@ -3,7 +3,12 @@
 trimesh's reader drops opacity (`d`, `Tr`), emission, and textures behind options (`map_Kd -s 1 1 1 wood.png`).
 
 A texture takes the place of `Kd`, as in Blender and so in the pictures of ShapeNet: exporters write any Kd beside it.
-`d` is opacity; `Tr` is 1 - d where there is no d, but a lone `Tr 1` is what many programs write for opaque.
+Opacity is that of `d` times that of `map_d` (its alpha where it has one, else its brightness), never the alpha of
+`map_Kd`; `Tr` is 1 - d where there is no d, but a lone `Tr 1` is what many programs write for opaque.
+
+`Kd` is sRGB, as the colours on their authors' screens were: 3ds Max writes its grey of 150/255 as 0.588. A ball of it in
+the studio light is 165 of 255 where it is brightest; read as linear, as Blender's importer does, it is 209, and a dark
+0.2 (51 of 255) comes out at up to 143 in place of 97.
 """
 
 from __future__ import annotations
@@ -16,12 +21,11 @@ import PIL.Image
 from trimesh.visual.material import PBRMaterial
 
 from data_gen.meshes.files import MAX_TEXT_BYTES
+from data_gen.meshes.materials import convert_image
 from data_gen.meshes.model_folder import ModelFolder
 from hyperplanes.colour import convert_8bit, linear_from_srgb
 
 __all__ = ["decode_text", "read_materials"]
-
-_LOST_MAPS = {"map_d": "its opacity map", "map_ke": "its glow map"}
 
 
 def decode_text(data: bytes) -> str:
@@ -83,13 +87,12 @@ def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) 
     colour[:3] = convert_8bit(np.clip(np.round(colour[:3] * 255.0), 0, 255).astype(np.uint8), linear_from_srgb) / 255.0
     colour[3] = _opacity(values, label, warnings)
     image = _texture(values, label, folder, warnings)
-    if image is not None:
+    if image is not None and (values.get("map_kd") or values.get("map_ka")):
         colour[:3] = 1.0
     shininess = max(_floats(values.get("ns"), 1, (10.0,), f"{label}: Ns", warnings)[0], 0.0)
     glow = np.clip(_floats(values.get("ke"), 3, (0.0, 0.0, 0.0), f"{label}: Ke", warnings), 0.0, 1.0)
-    for keyword, what in _LOST_MAPS.items():
-        if values.get(keyword):
-            warnings.append(f"{label}: {what} {values[keyword]} left out")
+    if values.get("map_ke"):
+        warnings.append(f"{label}: its glow map {values['map_ke']} left out")
     return PBRMaterial(
         name=values["name"],
         baseColorFactor=colour,
@@ -114,17 +117,34 @@ def _opacity(values: dict[str, Any], label: str, warnings: list[str]) -> float:
 
 
 def _texture(values: dict[str, Any], label: str, folder: ModelFolder, warnings: list[str]) -> PIL.Image.Image | None:
-    name = values.get("map_kd") or values.get("map_ka")
+    """The colours of `map_Kd` with the opacity of `map_d`; white where there is only opacity."""
+    image = _image(
+        values.get("map_kd") or values.get("map_ka"), f"{label}: drawn without its texture", folder, warnings
+    )
+    mask = _image(values.get("map_d"), f"{label}: drawn without its opacity map", folder, warnings)
+    colour = None if image is None else convert_image(image, "RGB")
+    opacity = None if mask is None else convert_image(mask, "RGBA")
+    if opacity is None:
+        return colour
+    alpha = opacity.getchannel("A") if opacity.mode == "RGBA" else opacity.convert("L")
+    colour = PIL.Image.new("RGB", alpha.size, "white") if colour is None else colour
+    size = max(colour.width, alpha.width), max(colour.height, alpha.height)
+    colour = colour.resize(size)
+    colour.putalpha(alpha.resize(size))
+    return colour
+
+
+def _image(name: str | None, what: str, folder: ModelFolder, warnings: list[str]) -> PIL.Image.Image | None:
     if not name:
         return None
     try:
         image = PIL.Image.open(io.BytesIO(folder.get_image(name)))
         image.load()
     except FileNotFoundError:
-        warnings.append(f"{label}: drawn without its texture {name} ({folder.lost.get(name, 'not found')})")
+        warnings.append(f"{what} {name} ({folder.lost.get(name, 'not found')})")
         return None
     except (OSError, SyntaxError, ValueError) as error:
-        warnings.append(f"{label}: drawn without its texture {name}, which cannot be decoded: {error}")
+        warnings.append(f"{what} {name}, which cannot be decoded: {error}")
         return None
     return image
 

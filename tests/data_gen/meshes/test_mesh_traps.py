@@ -96,9 +96,27 @@ def test_nodes_without_extent_or_not_finite(tmp_path):
 
 
 def test_grey_textures_with_alpha_become_rgba(tmp_path):
-    path = write_obj(tmp_path, mtl=WOOD, texture=picture("LA", colour=(50, 200)))
+    path = write_obj(tmp_path, mtl=WOOD + "map_d wood.png\n", texture=picture("LA", colour=(50, 200)))
     image = only_part(load_mesh(path)).visual.material.baseColorTexture
     assert (image.mode, image.getpixel((0, 0))) == ("RGBA", (50, 50, 50, 200))
+
+
+def test_the_opacity_of_an_obj_comes_from_map_d_and_d_alone(tmp_path):
+    """As in Blender: textures are often saved with an alpha channel that means something else."""
+    (tmp_path / "mask.png").write_bytes(picture("L", size=(8, 8), colour=64))
+
+    def texel(mtl):
+        mesh = load_mesh(write_obj(tmp_path, mtl=mtl, texture=picture("RGBA", colour=(50, 60, 70, 0))))
+        material = only_part(mesh).visual.material
+        return material.baseColorTexture.getpixel((0, 0)), material.baseColorFactor.tolist(), mesh.warnings
+
+    white, red = [255, 255, 255, 255], [255, 0, 0, 255]
+    assert texel(WOOD) == ((50, 60, 70), white, ())
+    assert texel(WOOD + "map_d mask.png\n") == ((50, 60, 70, 64), white, ())
+    assert texel(WOOD + "map_d mask.png\nd 0.6\n")[1] == [255, 255, 255, 153]
+    assert texel(PAINT + "map_d mask.png\n") == ((255, 255, 255, 64), red, ())
+    lines = load_mesh(write_obj(tmp_path, mtl=WOOD + "map_d gone.png\n", texture=picture())).warnings
+    assert lines == ("material 'paint': drawn without its opacity map gone.png (not found)",)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +126,7 @@ def test_grey_textures_with_alpha_become_rgba(tmp_path):
         ("1", 1, (255, 255, 255)),
         ("P", 0, (0, 0, 0)),
         ("I;16", 65535, (255, 255, 255)),
-        ("RGBA", (1, 2, 3, 4), (1, 2, 3, 4)),
+        ("RGBA", (1, 2, 3, 4), (1, 2, 3)),
     ],
 )
 def test_textures_of_every_kind_become_8_bit_colours(tmp_path, mode, colour, expected):
