@@ -16,6 +16,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import tyro
+
 from data_gen import SUPERSAMPLE
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, optional
@@ -24,7 +26,7 @@ from hyperplanes.formatting import format_duration
 if TYPE_CHECKING:
     from data_gen.datasets.generate import GenerationReport, MeshFolder, Procedural
 
-__all__ = ["Arguments", "run", "source_of", "summary"]
+__all__ = ["Arguments", "remarks", "run", "source_of", "summary"]
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,9 @@ class Arguments:
         field_of_view: Of the cameras in degrees; that of the rig or the layout, else the object just fits.
         lighting: Where the light comes from.
         layout: How the files lie: native, or as another project's loader reads them.
-        up: The axis that points up in the mesh files.
+        up: The axis that points up in OBJ, PLY, STL and OFF files, which do not say it; glTF is y up by its
+            specification, and COLLADA declares its own.
+        up_of: Exceptions, for files of any format: a file, a folder or a pattern, and its axis: scans=z 'old/*.glb=z'.
         split_file: ShapeNet's official all.csv, which says what each model of the tree is for.
         channels: What is written of every view; more than rgba needs the native layout.
         workers: Processes; as many as there are cores when not given.
@@ -73,6 +77,7 @@ class Arguments:
     lighting: Literal["studio", "headlight", "random"] = "studio"
     layout: Literal["native", "srn", "learnit-128", "hyperplanes-200"] = "native"
     up: Literal["y", "z"] = "y"
+    up_of: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[PATTERN=AXIS [...]]")] = ()
     split_file: Annotated[Path | None, optional("FILE")] = None
     channels: tuple[Literal["rgba", "depth", "normals", "coordinates", "mesh"], ...] = ("rgba",)
     workers: OptionalInt = None
@@ -94,7 +99,7 @@ def source_of(arguments: Arguments) -> Procedural | MeshFolder:
         found = "none" if arguments.meshes is None else "both"
         raise ValueError(f"expected --class NAME or --meshes FOLDER, found {found}; `hyperplanes generate --help`")
     if arguments.meshes is not None:
-        return MeshFolder(arguments.meshes, arguments.up, arguments.split_file)
+        return MeshFolder(arguments.meshes, arguments.up, arguments.split_file, arguments.up_of)
     if arguments.split_file is not None:
         raise ValueError("split_file: expected with --meshes and a ShapeNetCore tree, found with --class")
     return Procedural(str(arguments.class_name), arguments.count, arguments.seed)
@@ -112,10 +117,20 @@ def summary(report: GenerationReport, out: Path) -> str:
     return f"{out}: {report.written} objects ({splits}{reused}){speed}"
 
 
-def unlisted(names: list[str]) -> str:
-    """One line about objects that the split file does not name."""
-    shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-    return f"not in the split file, so trained on: {len(names)} objects ({shown}), listed in the manifest"
+def remarks(report: GenerationReport, out: Path) -> list[str]:
+    """One line about each set of objects that a user should look at, and where they are listed."""
+    others = [name for name in report.warned if name not in set(report.incomplete)]
+    found = {
+        ("not in the split file, so trained on", "not_in_split_file"): report.unlisted,
+        ("drawn without a texture or another file that they name", "with_lost_files"): report.incomplete,
+        ("drawn with other warnings", "with_warnings"): others,
+    }
+    return [
+        f"{what}: {len(names)} of {report.written} objects ({', '.join(names[:3])}{', ...' * (len(names) > 3)}), "
+        f"listed in {out / 'manifest.json'} under {key}"
+        for (what, key), names in found.items()
+        if names
+    ]
 
 
 def run(arguments: Arguments) -> int:
@@ -137,9 +152,9 @@ def run(arguments: Arguments) -> int:
         report = generate(source, arguments.out, config, progress=bar.show)
     for name, reason in report.skipped:
         console.warn(f"skipped {name}: {reason}")
-    if report.unlisted:
-        console.warn(unlisted(report.unlisted))
     console.say(summary(report, arguments.out))
+    for line in remarks(report, arguments.out):
+        console.warn(line)
     if not arguments.verify:
         return 0
     verification = verify(arguments.out)

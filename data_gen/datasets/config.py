@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from data_gen import SUPERSAMPLE
 from data_gen.datasets.layouts import LAYOUTS
@@ -37,7 +37,6 @@ class RenderConfig:
         seed: of random rigs and lights.
         supersample: samples along a side of a pixel.
         renderer: a name in `data_gen.rendering.renderers.RENDERERS`.
-        up: the axis that points up in mesh files, y or z.
     """
 
     rig: str
@@ -51,7 +50,6 @@ class RenderConfig:
     seed: int
     supersample: int
     renderer: str
-    up: Literal["y", "z"]
 
     def make_rig(self, name: str) -> Rig:
         """The cameras of an object.
@@ -123,11 +121,8 @@ class GenerationConfig:
     recycle: int = 200
     verify: bool = False
 
-    def resolve(self, up: Literal["y", "z"] = "y") -> RenderConfig:
+    def resolve(self) -> RenderConfig:
         """Check everything, and settle what was left open: by the layout, else by the preset, else by default.
-
-        Args:
-            up: the axis that points up in mesh files.
 
         Returns:
             What workers need to know.
@@ -163,7 +158,6 @@ class GenerationConfig:
             seed=self.seed,
             supersample=self.supersample,
             renderer="",
-            up=up,
         )
         _check_sizes(config)
         config.make_rig("")  # numbers that make no sense show here, not in every worker

@@ -39,6 +39,8 @@ class GenerationReport:
         reused: objects that an earlier call had written.
         splits: how many objects are in each split.
         unlisted: objects that the split file does not name, and that are trained on.
+        incomplete: objects that are drawn without a texture or another file that they name.
+        warned: objects with warnings, of which those with lost files are some.
     """
 
     written: int
@@ -48,6 +50,8 @@ class GenerationReport:
     reused: int = 0
     splits: dict[str, int] = field(default_factory=dict)
     unlisted: list[str] = field(default_factory=list)
+    incomplete: list[str] = field(default_factory=list)
+    warned: list[str] = field(default_factory=list)
 
 
 def generate(
@@ -77,13 +81,14 @@ def generate(
     """
     begun = time.monotonic()
     out, config = Path(out), config or GenerationConfig()
-    render = config.resolve(source.up if isinstance(source, MeshFolder) else "y")
+    render = config.resolve()
     items = list_items(source, config.held_out)
     with GenerationState(out, _configuration(source, items, render, config.held_out)) as state:
         done = state.done(verified=config.verify)
         reused = sum(item.name in done for item in items)
         pending = (asdict(item) for item in items if item.name not in done)
-        settings = {"out": str(out.resolve()), "render": render.as_json()}
+        meshes = str(source.path) if isinstance(source, MeshFolder) else None
+        settings = {"out": str(out.resolve()), "render": render.as_json(), "meshes": meshes}
         count, skipped, images = reused, [], 0
         try:
             with closing(_outcomes(config, settings, pending)) as outcomes:
@@ -107,8 +112,8 @@ def generate(
         state.finish(manifest, LAYOUTS[render.layout].splits(kept))
     seconds = time.monotonic() - begun
     splits = {split: len(names) for split, names in manifest["splits"].items()}
-    unlisted = manifest["not_in_split_file"]["names"]
-    return GenerationReport(len(kept), sorted(skipped), seconds, images / seconds, reused, splits, unlisted)
+    named = (manifest[key]["names"] for key in ("not_in_split_file", "with_lost_files", "with_warnings"))
+    return GenerationReport(len(kept), sorted(skipped), seconds, images / seconds, reused, splits, *named)
 
 
 def _configuration(
@@ -118,10 +123,12 @@ def _configuration(
     if isinstance(source, Procedural):
         described = asdict(source)
     else:
-        names = [[item.name, item.split] for item in items]
+        names = [[item.name, item.split, item.up] for item in items]
         described = {
             "folder": Path(source.path).resolve().name,
             "meshes": len(items),
+            "up": source.up,
+            "up_of": list(source.up_of),
             "names": sha256(repr(names).encode()),
         }
     generator = f"hyperplanes {version('hyperplanes')}, pictures {PICTURES}"

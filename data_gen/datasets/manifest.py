@@ -78,6 +78,8 @@ def build_manifest(
     by_name = {entry["name"]: entry for entry in entries}
     done = [item for item in items if item.name in by_name]
     unlisted = [item.name for item in done if item.unlisted]
+    incomplete = [item.name for item in done if "lost_files" in by_name[item.name]["record"]]
+    warned = [item.name for item in done if "warnings" in by_name[item.name]["record"]]
     splits = {split: [item.name for item in done if item.split == split] for split in ("train", "val", "test")}
     return {
         "format": FORMAT,
@@ -86,6 +88,8 @@ def build_manifest(
         "configuration": configuration,
         "splits": splits,
         "not_in_split_file": {"count": len(unlisted), "split": "train", "names": unlisted},
+        "with_lost_files": {"count": len(incomplete), "names": incomplete},
+        "with_warnings": {"count": len(warned), "names": warned},
         "objects": {item.name: {**by_name[item.name]["record"], "files": by_name[item.name]["files"]} for item in done},
         "skipped": [{"name": name, "reason": reason} for name, reason in sorted(skipped)],
     }

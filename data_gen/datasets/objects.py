@@ -21,7 +21,8 @@ def open_renderer(settings: dict[str, Any]) -> Generator[Callable[[dict[str, Any
     """A function from an `Item`'s fields to the record of the object it wrote; one renderer serves all calls.
 
     Args:
-        settings: `out`, the folder of the data set, and `render`, a `RenderConfig` as JSON.
+        settings: `out`, the folder of the data set, `render`, a `RenderConfig` as JSON, and `meshes`, the folder that
+            no mesh may read outside of, or None.
 
     Yields:
         The function. It raises ValueError, with the reason, for an object that cannot be drawn.
@@ -29,20 +30,21 @@ def open_renderer(settings: dict[str, Any]) -> Generator[Callable[[dict[str, Any
     from data_gen.rendering.mesh_renderer import MeshRenderer
 
     config, out = RenderConfig.from_json(settings["render"]), Path(settings["out"])
+    meshes = None if settings["meshes"] is None else Path(settings["meshes"])
     with MeshRenderer(config.renderer, config.supersample) as renderer:
 
         def process(fields: dict[str, Any]) -> dict[str, Any]:
-            rendered = _render(renderer, Item(**fields), config)
+            rendered = _render(renderer, Item(**fields), config, meshes)
             return _write(rendered, LAYOUTS[config.layout].files(rendered), out)
 
         yield process
 
 
-def _render(renderer: Any, item: Item, config: RenderConfig) -> RenderedObject:
+def _render(renderer: Any, item: Item, config: RenderConfig, meshes: Path | None) -> RenderedObject:
     from data_gen.meshes.mesh import load_mesh, mesh_parts, prepare_scene
 
     if item.path is not None:
-        mesh = load_mesh(item.path, up=config.up, name=item.name)
+        mesh = load_mesh(item.path, up=item.up, name=item.name, within=meshes)
     else:
         from data_gen.shapes import make
 
@@ -83,6 +85,8 @@ def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict
         record["seed"] = item.seed
     if mesh.warnings:
         record["warnings"] = list(mesh.warnings)
+    if mesh.lost_files:
+        record["lost_files"] = list(mesh.lost_files)
     checksums = {path: sha256(data) for path, data in files.items()}
     done = {"name": item.name, "record": record, "files": checksums}
     write_whole(out / ".progress" / "done" / f"{item.name}.json", encode_json(done), scratch, durable=False)

@@ -6,10 +6,13 @@ import hashlib
 import math
 from collections import defaultdict
 from dataclasses import dataclass
+from fnmatch import fnmatchcase as fnmatch
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+
+from data_gen.meshes.files import STATES_ITS_AXIS
 
 __all__ = ["Item", "MeshFolder", "Procedural", "Source", "list_items", "seed_of"]
 
@@ -36,7 +39,9 @@ class MeshFolder:
 
     Attributes:
         path: the folder.
-        up: which axis is up in the files, y or z.
+        up: which axis is up, y or z, in files of formats that do not say it: OBJ, PLY, STL and OFF.
+        up_of: exceptions as `PATTERN=AXIS`, for files of any format; the last that fits counts. The pattern is a
+            folder, a file, or one with wildcards (`scans/*.glb`), from `path` on.
         split_file: ShapeNet's official all.csv; models that it does not list are trained on, and the manifest names
             them.
     """
@@ -44,6 +49,7 @@ class MeshFolder:
     path: str | Path
     up: Literal["y", "z"] = "y"
     split_file: str | Path | None = None
+    up_of: tuple[str, ...] = ()
 
 
 Source = Procedural | MeshFolder
@@ -60,6 +66,7 @@ class Item:
         seed: of the procedural shape, or None for a file.
         path: of the mesh file, or None for a procedural shape.
         unlisted: whether a split file decides and does not name it, so that it is trained on.
+        up: the axis that points up in the file, y or z; None for what its format says.
     """
 
     name: str
@@ -68,6 +75,7 @@ class Item:
     seed: int | None = None
     path: str | None = None
     unlisted: bool = False
+    up: Literal["y", "z"] | None = None
 
 
 def list_items(source: Source, held_out: float | int | None) -> list[Item]:
@@ -127,6 +135,7 @@ def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
     found = find_meshes(source.path, split_file=source.split_file)
     if source.split_file is not None and not any(mesh.split for mesh in found):
         raise ValueError(f"{source.split_file}: expected models of {source.path}, found none of them; check both")
+    axes = _axes(source, [mesh.path for mesh in found])
     stated = held_out is None and any(mesh.split for mesh in found)
     classes: dict[str | None, list[Any]] = defaultdict(list)
     for mesh in sorted(found, key=lambda mesh: mesh.name):
@@ -139,8 +148,25 @@ def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
             if stated:
                 split = mesh.split or "train"
             unlisted = stated and mesh.split is None
-            items.append(Item(mesh.name, class_name, split, path=str(mesh.path), unlisted=unlisted))
+            up = axes[mesh.path]
+            items.append(Item(mesh.name, class_name, split, path=str(mesh.path), unlisted=unlisted, up=up))
     return items
+
+
+def _axes(source: MeshFolder, paths: list[Path]) -> dict[Path, Any]:
+    """Which axis is up in each file; None for what its format says."""
+    axes: dict[Path, Any] = {path: None if path.suffix.lower() in STATES_ITS_AXIS else source.up for path in paths}
+    names = {path: path.relative_to(source.path).as_posix() for path in paths}
+    for exception in source.up_of:
+        pattern, _, axis = exception.rpartition("=")
+        if not pattern or axis not in ("y", "z"):
+            raise ValueError(f"up_of: expected PATTERN=y or PATTERN=z, got {exception!r}")
+        pattern = pattern.strip("/")
+        chosen = [path for path, name in names.items() if fnmatch(name, pattern) or fnmatch(name, f"{pattern}/*")]
+        if not chosen:
+            raise ValueError(f"up_of: expected a file or folder of {source.path}, got {pattern!r}, which fits none")
+        axes |= dict.fromkeys(chosen, axis)
+    return axes
 
 
 def _held_out(total: int, wanted: float | int) -> int:

@@ -17,6 +17,7 @@ __all__ = [
     "MAX_PIXELS",
     "MAX_TEXT_BYTES",
     "MESH_SUFFIXES",
+    "STATES_ITS_AXIS",
     "MeshError",
     "check_image",
     "read_bytes",
@@ -24,6 +25,9 @@ __all__ = [
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".dae")
 """Endings of mesh files, lower case."""
+
+STATES_ITS_AXIS = (".glb", ".gltf", ".dae")
+"""Endings of formats that say which axis points up: glTF y, by its specification, COLLADA in the file."""
 
 MAX_FILE_BYTES = 1 << 30
 """Bytes of one file that are read at most."""

@@ -206,6 +206,7 @@ def _check_textures(
         name = name if len(name) < 100 else f"image {index}"
         if image.get("mimeType") == "image/ktx2":
             lost[index] = f"{name} (KTX2 is not supported)"
+            folder.lost.setdefault(name, "KTX2 is not supported")
             continue
         if "bufferView" in image:
             view = header["bufferViews"][image["bufferView"]]

@@ -7,7 +7,7 @@ what cannot be drawn as the file states is named in `Mesh.warnings`, what cannot
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +22,6 @@ from data_gen.meshes.formats import declared_up
 from data_gen.meshes.materials import ColourSpace, canonical_visual
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.read import read_scene
-from data_gen.meshes.shapenet import model_root
 
 __all__ = [
     "MAX_FACES",
@@ -52,6 +51,7 @@ class Mesh:
         world_from_file: the similarity `(4, 4)` that took the file's coordinates here.
         warnings: what was lost or repaired, one line each.
         face_count: triangles.
+        lost_files: textures and material libraries that it names and is drawn without.
     """
 
     name: str
@@ -59,25 +59,27 @@ class Mesh:
     world_from_file: npt.NDArray[np.float64]
     warnings: tuple[str, ...]
     face_count: int
+    lost_files: tuple[str, ...] = ()
 
 
 def load_mesh(
     path: str | Path,
     *,
-    up: Literal["y", "z"] = "y",
+    up: Literal["y", "z"] | None = None,
     name: str | None = None,
     max_faces: int = MAX_FACES,
     fit: Literal["sphere", "cube"] = "sphere",
+    within: Path | None = None,
 ) -> Mesh:
     """Read a mesh file.
 
     Args:
-        path: a GLB, glTF, OBJ, PLY, STL, OFF or DAE file. What it refers to is read from its own folder and those
-            inside; for `SYNSET/ID/models/model_normalized.obj` of ShapeNet v2 from the folder of the ID.
-        up: the axis that points up in the file. A COLLADA file that declares its own is turned accordingly.
+        path: a GLB, glTF, OBJ, PLY, STL, OFF or DAE file.
+        up: the axis that points up in the file. By default y, but what a COLLADA file declares.
         name: what to call it; the file's name by default.
         max_faces: triangles at most.
         fit: what is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
+        within: the folder that no file which the mesh refers to may leave; the model's own by default.
 
     Returns:
         The mesh.
@@ -92,23 +94,24 @@ def load_mesh(
             f"{path}: expected a file that ends in {', '.join(MESH_SUFFIXES)}, found {suffix!r}; convert it"
         )
     data = read_bytes(path, limit=MAX_TEXT_BYTES if suffix in _TEXT else MAX_FILE_BYTES)
-    folder = ModelFolder(path, model_root(path))
+    folder = ModelFolder(path, within)
     scene, colours, lines = read_scene(data, folder)
     mentioned = "; ".join(lines)
     lost = [f"{reference}: {reason}" for reference, reason in folder.lost.items() if reference not in mentioned]
     axis = declared_up(data) if suffix == ".dae" else None
-    if axis == "x":
+    if axis == "x" and up is None:
         lines.append("declares x up; taken as y up")
-    return prepare_scene(
+    mesh = prepare_scene(
         scene,
         name or safe_name(path.stem),
-        up="z" if axis == "z" else up,
+        up=up or ("z" if axis == "z" else "y"),
         max_faces=max_faces,
         fit=fit,
         colours=colours,
         warnings=(*lost, *lines, *folder.notes),
         source=str(path),
     )
+    return replace(mesh, lost_files=tuple(folder.lost))
 
 
 def prepare_scene(

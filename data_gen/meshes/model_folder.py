@@ -1,6 +1,6 @@
 """The folder of one model: gives a mesh loader its materials, textures and buffers, and nothing else.
 
-Every name in a mesh file is resolved here. Nothing outside the model's own folder is opened, and never the network.
+Every name in a mesh file is resolved here. Nothing outside the folder that was given is opened, and never the network.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from trimesh.resolvers import Resolver
 
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PIXELS, MeshError, check_image, read_bytes
 
-__all__ = ["ModelFolder"]
+__all__ = ["ModelFolder", "model_root"]
 
 _MTL_OPTION = re.compile(
     r"^\s*-(?:(?:blendu|blendv|cc|clamp|imfchan|type|texres|boost|bm)\s+\S+|(?:o|s|t)(?:\s+[-+.\deE]+){1,3}"
@@ -22,16 +22,33 @@ _MTL_OPTION = re.compile(
 )
 
 
+def model_root(path: Path) -> Path:
+    """The folder that holds all files of a model.
+
+    Args:
+        path: a mesh file.
+
+    Returns:
+        That of the ID for ShapeNet's `ID/models/model_normalized.obj`, whose textures are in `ID/images`; that of NAME
+        for Gazebo's `NAME/meshes/x.dae` where there is a `NAME/materials`; else the file's.
+    """
+    folder = path.parent.resolve()
+    of_shapenet = (folder.name, path.name) == ("models", "model_normalized.obj")
+    of_gazebo = folder.name.lower() == "meshes" and (folder.parent / "materials").is_dir()
+    return folder.parent if of_shapenet or of_gazebo else folder
+
+
 class ModelFolder(Resolver):
     """Gives a mesh loader the other files of its model, from one folder and no other place.
 
-    Names are accepted as files hold them: with backslashes, percent-encoded, in the wrong case, as `model://NAME/rest`
-    (the folder stands for NAME), behind MTL options (`-s 1 1 1 wood.png`), or with the absolute path of the machine
-    they were made on, of which only the last part is looked for.
+    Names are accepted as files hold them: with backslashes, percent-encoded, in the wrong case, behind MTL options
+    (`-s 1 1 1 wood.png`), or as `model://NAME/rest`, for which a folder NAME is looked for, and the model's own stands
+    in. What is not where its name says is looked for by the last part of it, as Blender does: beside the mesh, and in
+    the folders that usually hold textures. That is noted.
 
     Args:
         path: the mesh file; its name is what messages begin with.
-        root: the folder that nothing may leave; the mesh file's own by default.
+        within: the folder that nothing may leave; `model_root(path)` by default, and where the file is not in it.
         pixels: pixels that all textures together may have.
 
     A file that is not there, and a texture that cannot be decoded, is a FileNotFoundError and noted in `lost`.
@@ -42,10 +59,12 @@ class ModelFolder(Resolver):
         refused: the first reason to refuse the whole model, if there was one: loaders swallow exceptions.
     """
 
-    def __init__(self, path: Path, root: Path | None = None, *, pixels: int = MAX_PIXELS) -> None:
+    def __init__(self, path: Path, within: Path | None = None, *, pixels: int = MAX_PIXELS) -> None:
         self.path = path
         self.folder = path.parent.resolve()
-        self.root = (root or path.parent).resolve()
+        self.root = model_root(path) if within is None else within.resolve()
+        if not self.folder.is_relative_to(self.root):
+            self.root = model_root(path)
         self.pixels_left = pixels
         self.lost: dict[str, str] = {}
         self.notes: list[str] = []
@@ -150,38 +169,59 @@ class ModelFolder(Resolver):
         Raises:
             MeshError: if the name leaves the model's folder.
         """
-        plain_name = name.strip().strip('"')
-        for candidate in _candidates(plain_name):
-            found = self._inside(candidate, name)
+        plain = name.strip().strip('"')
+        if "\0" in plain:
+            return None
+        candidates = list(_candidates(plain))
+        places = [*self._of_named_model(plain), *(self.folder / each for each in candidates if not _is_absolute(each))]
+        for place in places:
+            found = self._file(place)
             if found is not None:
                 return found
-        if _is_absolute(plain_name):
-            last = PurePosixPath(plain_name.replace("\\", "/")).name
-            found = self._inside(last, name) if last else None
-            if found is None:
-                raise MeshError(
-                    f"{self.path}: expected references inside {self.root.name}/, found the absolute path "
-                    f"{plain_name!r}; "
-                    "put the file beside the mesh and name it without a folder"
-                )
-            self._note(f"{plain_name}: absolute path not followed, {last} beside the mesh taken")
-            return found
+        for last in dict.fromkeys(PurePosixPath(each.replace("\\", "/")).name for each in candidates):
+            for folder in self._usual_folders():
+                found = self._file(folder / last) if last else None
+                if found is not None:
+                    why = "absolute path not followed" if _is_absolute(plain) else "not there"
+                    self._note(f"{plain}: {why}, {found.relative_to(self.root).as_posix()} taken")
+                    return found
+        if _is_absolute(plain) or any(self._leaves(place) for place in places):
+            what = f"the absolute path {plain!r}" if _is_absolute(plain) else f"{plain!r}, which leaves it"
+            raise MeshError(
+                f"{self.path}: expected references inside {self.root.name}/, found {what}; put the file beside the mesh"
+            )
         return None
 
-    def _inside(self, relative: str, name: str) -> Path | None:
-        if not relative or _is_absolute(relative) or "\0" in relative:
-            return None
+    def _of_named_model(self, name: str) -> Iterator[Path]:
+        """Where a file of `model://NAME/rest` is if there is a folder NAME above the mesh, or beside one of those."""
+        parts = name.partition("://")[2].split("/")
+        if not name.startswith("model://") or len(parts) < 2 or parts[0] in ("", ".", ".."):
+            return
+        for above in (self.folder, *self.folder.parents):
+            if not above.is_relative_to(self.root):
+                return
+            if above.name == parts[0]:
+                yield above.joinpath(*parts[1:])
+            yield above.joinpath(*parts)
+
+    def _usual_folders(self) -> Iterator[Path]:
+        for folder in dict.fromkeys((self.folder, model_root(self.path))):
+            for name in ("", "textures", "texture", "images", "materials/textures"):
+                yield folder / name
+
+    def _leaves(self, place: Path) -> bool:
         try:
-            candidate = self.folder / relative
-            path = candidate.resolve()
+            return not place.resolve().is_relative_to(self.root)
+        except (OSError, RuntimeError):
+            return False
+
+    def _file(self, place: Path) -> Path | None:
+        """The file at a place inside the root, or one of a name that differs in case; None if there is none."""
+        try:
+            path = place.resolve()
             if not path.is_relative_to(self.root):
-                raise MeshError(
-                    f"{self.path}: expected references inside {self.root.name}/, found {name.strip()!r}, which leaves "
-                    "it; put the file beside the mesh"
-                )
-            if path.is_file():
-                return path
-            return self._other_case(path)
+                return None
+            return path if path.is_file() else self._other_case(path)
         except (OSError, RuntimeError):
             return None
 
@@ -214,9 +254,9 @@ def _candidates(name: str) -> Iterator[str]:
     """Relative paths that a name may stand for, likeliest first."""
     uri = re.match(r"^(?:model|package|file)://(.*)$", name)
     if uri:
-        parts = uri.group(1).split("/")
+        parts = [part for part in uri.group(1).split("/") if part]
         yield "/".join(parts[1:])
-        yield parts[-1]
+        yield "/".join(parts[-1:])
         return
     plain = name.replace("\\", "/")
     yield name

@@ -6,9 +6,9 @@ A texture takes the place of `Kd`, as in Blender and so in the pictures of Shape
 Opacity is that of `d` times that of `map_d` (its alpha where it has one, else its brightness), never the alpha of
 `map_Kd`; `Tr` is 1 - d where there is no d, but a lone `Tr 1` is what many programs write for opaque.
 
-`Kd` is sRGB, as the colours on their authors' screens were: 3ds Max writes its grey of 150/255 as 0.588. A ball of it in
-the studio light is 165 of 255 where it is brightest; read as linear, as Blender's importer does, it is 209, and a dark
-0.2 (51 of 255) comes out at up to 143 in place of 97.
+`Kd` is sRGB, as the colours on their authors' screens were: 3ds Max writes its grey of 150/255 as 0.588. A ball of it
+in the studio light is 165 of 255 where it is brightest; read as linear, as Blender's importer does, it is 209, and a
+dark 0.2 (51 of 255) comes out at up to 143 in place of 97.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ __all__ = [
     "class_of_synset",
     "find_models",
     "is_shapenet",
-    "model_root",
     "paper_split",
     "read_split_file",
 ]
@@ -63,19 +62,6 @@ def class_of_synset(synset: str) -> str:
     'car'
     """
     return SYNSETS.get(synset.zfill(8), synset)
-
-
-def model_root(path: Path) -> Path:
-    """The folder that holds all files of a model.
-
-    Args:
-        path: a mesh file.
-
-    Returns:
-        That of the ID for `ID/models/model_normalized.obj`, whose textures are in `ID/images`; else the file's.
-    """
-    two_up = path.name == _V2.name and path.parent.resolve().name == _V2.parent.name
-    return path.parent.resolve().parent if two_up else path.parent
 
 
 def is_shapenet(folder: Path) -> bool:

@@ -15,6 +15,7 @@ import torch
 import trimesh
 
 from data_gen import SUPERSAMPLE
+from data_gen.commands.generate import remarks
 from data_gen.datasets import objects
 from data_gen.datasets.generate import PICTURES, GenerationConfig, MeshFolder, Procedural, generate
 from data_gen.datasets.inspect import inspect
@@ -162,13 +163,39 @@ def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path)
     trimesh.creation.icosphere(subdivisions=1).export(meshes / "ball.obj")
     (meshes / "broken.glb").write_bytes(b"glTF but not really")
     (meshes / "empty.obj").write_text("")
+    cut = "mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 1\nusemtl paint\nf 1 2 3\n"
+    (meshes / "grey.obj").write_text(cut)
     report = generate(MeshFolder(meshes), tmp_path / "out", GenerationConfig(held_out=0, **SMALL))
-    assert report.written == 2
+    assert report.written == 3
     assert [name for name, _ in report.skipped] == ["broken", "empty"]
     assert all(reason.startswith(f"{name}.") for name, reason in report.skipped), "no path of this machine"
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert [(entry["name"], entry["reason"]) for entry in manifest["skipped"]] == report.skipped
-    assert Dataset(tmp_path / "out").names() == ["ball", "box"]
+    assert Dataset(tmp_path / "out").names() == ["ball", "box", "grey"]
+    assert manifest["with_lost_files"] == {"count": 1, "names": ["grey"]}
+    assert manifest["objects"]["grey"]["lost_files"] == ["gone.mtl"]
+    (line,) = remarks(report, tmp_path / "out")
+    assert line.startswith("drawn without a texture or another file that they name: 1 of 3 objects (grey), listed in")
+
+
+def test_the_axis_is_that_of_the_format_unless_a_file_or_folder_is_named(tmp_path):
+    for name in ("a.obj", "b.glb", "c.dae", "scans/d.glb", "scans/e.ply", "scans/old/f.stl"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+
+    def axes(**keywords):
+        return "".join(item.up or "-" for item in sorted(list_items(MeshFolder(tmp_path, **keywords), 0), key=by_path))
+
+    def by_path(item):
+        return item.path
+
+    assert axes() == "y---yy"
+    assert axes(up="z") == "z---zz"
+    assert axes(up="z", up_of=("scans=y",)) == "z--yyy"
+    assert axes(up_of=("scans=z", "*.stl=y", "b.glb=z")) == "yz-zzy"
+    for wrong, message in (("scan=z", "'scan', which fits none"), ("scans", "expected PATTERN=y or PATTERN=z")):
+        with pytest.raises(ValueError, match=message):
+            axes(up_of=(wrong,))
 
 
 def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypatch):

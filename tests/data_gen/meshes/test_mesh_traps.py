@@ -231,8 +231,43 @@ def test_an_absent_texture_is_named_with_its_material(tmp_path, name):
 @pytest.mark.parametrize("name", ["/srv/art/wood.png", "C:\\art\\wood.png", "\\\\server\\art\\wood.png"])
 def test_an_absolute_path_is_not_followed_but_its_file_beside_the_mesh_is_taken(tmp_path, name):
     mesh = load_mesh(write_obj(tmp_path, mtl=PAINT + f"map_Kd {name}\n", texture=picture(colour=(5, 6, 7))))
-    assert warning(mesh) == f"{name}: absolute path not followed, wood.png beside the mesh taken"
+    assert warning(mesh) == f"{name}: absolute path not followed, wood.png taken"
     assert only_part(mesh).visual.material.baseColorTexture.getpixel((0, 0)) == (5, 6, 7)
+
+
+@pytest.mark.parametrize(
+    ("mesh_at", "name", "texture_at"),
+    [
+        ("suv/meshes", "../materials/textures/wood.png", "suv/materials/textures"),
+        ("suv/meshes", "wood.png", "suv/materials/textures"),
+        ("suv/meshes", "model://suv/materials/textures/wood.png", "suv/materials/textures"),
+        ("suv/meshes", "model://wheels/materials/textures/wood.png", "wheels/materials/textures"),
+        ("suv", "C:\\art\\wood.png", "suv/textures"),
+        ("suv", "maps/WOOD.PNG", "suv"),
+        ("suv", "../shared/wood.png", "shared"),
+        ("suv/meshes", "../../../art/wood.png", "suv/materials/textures"),  # leaves all, and is here by its base name
+    ],
+)
+def test_textures_are_found_where_models_of_gazebo_and_others_keep_them(tmp_path, mesh_at, name, texture_at):
+    for folder in (mesh_at, texture_at, "suv/materials"):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    (tmp_path / texture_at / "wood.png").write_bytes(picture(colour=(5, 6, 7)))
+    path = write_obj(tmp_path / mesh_at, mtl=PAINT + f"map_Kd {name}\n")
+    mesh = load_mesh(path, within=tmp_path)
+    assert only_part(mesh).visual.material.baseColorTexture.getpixel((0, 0)) == (5, 6, 7)
+    assert mesh.lost_files == ()
+    assert all(line.endswith("wood.png taken") for line in mesh.warnings)
+
+
+def test_nothing_outside_the_folder_that_was_given_is_looked_at(tmp_path):
+    (tmp_path / "suv/meshes").mkdir(parents=True)
+    (tmp_path / "suv/materials/textures").mkdir(parents=True)
+    (tmp_path / "suv/materials/textures/wood.png").write_bytes(picture())
+    path = write_obj(tmp_path / "suv/meshes", mtl=WOOD)
+    assert load_mesh(path).lost_files == ()
+    assert load_mesh(path, within=tmp_path / "suv/meshes").lost_files == ("wood.png",)
+    write_obj(tmp_path / "suv/meshes", mtl=PAINT + "map_Kd ../materials/textures/wood.png\n")
+    assert "which leaves it" in refusal(path, within=tmp_path / "suv/meshes")
 
 
 @pytest.mark.parametrize("data", [b"", b"no image", picture(size=(64, 64), mode="RGB", colour=(3, 2, 1))[:-40]])

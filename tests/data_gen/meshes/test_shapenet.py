@@ -54,9 +54,14 @@ def test_version_1_finds_its_textures_inside_its_folder(tmp_path):
 
 @pytest.mark.parametrize(("version", "texture"), [(2, "../../b/images/texture0.jpg"), (1, "../b/images/texture0.jpg")])
 def test_a_model_never_reads_another_models_files(tmp_path, version, texture):
+    """It takes a file of that name of its own, and says so, or is refused; the other model is only read in one tree."""
     write_model(tmp_path, CAR, "b", version)
+    path = write_model(tmp_path, CAR, "a", version, texture=texture)
+    assert load_mesh(path).warnings == (f"{texture}: not there, images/texture0.jpg taken",)
+    (tmp_path / CAR / "a/images/texture0.jpg").unlink()
     with pytest.raises(MeshError, match="which leaves it"):
-        load_mesh(write_model(tmp_path, CAR, "a", version, texture=texture))
+        load_mesh(path)
+    assert load_mesh(path, within=tmp_path).warnings == ()
 
 
 @pytest.mark.parametrize("version", [1, 2])
