@@ -10,6 +10,7 @@ Example:
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method nearest_view hyperplanes hyperplanes_swapped
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method hyperplanes scratch --steps 10 100
     hyperplanes evaluate --data photos/ --checkpoint runs/demo --method hyperplanes --json photos.json
+    hyperplanes evaluate --data photos/ --method nearest_view hull_blend point_multiplane_scratch_300
 """
 
 from __future__ import annotations
@@ -37,9 +38,11 @@ class Arguments:
 
     Attributes:
         data: A data set or one posed scene.
-        method: nearest_view, nerf, multiplane, point_multiplane, hyperplanes, hyperplanes_swapped (each object with the
-            update of another) or scratch (random weights); all but the first and hyperplanes_swapped may be followed by
-            _N or _auto for fine-tuning steps.
+        method: nearest_view and hull_blend (nothing is learned); nerf, multiplane, point_multiplane, hyperplanes,
+            hyperplanes_swapped (each object with the update of another), autoencoder; scratch_N (the field of a
+            checkpoint from random weights), nerf_scratch_N, multiplane_scratch_N, point_multiplane_scratch_N (no
+            checkpoint is needed); standard, mv_matched, mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but
+            the first two and hyperplanes_swapped may be followed by _N or _auto for gradient steps.
         checkpoint: Folders that `train` wrote, or folders of them such as runs/demo.
         json: Write the table here too, with every object.
         steps: Evaluate methods after so many fine-tuning steps, each number a row; 0 is the method itself.
@@ -47,6 +50,8 @@ class Arguments:
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         split: Which objects.
         objects: Only the first so many.
+        support: Support views an object; more than there are go on with the query views.
+        preset: The shape of fields that need no checkpoint.
         up: The axis that points up in the data's world: y as in training data, z as in Blender.
         protocol: How fields are sampled: as they were trained, or 64 + 128 times a ray as in the paper.
         device: auto, cpu or cuda.
@@ -61,6 +66,8 @@ class Arguments:
     fine_tune: Free = "weights"
     split: Literal["test", "val", "train", "all"] = "test"
     objects: OptionalInt = None
+    support: OptionalInt = None
+    preset: str = "quick"
     up: Up = "y"
     protocol: Protocol = "default"
     device: str = "auto"
@@ -90,12 +97,15 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.files import write_json
     from hyperplanes.methods import WithSampler, at_steps, make_method
     from hyperplanes.presets import PROTOCOLS
+    from hyperplanes.support import WithSupport
 
     if arguments.curve is not None and len(arguments.steps) < 2:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
     console, device = Console(), choose_device(arguments.device)
     checkpoints = find_checkpoints(arguments.checkpoint)
-    data = TasksOnDevice(open_dataset(arguments.data), device, arguments.up)
+    opened = open_dataset(arguments.data)
+    tasks = opened if arguments.support is None else WithSupport(opened, arguments.support)
+    data = TasksOnDevice(tasks, device, arguments.up)
     names = data.names(arguments.split)[: arguments.objects]
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
@@ -103,7 +113,16 @@ def run(arguments: Arguments) -> int:
 
     def make(name: str) -> WithSampler:
         objects = (data.task(each).support for each in names)
-        return WithSampler(make_method(name, checkpoints, device=device, settings=settings, objects=objects), sampling)
+        made = make_method(
+            name,
+            checkpoints,
+            device=device,
+            settings=settings,
+            objects=objects,
+            preset=arguments.preset,
+            protocol=arguments.protocol,
+        )
+        return WithSampler(made, sampling)
 
     chosen = [each for name in arguments.method for each in at_steps(name, arguments.steps)]
     methods = {name: make(name) for name in dict.fromkeys(chosen)}
