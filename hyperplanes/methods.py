@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,10 +15,12 @@ from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.entry_points import load_entries
+from hyperplanes.fields import find_targets
 from hyperplanes.rendering.samplers import Sampler
 from hyperplanes.views import Views
 
-__all__ = ["METHODS", "at_steps", "WithSampler", "describe_method", "make_method"]
+__all__ = ["METHODS", "Method", "at_steps", "WithSampler", "describe_method", "find_methods", "make_method"]
 
 METHODS: dict[str, str] = {
     "nearest_view": "the nearest support view, copied",
@@ -36,16 +38,42 @@ _NAME = re.compile(r"(?P<base>.+?)(?:_(?P<steps>\d+|auto))?")
 _WITHOUT_STEPS = ("nearest_view", "hyperplanes_swapped")
 
 
+@dataclass(frozen=True)
+class Method:
+    """A method of another package, which names it by an entry point of the group `hyperplanes.methods`.
+
+    Attributes:
+        about: what it stands for.
+        make: its adapter; called with `checkpoints`, `device`, `settings` and `objects`, as `make_method` is.
+    """
+
+    about: str
+    make: Callable[..., Adapter]
+
+
+def find_methods() -> dict[str, Method]:
+    """The methods of the other packages that are installed, by name."""
+    return load_entries("hyperplanes.methods", METHODS)
+
+
 def _parse(name: str) -> tuple[str, Steps | None]:
     """The entry of METHODS and the number of steps.
 
     Raises:
         ValueError: no method has that name.
     """
+    if name in (brought := find_methods()):
+        return name, None
     match = _NAME.fullmatch(name)
     base, steps = (match["base"], match["steps"]) if match else (name, None)
-    if base not in METHODS or (steps and base in _WITHOUT_STEPS) or (base == "scratch" and not steps):
-        known = ", ".join(f"{each}_N" if each == "scratch" else each for each in METHODS)
+    if (
+        (base not in METHODS and base not in find_targets())
+        or (steps and base in _WITHOUT_STEPS)
+        or (base == "scratch" and not steps)
+    ):
+        known = ", ".join(
+            f"{each}_N" if each == "scratch" else each for each in {**METHODS, **find_targets(), **brought}
+        )
         raise ValueError(
             f"method: expected one of {known}, with _N or _auto after it for so many fine-tuning steps, got {name!r}"
         )
@@ -62,7 +90,7 @@ def at_steps(name: str, steps: Sequence[int]) -> list[str]:
         name: without steps, or it stays alone.
         steps: 0 is the method itself; "scratch" has no such row.
     """
-    if not steps or name in _WITHOUT_STEPS or _NAME.fullmatch(name)["steps"]:  # pyright: ignore[reportOptionalSubscript]
+    if not steps or name in _WITHOUT_STEPS or name in find_methods() or _NAME.fullmatch(name)["steps"]:  # pyright: ignore[reportOptionalSubscript]
         return [name]
     return [f"{name}_{count}" if count else name for count in steps if count or name != "scratch"]
 
@@ -77,9 +105,11 @@ def describe_method(name: str) -> str:
         name: such as "hyperplanes_100".
     """
     base, steps = _parse(name)
+    brought = find_methods()
+    whole = brought[base].about if base in brought else METHODS.get(base, f"{base}, one set of weights for all objects")
     if steps is None:
-        return METHODS[base]
-    about = METHODS[base].removesuffix(" in one step").replace(", one set of weights for all objects", "")
+        return whole
+    about = whole.removesuffix(" in one step").replace(", one set of weights for all objects", "")
     count = "as many fine-tuning steps as left-out views ask for" if steps == "auto" else f"{steps} fine-tuning steps"
     return f"{about}, {steps} steps" if base == "scratch" and steps != "auto" else f"{about} after {count}"
 
@@ -109,6 +139,8 @@ def make_method(
     """
     base, steps = _parse(name)
     settings = settings or FineTuning()
+    if base in (brought := find_methods()):
+        return brought[base].make(checkpoints=checkpoints, device=device, settings=settings, objects=objects)
     if base == "nearest_view":
         return NearestView()
     family = "hyperplanes" if base == "hyperplanes_swapped" else base

@@ -5,16 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from hyperplanes.adaptation.hyperplanes import ModelConfig
+from hyperplanes.fields import find_targets
 from hyperplanes.fields.base import TargetConfig
 from hyperplanes.hypernetwork.hypernetwork import HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import TrainingConfig
 
-__all__ = ["PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]
+__all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]
 
 
-PROTOCOLS: dict[str, Hierarchical | None] = {"default": None, "paper": Hierarchical(64, 128)}
-"""How fields are sampled: as the preset says (packed samples where something is), or as the paper does."""
+PAPER_SAMPLING = Hierarchical(64, 128)
+"""The paper's: 64 stratified and 128 importance samples on every ray, no masks (Appendix B)."""
+
+PROTOCOLS: dict[str, Hierarchical | Marched | None] = {"default": None, "paper": PAPER_SAMPLING, "fast": Marched()}
+"""How fields are sampled: as the preset or the checkpoint says, as the paper does, or packed where something is."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,13 @@ class Preset:
     about: str
 
     def by_protocol(self, name: str) -> Preset:
-        """The same model sampled by another protocol: "paper" is 64 coarse and 128 fine samples on every ray.
+        """The same model sampled by another protocol.
+
+        Args:
+            name: of PROTOCOLS; "fast" leaves a preset that is sampled so already as it is.
+
+        Returns:
+            The preset.
 
         Raises:
             ValueError: an unknown protocol.
@@ -42,7 +52,27 @@ class Preset:
         if name not in PROTOCOLS:
             raise ValueError(f"protocol: expected one of {', '.join(PROTOCOLS)}, got {name!r}")
         sampling = PROTOCOLS[name]
-        return self if sampling is None else replace(self, model=replace(self.model, sampling=sampling))
+        if sampling is None or (name == "fast" and isinstance(self.model.sampling, Marched)):
+            return self
+        return replace(self, model=replace(self.model, sampling=sampling))
+
+    def by_method(self, method: str) -> Preset:
+        """The configuration of a method: HyperPlanes, or a field alone with one set of weights for all objects.
+
+        Raises:
+            ValueError: an unknown method, or HyperPlanes of a configuration without a hypernetwork.
+        """
+        known = [*TRAINABLE, *(name for name in find_targets() if name not in TRAINABLE)]
+        if method not in known:
+            raise ValueError(f"method: expected one of {', '.join(known)}, got {method!r}")
+        if method == "hyperplanes":
+            if self.model.hypernetwork is None:
+                raise ValueError(
+                    "method: expected a configuration with a hypernetwork for hyperplanes, got one without"
+                )
+            return self
+        without = self.without_hypernetwork()
+        return replace(without, model=replace(without.model, target=method))
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
@@ -99,10 +129,10 @@ PRESETS: dict[str, Preset] = {
         "128x128, hours on a few cores",
     ),
     "paper-128": Preset(
-        ModelConfig(coarse_network=True),
+        ModelConfig(coarse_network=True, sampling=PAPER_SAMPLING),
         PAPER_TRAINING,
         128,
-        "the paper's ShapeNet 128x128 setting (Appendix B): ConvNet, 5 HyperPlanes",
+        "the paper's ShapeNet 128x128 setting (Appendix B): ConvNet, 5 HyperPlanes, 64 + 128 samples on every ray",
     ),
     "paper-128-brief": Preset(
         ModelConfig(coarse_network=True),
@@ -119,16 +149,17 @@ PRESETS: dict[str, Preset] = {
             evaluate_every=200,
         ),
         128,
-        "the paper's 128x128 networks in half an hour on one core: the weights that the benchmarks render with",
+        "the paper's 128x128 networks by the fast protocol, half an hour on one core: what the benchmarks render with",
     ),
     "paper-200": Preset(
         ModelConfig(
             hypernetwork=HyperNetworkConfig(views=25, encoder="resnet101", depth=10),
             coarse_network=True,
+            sampling=PAPER_SAMPLING,
         ),
         PAPER_TRAINING,
         200,
-        "the paper's ShapeNet 200x200 setting (Appendix B): ResNet101, 25 HyperPlanes",
+        "the paper's ShapeNet 200x200 setting (Appendix B): ResNet101, 25 HyperPlanes, 64 + 128 samples on every ray",
     ),
 }
 
@@ -145,7 +176,8 @@ def preset(name: str) -> Preset:
 
 
 TRAINABLE = ("hyperplanes", "point_multiplane", "multiplane", "nerf")
-"""Methods that `train` knows; all but the first are one set of weights for all objects."""
+"""Methods that `train` knows, with the fields of other installed packages; all but the first are one set of weights for
+all objects."""
 
 
 def configure(
@@ -155,7 +187,7 @@ def configure(
 
     Args:
         name: of the preset.
-        method: one of TRAINABLE.
+        method: one of TRAINABLE, or a field that another installed package brings.
         steps: other than the preset's.
         seed: of the training.
         protocol: a name in PROTOCOLS: how rays are sampled.
@@ -166,15 +198,7 @@ def configure(
     Raises:
         ValueError: an unknown preset, method or protocol, or no step.
     """
-    if method not in TRAINABLE:
-        raise ValueError(f"method: expected one of {', '.join(TRAINABLE)}, got {method!r}")
     if steps is not None and steps < 1:
         raise ValueError(f"steps: expected at least 1, got {steps}")
-    chosen = preset(name).by_protocol(protocol)
-    if method != "hyperplanes":
-        chosen = chosen.without_hypernetwork()
-    return replace(
-        chosen,
-        model=chosen.model if method == "hyperplanes" else replace(chosen.model, target=method),
-        training=replace(chosen.training, steps=steps or chosen.training.steps, seed=seed),
-    )
+    chosen = preset(name).by_protocol(protocol).by_method(method)
+    return replace(chosen, training=replace(chosen.training, steps=steps or chosen.training.steps, seed=seed))

@@ -18,6 +18,9 @@ LAYERS = {
     "data_gen.datasets": 5.4,
     "hyperplanes.training": 4,
     "hyperplanes.training_state": 4,
+    "hyperplanes.experiment": 4,
+    "hyperplanes.prefetching": 4,
+    "hyperplanes.watching": 4,
     "hyperplanes.episodes": 4,
     "hyperplanes.evaluation": 4,
     "hyperplanes.methods": 4,
@@ -41,9 +44,11 @@ LAYERS = {
     "hyperplanes.files": 1,
     "hyperplanes.colour": 1,
     "hyperplanes.axes": 1,
+    "hyperplanes.entry_points": 1,
     "hyperplanes.errors": 1,
     "hyperplanes.formatting": 1,
     "hyperplanes.lru_cache": 1,
+    "hyperplanes.settings": 1,
 }
 OURS = ("hyperplanes", "data_gen", "benchmarks")
 

@@ -2,38 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Annotated, Any
 
 from hyperplanes.checkpoints import CheckpointError, read_json
 from hyperplanes.fields import TargetConfig
 from hyperplanes.hypernetwork.hypernetwork import HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.settings import SettingsError, choose_by_tag, structure
 
 __all__ = ["ModelConfig", "checkpoint_folder"]
 
 PACKAGED = Path(__file__).parent.parent / "pretrained"  # a folder a model, by its name
 
-Made = TypeVar("Made")
-
-SMALLEST = {"point_octaves": 0, "direction_octaves": 0, "fine": 0}  # of whole numbers; 1 for all others
-LARGEST = {
-    "depth": 256,
-    "width": 8192,
-    "code": 8192,
-    "rank": 1024,
-    "planes": 1024,
-    "views": 1024,
-    "point_octaves": 32,
-    "direction_octaves": 32,
-    "hull_side": 512,
-    "coarse": 16384,
-    "fine": 16384,
-    "steps": 16384,
-}
+choose_by_tag(Hierarchical | Marched, "protocol")
 
 
 @dataclass(frozen=True)
@@ -47,6 +31,8 @@ class ModelConfig:
         coarse_network: whether a second network of the same shape proposes where to sample (NeRF's coarse network).
         sampling: how fields are rendered by default, in training too.
         hull_side: voxels an axis of the visual hull.
+        choice: which planes are HyperPlanes: the "farthest" apart on the rig, or the "first" k.
+        order: of the planes: "matched" to the nearest standpoints of the training's rig, or as in the "file".
     """
 
     target: str = "point_multiplane"
@@ -54,7 +40,14 @@ class ModelConfig:
     hypernetwork: HyperNetworkConfig | None = field(default_factory=HyperNetworkConfig)
     coarse_network: bool = False
     sampling: Hierarchical | Marched = field(default_factory=Marched)
-    hull_side: int = 64
+    hull_side: Annotated[int, range(1, 513)] = 64
+    choice: str = "farthest"
+    order: str = "matched"
+
+    def __post_init__(self) -> None:
+        for name, known in (("choice", ("farthest", "first")), ("order", ("matched", "file"))):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}: expected one of {', '.join(map(repr, known))}, got {getattr(self, name)!r}")
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""
@@ -75,20 +68,23 @@ class ModelConfig:
             CheckpointError: an unknown or missing entry, one of another type, or an absurd number.
         """
         try:
-            rest = dict(value)
-            sampling = {"hierarchical": Hierarchical, "marched": Marched}[rest.pop("protocol")]
-            hyper = rest.pop("hypernetwork")
-            parts = {
-                "network": _made(TargetConfig, rest.pop("network")),
-                "sampling": _made(sampling, rest.pop("sampling")),
-                "hypernetwork": None if hyper is None else _made(HyperNetworkConfig, hyper),
-            }
-            return _made(cls, rest, parts)
-        except (KeyError, TypeError, ValueError) as error:
+            return cls.structured(value)
+        except SettingsError as error:
             raise CheckpointError(
                 f"{where}: expected the entries of this version's models, found a misfit ({error}); "
                 "copy the file again, or train again with this version"
             ) from None
+
+    @classmethod
+    def structured(cls, value: Mapping[str, Any]) -> ModelConfig:
+        """As `of_json`; SettingsError names the entry that does not fit."""
+        for name in ("network", "sampling", "hypernetwork", "protocol"):
+            if name not in value:
+                raise SettingsError(name, "a missing entry")
+        sampling, protocol = value["sampling"], value["protocol"]
+        if isinstance(sampling, Mapping):
+            sampling = {**sampling, "protocol": protocol}
+        return structure(cls, {**{k: v for k, v in value.items() if k != "protocol"}, "sampling": sampling})
 
     @classmethod
     def load(cls, folder: Path) -> ModelConfig:
@@ -125,29 +121,3 @@ def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, part in value.items():
         flat |= _flat(part, f"{prefix}{name}.") if isinstance(part, Mapping) else {f"{prefix}{name}": part}
     return flat
-
-
-def _made(kind: type[Made], value: object, parts: Mapping[str, Any] | None = None) -> Made:
-    """A dataclass of entries that are what they are declared to be; `parts` are ready already."""
-    if not isinstance(value, Mapping):
-        raise TypeError(f"{kind.__name__}: {value!r} instead of its entries")
-    hints = get_type_hints(kind)
-    checked = {name: _checked(name, hints.get(name), entry) for name, entry in value.items()}
-    return kind(**checked, **(parts or {}))
-
-
-def _checked(name: str, hint: object, value: object) -> object:
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-        return float(value)
-    if hint is int and isinstance(value, int) and not isinstance(value, bool):
-        low, high = SMALLEST.get(name, 1), LARGEST[name]
-        if not low <= value <= high:
-            raise ValueError(f"{name}: {value} instead of a number from {low} to {high}")
-        return value
-    if (hint is str and isinstance(value, str)) or (hint is bool and isinstance(value, bool)):
-        return value
-    if hint == tuple[str, ...] and isinstance(value, list | tuple) and all(isinstance(each, str) for each in value):
-        return tuple(value)
-    if hint is None:
-        raise TypeError(f"an unknown entry {name!r}")
-    raise TypeError(f"{name}: {value!r} instead of {getattr(hint, '__name__', hint)}")

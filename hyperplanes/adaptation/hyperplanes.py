@@ -18,7 +18,7 @@ from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
 from hyperplanes.adaptation.fine_tuning import FineTuning, Steps, best_stop, minimise
 from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
-from hyperplanes.fields import TARGETS, Target
+from hyperplanes.fields import Target, find_targets
 from hyperplanes.files import write_json
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
@@ -66,15 +66,16 @@ class HyperPlanes(nn.Module):
 
     def __init__(self, config: ModelConfig, seed: int = 0) -> None:
         super().__init__()
-        if config.target not in TARGETS:
-            raise ValueError(f"target: expected one of {sorted(TARGETS)}, got {config.target!r}")
+        targets = find_targets()
+        if config.target not in targets:
+            raise ValueError(f"target: expected one of {sorted(targets)}, got {config.target!r}")
         planes = config.network.planes
         if config.hypernetwork and config.hypernetwork.views > planes:
             raise ValueError(
                 f"views: expected at most as many HyperPlanes as planes, {planes}, got {config.hypernetwork.views}"
             )
         self.config = config
-        make = TARGETS[config.target]
+        make = targets[config.target]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.networks = nn.ModuleDict({"fine": make(config.network)})
@@ -102,7 +103,8 @@ class HyperPlanes(nn.Module):
     def arrange(self, support: Views) -> Views:
         """One support view a plane, each the nearest to where the training rig has one.
 
-        More views than planes: the best matching ones, none twice. Fewer: some stand for several planes.
+        More views than planes: the best matching ones, none twice. Fewer: some stand for several planes. Where the
+        configuration says "file", they stay in their order: the first ones, or all of them over and over.
 
         Raises:
             ValueError: no view, or a model that was never shown its rig.
@@ -111,6 +113,8 @@ class HyperPlanes(nn.Module):
 
         if not len(support):
             raise ValueError("support: expected at least one view, got none")
+        if self.config.order == "file":
+            return support[torch.arange(len(self.rig), device=support.images.device) % len(support)]
         cost = (1 - self._known_rig() @ _standpoints(support).cpu().T).double().numpy()
         repeats = -(-len(self.rig) // len(support))
         _, column = linear_sum_assignment(np.tile(cost, (1, repeats)))
@@ -133,12 +137,14 @@ class HyperPlanes(nn.Module):
         return Prepared(views, ImagePlanes(views.images, views.cameras), region)
 
     def hyperplanes(self) -> Int[Tensor, " k"]:
-        """Which planes the hypernetwork reads: k of the rig, spread as far apart as they can be.
+        """Which planes the hypernetwork reads: k of the rig, spread as far apart as they can be, or the first.
 
         A model that was never shown its rig raises ValueError.
         """
         count = self.hypernetwork.config.views if self.hypernetwork else 0
         rig = self._known_rig()
+        if self.config.choice == "first":
+            return torch.arange(count, device=self.rig.device)
         chosen = [0]
         nearest = rig @ rig[0]
         while len(chosen) < count:

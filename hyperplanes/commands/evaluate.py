@@ -48,7 +48,8 @@ class Arguments:
         split: Which objects.
         objects: Only the first so many.
         up: The axis that points up in the data's world: y as in training data, z as in Blender.
-        protocol: How fields are sampled: as they were trained, or 64 + 128 times a ray as in the paper.
+        protocol: How fields are sampled: as they were trained, 64 + 128 times a ray as in the paper, or fast.
+        legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.
         device: auto, cpu or cuda.
     """
 
@@ -63,6 +64,7 @@ class Arguments:
     objects: OptionalInt = None
     up: Up = "y"
     protocol: Protocol = "default"
+    legacy: bool = False
     device: str = "auto"
 
 
@@ -95,7 +97,10 @@ def run(arguments: Arguments) -> int:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
     console, device = Console(), choose_device(arguments.device)
     checkpoints = find_checkpoints(arguments.checkpoint)
-    data = TasksOnDevice(open_dataset(arguments.data), device, arguments.up)
+    opened = open_dataset(arguments.data, legacy=arguments.legacy)
+    for line in opened.skipped:
+        console.warn(line)
+    data = TasksOnDevice(opened, device, arguments.up)
     names = data.names(arguments.split)[: arguments.objects]
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
