@@ -69,7 +69,7 @@ def main(arguments: list[str]) -> int:
             plot(rows, options.plot)
         return finish("training", rows, options.json)
     for name in ("quick",) if options.quick else ("quick", "small", "paper-128"):
-        chosen = preset(name)
+        chosen = preset(name).by_protocol("fast")
         tasks = held_out(2 + UNSEEN, chosen.resolution, device=options.device)
         rows += compare(name, chosen, Objects(tasks), 3 if options.quick else 8)
     return finish("training", rows, options.json)

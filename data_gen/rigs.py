@@ -71,13 +71,15 @@ class RigPreset:
 
 RIG_PRESETS: dict[str, RigPreset] = {
     "paper-128": RigPreset("random", 50, 128, distance=4.0, field_of_view=_BLENDER_FIELD_OF_VIEW),
-    "paper-200": RigPreset("fixed", 50, 200),
+    "paper-200": RigPreset("fixed", 50, 200, distance=4.0, field_of_view=_BLENDER_FIELD_OF_VIEW),
 }
 """The cameras of the paper's two data sets.
 
 `paper-128` follows the ShapeNet renders of "Learned Initializations" (Tancik et al. 2021), the paper's first data set:
 at random all over the sphere, at distance 4 (its loaders sample rays from 2 to 6), with Blender's field of view; the
-unit sphere spans 72 % of the picture. `paper-200` is the paper's second: the same 50 poses for every object.
+unit sphere spans 72 % of the picture. `paper-200` is the paper's second: the same 50 poses for every object. The
+paper does not say where they stand; its loader assumes a focal length of 277.77 pixels, which is the same field of
+view, near 2 and far 6.
 """
 
 RIGS = ("fixed", "random", "hemisphere", "orbit", *RIG_PRESETS)

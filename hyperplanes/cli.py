@@ -10,9 +10,10 @@ import inspect
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
 
-from hyperplanes.commands import EXAMPLES, find_verb, find_verbs
+from hyperplanes.commands import EXAMPLES, find_verb, find_verbs, split_settings
 
 __all__ = ["main"]
 
@@ -67,6 +68,9 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
     import tyro
 
     module = import_module(name)
+    settings: list[str] = []
+    if "settings" in module.Arguments.__annotations__:  # options with a dot, such as --model.hypernetwork.views 3
+        rest, settings = split_settings(rest)
     parsed = tyro.cli(
         module.Arguments,
         prog=f"hyperplanes {verb}",
@@ -74,7 +78,7 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
         args=rest,
         config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
     )
-    return module.run(parsed)
+    return module.run(replace(parsed, settings=tuple(settings)) if settings else parsed)
 
 
 def _one_line(error: Exception) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,11 +17,13 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.initialisation import LEARNED, shuffled
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.entry_points import load_entries
+from hyperplanes.fields import find_targets
 from hyperplanes.presets import configure
 from hyperplanes.rendering.samplers import Sampler
 from hyperplanes.views import Views
 
-__all__ = ["METHODS", "at_steps", "WithSampler", "describe_method", "make_method"]
+__all__ = ["METHODS", "Method", "at_steps", "WithSampler", "describe_method", "find_methods", "make_method"]
 
 METHODS: dict[str, str] = {
     "nearest_view": "the nearest support view, copied",
@@ -50,16 +52,41 @@ _INITIALISATIONS = ("standard", "mv_shuffled", *LEARNED)
 _NEED_STEPS = ("scratch", "nerf_scratch", "multiplane_scratch", "point_multiplane_scratch")
 
 
+@dataclass(frozen=True)
+class Method:
+    """A method of another package, which names it by an entry point of the group `hyperplanes.methods`.
+
+    Attributes:
+        about: what it stands for.
+        make: its adapter; called with `checkpoints`, `device`, `settings` and `objects`, as `make_method` is.
+    """
+
+    about: str
+    make: Callable[..., Adapter]
+
+
+def find_methods() -> dict[str, Method]:
+    """The methods of the other packages that are installed, by name."""
+    return load_entries("hyperplanes.methods", METHODS)
+
+
 def _parse(name: str) -> tuple[str, Steps | None]:
     """The entry of METHODS and the number of steps.
 
     Raises:
         ValueError: no method has that name.
     """
+    if name in (brought := find_methods()):
+        return name, None
     match = _NAME.fullmatch(name)
     base, steps = (match["base"], match["steps"]) if match else (name, None)
-    if base not in METHODS or (steps and base in _WITHOUT_STEPS) or (base in _NEED_STEPS and not steps):
-        known = ", ".join(f"{each}_N" if each in _NEED_STEPS else each for each in METHODS)
+    if (
+        (base not in METHODS and base not in find_targets())
+        or (steps and base in _WITHOUT_STEPS)
+        or (base in _NEED_STEPS and not steps)
+    ):
+        every = {**METHODS, **find_targets(), **brought}
+        known = ", ".join(f"{each}_N" if each in _NEED_STEPS else each for each in every)
         raise ValueError(
             f"method: expected one of {known}, with _N or _auto after it for so many gradient steps, got {name!r}"
         )
@@ -76,7 +103,7 @@ def at_steps(name: str, steps: Sequence[int]) -> list[str]:
         name: without steps, or it stays alone.
         steps: 0 is the method itself, of an initialisation its weights as they are; "scratch" has no such row.
     """
-    if not steps or name in _WITHOUT_STEPS or _NAME.fullmatch(name)["steps"]:  # pyright: ignore[reportOptionalSubscript]
+    if not steps or name in _WITHOUT_STEPS or name in find_methods() or _NAME.fullmatch(name)["steps"]:  # pyright: ignore[reportOptionalSubscript]
         return [name]
     if name in _INITIALISATIONS:
         return [f"{name}_{count}" for count in steps]
@@ -93,9 +120,11 @@ def describe_method(name: str) -> str:
         name: such as "hyperplanes_100".
     """
     base, steps = _parse(name)
+    brought = find_methods()
+    whole = brought[base].about if base in brought else METHODS.get(base, f"{base}, one set of weights for all objects")
     if steps is None:
-        return METHODS[base]
-    about = METHODS[base].removesuffix(" in one step").replace(", one set of weights for all objects", "")
+        return whole
+    about = whole.removesuffix(" in one step").replace(", one set of weights for all objects", "")
     if base in _NEED_STEPS or base in _INITIALISATIONS:
         return f"{about}, {'as many steps as left-out views ask for' if steps == 'auto' else f'{steps} steps'}"
     count = "as many fine-tuning steps as left-out views ask for" if steps == "auto" else f"{steps} fine-tuning steps"
@@ -128,6 +157,8 @@ def make_method(
     """
     base, steps = _parse(name)
     settings = settings or FineTuning()
+    if base in (brought := find_methods()):
+        return brought[base].make(checkpoints=checkpoints, device=device, settings=settings, objects=objects)
     if base == "nearest_view":
         return NearestView()
     if base == "hull_blend":

@@ -6,16 +6,19 @@ from dataclasses import dataclass, field, replace
 
 from hyperplanes.adaptation.hyperplanes import ModelConfig
 from hyperplanes.adaptation.initialisation import LEARNED, InitialisationConfig
-from hyperplanes.fields import TARGETS, TargetConfig
+from hyperplanes.fields import TARGETS, TargetConfig, find_targets
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import TrainingConfig
 
-__all__ = ["PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]
+__all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]
 
 
-PROTOCOLS: dict[str, Hierarchical | None] = {"default": None, "paper": Hierarchical(64, 128)}
-"""How fields are sampled: as the preset says (packed samples where something is), or as the paper does."""
+PAPER_SAMPLING = Hierarchical(64, 128)
+"""The paper's: 64 stratified and 128 importance samples on every ray, no masks (Appendix B)."""
+
+PROTOCOLS: dict[str, Hierarchical | Marched | None] = {"default": None, "paper": PAPER_SAMPLING, "fast": Marched()}
+"""How fields are sampled: as the preset or the checkpoint says, as the paper does, or packed where something is."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,13 @@ class Preset:
     autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
 
     def by_protocol(self, name: str) -> Preset:
-        """The same model sampled by another protocol: "paper" is 64 coarse and 128 fine samples on every ray.
+        """The same model sampled by another protocol.
+
+        Args:
+            name: of PROTOCOLS; "fast" leaves a preset that is sampled so already as it is.
+
+        Returns:
+            The preset.
 
         Raises:
             ValueError: an unknown protocol.
@@ -49,7 +58,41 @@ class Preset:
         if name not in PROTOCOLS:
             raise ValueError(f"protocol: expected one of {', '.join(PROTOCOLS)}, got {name!r}")
         sampling = PROTOCOLS[name]
-        return self if sampling is None else replace(self, model=replace(self.model, sampling=sampling))
+        if sampling is None or (name == "fast" and isinstance(self.model.sampling, Marched)):
+            return self
+        return replace(self, model=replace(self.model, sampling=sampling))
+
+    def by_method(self, method: str, target: str | None = None) -> Preset:
+        """The configuration of a method.
+
+        Args:
+            method: of TRAINABLE, or a field of another installed package.
+            target: which field; that of the preset where not given, or for learned initialisations NeRF.
+
+        Returns:
+            The same scale for that method.
+
+        Raises:
+            ValueError: an unknown method or target, HyperPlanes of a configuration without a hypernetwork, or a target
+                beside a method that is another one.
+        """
+        targets = find_targets()
+        known = [*TRAINABLE, *(name for name in targets if name not in TRAINABLE)]
+        if method not in known:
+            raise ValueError(f"method: expected one of {', '.join(known)}, got {method!r}")
+        if target is not None and (target not in targets or (method in targets and method != target)):
+            expected = repr(method) if method in targets else f"one of {', '.join(targets)}"
+            raise ValueError(f"target: expected {expected}, got {target!r}")
+        chosen = self
+        if method in targets:
+            chosen, target = self.without_hypernetwork(), method
+        elif method == "autoencoder":
+            chosen = self.with_autoencoder()
+        elif method in LEARNED:
+            chosen, target = self.learning_initialisation(method), target or "nerf"
+        elif self.model.hypernetwork is None:
+            raise ValueError("method: expected a configuration with a hypernetwork for hyperplanes, got one without")
+        return replace(chosen, model=replace(chosen.model, target=target or chosen.model.target))
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
@@ -89,8 +132,9 @@ ALL_LAYERS = HyperNetworkConfig(
 )
 """What served best in docs/hypernetwork.md: a low-rank update of every layer, and no batch statistics."""
 
-PAPER_TRAINING = TrainingConfig(steps=100_000, tasks=1, rays=512)
-"""One object and 512 rays a step, Adam at 1e-4 for theta and the hypernetwork (Appendix B)."""
+PAPER_TRAINING = TrainingConfig(steps=100_000, tasks=1, reference_objects=3, rays=512)
+"""One object and 512 rays a step, Adam at 1e-4 for theta and the hypernetwork (Appendix B); the HyperPlanes of three
+more objects are read for the standardisation."""
 
 PRESETS: dict[str, Preset] = {
     "quick": Preset(
@@ -136,10 +180,10 @@ PRESETS: dict[str, Preset] = {
         "128x128, hours on a few cores",
     ),
     "paper-128": Preset(
-        ModelConfig(coarse_network=True),
+        ModelConfig(coarse_network=True, sampling=PAPER_SAMPLING),
         PAPER_TRAINING,
         128,
-        "the paper's ShapeNet 128x128 setting (Appendix B): ConvNet, 5 HyperPlanes",
+        "the paper's ShapeNet 128x128 setting (Appendix B): ConvNet, 5 HyperPlanes, 64 + 128 samples on every ray",
     ),
     "paper-128-brief": Preset(
         ModelConfig(coarse_network=True),
@@ -156,16 +200,17 @@ PRESETS: dict[str, Preset] = {
             evaluate_every=200,
         ),
         128,
-        "the paper's 128x128 networks in half an hour on one core: the weights that the benchmarks render with",
+        "the paper's 128x128 networks by the fast protocol, half an hour on one core: what the benchmarks render with",
     ),
     "paper-200": Preset(
         ModelConfig(
             hypernetwork=HyperNetworkConfig(views=25, encoder="resnet101", depth=10),
             coarse_network=True,
+            sampling=PAPER_SAMPLING,
         ),
         PAPER_TRAINING,
         200,
-        "the paper's ShapeNet 200x200 setting (Appendix B): ResNet101, 25 HyperPlanes",
+        "the paper's ShapeNet 200x200 setting (Appendix B): ResNet101, 25 HyperPlanes, 64 + 128 samples on every ray",
     ),
 }
 
@@ -182,7 +227,8 @@ def preset(name: str) -> Preset:
 
 
 TRAINABLE = ("hyperplanes", *reversed(TARGETS), "autoencoder", *LEARNED)
-"""Methods that `train` knows; those that are named as a field are one set of weights for all objects."""
+"""Methods that `train` knows, with the fields of other installed packages; those that are named as a field are one set
+of weights for all objects."""
 
 
 def configure(
@@ -198,7 +244,7 @@ def configure(
 
     Args:
         name: of the preset.
-        method: one of TRAINABLE.
+        method: one of TRAINABLE, or a field that another installed package brings.
         steps: other than the preset's.
         seed: of the training.
         protocol: a name in PROTOCOLS: how rays are sampled.
@@ -210,22 +256,7 @@ def configure(
     Raises:
         ValueError: an unknown preset, method, protocol or target, no step, or a target beside a method that is another.
     """
-    if method not in TRAINABLE:
-        raise ValueError(f"method: expected one of {', '.join(TRAINABLE)}, got {method!r}")
     if steps is not None and steps < 1:
         raise ValueError(f"steps: expected at least 1, got {steps}")
-    if target is not None and (target not in TARGETS or (method in TARGETS and method != target)):
-        expected = repr(method) if method in TARGETS else f"one of {', '.join(TARGETS)}"
-        raise ValueError(f"target: expected {expected}, got {target!r}")
-    chosen = preset(name).by_protocol(protocol)
-    if method in TARGETS:
-        chosen, target = chosen.without_hypernetwork(), method
-    elif method == "autoencoder":
-        chosen = chosen.with_autoencoder()
-    elif method in LEARNED:
-        chosen, target = chosen.learning_initialisation(method), target or "nerf"
-    return replace(
-        chosen,
-        model=replace(chosen.model, target=target or chosen.model.target),
-        training=replace(chosen.training, steps=steps or chosen.training.steps, seed=seed),
-    )
+    chosen = preset(name).by_protocol(protocol).by_method(method, target)
+    return replace(chosen, training=replace(chosen.training, steps=steps or chosen.training.steps, seed=seed))

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -19,18 +20,22 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.devices import TasksOnDevice
 from hyperplanes.episodes import Episode, prepare_episode
 from hyperplanes.errors import prefix_errors
-from hyperplanes.files import write_json
+from hyperplanes.files import encode_png, write_json, write_whole
 from hyperplanes.lru_cache import LRUCache
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
+from hyperplanes.parameters import Parameters
+from hyperplanes.prefetching import Prefetcher
 from hyperplanes.training_state import Curve, check_model, load_state, save_state
 from hyperplanes.views import Tasks
+from hyperplanes.watching import Samples, write_curve
 
 __all__ = ["Progress", "Trainer", "TrainingConfig", "start_training", "train"]
 
 
 EMPTINESS = 0.01  # weight of the opacity of empty space beside the squared error of pixels
-FREE = ("steps", "evaluate_every", "held_out", "checkpoint_every", "memory")  # may differ in a training that is resumed
+FREE = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every", "memory", "prefetch")
+"""What may differ in a training that is resumed."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,10 @@ class TrainingConfig:
 
     Attributes:
         steps: Adam steps.
+        epochs: how often each training object is drawn, on average, instead of `steps`; 0 takes `steps`.
         tasks: objects a step.
+        reference_objects: further objects a step, of which only the HyperPlanes are read. The hypernetwork standardises
+            codes by the objects of the step, and cannot tell what one object alone has in common with the others.
         rays: query rays an object and step.
         empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
             training sees nothing there, but a field that is rendered without masks must know.
@@ -57,25 +65,40 @@ class TrainingConfig:
         held_out: how many of them are looked at: objects of the "val" split, or where there is none of "test".
         checkpoint_every: steps between checkpoints.
         memory: bytes of images, planes and hulls that are kept for later steps; the last object always is.
+        prefetch: steps whose objects a thread makes ready ahead, beyond `memory`; 0 makes them when they are due.
         seed: of the objects, rays and samples of every step.
     """
 
-    steps: int = 2000
-    tasks: int = 4
-    rays: int = 128
-    empty_points: int = 0
+    steps: Annotated[int, range(1, 10**10)] = 2000
+    epochs: Annotated[int, range(10**7)] = 0
+    tasks: Annotated[int, range(1, 4097)] = 4
+    reference_objects: Annotated[int, range(4097)] = 0
+    rays: Annotated[int, range(1, 2**24)] = 128
+    empty_points: Annotated[int, range(2**24)] = 0
     optimiser: str = "adam"
     learning_rate: float = 1e-4
     muon_learning_rate: float = 0.02
     hypernetwork_learning_rate: float = 1e-4
-    warmup: int = 0
+    warmup: Annotated[int, range(10**10)] = 0
     final: float = 1.0
     alternating: bool = False
-    evaluate_every: int = 250
-    held_out: int = 4
-    checkpoint_every: int = 500
-    memory: int = 2 * 2**30
-    seed: int = 0
+    evaluate_every: Annotated[int, range(1, 10**10)] = 250
+    held_out: Annotated[int, range(10**6)] = 4
+    checkpoint_every: Annotated[int, range(1, 10**10)] = 500
+    memory: Annotated[int, range(2**50)] = 2 * 2**30
+    prefetch: Annotated[int, range(1025)] = 1
+    seed: Annotated[int, range(2**40)] = 0
+
+    def steps_for(self, objects: int) -> int:
+        """How many steps are taken with so many training objects.
+
+        >>> TrainingConfig(epochs=10, tasks=4).steps_for(150)
+        375
+
+        Args:
+            objects: to train on.
+        """
+        return -(-self.epochs * objects // self.tasks) if self.epochs else self.steps
 
 
 @dataclass(frozen=True)
@@ -90,6 +113,7 @@ class Progress:
         psnr: in dB, of some views of held-out objects, where this step looked at them.
         seconds_left: by the speed so far.
         diagnostics: of the hypernetwork on those objects.
+        ssim: of the same views, where they are large enough for it.
     """
 
     step: int
@@ -99,6 +123,7 @@ class Progress:
     psnr: float | None
     seconds_left: float
     diagnostics: Diagnostics | None = None
+    ssim: float | None = None
 
 
 class Trainer:
@@ -120,16 +145,19 @@ class Trainer:
     def __init__(self, model: HyperPlanes, data: Tasks, config: TrainingConfig, folder: Path | None = None) -> None:
         self.model = model
         self.data = data
-        self.config = config
         self.folder = folder
         self.step = 0
         self.curve: Curve = []
         self.diagnostics: Diagnostics | None = None
+        self.samples: Samples | None = None
         self.names = sorted(data.names("train"))
         if not self.names:
             raise ValueError("data: expected at least one training object, got none")
+        self.config = config = replace(config, steps=config.steps_for(len(self.names)))
         self._episodes: LRUCache[Episode] = LRUCache(config.memory, keep_last=True)
+        self._prefetcher = Prefetcher(self._load, self._episodes)
         self._held_out: dict[str, Episode] = {}
+        self._updates: list[Parameters] = []
         theta = list(model.networks.parameters())
         self.optimisers = make_optimisers(theta, config.optimiser, config.learning_rate, config.muon_learning_rate)
         self._of_theta = len(self.optimisers)
@@ -148,11 +176,21 @@ class Trainer:
     def run(self) -> Iterator[Progress]:
         """Train until the last step, reporting every 25 steps; checkpoints are written on the way and at the end.
 
+        With them come curve.csv and samples/STEP.png, held-out views beside the truth.
+
         Yields:
             Where the training stands.
         """
+        try:
+            yield from self._run()
+        finally:
+            self._prefetcher.close()
+
+    def _run(self) -> Iterator[Progress]:
         started, first, reported = time.perf_counter(), self.step, (time.perf_counter(), self.step)
         while self.step < self.config.steps:
+            ahead = range(self.step, min(self.step + 1 + self.config.prefetch, self.config.steps))
+            self._prefetcher.expect(name for step in ahead[1:] for name in self._drawn(self._generator(step)))
             loss = self.take_step()
             step, last = self.step, self.step == self.config.steps
             look = step % self.config.evaluate_every == 0 or last
@@ -160,40 +198,48 @@ class Trainer:
             now = time.perf_counter()
             quality, diagnostics = self.look() if look else (None, None)
             self.diagnostics = diagnostics or self.diagnostics
+            seen = self.samples if look else None
             if report:
-                seen = {} if quality is None else {"psnr": quality}
-                seen |= diagnostics.as_json() if diagnostics else {}
-                self.curve.append({"step": step, "loss": loss, **seen})
-            if step % self.config.checkpoint_every == 0 or last:
+                row = {"step": step, "loss": loss, **self.norms()}
+                row |= {} if quality is None else {"psnr": quality}
+                row |= {} if seen is None or seen.ssim is None else {"ssim": seen.ssim}
+                row |= diagnostics.as_json() if diagnostics else {}
+                self.curve.append(row)
+            saving = step % self.config.checkpoint_every == 0 or last
+            if self.folder is not None and (look or saving):
+                write_curve(self.folder / "curve.csv", self.curve)
+                if seen is not None:
+                    write_whole(self.folder / "samples" / f"{step:08d}.png", encode_png(seen.sheet()))
+            if saving:
                 self.save()
             if not report:
                 continue
             rays = (step - reported[1]) * self.rays_per_step / max(now - reported[0], 1e-9)
             left = (time.perf_counter() - started) / (step - first) * (self.config.steps - step)
             reported = (time.perf_counter(), step)
-            yield Progress(step, self.config.steps, loss, rays, quality, left, diagnostics)
+            ssim = seen.ssim if seen else None
+            yield Progress(step, self.config.steps, loss, rays, quality, left, diagnostics, ssim)
 
     def take_step(self) -> float:
         """One step of the optimisers on freshly drawn objects and rays; returns the loss."""
-        config = self.config
-        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + self.step)
+        generator = self._generator(self.step)
         self.model.train()
         for optimiser in self.optimisers:
             optimiser.zero_grad(set_to_none=True)
-        drawn = [self.names[index] for index in self._draw(generator)]
+        drawn = self._drawn(generator)
         with record_function("step:data"):
-            episodes = [self._episode(name) for name in drawn]
+            episodes = [self._prefetcher.get(name) for name in drawn]
         loss = self.gradients(drawn, episodes, generator)
         if not math.isfinite(loss):
             raise ValueError(
                 f"step {self.step + 1}, on {', '.join(drawn)}: expected a finite loss, got {loss}; the last checkpoint "
                 "is kept; check the images of these objects, or train with lower rates"
             )
-        for index, (optimiser, rate) in enumerate(zip(self.optimisers, self.rates, strict=True)):
+        for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
             optimiser.param_groups[0]["lr"] = rate * self._schedule()
-            if not config.alternating or (index < self._of_theta) == (self.step % 2 == 0):
-                with record_function("step:optimisers"):
-                    optimiser.step()
+        with record_function("step:optimisers"):
+            for optimiser in self._due():
+                optimiser.step()
         self.step += 1
         return loss
 
@@ -206,7 +252,7 @@ class Trainer:
         """Set the gradients of a step.
 
         Args:
-            drawn: names of the objects.
+            drawn: names of the objects, those that are rendered first.
             episodes: the objects.
             generator: of rays and samples.
 
@@ -217,7 +263,7 @@ class Trainer:
         total = torch.zeros(())
         with record_function("step:update"):
             updates = self.model.updates([episode.prepared for episode in episodes])
-        for name, episode, update in zip(drawn, episodes, updates, strict=True):
+        for name, episode, update in list(zip(drawn, episodes, updates, strict=True))[: config.tasks]:
             field = self.model.field(episode.prepared, self.model.theta + update)
             span = field.sampling.span
             with record_function("step:rays"), prefix_errors(name):
@@ -230,19 +276,48 @@ class Trainer:
             total = total + ray_loss(seen, truth)
         with record_function("step:gradients"):
             (total / config.tasks).backward()
+        self._updates = [update.detach() for update in updates]
         return float(total.detach()) / config.tasks
 
-    def _draw(self, generator: torch.Generator) -> list[int]:
-        """Indices of the objects of a step, different ones while there are enough."""
+    def _due(self) -> list[torch.optim.Optimizer]:
+        """The optimisers of this step: all, or in turns those of theta and that of the hypernetwork."""
+        theta, hypernetwork = self.optimisers[: self._of_theta], self.optimisers[self._of_theta :]
+        if not self.config.alternating or not hypernetwork:
+            return self.optimisers
+        return hypernetwork if self.step % 2 else theta
+
+    @torch.no_grad()
+    def norms(self) -> dict[str, float]:
+        """Norms of the last step: of the gradient of each part, and of its objects' updates (root mean square)."""
+        parts = {"theta": self.model.networks, "hypernetwork": self.model.hypernetwork}
+        found = {}
+        for name, part in parts.items():
+            gradients = [] if part is None else [each.grad for each in part.parameters() if each.grad is not None]
+            if gradients:
+                found[f"gradient_{name}"] = float(torch.stack([each.norm() for each in gradients]).norm())
+        if self.model.hypernetwork is not None and self._updates:
+            squares = [value.square().sum() for update in self._updates for value in update.values()]
+            found["update"] = float((torch.stack(squares).sum() / len(self._updates)).sqrt())
+        return found
+
+    def _generator(self, step: int) -> torch.Generator:
+        """What everything random of a step is drawn from, its objects first."""
+        return torch.Generator().manual_seed(self.config.seed * 1_000_003 + step)
+
+    def _drawn(self, generator: torch.Generator) -> list[str]:
+        """The objects of a step, different ones while there are enough: those to render, then the reference objects."""
         count, total = self.config.tasks, len(self.names)
+        if self.model.hypernetwork is not None:
+            count += self.config.reference_objects
         if count == 1:
-            return [int(torch.randint(total, (), generator=generator))]
+            return [self.names[int(torch.randint(total, (), generator=generator))]]
         repeats = -(-count // total)
-        return torch.cat([torch.randperm(total, generator=generator) for _ in range(repeats)])[:count].tolist()
+        drawn = torch.cat([torch.randperm(total, generator=generator) for _ in range(repeats)])[:count]
+        return [self.names[index] for index in drawn.tolist()]
 
     def warm(self, name: str) -> None:
         """Have the planes and the hull of an object ready, as its first step otherwise makes them."""
-        self._episode(name)
+        self._prefetcher.get(name)
 
     @torch.no_grad()
     def look(self) -> tuple[float | None, Diagnostics | None]:
@@ -250,6 +325,7 @@ class Trainer:
 
         The objects are those of the "val" split, or of "test" where a data set has no other; nothing is chosen by these
         numbers. None where there are no such objects, and no hypernetwork or a single object to compare updates of.
+        `samples` holds the views themselves.
         """
         names = sorted(self.data.names("val")) or sorted(self.data.names("test"))
         for name in names[: self.config.held_out]:
@@ -264,12 +340,13 @@ class Trainer:
         training = self.model.training
         self.model.eval()
         try:
+            fields = [self._adapted(each) for each in episodes]
+            pictures = [field.render(query.cameras).images for field, query in zip(fields, queries, strict=True)]
+            self.samples = Samples(pictures, [query.images for query in queries])
+            quality = float(torch.cat([psnr(*pair) for pair in self.samples.pairs]).mean())
             if self.model.hypernetwork is None or len(episodes) < 2:
-                fields = [self._adapted(each) for each in episodes]
-                pictures = [f.render(q.cameras).images for f, q in zip(fields, queries, strict=True)]
-                values = [psnr(image, query.images) for image, query in zip(pictures, queries, strict=True)]
-                return float(torch.cat(values).mean()), None
-            quality, gap = swap_gap(self.model, prepared, queries)
+                return quality, None
+            _, gap = swap_gap(self.model, prepared, queries, quality)
             return quality, replace(diagnose(self.model, prepared), swap_gap=gap)
         finally:
             self.model.train(training)
@@ -307,12 +384,8 @@ class Trainer:
         """Whether any sample depends on the hull; the paper's protocol samples without one."""
         return self.model.config.sampling.needs_occupancy or self.config.empty_points > 0
 
-    def _episode(self, name: str) -> Episode:
-        episode = self._episodes.get(name)
-        if episode is None:
-            episode = prepare_episode(self.model, self.data.task(name), carved=self._reads_hull)
-            self._episodes.add(name, episode)
-        return episode
+    def _load(self, name: str) -> Episode:
+        return prepare_episode(self.model, self.data.task(name), carved=self._reads_hull)
 
 
 def train(

@@ -308,7 +308,7 @@ def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tm
     assert main([*command, "--method", "nerf", "--protocol", "paper"]) == 0
     config = json.loads((run / "model.json").read_text())
     assert (config["target"], config["hypernetwork"], config["protocol"]) == ("nerf", None, "hierarchical")
-    assert config["sampling"] == {"coarse": 64, "fine": 128}
+    assert config["sampling"] == {"coarse": 64, "fine": 128, "placement": "intervals"}
     assert main(["evaluate", "--data", data, "--checkpoint", str(run), "--method", "nerf"]) == 0
     assert "nerf " in capsys.readouterr().out
 

@@ -20,6 +20,9 @@ LAYERS = {
     "hyperplanes.training_state": 4,
     "hyperplanes.meta_training": 4,
     "hyperplanes.support": 4,
+    "hyperplanes.experiment": 4,
+    "hyperplanes.prefetching": 4,
+    "hyperplanes.watching": 4,
     "hyperplanes.episodes": 4,
     "hyperplanes.evaluation": 4,
     "hyperplanes.methods": 4,
@@ -43,9 +46,11 @@ LAYERS = {
     "hyperplanes.files": 1,
     "hyperplanes.colour": 1,
     "hyperplanes.axes": 1,
+    "hyperplanes.entry_points": 1,
     "hyperplanes.errors": 1,
     "hyperplanes.formatting": 1,
     "hyperplanes.lru_cache": 1,
+    "hyperplanes.settings": 1,
 }
 OURS = ("hyperplanes", "data_gen", "benchmarks")
 

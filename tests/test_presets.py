@@ -7,7 +7,7 @@ from torch import nn
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.hypernetwork import ConvNet, ResNet101
 from hyperplanes.presets import PRESETS, preset
-from hyperplanes.rendering import Hierarchical
+from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer
 from tests.reference_rendering import Balls, ring
 
@@ -51,8 +51,10 @@ def test_the_papers_encoders():
 @pytest.mark.parametrize("name", ["paper-128", "paper-200"])
 def test_the_papers_protocol_and_training(name):
     chosen = preset(name)
-    assert Hierarchical() == Hierarchical(64, 128)  # what `--protocol paper` renders by, with the coarse network
+    assert chosen.model.sampling == Hierarchical(64, 128)  # Appendix B: samples 64, importance 128
     assert chosen.model.coarse_network
+    assert chosen.by_protocol("fast").model == replace(chosen.model, sampling=Marched())
+    assert chosen.by_protocol("fast").by_protocol("paper") == chosen
     training = chosen.training
     assert (training.tasks, training.rays, training.learning_rate) == (1, 512, 1e-4)
     assert training.hypernetwork_learning_rate == 1e-4
@@ -89,6 +91,12 @@ def test_a_preset_trains_and_renders_at_toy_resolution(name):
     pictures = model.adapt(data.task("train0").support).render(ring(1, (6, 6)))
     assert torch.isfinite(pictures.images).all()
     assert ((pictures.images >= 0) & (pictures.images <= 1.0001)).all()
+
+
+def test_the_fast_protocol_leaves_a_fast_preset_as_it_is():
+    for name in ("quick", "small", "paper-128-brief"):
+        assert preset(name).by_protocol("fast") == preset(name)
+    assert isinstance(preset("paper-128-brief").model.sampling, Marched)  # what the benchmarks' weights were trained by
 
 
 def test_an_unknown_preset_is_refused():

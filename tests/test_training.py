@@ -1,8 +1,12 @@
+import csv
 import json
+import threading
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from hyperplanes import checkpoints, files
 from hyperplanes.adaptation import Diagnostics, HyperPlanes, base, diagnose
@@ -14,6 +18,7 @@ from hyperplanes.hypernetwork import HyperNetworkConfig
 from hyperplanes.metrics import psnr
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer, TrainingConfig, train
+from hyperplanes.watching import TensorBoard
 from tests.reference_rendering import Balls, awaken, small_model
 
 FAST = TrainingConfig(steps=6, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
@@ -213,6 +218,100 @@ def test_no_training_object_is_refused():
 
 class Killed(BaseException):
     """The process ends here."""
+
+
+@pytest.mark.parametrize("memory", [1, 2**30], ids=["nothing kept", "all kept"])
+def test_objects_made_ready_by_a_thread_change_nothing(memory):
+    """The same curve to the bit, and every object that is not kept is made in the thread."""
+    threads, runs = set(), []
+    for prefetch in (0, 2):
+        data = Balls(train=5)
+        task = data.task
+        data.task = lambda name, task=task: threads.add(threading.current_thread().name) or task(name)
+        config = with_(steps=4, tasks=2, rays=16, memory=memory, prefetch=prefetch)
+        trainer = train(small_model(), data, config)
+        runs.append((trainer.curve, state_of(trainer.model)))
+        assert any("prefetch" in name for name in threads) == (prefetch > 0)
+    for curve, weights in runs[1:]:
+        assert curve == runs[0][0]
+        assert same(weights, runs[0][1])
+
+
+def test_an_object_that_the_thread_cannot_read_ends_the_step_that_needs_it():
+    data = Balls(train=1)
+    task = data.task
+    trainer = Trainer(small_model(), data, with_(steps=3, memory=1))
+    data.task = lambda name: task("no such object")
+    with pytest.raises(ValueError, match="invalid literal"):
+        list(trainer.run())
+    assert trainer.step == 0
+
+
+def test_epochs_are_steps_in_which_every_object_is_drawn_so_often():
+    # 5 objects, 2 a step, 4 epochs: 20 draws, 10 steps
+    assert Trainer(small_model(), Balls(train=5), with_(epochs=4, tasks=2)).config.steps == 10
+    assert Trainer(small_model(), Balls(train=5), with_(epochs=1, tasks=2)).config.steps == 3
+    assert train(small_model(), Balls(train=2), with_(epochs=2, tasks=2, rays=4)).step == 2
+
+
+def test_theta_and_the_hypernetwork_take_turns_where_asked():
+    model = awaken(small_model())
+    trainer = Trainer(model, Balls(), with_(alternating=True, hypernetwork_learning_rate=1e-3))
+    for part in ("networks", "hypernetwork", "networks"):
+        before = {name: value.clone() for name, value in model.named_parameters()}
+        trainer.take_step()
+        moved = {name.split(".")[0] for name, v in model.named_parameters() if not torch.equal(v, before[name])}
+        assert moved == {part}
+
+
+def test_norms_are_those_of_gradients_and_updates():
+    trainer = Trainer(awaken(small_model()), Balls(), with_(tasks=2))
+    trainer.take_step()
+    found = trainer.norms()
+    for name, part in (("theta", trainer.model.networks), ("hypernetwork", trainer.model.hypernetwork)):
+        squares = [each.grad.square().sum() for each in part.parameters() if each.grad is not None]
+        assert found[f"gradient_{name}"] == pytest.approx(float(sum(squares)) ** 0.5, rel=1e-5)
+    model = awaken(small_model())
+    trainer = Trainer(model, Balls(train=1), with_(learning_rate=0.0, hypernetwork_learning_rate=0.0))
+    trainer.take_step()
+    with torch.no_grad():
+        update = model.eval().update(model.prepare(Balls().task("train0").support))
+    expected = sum(float(value.square().sum()) for value in update.values()) ** 0.5
+    assert trainer.norms()["update"] == pytest.approx(expected, rel=0.2)  # running statistics have moved since
+
+
+def test_a_curve_and_pictures_lie_beside_the_weights(tmp_path):
+    trainer = train(small_model(), Balls(test=2), with_(steps=4, evaluate_every=2), tmp_path)
+    with (tmp_path / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [{name: float(value) for name, value in row.items()} for row in rows] == trainer.curve
+    assert {"step", "loss", "psnr", "ssim", "spread", "swap_gap", "gradient_theta", "update"} <= set(rows[0])
+    assert sorted(path.name for path in (tmp_path / "samples").iterdir()) == ["00000002.png", "00000004.png"]
+    with Image.open(tmp_path / "samples" / "00000004.png") as sheet:  # two views of two objects, beside the truth
+        pixels = np.asarray(sheet)
+    assert pixels.shape == (4 * 16, 2 * 16, 3)
+    for index, (name, view) in enumerate((name, view) for name in ("test0", "test1") for view in (0, 2)):
+        truth = Balls(test=2).task(name).query.images[view].permute(1, 2, 0).numpy()
+        assert abs(pixels[16 * index : 16 * index + 16, 16:] / 255 - truth).max() <= 0.5 / 255 + 1e-6
+        task = Balls(test=2).task(name)
+        seen = trainer.model.eval().adapt(task.support).render(task.query[[view]].cameras).images[0].permute(1, 2, 0)
+        assert abs(pixels[16 * index : 16 * index + 16, :16] / 255 - seen.clamp(0, 1).numpy()).max() <= 1 / 255
+
+
+def test_tensorboard_shows_the_curve_and_the_pictures(tmp_path):
+    """Source of truth: TensorBoard's own reader of event files."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    trainer = Trainer(small_model(), Balls(test=2), with_(steps=4, evaluate_every=2))
+    board = TensorBoard(tmp_path)
+    with Console().bar("training") as bar:
+        follow(trainer, bar, board)
+    board.close()
+    found = EventAccumulator(str(tmp_path)).Reload()
+    for name in set(trainer.curve[-1]) - {"step"}:
+        expected = [(row["step"], pytest.approx(row[name], rel=1e-6)) for row in trainer.curve]
+        assert [(event.step, event.value) for event in found.Scalars(name)] == expected
+    assert [event.step for event in found.Images(found.Tags()["images"][0])] == [2, 4]
 
 
 def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, monkeypatch):

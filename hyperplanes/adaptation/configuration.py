@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Annotated, Any
 
 from hyperplanes.adaptation.initialisation import InitialisationConfig
 from hyperplanes.checkpoints import CheckpointError, read_json
 from hyperplanes.fields import TargetConfig
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.settings import SettingsError, choose_by_tag, structure
 
 __all__ = ["ORDERS", "ModelConfig", "checkpoint_folder"]
 
@@ -20,26 +20,7 @@ ORDERS = ("matched", "file")
 
 PACKAGED = Path(__file__).parent.parent / "pretrained"  # a folder a model, by its name
 
-Made = TypeVar("Made")
-
-SMALLEST = {"point_octaves": 0, "direction_octaves": 0, "fine": 0}  # of whole numbers; 1 for all others
-LARGEST = {
-    "depth": 256,
-    "width": 8192,
-    "code": 8192,
-    "latent": 8192,
-    "inner_steps": 16384,
-    "test_rays": 1 << 20,
-    "rank": 1024,
-    "planes": 1024,
-    "views": 1024,
-    "point_octaves": 32,
-    "direction_octaves": 32,
-    "hull_side": 512,
-    "coarse": 16384,
-    "fine": 16384,
-    "steps": 16384,
-}
+choose_by_tag(Hierarchical | Marched, "protocol")
 
 
 @dataclass(frozen=True)
@@ -66,7 +47,7 @@ class ModelConfig:
     initialisation: InitialisationConfig | None = None
     coarse_network: bool = False
     sampling: Hierarchical | Marched = field(default_factory=Marched)
-    hull_side: int = 64
+    hull_side: Annotated[int, range(1, 513)] = 64
     order: str = "matched"
 
     def __post_init__(self) -> None:
@@ -104,26 +85,23 @@ class ModelConfig:
             CheckpointError: an unknown or missing entry, one of another type, or an absurd number.
         """
         try:
-            rest = dict(value)
-            sampling = {"hierarchical": Hierarchical, "marched": Marched}[rest.pop("protocol")]
-            kinds = {
-                "hypernetwork": HyperNetworkConfig,
-                "autoencoder": AutoencoderConfig,
-                "initialisation": InitialisationConfig,
-            }
-            found = {"hypernetwork": rest.pop("hypernetwork")}
-            found |= {name: rest.pop(name, None) for name in kinds if name not in found}
-            parts = {
-                "network": _made(TargetConfig, rest.pop("network")),
-                "sampling": _made(sampling, rest.pop("sampling")),
-            }
-            parts |= {name: None if found[name] is None else _made(kind, found[name]) for name, kind in kinds.items()}
-            return _made(cls, rest, parts)
-        except (KeyError, TypeError, ValueError) as error:
+            return cls.structured(value)
+        except SettingsError as error:
             raise CheckpointError(
                 f"{where}: expected the entries of this version's models, found a misfit ({error}); "
                 "copy the file again, or train again with this version"
             ) from None
+
+    @classmethod
+    def structured(cls, value: Mapping[str, Any]) -> ModelConfig:
+        """As `of_json`; SettingsError names the entry that does not fit."""
+        for name in ("network", "sampling", "hypernetwork", "protocol"):
+            if name not in value:
+                raise SettingsError(name, "a missing entry")
+        sampling, protocol = value["sampling"], value["protocol"]
+        if isinstance(sampling, Mapping):
+            sampling = {**sampling, "protocol": protocol}
+        return structure(cls, {**{k: v for k, v in value.items() if k != "protocol"}, "sampling": sampling})
 
     @classmethod
     def load(cls, folder: Path) -> ModelConfig:
@@ -160,29 +138,3 @@ def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, part in value.items():
         flat |= _flat(part, f"{prefix}{name}.") if isinstance(part, Mapping) else {f"{prefix}{name}": part}
     return flat
-
-
-def _made(kind: type[Made], value: object, parts: Mapping[str, Any] | None = None) -> Made:
-    """A dataclass of entries that are what they are declared to be; `parts` are ready already."""
-    if not isinstance(value, Mapping):
-        raise TypeError(f"{kind.__name__}: {value!r} instead of its entries")
-    hints = get_type_hints(kind)
-    checked = {name: _checked(name, hints.get(name), entry) for name, entry in value.items()}
-    return kind(**checked, **(parts or {}))
-
-
-def _checked(name: str, hint: object, value: object) -> object:
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-        return float(value)
-    if hint is int and isinstance(value, int) and not isinstance(value, bool):
-        low, high = SMALLEST.get(name, 1), LARGEST[name]
-        if not low <= value <= high:
-            raise ValueError(f"{name}: {value} instead of a number from {low} to {high}")
-        return value
-    if (hint is str and isinstance(value, str)) or (hint is bool and isinstance(value, bool)):
-        return value
-    if hint == tuple[str, ...] and isinstance(value, list | tuple) and all(isinstance(each, str) for each in value):
-        return tuple(value)
-    if hint is None:
-        raise TypeError(f"an unknown entry {name!r}")
-    raise TypeError(f"{name}: {value!r} instead of {getattr(hint, '__name__', hint)}")

@@ -111,13 +111,16 @@ def diagnose(model: HyperPlanes, prepared: Sequence[Prepared]) -> Diagnostics:
 
 
 @torch.no_grad()
-def swap_gap(model: HyperPlanes, prepared: Sequence[Prepared], queries: Sequence[Views]) -> tuple[float, float]:
+def swap_gap(
+    model: HyperPlanes, prepared: Sequence[Prepared], queries: Sequence[Views], own: float | None = None
+) -> tuple[float, float]:
     """PSNR of query views with each object's own update, and what the update of the next object costs, in dB.
 
     Args:
         model: with a hypernetwork, in evaluation mode.
         prepared: the objects.
         queries: views of each, to compare with.
+        own: the PSNR with each object's own update, where it is known.
 
     Returns:
         Mean PSNR over all views, and own minus swapped.
@@ -131,7 +134,7 @@ def swap_gap(model: HyperPlanes, prepared: Sequence[Prepared], queries: Sequence
             values.append(psnr(field.render(query.cameras).images, query.images))
         return float(torch.cat(values).mean())
 
-    own = quality(0)
+    own = quality(0) if own is None else own
     return own, own - quality(1)
 
 

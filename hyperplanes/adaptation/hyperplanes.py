@@ -18,7 +18,7 @@ from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
 from hyperplanes.adaptation.fine_tuning import FineTuning, Steps, best_stop, minimise
 from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
-from hyperplanes.fields import TARGETS, Target
+from hyperplanes.fields import Target, find_targets
 from hyperplanes.files import write_json
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
@@ -66,14 +66,15 @@ class HyperPlanes(nn.Module):
 
     def __init__(self, config: ModelConfig, seed: int = 0) -> None:
         super().__init__()
-        if config.target not in TARGETS:
-            raise ValueError(f"target: expected one of {sorted(TARGETS)}, got {config.target!r}")
+        targets = find_targets()
+        if config.target not in targets:
+            raise ValueError(f"target: expected one of {sorted(targets)}, got {config.target!r}")
         planes = config.network.planes
         reader = config.hypernetwork or config.autoencoder
         if reader and reader.views > planes:
             raise ValueError(f"views: expected at most as many HyperPlanes as planes, {planes}, got {reader.views}")
         self.config = config
-        make = TARGETS[config.target]
+        make = targets[config.target]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.networks = nn.ModuleDict({"fine": make(config.network)})

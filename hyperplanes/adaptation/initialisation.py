@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 
@@ -43,10 +43,10 @@ class InitialisationConfig:
     """
 
     method: str = "mv_meta"
-    inner_steps: int = 32
+    inner_steps: Annotated[int, range(1, 16385)] = 32
     inner_rate: float = 0.5
-    steps: int = 2000
-    test_rays: int = 64
+    steps: Annotated[int, range(10**7)] = 2000
+    test_rays: Annotated[int, range(1, 2**20 + 1)] = 64
 
     def __post_init__(self) -> None:
         if self.method not in LEARNED:

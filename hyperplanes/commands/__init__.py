@@ -7,9 +7,10 @@ imports nothing heavy; so does data_gen with `generate` and `inspect`.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["EXAMPLES", "VERBS", "Verb", "find_verb", "find_verbs"]
+__all__ = ["EXAMPLES", "VERBS", "Verb", "find_verb", "find_verbs", "split_settings"]
 
 
 @dataclass(frozen=True)
@@ -73,3 +74,25 @@ def find_verb(name: str) -> Verb:
         known = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(verbs)}"
         raise ValueError(f"no verb {name!r}; {known}")
     return verbs[name]
+
+
+def split_settings(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The options of a verb, and those with a dot in their names, which set a field of a model or a training.
+
+    >>> split_settings(["--model.network.depth", "4", "--out", "runs/a.b"])
+    (['--out', 'runs/a.b'], ['--model.network.depth', '4'])
+
+    Args:
+        arguments: What stands after the verb.
+
+    Returns:
+        Both, each option with its values.
+    """
+    plain: list[str] = []
+    dotted: list[str] = []
+    here = plain
+    for argument in arguments:
+        if argument.startswith("--"):
+            here = dotted if "." in argument.partition("=")[0] else plain
+        here.append(argument)
+    return plain, dotted

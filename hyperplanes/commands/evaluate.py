@@ -53,7 +53,8 @@ class Arguments:
         support: Support views an object; more than there are go on with the query views.
         preset: The shape of fields that need no checkpoint.
         up: The axis that points up in the data's world: y as in training data, z as in Blender.
-        protocol: How fields are sampled: as they were trained, or 64 + 128 times a ray as in the paper.
+        protocol: How fields are sampled: as they were trained, 64 + 128 times a ray as in the paper, or fast.
+        legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.
         device: auto, cpu or cuda.
     """
 
@@ -70,6 +71,7 @@ class Arguments:
     preset: str = "quick"
     up: Up = "y"
     protocol: Protocol = "default"
+    legacy: bool = False
     device: str = "auto"
 
 
@@ -103,7 +105,9 @@ def run(arguments: Arguments) -> int:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
     console, device = Console(), choose_device(arguments.device)
     checkpoints = find_checkpoints(arguments.checkpoint)
-    opened = open_dataset(arguments.data)
+    opened = open_dataset(arguments.data, legacy=arguments.legacy)
+    for line in opened.skipped:
+        console.warn(line)
     tasks = opened if arguments.support is None else WithSupport(opened, arguments.support)
     data = TasksOnDevice(tasks, device, arguments.up)
     names = data.names(arguments.split)[: arguments.objects]

@@ -33,7 +33,7 @@ OptionalInt = Annotated[int | None, optional("INT")]
 OptionalName = Annotated[str | None, optional("NAME")]
 OptionalNumber = Annotated[int | float | None, optional("NUMBER")]
 
-Protocol = Literal["default", "paper"]
+Protocol = Literal["default", "paper", "fast"]
 """A name in `hyperplanes.presets.PROTOCOLS`."""
 
 Steps = int | Literal["auto"]

@@ -1,7 +1,8 @@
-"""List the named configurations that `train --preset` knows.
+"""List the named configurations that `train --preset` knows, or print all settings of one as YAML.
 
 Example:
     hyperplanes presets
+    hyperplanes presets quick > mine.yaml    # to be changed and given to `hyperplanes train --config mine.yaml`
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import tyro
+
 from hyperplanes.commands.console import Console
+from hyperplanes.commands.options import OptionalName
 
 if TYPE_CHECKING:
     from hyperplanes.presets import Preset
@@ -21,7 +25,13 @@ HEADINGS = ("preset", "pixels", "network", "encoder", "shown", "sampling", "step
 
 @dataclass(frozen=True)
 class Arguments:
-    """Nothing to choose."""
+    """Which preset.
+
+    Attributes:
+        name: Print all settings of this one.
+    """
+
+    name: tyro.conf.Positional[OptionalName] = None
 
 
 def row(name: str, preset: Preset) -> tuple[str, ...]:
@@ -41,10 +51,14 @@ def row(name: str, preset: Preset) -> tuple[str, ...]:
 
 
 def run(arguments: Arguments) -> int:
-    """Print the table."""
-    from hyperplanes.presets import PRESETS
+    """Print the table, or one of its rows in full."""
+    from hyperplanes.experiment import document
+    from hyperplanes.presets import PRESETS, configure
 
     console = Console()
+    if arguments.name is not None:
+        console.say(document("hyperplanes", configure(arguments.name)).rstrip())
+        return 0
     console.table(HEADINGS, [row(name, preset) for name, preset in PRESETS.items()])
     console.say("")
     for name, preset in PRESETS.items():

@@ -43,7 +43,7 @@ class Arguments:
         turntable: The format of the turntable.
         all_views: Show the model every view, not only the support half.
         up: The axis that points up in the world of the views: y as in training data, z as in Blender.
-        protocol: How the field is sampled: as it was trained, or 64 + 128 times a ray as in the paper.
+        protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or fast.
         device: auto, cpu or cuda.
     """
 

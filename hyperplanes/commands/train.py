@@ -1,12 +1,17 @@
 """Train a model on a data set; what `generate` writes, or any other layout that `inspect` can read.
 
 The model is looked at on held-out objects now and then. Checkpoints are written to --out on the way; interrupted, the
-same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once.
+same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once. Beside the weights
+lie config.yaml, which --config takes, curve.csv, and samples/ with held-out views beside the truth.
+
+Every field of the model and of the training is an option too, such as --model.hypernetwork.views 3 or
+--training.learning-rate 1e-3; `hyperplanes presets quick` prints all of them with their values, as a file for --config.
 
 Example:
     hyperplanes train --data data/cars --preset quick --out runs/cars
     hyperplanes train --data data/cars --preset quick --method point_multiplane --out runs/cars-baseline
     hyperplanes train --data data/cars --preset quick --method mv_meta --field nerf --out runs/cars-meta
+    hyperplanes train --data data/cars --config runs/cars/config.yaml --model.hypernetwork.views 3 --out runs/cars-3
 """
 
 from __future__ import annotations
@@ -16,16 +21,28 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from hyperplanes.commands.console import Bar, Console
-from hyperplanes.commands.options import OptionalField, OptionalFolder, OptionalInt, Protocol, Trainable
+from hyperplanes.commands.options import (
+    OptionalField,
+    OptionalFolder,
+    OptionalInt,
+    OptionalName,
+    OptionalNumber,
+    Protocol,
+    optional,
+)
 from hyperplanes.formatting import format_duration, format_rate
 
 if TYPE_CHECKING:
+    from hyperplanes.presets import Preset
     from hyperplanes.training import Progress, Trainer
+    from hyperplanes.watching import TensorBoard
 
-__all__ = ["Arguments", "follow", "progress_line", "run"]
+__all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 
 
 @dataclass(frozen=True)
@@ -35,29 +52,43 @@ class Arguments:
     Attributes:
         data: The data set, or several whose objects are drawn alike.
         out: The folder for checkpoints; a training that was interrupted there goes on.
-        preset: One of `hyperplanes presets`: how large the model is and how long it is trained.
-        method: HyperPlanes, a target network alone with one set of weights for all objects, an autoencoder, or a
-            learned initialisation (Reptile from many views or a single one, MAML, or random weights matched to one).
+        config: A YAML file of settings, such as the config.yaml of another run, whole or in part.
+        preset: One of `hyperplanes presets`: what holds where nothing else is said; quick where no file says otherwise.
+        method: hyperplanes; a target network alone with one set of weights for all objects: point_multiplane,
+            multiplane, nerf, or a field of another package; autoencoder; or a learned initialisation: mv_meta, sv_meta
+            (Reptile from many views or a single one), maml, maml_first_order, mv_matched (random weights matched to
+            mv_meta).
         field: Which target network: the preset's, or for learned initialisations NeRF, when not given.
         support: Support views and ImagePlanes an object; more than there are go on with the query views.
         checkpoint: What mv_matched is to match: a checkpoint of mv_meta.
-        protocol: How rays are sampled: as the preset says, or 64 + 128 times each as in the paper.
+        protocol: How rays are sampled: paper is 64 + 128 times each on every ray, fast only where something is; as the
+            preset says where not given.
         steps: Other than the preset's.
+        epochs: Instead of steps: how often each object is drawn, on average.
         seed: Of the first weights and of every draw.
+        cache_size: GiB of memory for prepared objects, and as much again for their decoded pictures; 2 by default.
+        legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.
+        tensorboard: Write event files for TensorBoard to --out/tensorboard.
         device: auto, cpu or cuda.
     """
 
     data: tuple[Path, ...]
     out: Path
-    preset: str = "quick"
-    method: Trainable = "hyperplanes"
+    config: Annotated[Path | None, optional("FILE")] = None
+    preset: OptionalName = None
+    method: OptionalName = None
     field: OptionalField = None
     support: OptionalInt = None
     checkpoint: OptionalFolder = None
     protocol: Protocol = "default"
     steps: OptionalInt = None
-    seed: int = 0
+    epochs: OptionalInt = None
+    seed: OptionalInt = None
+    cache_size: OptionalNumber = None
+    legacy: bool = False
+    tensorboard: bool = False
     device: str = "auto"
+    settings: tyro.conf.Suppress[tuple[str, ...]] = ()
 
 
 def progress_line(progress: Progress, best: float | None = None) -> str:
@@ -92,8 +123,13 @@ def _polite_interrupt() -> Generator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def follow(trainer: Trainer, bar: Bar) -> None:
+def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None:
     """Train to the end and show how it goes.
+
+    Args:
+        trainer: at any step.
+        bar: where a line a report is shown.
+        board: where every report goes as well.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C, with a checkpoint written and advice as its text.
@@ -105,6 +141,8 @@ def follow(trainer: Trainer, bar: Bar) -> None:
         warned = False
         for progress in trainer.run():
             quality = progress.psnr if progress.psnr is not None else quality
+            if board is not None:
+                board.add(trainer.curve[-1], trainer.samples if progress.psnr is not None else None)
             line = progress_line(progress, quality)
             if progress.diagnostics is not None:
                 line += f"\n  {progress.diagnostics}"
@@ -121,51 +159,92 @@ def follow(trainer: Trainer, bar: Bar) -> None:
                 raise KeyboardInterrupt(f"step {progress.step} is saved, the same command goes on from there")
 
 
+def resolve(arguments: Arguments) -> tuple[str, Preset]:
+    """The method, the model and its training: the preset's, changed by the file, by the options, by the settings.
+
+    Raises:
+        ValueError: an unknown name, or a value that does not fit; the message names the file or the option.
+    """
+    from hyperplanes.experiment import changed, parse_options, read_experiment
+    from hyperplanes.presets import preset
+    from hyperplanes.settings import SettingsError
+
+    given = read_experiment(arguments.config) if arguments.config else {}
+    chosen = preset(arguments.preset or given.get("preset", "quick"))
+    if "method" in given:
+        chosen = chosen.by_method(given["method"])
+    try:
+        chosen = changed(chosen, given)
+    except SettingsError as error:
+        raise ValueError(f"{arguments.config}: {error}") from None
+    chosen = chosen.by_protocol(arguments.protocol)
+    if arguments.method or arguments.field:
+        chosen = chosen.by_method(arguments.method or chosen.model.method, arguments.field)
+    options = {"steps": arguments.steps, "epochs": arguments.epochs, "seed": arguments.seed}
+    if arguments.steps is not None:
+        options["epochs"] = arguments.epochs or 0
+    if arguments.cache_size is not None:
+        options["memory"] = int(arguments.cache_size * 2**30)
+    for name, value in options.items():
+        if value is not None:
+            try:
+                chosen = changed(chosen, {"training": {name: value}})
+            except SettingsError as error:
+                raise ValueError(f"--{'cache-size' if name == 'memory' else name}: {error.problem}") from None
+    try:
+        chosen = changed(chosen, parse_options(arguments.settings))
+    except SettingsError as error:
+        raise ValueError(f"--{error.path.replace('_', '-')}: {error.problem}") from None
+    if arguments.support is not None:
+        network = replace(chosen.model.network, planes=arguments.support)
+        chosen = replace(chosen, model=replace(chosen.model, network=network))
+    return chosen.model.method, chosen
+
+
 def run(arguments: Arguments) -> int:
     """Train, from the start or from where it was interrupted."""
     from hyperplanes.adaptation.pretrained import find_checkpoints
     from hyperplanes.data.dataset import open_datasets
     from hyperplanes.devices import choose_device
-    from hyperplanes.presets import configure
+    from hyperplanes.experiment import write_experiment
     from hyperplanes.support import WithSupport
     from hyperplanes.training import start_training
+    from hyperplanes.watching import TensorBoard
 
     console = Console()
-    chosen = configure(
-        arguments.preset,
-        arguments.method,
-        steps=arguments.steps,
-        seed=arguments.seed,
-        protocol=arguments.protocol,
-        target=arguments.field,
-    )
-    data, shown = open_datasets(arguments.data), " ".join(map(str, arguments.data))
+    method, chosen = resolve(arguments)
+    data = open_datasets(arguments.data, chosen.training.memory, legacy=arguments.legacy)
+    shown = " ".join(map(str, arguments.data))
+    for line in data.skipped:
+        console.warn(line)
     if not data.names("train"):
         raise ValueError(
             f"{shown}: expected objects to train on, found none in its train split; "
             "a single scene can only be rendered or evaluated"
         )
-    model, tasks = chosen.model, data
-    if arguments.support is not None:
-        model = replace(model, network=replace(model.network, planes=arguments.support))
-        tasks = WithSupport(data, arguments.support)
+    tasks = data if arguments.support is None else WithSupport(data, arguments.support)
     reference = None
     if arguments.checkpoint is not None:
         reference = find_checkpoints([arguments.checkpoint]).get("mv_meta", arguments.checkpoint)
     device = choose_device(arguments.device)
-    trainer = start_training(model, chosen.training, tasks, arguments.out, device, reference)
+    trainer = start_training(chosen.model, chosen.training, tasks, arguments.out, device, reference)
+    write_experiment(arguments.out / "config.yaml", method, chosen)
     held_out = len(data.names("test"))
     console.say(
-        f"{arguments.method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "
+        f"{method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "
         f"{len(trainer.names)} objects to train on, {held_out} held out"
     )
     if trainer.step:
         console.say(f"going on from step {trainer.step}")
-    with console.bar("training") as bar:
-        follow(trainer, bar)
+    board = TensorBoard(arguments.out / "tensorboard", trainer.step) if arguments.tensorboard else None
+    try:
+        with console.bar("training") as bar:
+            follow(trainer, bar, board)
+    finally:
+        if board is not None:
+            board.close()
     console.say(f"{arguments.out}: trained for {trainer.step} steps")
     if held_out:
-        method = arguments.method
         console.say(
             f"next: hyperplanes evaluate --data {arguments.data[0]} --checkpoint {arguments.out} --method {method}"
         )

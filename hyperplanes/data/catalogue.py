@@ -28,12 +28,14 @@ class Catalogue:
         splits: the names of each of SPLITS, in their order.
         read: from a name to its pictures.
         manifest: what manifest.json says, empty without one.
+        skipped: a line about each list of objects of which some are missing.
     """
 
     layout: str
     splits: dict[str, tuple[str, ...]]
     read: Callable[[str], PosedTask]
     manifest: dict[str, Any] = field(default_factory=dict)
+    skipped: tuple[str, ...] = ()
 
 
 def native(folder: Path, manifest: dict[str, Any]) -> Catalogue:

@@ -27,14 +27,16 @@ class Dataset:
     Args:
         folder: a data set in the native layout, SRN's, learnit's or the HyperPlanes authors', or one posed scene.
         budget: bytes of decoded pictures to keep in memory; the least recently used go first.
+        legacy: principal points of learnit's and the authors' layouts at W / 2 at integer pixel centres, as the code
+            that was published with these data has them, instead of at the middle of the pictures.
 
     Raises:
         DataError: nothing that is known lies there.
     """
 
-    def __init__(self, folder: str | Path, budget: int = DEFAULT_BUDGET) -> None:
+    def __init__(self, folder: str | Path, budget: int = DEFAULT_BUDGET, *, legacy: bool = False) -> None:
         self.folder = Path(folder)
-        self._catalogue = find_catalogue(self.folder)
+        self._catalogue = find_catalogue(self.folder, legacy=legacy)
         self._cache: LRUCache[PosedTask] = LRUCache(budget)
         self._lock = threading.Lock()
 
@@ -42,6 +44,11 @@ class Dataset:
     def manifest(self) -> dict[str, Any]:
         """What manifest.json says; empty where the layout has none."""
         return self._catalogue.manifest
+
+    @property
+    def skipped(self) -> tuple[str, ...]:
+        """A line about each split of which some objects are missing."""
+        return self._catalogue.skipped
 
     @property
     def layout(self) -> str:
@@ -110,17 +117,18 @@ class Dataset:
         return (self.task(name) for name in self.names())
 
 
-def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET) -> Dataset:
+def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET, *, legacy: bool = False) -> Dataset:
     """A data set in any layout, or a single posed scene presented as one with one test task.
 
     Args:
         path: a folder, or a transforms file.
         budget: as in `Dataset`.
+        legacy: as in `Dataset`.
 
     Returns:
         The data set; objects are read when asked for.
     """
-    return Dataset(path, budget)
+    return Dataset(path, budget, legacy=legacy)
 
 
 class Datasets:
@@ -132,6 +140,11 @@ class Datasets:
 
     def __init__(self, parts: Mapping[str, Dataset]) -> None:
         self.parts = dict(parts)
+
+    @property
+    def skipped(self) -> tuple[str, ...]:
+        """As `Dataset.skipped`, of all data sets."""
+        return tuple(line for data in self.parts.values() for line in data.skipped)
 
     def names(self, split: str = "all") -> list[str]:
         """The names of the objects of a split of all data sets, one after the other."""
@@ -150,11 +163,15 @@ class Datasets:
         return replace(self.parts[part].task(own), name=name)
 
 
-def open_datasets(paths: Sequence[str | Path]) -> Dataset | Datasets:
+def open_datasets(
+    paths: Sequence[str | Path], budget: int = DEFAULT_BUDGET, *, legacy: bool = False
+) -> Dataset | Datasets:
     """One data set, or several as one.
 
     Args:
         paths: as in `open_dataset`.
+        budget: as in `Dataset`, for all of them together.
+        legacy: as in `Dataset`.
 
     Returns:
         The data set, or `Datasets` of several.
@@ -163,11 +180,12 @@ def open_datasets(paths: Sequence[str | Path]) -> Dataset | Datasets:
         ValueError: two folders of the same name.
     """
     if len(paths) == 1:
-        return open_dataset(paths[0])
+        return open_dataset(paths[0], budget, legacy=legacy)
     names = [Path(path).resolve().name for path in paths]
     if len(set(names)) < len(names):
         raise ValueError(f"data: expected folders of different names, got {', '.join(names)}; rename one")
-    return Datasets({name: open_dataset(path) for name, path in zip(names, paths, strict=True)})
+    share = budget // len(paths)
+    return Datasets({name: open_dataset(path, share, legacy=legacy) for name, path in zip(names, paths, strict=True)})
 
 
 def read_views(path: str | Path) -> Views:

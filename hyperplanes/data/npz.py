@@ -13,7 +13,7 @@ from hyperplanes.data.bounds import stated_bounds
 from hyperplanes.data.catalogue import SPLITS, Catalogue, is_plain
 from hyperplanes.data.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.data.transforms_document import opencv_from_opengl
-from hyperplanes.data.transforms_json import read_transforms_task
+from hyperplanes.data.transforms_json import read_transforms, read_transforms_task
 from hyperplanes.files import DataError, read_json
 from hyperplanes.geometry.rays import Sphere
 
@@ -106,8 +106,10 @@ def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -
     """The catalogue of a folder in one of the two layouts.
 
     learnit: CLASS_splits.json beside the folder of the class; CLASSs/NAME/transforms.json with its pictures beside it.
-    The authors': CLASS/sampled/VIEWS_NAME.npz, sorted by name, the first 80 % to train on and the rest to test, unless
-    a manifest says otherwise. In both, views alternate between support and query.
+    Names whose folder is missing are skipped and counted. The authors': CLASS/sampled/VIEWS_NAME.npz, sorted by name,
+    the first 80 % to train on and the last 20 % to test, unless a manifest says otherwise. In both, the first half of
+    the views is support and the rest query, as learnit's notebook and the authors' code take 25 and 25 of 50; in data
+    sets with a manifest, which `generate` wrote, views alternate.
 
     Args:
         folder: what may be in one of the layouts.
@@ -135,12 +137,13 @@ def _authors(archives: list[Path], manifest: dict[str, Any], bounds: Sphere | No
     else:
         for home in sorted({path.parent for path in archives}):
             names = sorted(name for name, path in paths.items() if path.parent == home)
-            first = max(1, int(len(names) * 0.8))
+            first, last = max(1, int(len(names) * 0.8)), max(1, int(len(names) * 0.2))
             splits["train"] += tuple(names[:first])
-            splits["test"] += tuple(names[first:])
+            splits["test"] += tuple(names[first:][-last:])
+    split = PosedTask.alternating if manifest else PosedTask.halves
 
     def read(name: str) -> PosedTask:
-        return PosedTask.alternating(read_npz(paths[name], legacy=legacy, bounds=bounds), name)
+        return split(read_npz(paths[name], legacy=legacy, bounds=bounds), name)
 
     return Catalogue("hyperplanes-200", splits, read, manifest)
 
@@ -149,6 +152,7 @@ def _learnit(
     folder: Path, files: list[Path], manifest: dict[str, Any], bounds: Sphere | None, legacy: bool
 ) -> Catalogue:
     homes: dict[str, Path] = {}
+    skipped: list[str] = []
     splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
     for file in files:
         document = read_json(file)
@@ -156,20 +160,30 @@ def _learnit(
             names = document.get(split, [])
             if not isinstance(names, list) or not all(isinstance(name, str) and is_plain(name) for name in names):
                 raise DataError(file, f"plain names in {split}", repr(names)[:60], "correct the file")
-            splits[split] += tuple(names)
-            homes |= {name: _home(folder, name, file) for name in names}
+            found = {name: home for name in names if (home := _home(folder, name, file)) is not None}
+            splits[split] += tuple(found)
+            homes |= found
+            if missing := [name for name in names if name not in found]:
+                skipped.append(f"{file}: skipped {len(missing)} of {len(names)} objects of {split} without a folder, "
+                               f"as {missing[0]}")  # fmt: skip
+    if not homes:
+        raise DataError(folder, "the objects that its splits name", "none of their folders", "download them again")
 
     def read(name: str) -> PosedTask:
-        return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, flat=True)
+        if manifest:
+            return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, flat=True)
+        scene = read_transforms(homes[name] / "transforms.json", legacy=legacy, bounds=bounds, flat=True)
+        return PosedTask.halves(scene, name)
 
-    return Catalogue("learnit-128", splits, read, manifest)
+    return Catalogue("learnit-128", splits, read, manifest, tuple(skipped))
 
 
-def _home(folder: Path, name: str, file: Path) -> Path:
+def _home(folder: Path, name: str, file: Path) -> Path | None:
+    """The folder of an object, None where there is none."""
     singular = file.name.removesuffix("_splits.json")
     candidates = [folder / f"{singular}s" / name, folder / singular / name, folder / name]
     candidates += [child / name for child in sorted(folder.iterdir()) if child.is_dir()]
-    return next((path for path in candidates if (path / "transforms.json").is_file()), candidates[0])
+    return next((path for path in candidates if (path / "transforms.json").is_file()), None)
 
 
 def _rgba(images: npt.NDArray[Any], path: Path) -> tuple[npt.NDArray[np.uint8], bool]:

@@ -90,6 +90,12 @@ class PosedTask:
         return self.support.nbytes + self.query.nbytes
 
     @classmethod
+    def halves(cls, scene: Posed, name: str) -> PosedTask:
+        """The first half of the views as support, the rest as query."""
+        index = list(range(len(scene)))
+        return cls(scene.select(index[: len(index) // 2]), scene.select(index[len(index) // 2 :]), name)
+
+    @classmethod
     def alternating(cls, scene: Posed, name: str) -> PosedTask:
         """Every other view from the first on as support, the rest as query."""
         index = list(range(len(scene)))

@@ -13,7 +13,7 @@ from hyperplanes.files import DataError, read_json
 __all__ = ["find_catalogue", "posed_folder", "read_posed_task"]
 
 
-def find_catalogue(path: str | Path) -> Catalogue:
+def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
     """The catalogue of whatever lies at a path.
 
     A manifest.json that names its layout decides; else the folder's content does: a posed scene (one object, in the
@@ -22,6 +22,7 @@ def find_catalogue(path: str | Path) -> Catalogue:
 
     Args:
         path: a folder, or a transforms file.
+        legacy: of learnit's and the authors' layouts, as in `npz.read_npz`.
 
     Returns:
         The catalogue; no picture has been read yet.
@@ -37,10 +38,9 @@ def find_catalogue(path: str | Path) -> Catalogue:
     manifest = read_json(path / "manifest.json") if (path / "manifest.json").is_file() else {}
     if manifest.get("format") == FORMAT and manifest.get("layout", "native") == "native":
         return native(path, manifest)
-    for layout in (srn, npz):
-        found = layout.catalogue(path, manifest)
-        if found is not None:
-            return found
+    found = srn.catalogue(path, manifest) or npz.catalogue(path, manifest, legacy=legacy)
+    if found is not None:
+        return found
     if find_transforms(path) or colmap.find_model(path) is not None:
         return posed_folder(path)
     children = sorted(child.name for child in path.iterdir() if child.is_dir() and find_transforms(child))

@@ -1,13 +1,31 @@
-"""Target networks: (x, d; parameters) -> (colour, density)."""
+"""Target networks: (x, d; parameters) -> (colour, density).
 
+Another package adds one by an entry point of the group `hyperplanes.fields` that names a subclass of `Target`.
+"""
+
+from hyperplanes.entry_points import load_entries
 from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.multiplane import MultiPlaneNeRF, PointMultiPlaneNeRF
 from hyperplanes.fields.nerf import NeRF
 
-__all__ = ["TARGETS", "Field", "MultiPlaneNeRF", "NeRF", "PointMultiPlaneNeRF", "Target", "TargetConfig"]
+__all__ = [
+    "TARGETS",
+    "Field",
+    "MultiPlaneNeRF",
+    "NeRF",
+    "PointMultiPlaneNeRF",
+    "Target",
+    "TargetConfig",
+    "find_targets",
+]
 
 TARGETS: dict[str, type[Target]] = {
     "nerf": NeRF,
     "multiplane": MultiPlaneNeRF,
     "point_multiplane": PointMultiPlaneNeRF,
 }
+
+
+def find_targets() -> dict[str, type[Target]]:
+    """All fields by name: those of this package, then those of the other packages that are installed."""
+    return TARGETS | load_entries("hyperplanes.fields", TARGETS)

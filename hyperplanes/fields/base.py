@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -34,11 +35,11 @@ class TargetConfig:
             densities of tens are the rule.
     """
 
-    depth: int = 8
-    width: int = 256
-    planes: int = 25
-    point_octaves: int = 10
-    direction_octaves: int = 4
+    depth: Annotated[int, range(1, 257)] = 8
+    width: Annotated[int, range(1, 8193)] = 256
+    planes: Annotated[int, range(1, 1025)] = 25
+    point_octaves: Annotated[int, range(33)] = 10
+    direction_octaves: Annotated[int, range(33)] = 4
     density_scale: float = 25.0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -29,12 +30,12 @@ class AutoencoderConfig:
         latent: length of the code of an object.
     """
 
-    views: int = 5
+    views: Annotated[int, range(1, 1025)] = 5
     choice: str = "farthest"
     encoder: str = "convnet"
     normalisation: str = "group"
-    code: int = 128
-    latent: int = 128
+    code: Annotated[int, range(1, 8193)] = 128
+    latent: Annotated[int, range(1, 8193)] = 128
 
     def __post_init__(self) -> None:
         known = {"choice": CHOICES, "encoder": ENCODERS, "normalisation": NORMALISATIONS}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -56,20 +57,20 @@ class HyperNetworkConfig:
         gain: what the outputs are multiplied with.
     """
 
-    views: int = 5
+    views: Annotated[int, range(1, 1025)] = 5
     choice: str = "farthest"
     encoder: str = "convnet"
     normalisation: str = "batch"
-    code: int = 128
+    code: Annotated[int, range(1, 8193)] = 128
     code_activation: str = "none"
     code_normalisation: str = "running"
     join: str = "concatenate"
-    depth: int = 3
-    width: int = 256
+    depth: Annotated[int, range(1, 257)] = 3
+    width: Annotated[int, range(1, 8193)] = 256
     activation: str = "relu"
     layers: tuple[str, ...] = ("colour", "density")
     update: str = "full"
-    rank: int = 4
+    rank: Annotated[int, range(1, 1025)] = 4
     see_weights: bool = True
     weights_seen: str = "updated"
     see_directions: bool = True

@@ -7,6 +7,7 @@ interval; `weights` are the compositing weights of the intervals, (ray, interval
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -17,7 +18,9 @@ from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered, composite
 from hyperplanes.rendering.samplers import FieldFunction, evaluate
 
-__all__ = ["Hierarchical", "importance", "intervals", "stratified"]
+__all__ = ["PLACEMENTS", "Hierarchical", "importance", "intervals", "stratified"]
+
+PLACEMENTS = ("intervals", "samples")
 
 
 @dataclass(frozen=True)
@@ -26,12 +29,22 @@ class Hierarchical:
 
     Attributes:
         coarse: stratified samples a ray.
-        fine: importance samples a ray. They cut the coarse intervals further, and the field is evaluated once in each
-            of the coarse + fine intervals, where NeRF evaluates it at the coarse and the fine samples themselves.
+        fine: importance samples a ray.
+        placement: where the field is evaluated. "intervals": importance samples cut the coarse intervals further, and
+            the field is evaluated once in each of the coarse + fine intervals. "samples", as in NeRF: at the coarse and
+            the fine samples themselves, each of which stands for the way to the next, the last for the way to far.
     """
 
-    coarse: int = 64
-    fine: int = 128
+    coarse: Annotated[int, range(1, 16385)] = 64
+    fine: Annotated[int, range(16385)] = 128
+    placement: str = "intervals"
+
+    def __post_init__(self) -> None:
+        if self.placement not in PLACEMENTS:
+            known = ", ".join(map(repr, PLACEMENTS))
+            raise ValueError(f"placement: expected one of {known}, got {self.placement!r}")
+        if self.placement == "samples" and self.fine and self.coarse < 3:
+            raise ValueError(f"coarse: expected at least 3 samples to draw fine ones between, got {self.coarse}")
 
     @property
     def span(self) -> str:
@@ -74,19 +87,29 @@ class Hierarchical:
     ) -> Rendered:
         """The pixels of rays; `occupancy` is not read, the other arguments are those of `renderer.render`."""
 
-        def composited(function: FieldFunction, edges: Tensor) -> tuple[Rendered, Tensor]:
-            t = stratified(edges, generator)
+        def composited(function: FieldFunction, t: Tensor, edges: Tensor) -> tuple[Rendered, Tensor]:
             points = rays.at(t)
             directions = rays.directions[:, None].expand_as(points)
             colour, density = evaluate(function, points.reshape(-1, 3), directions.reshape(-1, 3), differentiable)
             return composite(colour.reshape(*t.shape, 3), density.reshape(t.shape), edges, background, distances=t)
 
+        at_samples = self.placement == "samples"
         edges = intervals(rays, self.coarse)
-        coarse, weights = composited(proposal or field, edges)
+        first = stratified(edges, generator)
+        far = rays.far[:, None]
+        coarse, weights = composited(proposal or field, first, torch.cat([first, far], 1) if at_samples else edges)
         if not self.fine:
             return coarse
-        added = importance(edges, weights, self.fine, generator)
-        fine, _ = composited(field, torch.cat([edges, added], 1).sort(1).values)
+        if at_samples:  # drawn between the middles of the coarse samples (NeRF, section 5.2)
+            middles = (first[:, 1:] + first[:, :-1]) / 2
+            added = importance(middles, weights[:, 1:-1], self.fine, generator)
+            places = torch.cat([first, added], 1).sort(1).values
+            edges = torch.cat([places, far], 1)
+        else:
+            added = importance(edges, weights, self.fine, generator)
+            edges = torch.cat([edges, added], 1).sort(1).values
+            places = stratified(edges, generator)
+        fine, _ = composited(field, places, edges)
         return Rendered(fine.colour, fine.opacity, fine.depth, coarse.samples + fine.samples, coarse.colour)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -51,7 +52,7 @@ class Marched:
         stop: transmittance below which a ray is finished (only where no gradient is wanted); 0 never stops.
     """
 
-    steps: int = 96
+    steps: Annotated[int, range(1, 16385)] = 96
     stop: float = 5e-3
 
     @property

@@ -242,18 +242,18 @@ def config_of(model):
 @pytest.mark.parametrize(
     ("part", "change", "words"),
     [
-        ("network", {"width": "16"}, "width: '16' instead of int"),
-        ("network", {"depth": True}, "depth: True instead of int"),
-        ("network", {"width": 10**12}, "width: 1000000000000 instead of a number from 1 to 8192"),
-        ("network", {"planes": 0}, "planes: 0 instead of a number from 1 to 1024"),
-        ("network", {"density_scale": float("inf")}, "density_scale: inf instead of float"),
-        ("hypernetwork", {"layers": "colour"}, "layers: 'colour' instead of tuple"),
+        ("network", {"width": "16"}, "network.width: '16' instead of a whole number from 1 to 8192"),
+        ("network", {"depth": True}, "network.depth: True instead of a whole number"),
+        ("network", {"width": 10**12}, "width: 1000000000000 instead of a whole number from 1 to 8192"),
+        ("network", {"planes": 0}, "planes: 0 instead of a whole number from 1 to 1024"),
+        ("network", {"density_scale": float("inf")}, "network.density_scale: inf instead of a number"),
+        ("hypernetwork", {"layers": "colour"}, "hypernetwork.layers: 'colour' instead of a list of names"),
         ("hypernetwork", {"encoder": "vgg"}, "encoder: expected one of .*, got 'vgg'"),
         ("hypernetwork", {"views": 5}, "views: expected at most as many HyperPlanes as planes, 4, got 5"),
         (None, {"target": "voxels"}, "target: expected one of .*, got 'voxels'"),
-        (None, {"target": 3}, "target: 3 instead of str"),
-        (None, {"hull_side": 10**6}, "hull_side: 1000000 instead of a number from 1 to 512"),
-        ("sampling", {"steps": 0}, "steps: 0 instead of a number from 1 to 16384"),
+        (None, {"target": 3}, "target: 3 instead of a name"),
+        (None, {"hull_side": 10**6}, "hull_side: 1000000 instead of a whole number from 1 to 512"),
+        ("sampling", {"steps": 0}, "sampling.steps: 0 instead of a whole number from 1 to 16384"),
     ],
 )
 def test_a_checkpoint_of_wrong_types_or_absurd_sizes_names_its_file(model, tmp_path, part, change, words):
@@ -347,3 +347,14 @@ def test_without_a_hull_one_voxel_holds_everything(model, support):
     assert prepared.occupancy.occupied.shape == (1, 1, 1)
     assert prepared.occupancy.occupied.all()
     assert prepared.occupancy.bounds == support.bounds
+
+
+def test_planes_in_the_order_of_the_file_and_the_first_as_hyperplanes():
+    hypernetwork = HyperNetworkConfig(views=3, choice="first", code=8, width=16)
+    model = small_model(order="file", hypernetwork=hypernetwork)
+    views = ball_views(ring(6))[[4, 1, 5, 0, 2, 3]]
+    assert torch.equal(model.arrange(views).images, views.images[:4])
+    assert torch.equal(model.arrange(views[[1, 0, 2]]).images, views.images[[1, 0, 2, 1]])
+    assert model.hyperplanes().tolist() == [0, 1, 2]
+    with pytest.raises(ValueError, match="order: expected one of 'matched', 'file', got 'random'"):
+        ModelConfig(order="random")

@@ -99,6 +99,9 @@ def test_presets():
     small, large = (
         [make_rig(name, 50, 16, seed=seed).world_from_camera for seed in (5, 6)] for name in ("paper-128", "paper-200")
     )
+    assert {preset.distance for preset in RIG_PRESETS.values()} == {4.0}  # near 2 and far 6 of both loaders
+    focal = 100 / np.tan(np.radians(RIG_PRESETS["paper-200"].field_of_view) / 2)
+    assert focal == pytest.approx(277.77, abs=0.01)  # of the authors' loader
     assert not np.array_equal(*small)
     assert np.array_equal(*large)
     with pytest.raises(ValueError, match="paper-128, paper-200, got 'paper-64'"):

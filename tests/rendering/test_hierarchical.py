@@ -1,8 +1,10 @@
+import numpy as np
 import pytest
 import torch
 
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.rendering import importance, intervals, stratified
+from hyperplanes.rendering import Hierarchical, importance, intervals, render, stratified
+from tests.reference_rendering import some_rays
 
 
 def rays_between(near, far, count):
@@ -114,3 +116,45 @@ def test_importance_passes_no_gradient_to_the_weights_but_to_the_edges():
     assert weights.grad is None
     # with quantiles fixed, a shift of all edges shifts every distance by the same: the gradient sums to 3
     assert edges.grad.sum().item() == pytest.approx(3)
+
+
+def test_placement_at_samples_is_nerfs():
+    """Source of truth: NeRF's section 5.2 in NumPy, ray by ray, on a field of colour and density that vary."""
+
+    def field(points, directions):
+        return torch.sigmoid(3 * points), 6 * torch.exp(-4 * points.square().sum(-1))
+
+    rays, coarse, fine = some_rays(5), 9, 14
+
+    def pixel(ray, t):
+        points = rays.origins[ray] + torch.tensor(t)[:, None] * rays.directions[ray]
+        colour, density = (value.numpy() for value in field(points, points))
+        alpha = 1 - np.exp(-density * np.diff(t, append=float(rays.far[ray])))
+        weights = alpha * np.concatenate([[1.0], np.cumprod(1 - alpha)[:-1]])
+        return weights @ colour + 1 - weights.sum(), weights
+
+    found = render(field, rays, Hierarchical(coarse, fine, "samples"))
+    for ray in range(5):
+        near, far = float(rays.near[ray]), float(rays.far[ray])
+        t = near + (far - near) * (np.arange(coarse) + 0.5) / coarse
+        first, weights = pixel(ray, t)
+        mass = weights[1:-1] + 1e-5
+        cumulative = np.concatenate([[0.0], np.cumsum(mass / mass.sum())])
+        added = np.interp((np.arange(fine) + 0.5) / fine, cumulative, (t[1:] + t[:-1]) / 2)
+        last, _ = pixel(ray, np.sort(np.concatenate([t, added])))
+        assert found.coarse[ray].numpy() == pytest.approx(first, abs=1e-9)
+        assert found.colour[ray].numpy() == pytest.approx(last, abs=1e-9)
+    assert found.samples == 5 * (coarse + coarse + fine)
+
+
+def test_placements_agree_where_samples_are_many_and_others_are_refused():
+    def field(points, directions):
+        return torch.sigmoid(3 * points), 6 * torch.exp(-4 * points.square().sum(-1))
+
+    rays = some_rays(20)
+    one, other = (render(field, rays, Hierarchical(300, 300, place)).colour for place in ("intervals", "samples"))
+    assert (one - other).abs().max() < 5e-3
+    with pytest.raises(ValueError, match="placement: expected one of 'intervals', 'samples', got 'edges'"):
+        Hierarchical(placement="edges")
+    with pytest.raises(ValueError, match="coarse: expected at least 3"):
+        Hierarchical(2, 4, "samples")

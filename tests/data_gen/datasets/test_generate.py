@@ -279,7 +279,7 @@ def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
     car = Procedural("car", 1, seed=3)
     generate(car, tmp_path / "200", GenerationConfig(rig="paper-200", resolution=8, held_out=0, workers=1))
     task = Dataset(tmp_path / "200").task("car_00000")
-    expected = make_rig("paper-200", 50, 8)
+    expected = make_rig("paper-200", 50, 8, distance=4.0, field_of_view=RIG_PRESETS["paper-200"].field_of_view)
     assert len(task.support) + len(task.query) == len(expected) == 50
     poses = camera.camera_from_world(expected.cameras(slice(0, None, 2))).float()
     assert torch.allclose(camera.camera_from_world(task.support.cameras), poses, atol=1e-6)

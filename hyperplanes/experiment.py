@@ -1,0 +1,177 @@
+"""An experiment in a file: YAML of the dataclasses of a model and its training, whole or in part.
+
+preset: small               # where the entries that are not given come from
+method: hyperplanes
+model: {hypernetwork: {views: 3}}
+training: {learning_rate: 1e-3}
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hyperplanes.adaptation.configuration import ModelConfig
+from hyperplanes.files import DataError, write_whole
+from hyperplanes.presets import Preset
+from hyperplanes.settings import SettingsError, nearest, structure
+from hyperplanes.training import TrainingConfig
+
+__all__ = ["changed", "document", "parse_options", "read_experiment", "write_experiment"]
+
+ENTRIES = {"preset": str, "method": str, "model": dict, "training": dict}
+LARGEST = 2**20  # bytes of a file
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values only; 1e-3 is a number, as in YAML 1.2, and nothing stands for another part of the file."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("an alias (*name), which is not supported")
+        return super().compose_node(parent, index)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def read_experiment(path: Path) -> dict[str, Any]:
+    """The entries of a file.
+
+    Args:
+        path: YAML, such as the config.yaml that `train` writes beside its weights.
+
+    Returns:
+        Some of preset, method, model and training; what is in them is not looked at.
+
+    Raises:
+        DataError: no such file, no YAML, or other entries.
+    """
+    remedy = "`hyperplanes presets quick` prints a whole one"
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise DataError(path, "a YAML file of settings", error.strerror or str(error), "check the path") from None
+    if len(text) > LARGEST:
+        raise DataError(path, f"at most {LARGEST} bytes", str(len(text)), remedy)
+    try:
+        value = yaml.load(text, _Loader)  # noqa: S506 - a subclass of SafeLoader
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise DataError(path, "YAML", str(error) or type(error).__name__, remedy) from None
+    if not isinstance(value, dict):
+        raise DataError(path, "a mapping of settings", f"a {type(value).__name__}", remedy)
+    for name, entry in value.items():
+        if name not in ENTRIES:
+            raise DataError(f"{path}: {name}: an unknown entry; {nearest(str(name), list(ENTRIES))}")
+        if not isinstance(entry, ENTRIES[name]):
+            raise DataError(path, f"{name} of type {ENTRIES[name].__name__}", type(entry).__name__, remedy)
+    return value
+
+
+def write_experiment(path: Path, method: str, chosen: Preset) -> None:
+    """Write a file from which `read_experiment` and `changed` make the same model and training."""
+    write_whole(path, document(method, chosen).encode())
+
+
+def document(method: str, chosen: Preset) -> str:
+    """The YAML of a configuration, every entry of it."""
+    entries = {"method": method, "model": chosen.model.as_json(), "training": asdict(chosen.training)}
+    return yaml.safe_dump(entries, sort_keys=False)
+
+
+def changed(chosen: Preset, changes: Mapping[str, Any]) -> Preset:
+    """A configuration with some entries replaced.
+
+    Where the protocol changes, samples that are not given are those that it has by default.
+
+    Args:
+        chosen: the configuration.
+        changes: entries of `model` and `training`, nested as the dataclasses are.
+
+    Returns:
+        The new configuration.
+
+    Raises:
+        SettingsError: an unknown entry, or a value that does not fit; its path begins with "model" or "training".
+    """
+    model, training = chosen.model.as_json(), asdict(chosen.training)
+    wanted = changes.get("model", {})
+    if isinstance(wanted, Mapping) and wanted.get("protocol", model["protocol"]) != model["protocol"]:
+        model["sampling"] = {}
+    try:
+        path = "model"
+        made = ModelConfig.structured(_merged(model, wanted))
+        path = "training"
+        trained = structure(TrainingConfig, _merged(training, changes.get("training", {})))
+    except SettingsError as error:
+        raise SettingsError(f"{path}.{error.path}" if error.path else path, error.problem) from None
+    return replace(chosen, model=made, training=trained)
+
+
+def _merged(base: Mapping[str, Any], changes: Any) -> Any:
+    """A mapping with some entries replaced, entry by entry where both are mappings."""
+    if not isinstance(changes, Mapping):
+        return changes
+    result = dict(base)
+    for name, value in changes.items():
+        before = result.get(name)
+        if isinstance(value, Mapping):
+            result[name] = _merged(before if isinstance(before, Mapping) else {}, value)
+        elif isinstance(before, list | tuple) and isinstance(value, str):
+            result[name] = [value]
+        else:
+            result[name] = value
+    return result
+
+
+def parse_options(given: Sequence[str]) -> dict[str, Any]:
+    """The entries that options of the command line name.
+
+    >>> parse_options(["--model.hypernetwork.views", "3", "--training.learning-rate=1e-3"])
+    {'model': {'hypernetwork': {'views': 3}}, 'training': {'learning_rate': 0.001}}
+
+    Args:
+        given: options with a dot in their names, each followed by its value or values; without one it is switched on.
+
+    Returns:
+        Entries for `changed`.
+
+    Raises:
+        SettingsError: an option of neither the model nor the training, or a value that is no YAML.
+    """
+    result: dict[str, Any] = {}
+    for option, values in _grouped(given):
+        names = option.replace("-", "_").split(".")
+        if names[0] not in ("model", "training"):
+            raise SettingsError(option, f"an unknown option; {nearest(names[0], ['model', 'training'])}")
+        node = result
+        for name in names[:-1]:
+            node = node.setdefault(name, {})
+            if not isinstance(node, dict):
+                raise SettingsError(option, "given beside the whole of which it is a part; leave one of them out")
+        try:
+            read = [yaml.load(value, _Loader) for value in values]  # noqa: S506 - a subclass of SafeLoader
+        except (yaml.YAMLError, ValueError) as error:
+            raise SettingsError(
+                option, f"expected a plain value, got {values} ({' '.join(str(error).split())})"
+            ) from None
+        node[names[-1]] = True if not read else read[0] if len(read) == 1 else read
+    return result
+
+
+def _grouped(given: Sequence[str]) -> list[tuple[str, list[str]]]:
+    groups: list[tuple[str, list[str]]] = []
+    for argument in given:
+        if argument.startswith("--"):
+            option, equals, value = argument[2:].partition("=")
+            groups.append((option, [value] if equals else []))
+        else:
+            groups[-1][1].append(argument)
+    return groups
