@@ -70,6 +70,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--planes", type=int, default=25, help="ImagePlanes of the field")
     parser.add_argument("--optimiser", choices=("adam", "muon"), default="muon", help="of theta")
     parser.add_argument("--tasks", type=int, default=4, help="objects a step; 768 rays are shared among them")
+    parser.add_argument("--references", type=int, default=0, help="further objects a step that are not rendered")
     parser.add_argument("--steps", type=int, default=1200)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--quick", action="store_true", help="20 steps: to see that it runs")
@@ -82,10 +83,11 @@ def main(arguments: list[str]) -> int:
     for name in chosen.variant:
         for seed in chosen.seeds:
             made = variant(name, planes=chosen.planes, optimiser=chosen.optimiser, tasks=chosen.tasks, steps=steps)
-            made = replace(made, training=replace(made.training, seed=seed))
+            made = replace(made, training=replace(made.training, seed=seed, reference_objects=chosen.references))
             folder = chosen.out and chosen.out / f"{name}-{chosen.planes}-{chosen.optimiser}-{seed}"
             classes = len(chosen.data)
-            setting = {"planes": chosen.planes, "classes": classes, "tasks": chosen.tasks, "seed": seed}
+            setting = {"planes": chosen.planes, "classes": classes, "tasks": chosen.tasks}
+            setting |= {"references": chosen.references, "seed": seed}
             rows.append({"name": name, **setting, **measure(made, data, folder)})
             print(rows[-1], flush=True)
     return finish("hypernetwork", rows, chosen.json)

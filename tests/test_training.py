@@ -94,6 +94,31 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, 
             assert same(states[0][place], states[1][place])
 
 
+@pytest.mark.parametrize("reference_objects", [0, 3])
+def test_reference_objects_take_what_objects_share_out_of_the_gradient_of_their_codes(reference_objects):
+    # Property: batch normalisation over the objects of a step has a gradient that sums to zero over them.
+    shape = HyperNetworkConfig(views=2, code=8, depth=2, width=16, normalisation="group", **ALL_LAYERS)
+    model = awaken(small_model(hypernetwork=shape))
+    trainer = Trainer(model, Balls(), with_(tasks=1, reference_objects=reference_objects))
+    trainer.take_step()  # the running statistics are those of a step before
+    gradients = []
+    model.hypernetwork.code_normalisation.register_full_backward_hook(lambda _, given, __: gradients.append(given[0]))
+    trainer.take_step()
+    (gradient,) = gradients
+    assert len(gradient) == 1 + reference_objects
+    shared = gradient.sum(0).abs().max() / gradient.abs().max()
+    assert shared < 1e-4 if reference_objects else shared == 1
+
+
+def test_only_the_objects_of_a_step_are_rendered():
+    trainer = Trainer(small_model(), Balls(), with_(tasks=1, reference_objects=2))
+    drawn = trainer._drawn(trainer._generator(0))
+    assert len(set(drawn)) == len(drawn) == 3
+    for name in drawn[1:]:
+        trainer._prefetcher.get(name).query.images.fill_(float("nan"))
+    assert np.isfinite(trainer.take_step())
+
+
 def test_a_finished_training_is_not_repeated(tmp_path):
     done = train(small_model(), Balls(), with_(steps=2), tmp_path)
     weights = state_of(done.model)
