@@ -37,6 +37,7 @@ class Arguments:
         out: The folder to write: new, empty, or one in which the same command was interrupted.
         class_name: Procedural objects of this class: car, chair, plane or lamp.
         meshes: A folder of mesh files, instead of --class.
+        meshes_class: What the meshes are, where their tree does not say it: layouts of other projects name folders so.
         count: How many procedural objects, the held-out ones included.
         seed: Of the procedural shapes and of random rigs and lights.
         resolution: Pixels along a side of the square images; what the rig or the layout is made for, else 64, when not
@@ -66,6 +67,7 @@ class Arguments:
     out: Path
     class_name: Annotated[Literal["car", "chair", "plane", "lamp"] | None, optional("NAME", name="class")] = None
     meshes: OptionalFolder = None
+    meshes_class: Annotated[str | None, optional("NAME", name="class-name")] = None
     count: int = 70
     seed: int = 0
     resolution: OptionalInt = None
@@ -99,9 +101,11 @@ def source_of(arguments: Arguments) -> Procedural | MeshFolder:
         found = "none" if arguments.meshes is None else "both"
         raise ValueError(f"expected --class NAME or --meshes FOLDER, found {found}; `hyperplanes generate --help`")
     if arguments.meshes is not None:
-        return MeshFolder(arguments.meshes, arguments.up, arguments.split_file, arguments.up_of)
+        return MeshFolder(arguments.meshes, arguments.up, arguments.split_file, arguments.up_of, arguments.meshes_class)
     if arguments.split_file is not None:
         raise ValueError("split_file: expected with --meshes and a ShapeNetCore tree, found with --class")
+    if arguments.meshes_class is not None or arguments.up_of:
+        raise ValueError("class_name, up_of: expected with --meshes, found with --class")
     return Procedural(str(arguments.class_name), arguments.count, arguments.seed)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from data_gen import SUPERSAMPLE
 from data_gen.datasets.layouts import LAYOUTS
 from data_gen.datasets.sources import seed_of
-from data_gen.rigs import RIG_PRESETS, RIGS, Rig, make_rig
+from data_gen.rigs import DEFAULT_DISTANCE, OBJECT_RADIUS, RIG_PRESETS, RIGS, Rig, make_rig
 
 __all__ = ["ENGINES", "GenerationConfig", "RenderConfig"]
 
@@ -29,7 +29,8 @@ class RenderConfig:
         rig: a name in `data_gen.rigs.RIGS`.
         views: cameras an object.
         resolution: pixels along a side.
-        distance: of the cameras from the origin, in world units.
+        distance: of the cameras from the origin, in world units; None for what suits the layout's loaders, which may
+            differ between classes.
         field_of_view: in degrees; None fits the unit sphere.
         lighting: a name in `data_gen.rendering.lighting.LIGHTING_PRESETS`.
         channels: "rgba", and further ones in alphabetical order.
@@ -42,7 +43,7 @@ class RenderConfig:
     rig: str
     views: int
     resolution: int
-    distance: float
+    distance: float | None
     field_of_view: float | None
     lighting: str
     channels: tuple[str, ...]
@@ -51,17 +52,42 @@ class RenderConfig:
     supersample: int
     renderer: str
 
-    def make_rig(self, name: str) -> Rig:
+    def make_rig(self, name: str, class_name: str | None = None) -> Rig:
         """The cameras of an object.
 
         Args:
             name: of the object, on which random rigs depend.
+            class_name: of the object, on which the distance may depend.
 
         Returns:
             The rig.
         """
-        numbers = {"distance": self.distance, "field_of_view": self.field_of_view}
-        return make_rig(self.rig, self.views, self.resolution, seed=self.seed_for("rig", name), **numbers)
+        distance = LAYOUTS[self.layout].distance(class_name) if self.distance is None else self.distance
+        lens = {"distance": distance, "field_of_view": self.field_of_view}
+        return make_rig(self.rig, self.views, self.resolution, seed=self.seed_for("rig", name), **lens)
+
+    def check_class(self, class_name: str | None) -> None:
+        """Refuse a class that the layout's loaders do not know, or of which they would not see all.
+
+        Args:
+            class_name: of objects, None where it is not known.
+
+        Raises:
+            ValueError: the class or the distance is none for this layout.
+        """
+        layout, rig = LAYOUTS[self.layout], self.make_rig("", class_name)
+        if layout.classes is not None and class_name not in layout.classes:
+            raise ValueError(
+                f"class: expected {', '.join(layout.classes)}, which the loaders of the {self.layout} layout know, got "
+                f"{class_name or 'meshes without a class; give --class-name'}"
+            )
+        planes = layout.near_far(class_name)
+        if planes is not None and (rig.near < planes[0] - 1e-9 or rig.far > planes[1] + 1e-9):
+            low, high = planes[0] + OBJECT_RADIUS, planes[1] - OBJECT_RADIUS
+            raise ValueError(
+                f"distance: expected {low:g} to {high:g} in the {self.layout} layout, whose loaders look from "
+                f"{planes[0]:g} to {planes[1]:g} radii for {class_name or 'any class'}, got {self.distance:g}"
+            )
 
     def seed_for(self, purpose: str, name: str) -> int:
         """A 32-bit seed for one purpose and one object."""
@@ -140,8 +166,8 @@ class GenerationConfig:
                 f"got {self.resolution}"
             )
         distance, field_of_view = self.distance, self.field_of_view
-        if distance is None:
-            distance = preset.distance if preset and self.layout == "native" else layout.distance
+        if distance is None and layout.planes is None:
+            distance = preset.distance if preset else DEFAULT_DISTANCE
         if field_of_view is None and preset:
             field_of_view = preset.field_of_view
         views = self.views
@@ -150,7 +176,7 @@ class GenerationConfig:
             rig=self.rig,
             views=(preset.views if preset else VIEWS) if views is None else views,
             resolution=(preset.resolution if preset else RESOLUTION) if resolution is None else resolution,
-            distance=float(distance),
+            distance=None if distance is None else float(distance),
             field_of_view=layout.field_of_view or field_of_view,
             lighting=self.lighting,
             channels=("rgba", *sorted(set(self.channels) - {"rgba"})),

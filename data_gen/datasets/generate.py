@@ -83,6 +83,9 @@ def generate(
     out, config = Path(out), config or GenerationConfig()
     render = config.resolve()
     items = list_items(source, config.held_out)
+    classes = sorted({item.class_name for item in items}, key=str)
+    for class_name in classes:
+        render.check_class(class_name)
     with GenerationState(out, _configuration(source, items, render, config.held_out)) as state:
         done = state.done(verified=config.verify)
         reused = sum(item.name in done for item in items)
@@ -108,7 +111,7 @@ def generate(
         if not kept:
             name, reason = skipped[0]
             raise ValueError(f"{out}: none of {len(items)} objects could be drawn; {name}: {reason}")
-        manifest = build_manifest(state.configuration, items, done.values(), skipped, _facts(render))
+        manifest = build_manifest(state.configuration, items, done.values(), skipped, _facts(render, classes))
         state.finish(manifest, LAYOUTS[render.layout].splits(kept))
     seconds = time.monotonic() - begun
     splits = {split: len(names) for split, names in manifest["splits"].items()}
@@ -129,6 +132,7 @@ def _configuration(
             "meshes": len(items),
             "up": source.up,
             "up_of": list(source.up_of),
+            "class_name": source.class_name,
             "names": sha256(repr(names).encode()),
         }
     generator = f"hyperplanes {version('hyperplanes')}, pictures {PICTURES}"
@@ -145,15 +149,15 @@ def _without_path(reason: str, source: Source) -> str:
     return reason
 
 
-def _facts(render: RenderConfig) -> dict[str, Any]:
+def _facts(render: RenderConfig, classes: list[str | None]) -> dict[str, Any]:
     """What readers of the data set want to know of all its objects."""
-    scale, rig = LAYOUTS[render.layout].scale, render.make_rig("")
+    scale, rigs = LAYOUTS[render.layout].scale, [render.make_rig("", name) for name in classes]
     return {
         "layout": render.layout,
         "renderer": render.renderer,
         "scene_sphere": {"centre": [0.0, 0.0, 0.0], "radius": OBJECT_RADIUS * scale},
-        "near": rig.near * scale,
-        "far": rig.far * scale,
+        "near": min(rig.near for rig in rigs) * scale,
+        "far": max(rig.far for rig in rigs) * scale,
     }
 
 

@@ -48,18 +48,34 @@ class Layout:
     Attributes:
         files: from an object to its files, relative path to bytes.
         splits: from the objects (in order) to the files that say which split they belong to.
-        distance: of the cameras from the origin, so that the near and far planes of the layout's loaders fit.
+        planes: near and far of the layout's loaders in their world units, by a part of the class's name; "" for all
+            others. None where they read them from the files.
         field_of_view: in degrees that the layout's loaders assume, or None.
         resolution: in pixels that they assume, or None.
         scale: their world units in one of ours.
+        classes: those that the loaders know, or None for any.
     """
 
     files: Callable[[RenderedObject], dict[str, bytes]]
     splits: Callable[[Sequence[Item]], dict[str, bytes]] = lambda _: {}
-    distance: float = DEFAULT_DISTANCE
+    planes: dict[str, tuple[float, float]] | None = None
     field_of_view: float | None = None
     resolution: int | None = None
     scale: float = 1.0
+    classes: tuple[str, ...] | None = None
+
+    def near_far(self, class_name: str | None) -> tuple[float, float] | None:
+        """Near and far of the loaders for a class, in our world units; None where they read them from the files."""
+        if self.planes is None:
+            return None
+        part = next((part for part in self.planes if part and part in (class_name or "")), "")
+        near, far = self.planes[part]
+        return near / self.scale, far / self.scale
+
+    def distance(self, class_name: str | None) -> float:
+        """How far from the origin cameras stand: in the middle of what the loaders look at."""
+        planes = self.near_far(class_name)
+        return DEFAULT_DISTANCE if planes is None else sum(planes) / 2
 
 
 def native(rendered: RenderedObject) -> dict[str, bytes]:
@@ -105,6 +121,7 @@ def learnit(rendered: RenderedObject) -> dict[str, bytes]:
     Returns:
         The files.
     """
+    _check_lens(rendered.rig, "learnit-128", centred=True)
     item, rig = rendered.item, rendered.rig
     folder = f"{_plural(item)}/{item.name}"
     names = [f"./r_{index:03d}" for index in range(len(rig))]
@@ -139,6 +156,7 @@ def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
     Returns:
         The file.
     """
+    _check_lens(rendered.rig, "hyperplanes-200", centred=True)
     item, rig = rendered.item, rendered.rig
     arrays = {
         "images": over_white(rendered.rgba).astype(np.float32) / np.float32(255),
@@ -152,9 +170,10 @@ def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
 def srn(rendered: RenderedObject) -> dict[str, bytes]:
     """CLASSs_SPLIT/NAME with intrinsics.txt, rgb/000000.png and pose/000000.txt (Sitzmann et al., 2019).
 
-    Poses are OpenCV camera-to-world, 16 numbers in a line, in a world half the size of ours, so that near 0.8 and far
-    1.8 of the usual loaders fit. intrinsics.txt: focal length and principal point (half-pixel centres); the centre of
-    the scene; near plane; scale; height and width. Pictures are RGB over white: the format has no alpha.
+    Poses are OpenCV camera-to-world, 16 numbers in a line, in a world half the size of ours, so that what pixel-nerf's
+    loader sees fits: 0.8 to 1.8, and 1.25 to 2.75 where the class is called chair. intrinsics.txt: focal length and
+    principal point (half-pixel centres); the centre of the scene; near plane; scale; height and width. Pictures are RGB
+    over white: the format has no alpha.
 
     Args:
         rendered: the object.
@@ -162,6 +181,7 @@ def srn(rendered: RenderedObject) -> dict[str, bytes]:
     Returns:
         The files.
     """
+    _check_lens(rendered.rig, "srn", centred=False)
     item, rig = rendered.item, rendered.rig
     folder = f"{_plural(item)}_{item.split}/{item.name}"
     matrix = rig.intrinsics[0]
@@ -192,16 +212,35 @@ def over_white(rgba: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return ((rgba[..., :3] * alpha + 255 * (255 - alpha) + 127) // 255).astype(np.uint8)
 
 
+def _check_lens(rig: Rig, layout: str, *, centred: bool) -> None:
+    """Refuse intrinsics that a layout with one focal length for everything, and perhaps no centre, cannot hold."""
+    middle = np.array([[rig.width - 1, rig.height - 1]]) / 2
+    lens, where = rig.intrinsics, "one focal length for both axes and all views"
+    wrong = np.abs(lens - lens[0]).max() > 1e-6 or abs(lens[0, 0, 0] - lens[0, 1, 1]) > 1e-6
+    if centred and not wrong:
+        where, wrong = "a principal point in the middle of the picture", np.abs(lens[:, :2, 2] - middle).max() > 1e-6
+    if wrong:
+        fx, fy, x, y = lens[0, 0, 0], lens[0, 1, 1], lens[0, 0, 2] + 0.5, lens[0, 1, 2] + 0.5
+        raise ValueError(
+            f"layout {layout}: expected {where}, for it holds no other, got focal lengths {fx:g}, {fy:g} and the point "
+            f"{x:g}, {y:g} of {rig.width} x {rig.height}; take the native layout"
+        )
+
+
 def _plural(item: Item) -> str:
     return f"{item.class_name or 'mesh'}s"
 
 
 LAYOUTS: dict[str, Layout] = {
     "native": Layout(native),
-    "learnit-128": Layout(learnit, learnit_splits, distance=4.0),
+    "learnit-128": Layout(learnit, learnit_splits, planes={"": (2.0, 6.0)}),
     "hyperplanes-200": Layout(
-        hyperplanes, distance=4.0, field_of_view=float(np.degrees(2 * np.arctan(100 / _AUTHORS_FOCAL))), resolution=200
+        hyperplanes,
+        planes={"": (2.0, 6.0)},
+        field_of_view=float(np.degrees(2 * np.arctan(100 / _AUTHORS_FOCAL))),
+        resolution=200,
+        classes=("car", "chair", "plane"),
     ),
-    "srn": Layout(srn, distance=2.6, scale=0.5),
+    "srn": Layout(srn, planes={"": (0.8, 1.8), "chair": (1.25, 2.75)}, scale=0.5),
 }
 """Layouts by the name under which the command line knows them."""

@@ -49,7 +49,7 @@ def _render(renderer: Any, item: Item, config: RenderConfig, meshes: Path | None
         from data_gen.shapes import make
 
         mesh = prepare_scene(make(str(item.class_name), int(item.seed or 0)), item.name, closed=True)
-    rig = config.make_rig(item.name)
+    rig = config.make_rig(item.name, item.class_name)
     channels = [channel for channel in config.channels if channel != "mesh"]
     rendering = renderer.render(
         mesh_parts(mesh),

@@ -42,6 +42,7 @@ class MeshFolder:
         up: which axis is up, y or z, in files of formats that do not say it: OBJ, PLY, STL and OFF.
         up_of: exceptions as `PATTERN=AXIS`, for files of any format; the last that fits counts. The pattern is a
             folder, a file, or one with wildcards (`scans/*.glb`), from `path` on.
+        class_name: of the meshes of which the tree does not state it; some layouts name folders by it.
         split_file: ShapeNet's official all.csv; models that it does not list are trained on, and the manifest names
             them.
     """
@@ -50,6 +51,7 @@ class MeshFolder:
     up: Literal["y", "z"] = "y"
     split_file: str | Path | None = None
     up_of: tuple[str, ...] = ()
+    class_name: str | None = None
 
 
 Source = Procedural | MeshFolder
@@ -126,10 +128,12 @@ def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
 
 
 def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
-    from data_gen.meshes.find import find_meshes
+    from data_gen.meshes.find import find_meshes, safe_name
 
     if source.up not in ("y", "z"):
         raise ValueError(f"up: expected y or z, got {source.up!r}")
+    if source.class_name is not None and safe_name(source.class_name) != source.class_name:
+        raise ValueError(f"class_name: expected letters, digits, . - and _, got {source.class_name!r}")
     if source.split_file is not None and held_out is not None:
         raise ValueError(f"held_out: expected none, for {source.split_file} decides, got {held_out}")
     found = find_meshes(source.path, split_file=source.split_file)
@@ -139,7 +143,7 @@ def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
     stated = held_out is None and any(mesh.split for mesh in found)
     classes: dict[str | None, list[Any]] = defaultdict(list)
     for mesh in sorted(found, key=lambda mesh: mesh.name):
-        classes[mesh.class_name].append(mesh)
+        classes[mesh.class_name or source.class_name].append(mesh)
     items = []
     for class_name, meshes in classes.items():
         kept = _held_out(len(meshes), 0.2 if held_out is None else held_out)

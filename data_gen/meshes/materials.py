@@ -24,6 +24,8 @@ __all__ = [
     "Visual",
     "canonical_visual",
     "convert_image",
+    "pbr_of_mtl",
+    "roughness_of_exponent",
     "texture_of",
     "visual_of",
 ]
@@ -101,7 +103,7 @@ def _textured(
         warnings.append(f"{label}: several materials on one surface; the first of {len(material.materials)} taken")
         material = material.materials[0] if material.materials else SimpleMaterial()
     is_gltf = isinstance(material, PBRMaterial)
-    data = _pbr_values(material, images) if is_gltf else _mtl_values(material, images)
+    data = _pbr_values(material if is_gltf else pbr_of_mtl(material, images), images)
     if colours == "srgb" and is_gltf and data.get("baseColorFactor") is not None:
         factor = np.round(np.asarray(data["baseColorFactor"]) * 255.0).astype(np.uint8)
         data["baseColorFactor"] = convert_8bit(factor, linear_from_srgb) / 255.0
@@ -182,20 +184,33 @@ def _pbr_values(material: PBRMaterial, images: dict[Any, Any]) -> dict[str, Any]
     }
 
 
-def _mtl_values(material: SimpleMaterial, images: dict[Any, Any]) -> dict[str, Any]:
-    image = _converted(material.image, "RGBA", images)
+def pbr_of_mtl(material: SimpleMaterial, images: dict[Any, Any] | None = None) -> PBRMaterial:
+    """The material of an MTL file or a texture without one, as glTF would state it.
+
+    Args:
+        material: its `diffuse` is sRGB; a texture takes its place, for programs write any colour beside one.
+        images: converted textures, shared between the meshes of a scene.
+
+    Returns:
+        The material, its factor linear; a mirror exponent (Ns) gives the roughness.
+    """
+    image = _converted(material.image, "RGBA", {} if images is None else images)
     factor = convert_8bit(np.asarray(material.diffuse, dtype=np.uint8), linear_from_srgb) / 255.0
     if image is not None:
         factor[:3] = 1.0
-    shininess = max(float(material.glossiness or 1.0), 0.0)
-    return {
-        "name": material.name,
-        "alphaMode": "BLEND",
-        "baseColorFactor": factor,
-        "baseColorTexture": image,
-        "metallicFactor": 0.0,
-        "roughnessFactor": float((2.0 / (shininess + 2.0)) ** 0.25),
-    }
+    return PBRMaterial(
+        name=material.name,
+        alphaMode="BLEND",
+        baseColorFactor=factor,
+        baseColorTexture=image,
+        metallicFactor=0.0,
+        roughnessFactor=roughness_of_exponent(float(material.glossiness or 1.0)),
+    )
+
+
+def roughness_of_exponent(exponent: float) -> float:
+    """Roughness of a highlight that falls off as the cosine to the power of `exponent` (Ns of an MTL file)."""
+    return float((2.0 / (max(exponent, 0.0) + 2.0)) ** 0.25)
 
 
 def _converted(image: PIL.Image.Image | None, mode: str, images: dict[Any, Any]) -> PIL.Image.Image | None:

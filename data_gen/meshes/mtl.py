@@ -21,7 +21,7 @@ import PIL.Image
 from trimesh.visual.material import PBRMaterial
 
 from data_gen.meshes.files import MAX_TEXT_BYTES
-from data_gen.meshes.materials import convert_image
+from data_gen.meshes.materials import convert_image, roughness_of_exponent
 from data_gen.meshes.model_folder import ModelFolder
 from hyperplanes.colour import convert_8bit, linear_from_srgb
 
@@ -89,7 +89,7 @@ def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) 
     image = _texture(values, label, folder, warnings)
     if image is not None and (values.get("map_kd") or values.get("map_ka")):
         colour[:3] = 1.0
-    shininess = max(_floats(values.get("ns"), 1, (10.0,), f"{label}: Ns", warnings)[0], 0.0)
+    exponent = _floats(values.get("ns"), 1, (10.0,), f"{label}: Ns", warnings)[0]
     glow = np.clip(_floats(values.get("ke"), 3, (0.0, 0.0, 0.0), f"{label}: Ke", warnings), 0.0, 1.0)
     if values.get("map_ke"):
         warnings.append(f"{label}: its glow map {values['map_ke']} left out")
@@ -99,7 +99,7 @@ def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) 
         baseColorTexture=image,
         alphaMode="BLEND",
         metallicFactor=0.0,
-        roughnessFactor=float((2.0 / (shininess + 2.0)) ** 0.25),
+        roughnessFactor=roughness_of_exponent(exponent),
         emissiveFactor=glow if glow.any() else None,
     )
 

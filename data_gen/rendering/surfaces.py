@@ -22,7 +22,7 @@ from PIL import Image
 from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from data_gen.meshes.materials import texture_of, visual_of
+from data_gen.meshes.materials import pbr_of_mtl, texture_of, visual_of
 from hyperplanes.colour import linear_from_srgb
 
 __all__ = [
@@ -51,8 +51,7 @@ MAX_TEXTURE_SIDE = 2048
 COINCIDENT = 1e-4
 """Distance, in radii of the object, up to which an outer side behind an inner one counts as in the same place."""
 
-_DEFAULT_KD = (102, 102, 102, 255)
-_PLAIN = 0.72
+_PLAIN = (0.72, 0.72, 0.72, 1.0)
 
 Floats = npt.NDArray[np.float64]
 
@@ -240,60 +239,37 @@ def _texture_coordinates(mesh: trimesh.Trimesh, material: dict[str, Any], where:
 
 def _material(material: Any, images: dict[Any, Any], where: str) -> dict[str, Any]:
     """The fields of a ShadedSurface that come from a trimesh material."""
-    fields: dict[str, Any] = {
-        "base_colour": np.array([_PLAIN, _PLAIN, _PLAIN, 1.0]) if material is None else np.ones(4),
-        "texture": None,
-        "emissive": np.zeros(3),
-        "emissive_texture": None,
-        "roughness": DEFAULT_ROUGHNESS,
-        "metallic": 0.0,
-        "cutoff": None,
-        "opaque": True,
-    }
-    if isinstance(material, PBRMaterial):
-        _fill_from_gltf(fields, material, images)
-    elif isinstance(material, SimpleMaterial):
-        _fill_from_mtl(fields, material, images)
-    elif material is not None:
+    if isinstance(material, SimpleMaterial):
+        material = pbr_of_mtl(material)
+    if material is None:
+        material = PBRMaterial(baseColorFactor=_PLAIN)
+    if not isinstance(material, PBRMaterial):
         raise RenderError(f"{where}: expected a PBRMaterial or a SimpleMaterial, received {type(material).__name__}")
-    return fields
-
-
-def _fill_from_gltf(fields: dict[str, Any], material: Any, images: dict[Any, Any]) -> None:
-    if material.baseColorFactor is not None:
-        fields["base_colour"] = np.asarray(material.baseColorFactor, dtype=np.float64) / 255.0
-    blends = material.alphaMode in {"BLEND", "MASK"}
-    fields["texture"] = _texels(material.baseColorTexture, images, keep_alpha=blends)
-    if material.emissiveFactor is not None:
-        fields["emissive"] = np.asarray(material.emissiveFactor, dtype=np.float64)[:3]
-        fields["emissive_texture"] = _texels(material.emissiveTexture, images, keep_alpha=False)
+    factor = material.baseColorFactor
+    base = np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64) / 255.0
+    texture = _texels(material.baseColorTexture, images, keep_alpha=material.alphaMode in {"BLEND", "MASK"})
+    if material.alphaMode not in {"BLEND", "MASK"}:
+        base[3] = 1.0
+    glows = material.emissiveFactor is not None
     roughness, metallic = material.roughnessFactor, material.metallicFactor
     fine = material.metallicRoughnessTexture
     if fine is not None:
         mean = np.asarray(fine.convert("RGB"), dtype=np.float64).mean(axis=(0, 1)) / 255.0
         roughness = mean[1] * (1.0 if roughness is None else roughness)
         metallic = mean[2] * (1.0 if metallic is None else metallic)
-    if roughness is not None:
-        fields["roughness"] = float(np.clip(roughness, MIN_ROUGHNESS, 1.0))
-    if metallic is not None:
-        fields["metallic"] = float(np.clip(metallic, 0.0, MAX_METALLIC))
+    cutoff = None
     if material.alphaMode == "MASK":
-        fields["cutoff"] = 0.5 if material.alphaCutoff is None else float(material.alphaCutoff)
-    if material.alphaMode == "BLEND":
-        fields["opaque"] = fields["base_colour"][3] >= 1.0 and _is_opaque(fields["texture"])
-    elif material.alphaMode != "MASK":
-        fields["base_colour"] = np.append(fields["base_colour"][:3], 1.0)
-
-
-def _fill_from_mtl(fields: dict[str, Any], material: Any, images: dict[Any, Any]) -> None:
-    diffuse = np.asarray(material.diffuse, dtype=np.float64)
-    fields["texture"] = _texels(material.image, images, keep_alpha=True)
-    # A texture is written with a Kd of black by some programs, and trimesh fills a Kd in where there is none.
-    unset = tuple(material.diffuse) == _DEFAULT_KD or not diffuse[:3].any()
-    if fields["texture"] is not None and unset:
-        diffuse = np.array([255.0, 255.0, 255.0, diffuse[3]])
-    fields["base_colour"] = np.append(linear_from_srgb(diffuse[:3] / 255.0), diffuse[3] / 255.0)
-    fields["opaque"] = fields["base_colour"][3] >= 1.0 and _is_opaque(fields["texture"])
+        cutoff = 0.5 if material.alphaCutoff is None else float(material.alphaCutoff)
+    return {
+        "base_colour": base,
+        "texture": texture,
+        "emissive": np.asarray(material.emissiveFactor, dtype=np.float64)[:3] if glows else np.zeros(3),
+        "emissive_texture": _texels(material.emissiveTexture, images, keep_alpha=False) if glows else None,
+        "roughness": DEFAULT_ROUGHNESS if roughness is None else float(np.clip(roughness, MIN_ROUGHNESS, 1.0)),
+        "metallic": 0.0 if metallic is None else float(np.clip(metallic, 0.0, MAX_METALLIC)),
+        "cutoff": cutoff,
+        "opaque": material.alphaMode != "BLEND" or (base[3] >= 1.0 and _is_opaque(texture)),
+    }
 
 
 def _is_opaque(texture: npt.NDArray[np.uint8] | None) -> bool:

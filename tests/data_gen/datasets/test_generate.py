@@ -218,6 +218,11 @@ def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypat
         ({"channels": ("depth",)}, "channels: expected rgba and any of"),
         ({"channels": ("rgba", "depth"), "layout": "srn"}, "channels: expected rgba alone in the srn layout"),
         ({"layout": "hyperplanes-200", "resolution": 64}, "resolution: the hyperplanes-200 layout's loaders take 200"),
+        ({"layout": "srn", "distance": 2.5}, "distance: expected 2.6 to 2.6 in the srn layout, .*, got 2.5"),
+        (
+            {"layout": "learnit-128", "distance": 5.5},
+            "distance: expected 3 to 5 in the learnit-128 layout, .*, got 5.5",
+        ),
         ({"resolution": 100_000}, "resolution: expected at most 16,384 samples along a side, got 100,000 pixels of 3"),
         ({"resolution": 5000}, "resolution: expected at most 4 GiB of pictures an object, got 4.7 GiB"),
         ({"views": 10**9}, "views: expected at most 10,000 an object, got 1,000,000,000"),
@@ -229,6 +234,20 @@ def test_arguments_that_make_no_sense_are_named(tmp_path, arguments, message):
     with pytest.raises(ValueError, match=message):
         generate(CARS, tmp_path / "out", GenerationConfig(**arguments))
     assert not (tmp_path / "out").exists()
+
+
+def test_the_authors_layout_takes_the_classes_that_their_loader_knows(tmp_path):
+    trimesh.creation.box().export(tmp_path / "box.ply")
+    config = GenerationConfig(layout="hyperplanes-200", views=1, held_out=0, workers=1)
+    for source, found in (
+        (Procedural("lamp", 1), "lamp"),
+        (MeshFolder(tmp_path), "meshes without a class; give --class-name"),
+    ):
+        with pytest.raises(ValueError, match=f"class: expected car, chair, plane, .*, got {found}"):
+            generate(source, tmp_path / "out", config)
+    GenerationConfig(layout="srn", distance=4.0).resolve().check_class("chair")
+    generate(MeshFolder(tmp_path, class_name="chair"), tmp_path / "out", config)
+    assert (tmp_path / "out/chairs/sampled/1_box.npz").is_file()
 
 
 def test_data_sets_of_one_seed_share_objects_and_never_mix_training_and_held_out():

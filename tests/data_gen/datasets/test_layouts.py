@@ -1,6 +1,7 @@
 """Source of truth: the pictures and the rig that went in; what other projects' loaders do, in a few lines each."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,7 +28,9 @@ ITEMS = [
 def rendered(layout, item, **more):
     style = LAYOUTS[layout]
     size = style.resolution or 20
-    rig = rigs.random(VIEWS, size, seed=item.seed, distance=style.distance, field_of_view=style.field_of_view)
+    rig = rigs.random(
+        VIEWS, size, seed=item.seed, distance=style.distance(item.class_name), field_of_view=style.field_of_view
+    )
     rgba = np.random.default_rng(item.seed).integers(0, 256, (VIEWS, size, size, 4), dtype=np.uint8)
     rgba[..., 3] = np.where(rgba[..., 3] < 128, 0, rgba[..., 3])
     rgba[:, [0, -1]] = rgba[:, :, [0, -1]] = 0
@@ -154,6 +157,36 @@ def test_srns_loader_finds_what_it_reads(tmp_path):
     assert original.rig.far / 2 <= 1.8 + 1e-9
     assert len(read_task(folder).support) == 3
     assert open_dataset(tmp_path / "cars_test").names("test") == ["car_test_00000"]
+
+
+@pytest.mark.parametrize(("class_name", "near", "far"), [("car", 0.8, 1.8), ("chair", 1.25, 2.75), ("lamp", 0.8, 1.8)])
+def test_pixel_nerfs_planes_lose_nothing_of_an_object_in_srns_layout(class_name, near, far):
+    """Its loader: z_near, z_far = 1.25, 2.75 where "chair" is in the path of the data set, else 0.8 and 1.8."""
+    rig = rendered("srn", Item("a", class_name, "train", seed=1)).rig
+    depths = np.linalg.norm(rig.camera_centres, axis=1) * LAYOUTS["srn"].scale
+    assert (depths - 0.5 >= near - 1e-9).all()
+    assert (depths + 0.5 <= far + 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "layouts"),
+    [
+        ({(0, 0): 1.1}, ("srn", "learnit-128", "hyperplanes-200")),
+        ({(0, 2): 1.2}, ("learnit-128", "hyperplanes-200")),
+    ],
+)
+def test_what_a_layout_cannot_hold_of_a_lens_is_refused(changes, layouts):
+    for layout in layouts:
+        one = rendered(layout, ITEMS[0])
+        lens = one.rig.intrinsics.copy()
+        for (row, column), factor in changes.items():
+            lens[:, row, column] *= factor
+        with pytest.raises(ValueError, match=f"layout {layout}: expected .*; take the native layout"):
+            LAYOUTS[layout].files(replace(one, rig=replace(one.rig, intrinsics=lens)))
+        lens = one.rig.intrinsics.copy()
+        lens[1:, :2, :2] *= 1.5
+        with pytest.raises(ValueError, match="for both axes and all views"):
+            LAYOUTS[layout].files(replace(one, rig=replace(one.rig, intrinsics=lens)))
 
 
 def test_other_channels_come_back_exactly(tmp_path):

@@ -272,7 +272,8 @@ def test_srgb_colours_come_out_alike_however_they_are_given(backend, kind):
     expected = 255 * (1.055 * (expected / 255) ** (1 / 2.4) - 0.055)
     with MeshRenderer(backend) as renderer:
         rgba = renderer.render([(square, EYE, False)], _front_rig(16), lighting=flat).rgba[0, 8, 8]
-    np.testing.assert_allclose(rgba, [*expected, 255], atol=1.5)
+    # trimesh keeps the factor of a material as 8 bits of LINEAR colour, steps of 3 of 255 where sRGB is dark.
+    np.testing.assert_allclose(rgba, [*expected, 255], atol=2.0 if kind == "kd" else 1.5)
 
 
 def test_geometry_lies_on_the_mesh_to_a_hundredth_of_a_pixel():
