@@ -122,6 +122,7 @@ class Trainer:
         self.step = 0
         self.curve: Curve = []
         self.diagnostics: Diagnostics | None = None
+        self.stopping = False  # set by whoever wants `run` to end after the step at hand
         self.names = sorted(data.names("train"))
         if not self.names:
             raise ValueError("data: expected at least one training object, got none")
@@ -144,6 +145,8 @@ class Trainer:
     def run(self) -> Iterator[Progress]:
         """Train until the last step, reporting every 25 steps; checkpoints are written on the way and at the end.
 
+        Once `stopping` is set, the step at hand is the last one, and a checkpoint of it is written.
+
         Yields:
             Where the training stands.
         """
@@ -160,8 +163,10 @@ class Trainer:
                 seen = {} if quality is None else {"psnr": quality}
                 seen |= diagnostics.as_json() if diagnostics else {}
                 self.curve.append({"step": step, "loss": loss, **seen})
-            if step % self.config.checkpoint_every == 0 or last:
+            if step % self.config.checkpoint_every == 0 or last or self.stopping:
                 self.save()
+            if self.stopping:
+                return
             if not report:
                 continue
             rays = (step - reported[1]) * self.config.rays * self.config.tasks / max(now - reported[0], 1e-9)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from hyperplanes.data.catalogue import SPLITS
-from hyperplanes.data.posed import PosedTask
+from hyperplanes.data.posed import Posed, PosedTask
 from hyperplanes.data.recognise import find_catalogue, posed_folder, read_posed_task
 from hyperplanes.data.transforms_json import find_transforms, read_transforms
-from hyperplanes.files import DataError
+from hyperplanes.files import DataError, malformed
 from hyperplanes.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
 
@@ -29,12 +29,14 @@ class Dataset:
         budget: bytes of decoded pictures to keep in memory; the least recently used go first.
 
     Raises:
-        DataError: nothing that is known lies there.
+        DataError: nothing that is known lies there, or an object that is listed twice.
     """
 
     def __init__(self, folder: str | Path, budget: int = DEFAULT_BUDGET) -> None:
         self.folder = Path(folder)
-        self._catalogue = find_catalogue(self.folder)
+        with malformed(self.folder, "a data set or posed images"):
+            self._catalogue = find_catalogue(self.folder)
+        _check_apart(self.folder, self._catalogue.splits)
         self._cache: LRUCache[PosedTask] = LRUCache(budget)
         self._lock = threading.Lock()
 
@@ -96,7 +98,8 @@ class Dataset:
             known = self.names()
             some = ", ".join(known[:3]) + (", ..." if len(known) > 3 else "")
             raise DataError(self.folder, f"one of its {len(known)} objects ({some})", repr(name), "check the name")
-        task = self._catalogue.read(name)
+        with malformed(f"{self.folder}, {name}", "an object with posed images"):
+            task = self._catalogue.read(name)
         with self._lock:
             self._cache.add(name, task)
         return task
@@ -108,6 +111,17 @@ class Dataset:
     def __iter__(self) -> Iterator[Task]:
         """The tasks of all splits, one after the other."""
         return (self.task(name) for name in self.names())
+
+
+def _check_apart(folder: Path, splits: Mapping[str, Sequence[str]]) -> None:
+    """Nothing, where every object is in one split, once: what is trained on may not be judged by."""
+    seen: dict[str, str] = {}
+    for split, names in splits.items():
+        for name in names:
+            if name in seen:
+                both = f"{name} in {seen[name]} and in {split}" if seen[name] != split else f"{name} twice in {split}"
+                raise DataError(folder, "every object in one split", both, "take it out of one of them")
+            seen[name] = split
 
 
 def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET) -> Dataset:
@@ -178,24 +192,27 @@ def read_views(path: str | Path) -> Views:
             one object. Of a folder with transforms_train, _val and _test files, all are read.
 
     Returns:
-        The views in the order of the files; masks where the files have alpha.
-
-    Raises:
-        DataError: anything wrong with a file.
+        The views in the order of the files; masks where the files have alpha. Anything wrong with a file is a
+        DataError that names it.
     """
+    path = Path(path)
+    with malformed(path, "posed images of one scene"):
+        return _read_scene(path).views()
+
+
+def _read_scene(path: Path) -> Posed:
     from hyperplanes.data import colmap, npz, srn
 
-    path = Path(path)
     if path.is_file():
-        return (npz.read_npz(path) if path.suffix == ".npz" else read_transforms(path)).views()
+        return npz.read_npz(path) if path.suffix == ".npz" else read_transforms(path)
     if not path.is_dir():
         raise DataError(path, "a transforms*.json or a folder that holds one", "nothing", "check the path")
     if files := find_transforms(path):
-        return read_transforms(files).views()
+        return read_transforms(files)
     if srn.is_srn(path):
-        return srn.read_srn(path).views()
+        return srn.read_srn(path)
     if colmap.find_model(path) is not None:
-        return colmap.read_colmap(path).views()
+        return colmap.read_colmap(path)
     found = ", ".join(sorted(child.name for child in path.iterdir())[:5]) or "an empty folder"
     raise DataError(path, "transforms.json or another layout of one scene", found, "give one object's folder")
 
@@ -208,19 +225,21 @@ def read_task(path: str | Path) -> Task:
             train_filenames and test_filenames decide, else views alternate), or another layout of one scene.
 
     Returns:
-        The task; its name is the folder's.
-
-    Raises:
-        DataError: anything wrong with a file.
+        The task; its name is the folder's. Anything wrong with a file is a DataError that names it.
     """
+    path = Path(path)
+    with malformed(path, "posed images of one scene"):
+        return _read_posed_task(path).task()
+
+
+def _read_posed_task(path: Path) -> PosedTask:
     from hyperplanes.data import npz, srn
 
-    path = Path(path)
     if path.is_file() and path.suffix == ".npz":
-        return PosedTask.alternating(npz.read_npz(path), path.stem).task()
+        return PosedTask.alternating(npz.read_npz(path), path.stem)
     if path.is_dir() and srn.is_srn(path):
-        return PosedTask.alternating(srn.read_srn(path), path.name).task()
+        return PosedTask.alternating(srn.read_srn(path), path.name)
     folder = path.parent if path.is_file() else path
     if not folder.is_dir():
         raise DataError(path, "a folder with posed images", "nothing", "check the path")
-    return read_posed_task(folder, posed_folder(folder).splits["test"][0]).task()
+    return read_posed_task(folder, posed_folder(folder).splits["test"][0])
