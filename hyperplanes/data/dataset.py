@@ -19,6 +19,7 @@ from hyperplanes.views import Task, Views
 __all__ = ["Dataset", "Datasets", "open_dataset", "open_datasets", "read_task", "read_views"]
 
 DEFAULT_BUDGET = 2 * 2**30
+EXAMPLES = Path(__file__).parent.parent / "examples"  # a folder a scene, by its name
 
 
 class Dataset:
@@ -189,15 +190,23 @@ def read_views(path: str | Path) -> Views:
 
     Args:
         path: a transforms*.json, or a folder that holds some, an SRN object's folder, a COLMAP model, or the .npz of
-            one object. Of a folder with transforms_train, _val and _test files, all are read.
+            one object. Of a folder with transforms_train, _val and _test files, all are read. "example-car" comes with
+            the package.
 
     Returns:
         The views in the order of the files; masks where the files have alpha. Anything wrong with a file is a
         DataError that names it.
     """
-    path = Path(path)
+    path = _located(path)
     with malformed(path, "posed images of one scene"):
         return _read_scene(path).views()
+
+
+def _located(path: str | Path) -> Path:
+    """The path, or where a bare name stands for nothing else, the scene of that name that comes with the package."""
+    path = Path(path)
+    packaged = EXAMPLES / path.name
+    return packaged if len(path.parts) == 1 and not path.exists() and packaged.is_dir() else path
 
 
 def _read_scene(path: Path) -> Posed:
@@ -223,11 +232,12 @@ def read_task(path: str | Path) -> Task:
     Args:
         path: a folder with transforms_train.json and transforms_test.json, or one transforms.json (whose
             train_filenames and test_filenames decide, else views alternate), or another layout of one scene.
+            "example-car" comes with the package.
 
     Returns:
         The task; its name is the folder's. Anything wrong with a file is a DataError that names it.
     """
-    path = Path(path)
+    path = _located(path)
     with malformed(path, "posed images of one scene"):
         return _read_posed_task(path).task()
 

@@ -68,8 +68,13 @@ def change_member(data, draw):
         at = draw.choice([found.start() for found in re.finditer(rb"PK\x01\x02|PK\x03\x04", data)])
         offset = (8 if data[at + 2] == 1 else 6) + 2 * (way == 2)
         return data[: at + offset] + bytes([data[at + offset] ^ 1, data[at + offset + 1]]) + data[at + offset + 2 :]
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+    except Exception:  # damaged before
+        return overwrite(data, draw)
+    if not members:
+        return data
     name = draw.choice(sorted(members))
     members[name] = draw.choice([flip, overwrite, cut, change_number])(members[name], draw)
     out = io.BytesIO()
