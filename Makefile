@@ -5,13 +5,16 @@ USE := $(VENV)/.ready
 DEVELOP := $(VENV)/.ready-dev
 WHAT_DECIDES := pyproject.toml setup.cfg constraints.txt scripts/setup
 
-.PHONY: demo test lint types bench docs clean setup dev
+.PHONY: demo test fuzz lint types bench docs clean setup dev
 
 demo: $(USE)  ## meshes, training, new views and a page about them: runs/demo/report.html
 	$(BIN)/hyperplanes demo $(DEMO)
 
 test: $(DEVELOP)  ## all tests, on the CPU
 	$(BIN)/python -m pytest $(TESTS)
+
+fuzz: $(DEVELOP)  ## 10,000 damaged files are read or refused in one line
+	$(BIN)/python -m tests.fuzz --files 10000 $(FUZZ)
 
 lint: $(DEVELOP)  ## style and docstrings
 	$(BIN)/ruff check .

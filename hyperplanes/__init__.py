@@ -4,8 +4,8 @@ What most programs need is here; a name is imported when it is first used, so `i
 
     import hyperplanes as hp
 
-    model = hp.HyperPlanes.from_pretrained("runs/demo/hyperplanes")
-    task = hp.read_task("runs/demo/data/car_test_00000")
+    model = hp.HyperPlanes.from_pretrained("cars-64")
+    task = hp.read_task("example-car")
     field = model.adapt(task.support)
     pictures = field.render(task.query.cameras)
     hp.save_images(pictures.images, "new_views")

@@ -1,11 +1,16 @@
-"""Weights as safetensors beside a JSON of the configuration; no pickle is ever read."""
+"""Weights as safetensors beside a JSON of the configuration; no pickle is ever read.
+
+Every file carries a checksum of its tensors, and none holds a number that is not finite.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from hyperplanes import files
@@ -17,6 +22,9 @@ __all__ = [
     "read_json",
     "save_tensors",
 ]
+
+CHECKSUM = "sha256"  # entry of the file's own metadata
+LARGEST = 64 * 2**30  # bytes
 
 
 class CheckpointError(ValueError):
@@ -38,10 +46,24 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write named tensors as safetensors, whole or not at all."""
+    """Write named tensors as safetensors, whole or not at all, with their checksum.
+
+    Args:
+        path: the file.
+        tensors: by name.
+
+    Raises:
+        CheckpointError: a number that is not finite; the file that was there stays.
+    """
     from safetensors.torch import save
 
-    files.write_whole(path, save({name: value.detach().cpu().contiguous() for name, value in tensors.items()}))
+    content = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    if (name := _not_finite(content)) is not None:
+        raise CheckpointError(
+            f"{path}: expected finite numbers to save, found NaN or infinity in {name}; nothing was written and what "
+            "was saved before stays; train with lower rates"
+        )
+    files.write_whole(path, save(content, {CHECKSUM: _checksum(content)}))
 
 
 def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
@@ -55,22 +77,50 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
         Tensors by name.
 
     Raises:
-        CheckpointError: no such file, a damaged one, or other names or shapes than expected.
+        CheckpointError: no such file, a damaged one, other names or shapes than expected, tensors that their checksum
+            does not fit (files of other programs have none), or a number that is not finite.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
+    from safetensors import SafetensorError, safe_open
 
     try:
-        found = load_file(path)
+        files.check_regular(path, LARGEST)
+        with safe_open(path, "pt") as file:
+            checksum = (file.metadata() or {}).get(CHECKSUM)
+            found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except FileNotFoundError:
         raise CheckpointError(f"{path}: expected weights, found no file; `hyperplanes train` writes them") from None
-    except (SafetensorError, OSError) as error:
+    except files.DataError as error:
+        raise CheckpointError(str(error)) from None
+    except (SafetensorError, OSError, ValueError, TypeError, RuntimeError) as error:
         raise CheckpointError(
             f"{path}: expected whole safetensors, found a damaged file ({error}); copy it again"
         ) from None
     if expected is not None:
         check_tensors(path, found, expected)
+    if checksum is not None and checksum != _checksum(found):
+        raise CheckpointError(
+            f"{path}: expected the tensors of its checksum {checksum[:12]}, found others; the file has changed since "
+            "it was written: copy it again"
+        )
+    if (name := _not_finite(found)) is not None:
+        raise CheckpointError(f"{path}: expected finite numbers, found NaN or infinity in {name}; train or bake again")
     return {name: value.clone() for name, value in found.items()}  # in memory of its own, as aligned as what was saved
+
+
+def _checksum(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of names, types, shapes and bytes, whatever the order."""
+    result = hashlib.sha256()
+    for name in sorted(tensors):
+        value = tensors[name].contiguous()
+        result.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
+        result.update(value.reshape(-1).view(torch.uint8).numpy())
+    return result.hexdigest()
+
+
+def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
+    """The name of the first tensor with a number that is not finite."""
+    floating = (name for name, value in tensors.items() if value.is_floating_point() or value.is_complex())
+    return next((name for name in floating if not torch.isfinite(tensors[name]).all()), None)
 
 
 def check_tensors(path: Path, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:

@@ -8,8 +8,11 @@ from __future__ import annotations
 import errno
 import inspect
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 
@@ -27,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: what stands after `hyperplanes` on the command line; that of this process where absent.
 
     Returns:
-        The exit code: 0 done, 1 done but something is wrong, 2 wrong input, 130 interrupted.
+        The exit code: 0 done, 1 done but something is wrong, 2 wrong input, 130 interrupted, 143 terminated.
 
     Raises:
         ValueError: wrong input, only where a traceback was asked for.
@@ -49,12 +52,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         module = find_verb(verb).module
     except ValueError as error:
         return _complain(f"hyperplanes: {error}")
+    ended: list[int] = []
     try:
-        return _run(verb, module, rest)
+        with _terminable(ended):
+            return _run(verb, module, rest)
     except KeyboardInterrupt as interrupt:
         advice = str(interrupt) or "the same command goes on where it can"
-        _complain(f"hyperplanes {verb}: interrupted; {advice}")
-        return 130
+        _complain(f"hyperplanes {verb}: {'terminated' if ended else 'interrupted'}; {advice}")
+        return 143 if ended else 130
     except BrokenPipeError:
         sys.stdout = None  # whoever read our output has gone; nothing is left to be flushed to
         return 0
@@ -62,6 +67,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if traceback:
             raise
         return _complain(f"hyperplanes {verb}: {_one_line(error)}")
+
+
+@contextmanager
+def _terminable(ended: list[int]) -> Generator[None]:
+    """SIGTERM, as `kill` and clusters send it, ends a verb as Ctrl-C does; it is noted in `ended`."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, _: object) -> None:
+        ended.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _run(verb: str, name: str, rest: list[str]) -> int:

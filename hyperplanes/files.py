@@ -1,4 +1,4 @@
-"""Reading and writing whole files: checked JSON, safe paths, atomic writes, deterministic PNG."""
+"""Reading and writing whole files: only regular ones, checked JSON, safe paths, atomic writes, one writer a folder."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ import json
 import math
 import os
 import shutil
+import stat
 import struct
+import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +25,16 @@ import numpy.typing as npt
 __all__ = [
     "DataError",
     "WriteError",
+    "check_regular",
     "encode_json",
     "encode_npz",
     "encode_png",
     "inside",
+    "malformed",
+    "one_writer",
+    "read_bytes",
     "read_json",
+    "read_text",
     "sha256",
     "write_folder",
     "write_json",
@@ -38,6 +46,16 @@ _unfinished = itertools.count()
 
 LARGEST_JSON = 256 * 2**20
 """Bytes above which a JSON file is refused unread."""
+
+LARGEST_FILE = 2 * 2**30
+"""Bytes above which any other file that is read whole is refused unread."""
+
+MALFORMED = (
+    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError,
+    NotImplementedError, RecursionError, RuntimeError, TypeError, ValueError, struct.error, zipfile.BadZipFile,
+    zlib.error,
+)  # fmt: skip
+"""What parsers raise where content is not what they took for granted."""
 
 
 class DataError(ValueError):
@@ -74,27 +92,89 @@ class WriteError(DataError, OSError):
         super().__init__(path, f"room to write {size} bytes", found, remedy)
 
 
+@contextmanager
+def malformed(path: str | Path, expected: str) -> Generator[None]:
+    """Turns what parsers raise on content that they did not expect into a DataError that names the file.
+
+    For the few places where bytes become values: a file that nobody foresaw is a wrong input and no fault of the
+    program. DataErrors and errors of the operating system pass as they are.
+
+    Args:
+        path: of what is read within.
+        expected: what it should be.
+
+    Raises:
+        DataError: any of MALFORMED.
+    """
+    try:
+        yield
+    except DataError:
+        raise
+    except MALFORMED as error:
+        found = f"{type(error).__name__} ({error})" if str(error) else type(error).__name__
+        raise DataError(path, expected, f"something else: {found[:200]}", "write or download it again") from error
+
+
+def check_regular(path: str | Path, largest: int = LARGEST_FILE) -> int:
+    """The size in bytes of a regular file, or of what a link to one leads to; FileNotFoundError where there is none.
+
+    Opening a pipe waits for a writer for ever, and reading a device may never end.
+
+    Args:
+        path: the file.
+        largest: bytes above which it is refused.
+
+    Raises:
+        DataError: a folder, pipe, socket or device, or too large a file.
+    """
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+        kind = kinds.get(stat.S_IFMT(found.st_mode), "a device")
+        raise DataError(path, "a regular file", kind, "copy its content into a file")
+    if found.st_size > largest:
+        raise DataError(path, f"at most {largest} bytes", f"{found.st_size}", "is it the right file?")
+    return found.st_size
+
+
+def read_bytes(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
+    """The content of a regular file; as `check_regular`."""
+    check_regular(path, largest)
+    return Path(path).read_bytes()
+
+
+def read_text(path: str | Path, largest: int = LARGEST_JSON) -> str:
+    """The content of a regular file of UTF-8; as `check_regular`, and UnicodeDecodeError where it is no text."""
+    return read_bytes(path, largest).decode("utf-8")
+
+
 def read_json(path: str | Path) -> dict[str, Any]:
     """The JSON object in a file.
 
     Raises:
-        DataError: no such file, too large, not JSON, not an object.
+        DataError: no such file, not a regular one, too large, not JSON, not an object, or a whole number beyond 64
+            bits, which neither NumPy nor PyTorch has.
     """
     path = Path(path)
     try:
-        size = path.stat().st_size
-        if size > LARGEST_JSON:
-            raise DataError(path, f"at most {LARGEST_JSON} bytes", f"{size}", "is it really a JSON file?")
-        value = json.loads(path.read_bytes())
+        value = json.loads(read_bytes(path, LARGEST_JSON), parse_int=_whole_number)
+    except DataError:
+        raise
     except FileNotFoundError as error:
         raise DataError(path, "a JSON file", "nothing", "check the path") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError, OverflowError) as error:
         raise DataError(path, "valid JSON", str(error), "write or download the file again") from error
     except OSError as error:
         raise DataError(path, "a readable file", error.strerror or str(error), "check its permissions") from error
     if not isinstance(value, dict):
         raise DataError(path, "a JSON object", f"a {type(value).__name__}", "check that it is the right file")
     return value
+
+
+def _whole_number(digits: str) -> int:
+    if len(digits) > 20 or not -(2**63) <= int(digits) < 2**63:
+        raise OverflowError(f"a whole number of {len(digits)} digits")
+    return int(digits)
 
 
 def inside(folder: str | Path, relative: str, source: str | Path) -> Path:
@@ -147,11 +227,67 @@ def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None
         except FileNotFoundError:  # looking for the folder every time would cost as much as the file
             path.parent.mkdir(parents=True, exist_ok=True)
             os.replace(temporary, path)
+        if durable:
+            _sync_folder(path.parent)
     except OSError as error:
         raise WriteError(path, len(data), error) from error
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have a rename on the disk too; file systems that cannot open folders do it by themselves."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+@contextmanager
+def one_writer(folder: str | Path) -> Generator[None]:
+    """The time in which nobody else may write into a folder, which is made when absent.
+
+    The lock belongs to the process: it ends with it, however it ends. A file `.lock` stands in the folder meanwhile.
+
+    Args:
+        folder: to write into.
+
+    Raises:
+        DataError: another process at work there, a file in its place, or a folder that cannot be written to.
+    """
+    import fcntl
+
+    folder = Path(folder)
+    path = folder / ".lock"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        while True:
+            lock = open(path, "w")
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if path.exists() and os.path.samestat(os.fstat(lock.fileno()), os.stat(path)):
+                    break
+            except BaseException:
+                lock.close()
+                raise
+            lock.close()  # of a writer that has just finished and taken its file away
+    except BlockingIOError as error:
+        remedy = "wait for it, or name another folder"
+        raise DataError(folder, "a folder of its own", "another hyperplanes at work there", remedy) from error
+    except (FileExistsError, NotADirectoryError) as error:
+        raise DataError(folder, "a folder to write into", "a file", "name another one") from error
+    except OSError as error:
+        found = error.strerror or str(error)
+        raise DataError(folder, "a folder to write into", found, "name another one") from error
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()
+        lock.close()
 
 
 def write_json(path: str | Path, value: object) -> None:
@@ -251,8 +387,6 @@ def encode_npz(arrays: dict[str, npt.NDArray[Any]]) -> bytes:
     >>> encode_npz({"a": np.zeros(3)}) == encode_npz({"a": np.zeros(3)})
     True
     """
-    import zipfile
-
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name, array in arrays.items():

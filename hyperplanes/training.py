@@ -150,6 +150,7 @@ class Trainer:
         self.curve: Curve = []
         self.diagnostics: Diagnostics | None = None
         self.samples: Samples | None = None
+        self.stopping = False  # set by whoever wants `run` to end after the step at hand
         self.names = sorted(data.names("train"))
         if not self.names:
             raise ValueError("data: expected at least one training object, got none")
@@ -177,6 +178,7 @@ class Trainer:
         """Train until the last step, reporting every 25 steps; checkpoints are written on the way and at the end.
 
         With them come curve.csv and samples/STEP.png, held-out views beside the truth.
+        Once `stopping` is set, the step at hand is the last one, and a checkpoint of it is written.
 
         Yields:
             Where the training stands.
@@ -205,13 +207,15 @@ class Trainer:
                 row |= {} if seen is None or seen.ssim is None else {"ssim": seen.ssim}
                 row |= diagnostics.as_json() if diagnostics else {}
                 self.curve.append(row)
-            saving = step % self.config.checkpoint_every == 0 or last
+            saving = step % self.config.checkpoint_every == 0 or last or self.stopping
             if self.folder is not None and (look or saving):
                 write_curve(self.folder / "curve.csv", self.curve)
                 if seen is not None:
                     write_whole(self.folder / "samples" / f"{step:08d}.png", encode_png(seen.sheet()))
             if saving:
                 self.save()
+            if self.stopping:
+                return
             if not report:
                 continue
             rays = (step - reported[1]) * self.rays_per_step / max(now - reported[0], 1e-9)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
-from hyperplanes.files import write_json
+from hyperplanes.files import DataError, malformed, write_json
 from hyperplanes.optimisers import Muon
 
 __all__ = ["Curve", "check_model", "load_state", "save_state"]
@@ -84,10 +84,28 @@ def load_state(
     """
     path = folder / "training.json"
     saved = read_json(path)
+    try:
+        with malformed(path, "the state of a training"):
+            return _load(path, saved, model, optimisers, config, free)
+    except DataError as error:
+        raise CheckpointError(str(error)) from error
+
+
+def _load(
+    path: Path,
+    saved: Mapping[str, Any],
+    model: HyperPlanes,
+    optimisers: Sequence[torch.optim.Optimizer],
+    config: Mapping[str, Any],
+    free: Sequence[str],
+) -> tuple[int, Curve]:
+    folder = path.parent
     for name, kind in ENTRIES.items():
         if not isinstance(saved.get(name), kind):
             found = "none" if name not in saved else type(saved[name]).__name__
             raise CheckpointError(f"{path}: expected an entry {name!r} ({kind.__name__}), found {found}; {REMEDY}")
+    if saved["step"] < 0:
+        raise CheckpointError(f"{path}: expected a number of steps, found {saved['step']}; {REMEDY}")
     differing = [name for name in config if name not in free and saved["config"].get(name, ...) != config[name]]
     if differing:
         raise CheckpointError(

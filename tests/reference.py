@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 NEAREST = 1e-4
+BORDER = 0.01  # pixels
 
 
 def project(matrix, point):
@@ -40,9 +41,10 @@ def lookup(points, matrices, images, views=None, background=1.0):
             for axis, size in enumerate((width, height)):
                 inside = min(max(seen[axis], 0.0), size - 1.0)
                 coordinates[p, slot, axis] = 2 * inside / max(size - 1, 1) - 1
-            if 0 <= seen[0] <= width - 1 and 0 <= seen[1] <= height - 1:
+            last = (width - 1, height - 1)
+            if all(-BORDER <= seen[axis] <= last[axis] + BORDER for axis in (0, 1)):
                 valid[p, slot] = True
-                colours[p, slot] = bilinear(images[view], seen[0], seen[1])
+                colours[p, slot] = bilinear(images[view], *(min(max(seen[a], 0.0), float(last[a])) for a in (0, 1)))
     return colours, coordinates, valid
 
 

@@ -161,3 +161,48 @@ def test_what_json_has_no_number_for_is_null(tmp_path):
     assert "Infinity" not in text
     assert "NaN" not in text
     assert read_json(path) == {"psnr": None, "rows": [[None, 1.5]], "down": None}
+
+
+def test_a_changed_number_is_noticed(weights):
+    """Property: whichever bit of the content is flipped, the file is refused."""
+    content = weights.read_bytes()
+    start = 8 + int.from_bytes(content[:8], "little")
+    for at in range(start, len(content)):
+        weights.write_bytes(content[:at] + bytes([content[at] ^ 16]) + content[at + 1 :])
+        assert "has changed since it was written" in complaint(weights, lambda: load_tensors(weights))
+
+
+def test_a_file_without_a_checksum_is_read(weights):
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.ones(2)}, weights)
+    assert torch.equal(load_tensors(weights)["a"], torch.ones(2))
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_numbers_that_are_not_finite_are_neither_written_nor_read(weights, number):
+    from safetensors.torch import save_file
+
+    before = weights.read_bytes()
+    broken = {"whole": torch.ones(2), "layers.3.bias": torch.tensor([0.0, number], dtype=torch.bfloat16)}
+    message = complaint(weights, lambda: save_tensors(weights, broken))
+    assert "NaN or infinity in layers.3.bias; nothing was written" in message
+    assert weights.read_bytes() == before
+    save_file(broken, weights)
+    assert "NaN or infinity in layers.3.bias" in complaint(weights, lambda: load_tensors(weights))
+
+
+@pytest.mark.parametrize("radius", [-1.0, 0.0])
+def test_a_baked_sphere_without_an_inside_is_refused(tmp_path, radius):
+    from safetensors.torch import load_file
+
+    from hyperplanes.fields.baked import BakedField
+    from hyperplanes.geometry import Sphere
+
+    path = tmp_path / "baked.safetensors"
+    index = torch.full((8, 8, 8), -1, dtype=torch.int32)
+    BakedField(index, torch.zeros(0, 28), Sphere()).save(path)
+    assert BakedField.load(path).side == 8
+    save_tensors(path, load_file(path) | {"sphere": torch.tensor([0.0, 0.0, 0.0, radius])})
+    with pytest.raises(CheckpointError, match=r"expected a sphere of positive radius, found -?[01]; bake again"):
+        BakedField.load(path)

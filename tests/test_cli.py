@@ -360,8 +360,9 @@ def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_pa
     first.send_signal(signal.SIGINT)
     _, errors = first.communicate(timeout=120)
     assert first.returncode == 130, errors
-    assert len(errors.strip().splitlines()) == 1
-    assert "the same command goes on" in errors
+    at_once, at_the_end = errors.strip().splitlines()
+    assert at_once == "SIGINT: stopping after this step; once more to stop at once"
+    assert "the same command goes on" in at_the_end
     assert main([*command, str(parts)]) == 0
     assert "going on from step" in capsys.readouterr().out
     assert main([*command, str(whole)]) == 0

@@ -1,5 +1,6 @@
 import csv
 import json
+import signal
 import threading
 from dataclasses import replace
 
@@ -528,3 +529,32 @@ def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stay
         trainer.take_step()
     assert (tmp_path / "model.safetensors").read_bytes() == before
     assert all(value.isfinite().all() for value in trainer.model.parameters())
+
+
+def test_sigterm_ends_a_training_after_its_step_with_a_checkpoint(tmp_path):
+    class Terminated(Trainer):
+        def take_step(self):
+            loss = super().take_step()
+            if self.step == 2:
+                signal.raise_signal(signal.SIGTERM)
+            return loss
+
+    before = signal.getsignal(signal.SIGTERM)
+    trainer = Terminated(small_model(), Balls(test=0), with_(steps=9, checkpoint_every=9), tmp_path)
+    with Console().bar("training") as bar, pytest.raises(KeyboardInterrupt, match="step 2 is saved, the same command"):
+        follow(trainer, bar)
+    assert json.loads((tmp_path / "training.json").read_text())["step"] == 2
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_weights_that_are_not_finite_are_not_saved(tmp_path):
+    trainer = Trainer(small_model(), Balls(test=0), with_(steps=4), tmp_path)
+    trainer.take_step()
+    trainer.save()
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with torch.no_grad():
+        next(iter(trainer.model.networks.parameters()))[0] = float("nan")
+    trainer.step = 2
+    with pytest.raises(ValueError, match=r"training-00000002.*expected finite numbers to save, found NaN .* model\."):
+        trainer.save()
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -40,7 +40,15 @@ def test_it_holds_the_packages_and_nothing_else(wheel):
         if path.suffix == ".py" and (path.parent / "__init__.py").exists()
     }
     models = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/pretrained").glob("*/*.*")}
-    assert found == there | {"hyperplanes/demo/style.css", *PACKAGED} | models
+    examples = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/examples").rglob("*.*")}
+    assert found == there | {"hyperplanes/demo/style.css", *PACKAGED} | models | examples
+
+
+def test_the_example_is_whole_and_small(wheel):
+    """What the README's first lines read, so that they run from the wheel alone: 50 views in less than 300 KiB."""
+    files = [entry for entry in wheel.infolist() if entry.filename.startswith("hyperplanes/examples/example-car/")]
+    assert sum(entry.filename.endswith(".png") for entry in files) == 50
+    assert sum(entry.file_size for entry in files) < 300 * 2**10
 
 
 def test_its_metadata(wheel):

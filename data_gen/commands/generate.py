@@ -61,7 +61,7 @@ class Arguments:
         engine: Worker processes of this machine, or a Ray cluster.
         supersample: Samples along a side of a pixel, each of them shaded.
         renderer: pyrender-egl, pyrender-osmesa or embree; the best that works here when not given.
-        verify: Compare all files with their checksums; objects of an interrupted call whose files differ are made anew.
+        verify: Compare all files with their checksums at the end, as objects of an interrupted call always are.
     """
 
     out: Path

@@ -126,7 +126,6 @@ class GenerationConfig:
         renderer: a name in `data_gen.rendering.renderers.RENDERERS`; the best that works here when None.
         timeout: seconds an object may take.
         recycle: objects after which a worker is replaced.
-        verify: compare files of an earlier call with their checksums, and make objects anew where they differ.
     """
 
     rig: str = "fixed"
@@ -145,7 +144,6 @@ class GenerationConfig:
     renderer: str | None = None
     timeout: float = 300.0
     recycle: int = 200
-    verify: bool = False
 
     def resolve(self) -> RenderConfig:
         """Check everything, and settle what was left open: by the layout, else by the preset, else by default.

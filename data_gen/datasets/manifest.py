@@ -7,6 +7,7 @@ datasets are not; so what exists, with its checksums, is kept here as one JSON.
 from __future__ import annotations
 
 import fcntl
+import os
 import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from data_gen.datasets.sources import Item
-from hyperplanes.files import DataError, encode_json, inside, read_json, sha256, write_whole
+from hyperplanes.files import DataError, encode_json, inside, malformed, read_bytes, read_json, sha256, write_whole
 
 __all__ = ["FORMAT", "MANIFEST", "GenerationState", "Verification", "build_manifest", "verify"]
 
@@ -102,12 +103,14 @@ def verify(folder: str | Path) -> Verification:
         folder: the data set.
 
     Returns:
-        What is missing or changed.
-
-    Raises:
-        DataError: no manifest, or one without checksums.
+        What is missing or changed. DataError where there is no manifest, or one without checksums.
     """
     folder = Path(folder)
+    with malformed(folder / MANIFEST, "a manifest"):
+        return _verify(folder)
+
+
+def _verify(folder: Path) -> Verification:
     objects = read_json(folder / MANIFEST).get("objects")
     if not isinstance(objects, dict):
         raise DataError(folder / MANIFEST, "objects with checksums", "none", "it was not made by hyperplanes generate")
@@ -118,7 +121,7 @@ def verify(folder: str | Path) -> Verification:
             path = inside(folder, name, folder / MANIFEST)
             if not path.is_file():
                 missing.append(name)
-            elif sha256(path.read_bytes()) != checksum:
+            elif sha256(read_bytes(path)) != checksum:
                 changed.append(name)
     return Verification(count, missing, changed)
 
@@ -174,20 +177,27 @@ class GenerationState:
         if self._lock is not None:
             self._lock.close()
 
-    def done(self, *, verified: bool = False) -> dict[str, Entry]:
-        """The finished objects, by name, of which all files are there.
+    def done(self) -> dict[str, Entry]:
+        """The finished objects, by name, of which all files are as they were written, by their checksums.
 
-        Args:
-            verified: only those whose files are as they were written, by their checksums.
+        An object without its files, or with files that a power failure has emptied, is made anew.
 
         Returns:
             What was noted of each when it was finished.
         """
+        with malformed(self.out, "an unfinished data set"):
+            entries = self._entries()
+            return {
+                name: entry
+                for name, entry in entries.items()
+                if all(self._is_intact(path, checksum) for path, checksum in entry["files"].items())
+            }
 
-        def is_intact(name: str, checksum: str) -> bool:
-            path = inside(self.out, name, self.out / MANIFEST)
-            return path.is_file() and (not verified or sha256(path.read_bytes()) == checksum)
+    def _is_intact(self, name: str, checksum: str) -> bool:
+        path = inside(self.out, name, self.out / MANIFEST)
+        return path.is_file() and sha256(read_bytes(path)) == checksum
 
+    def _entries(self) -> dict[str, Entry]:
         entries = {}
         manifest = self.out / MANIFEST
         if manifest.is_file():
@@ -195,20 +205,20 @@ class GenerationState:
                 files = record.pop("files", {})
                 entries[name] = {"name": name, "record": record, "files": files}
         for path in sorted((self.folder / "done").glob("*.json")):
-            entries[path.stem] = read_json(path)
-        return {
-            name: entry
-            for name, entry in entries.items()
-            if all(is_intact(path, checksum) for path, checksum in entry["files"].items())
-        }
+            with suppress(DataError):  # a note that was not whole on the disk when the power went
+                entries[path.stem] = read_json(path)
+        return {name: entry for name, entry in entries.items() if isinstance(entry.get("files"), dict)}
 
     def finish(self, manifest: dict[str, Any], others: dict[str, bytes]) -> None:
         """Write what describes the whole, and remove the state of the work.
+
+        Everything is put on the disk first: waiting for each of many small files would take longer than making them.
 
         Args:
             manifest: of the data set.
             others: further files of the layout, relative path to content.
         """
+        os.sync()
         for name, content in others.items():
             write_whole(self.out / name, content, self.scratch)
         write_whole(self.out / MANIFEST, encode_json(manifest), self.scratch)

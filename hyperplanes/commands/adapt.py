@@ -50,6 +50,13 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Adapt and write the weights."""
+    from hyperplanes.files import one_writer
+
+    with one_writer(arguments.out):
+        return _run(arguments)
+
+
+def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.pretrained import adapted_model, load_model
     from hyperplanes.devices import choose_device

@@ -67,6 +67,15 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
 
 def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
+    from hyperplanes.files import one_writer
+
+    if arguments.out.is_dir():
+        raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")
+    with one_writer(arguments.out.parent):
+        return _run(arguments)
+
+
+def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.pretrained import load_model
     from hyperplanes.baking import BakedScene, bake
     from hyperplanes.devices import choose_device

@@ -86,6 +86,13 @@ def settings_of(arguments: Arguments) -> DemoSettings:
 
 def run(arguments: Arguments) -> int:
     """All stages, each skipped when it is done."""
+    from hyperplanes.files import one_writer
+
+    with one_writer(arguments.out):
+        return _run(arguments)
+
+
+def _run(arguments: Arguments) -> int:
     from hyperplanes.demo.pipeline import stages
     from hyperplanes.demo.stages import Stages
 

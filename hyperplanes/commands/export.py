@@ -61,6 +61,13 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Adapt and write what was asked for."""
+    from hyperplanes.files import one_writer
+
+    with one_writer(arguments.out):
+        return _run(arguments)
+
+
+def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.pretrained import load_model
     from hyperplanes.devices import choose_device
     from hyperplanes.export import extract_mesh, save_images, save_mesh, save_turntable

@@ -89,6 +89,13 @@ def after_steps(taken: Sequence[int]) -> str:
 
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
+    from hyperplanes.files import one_writer
+
+    with one_writer(arguments.out):
+        return _run(arguments)
+
+
+def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.pretrained import load_model
     from hyperplanes.devices import choose_device

@@ -1,8 +1,9 @@
 """Train a model on a data set; what `generate` writes, or any other layout that `inspect` can read.
 
 The model is looked at on held-out objects now and then. Checkpoints are written to --out on the way; interrupted, the
-same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once. Beside the weights
-lie config.yaml, which --config takes, curve.csv, and samples/ with held-out views beside the truth.
+same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once; SIGTERM, as a
+cluster sends it, stops after a checkpoint too. Beside the weights lie config.yaml, which --config takes, curve.csv, and
+samples/ with held-out views beside the truth.
 
 Every field of the model and of the training is an option too, such as --model.hypernetwork.views 3 or
 --training.learning-rate 1e-3; `hyperplanes presets quick` prints all of them with their values, as a file for --config.
@@ -107,20 +108,21 @@ def progress_line(progress: Progress, best: float | None = None) -> str:
 
 
 @contextmanager
-def _polite_interrupt() -> Generator[list[int]]:
-    """The first Ctrl-C is only noted, the second one is a KeyboardInterrupt."""
-    noted: list[int] = []
+def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[None]:
+    """The first Ctrl-C or SIGTERM ends the training after its step, the second one is a KeyboardInterrupt."""
 
     def note(number: int, _: object) -> None:
-        if noted:
+        if trainer.stopping:
             raise KeyboardInterrupt
-        noted.append(number)
+        trainer.stopping = True
+        bar.warn(f"{signal.Signals(number).name}: stopping after this step; once more to stop at once")
 
-    before = signal.signal(signal.SIGINT, note)
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield noted
+        yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None:
@@ -137,7 +139,7 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
     from hyperplanes.adaptation.diagnostics import SMALLEST_SPREAD
 
     quality = None
-    with _polite_interrupt() as interrupted:
+    with _polite_interrupt(trainer, bar):
         warned = False
         for progress in trainer.run():
             quality = progress.psnr if progress.psnr is not None else quality
@@ -154,9 +156,8 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
                         "object; see docs/hypernetwork.md for options that prevent it"
                     )
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
-            if interrupted and progress.step < progress.steps:
-                trainer.save()
-                raise KeyboardInterrupt(f"step {progress.step} is saved, the same command goes on from there")
+    if trainer.stopping and trainer.step < trainer.config.steps:
+        raise KeyboardInterrupt(f"step {trainer.step} is saved, the same command goes on from there")
 
 
 def resolve(arguments: Arguments) -> tuple[str, Preset]:
@@ -203,6 +204,13 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
 
 def run(arguments: Arguments) -> int:
     """Train, from the start or from where it was interrupted."""
+    from hyperplanes.files import one_writer
+
+    with one_writer(arguments.out):
+        return _run(arguments)
+
+
+def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.pretrained import find_checkpoints
     from hyperplanes.data.dataset import open_datasets
     from hyperplanes.devices import choose_device

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from hyperplanes.data.images import image_size, read_image
 from hyperplanes.data.posed import Posed, check_pose, posed
 from hyperplanes.data.undistort import undistort
-from hyperplanes.files import DataError, inside
+from hyperplanes.files import DataError, inside, read_bytes, read_text
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["find_model", "read_colmap"]
@@ -146,7 +146,7 @@ def _pose(quaternion: npt.NDArray[np.float64], translation: npt.NDArray[np.float
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
-    for line in path.read_text().splitlines():
+    for line in read_text(path).splitlines():
         if not line.startswith("#"):
             yield line.split()
 
@@ -172,7 +172,7 @@ def _images_text(path: Path) -> list[_Image]:
 
 
 def _cameras_binary(path: Path) -> dict[int, _Camera]:
-    data, at = path.read_bytes(), 8
+    data, at = read_bytes(path), 8
     cameras = {}
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
@@ -184,7 +184,7 @@ def _cameras_binary(path: Path) -> dict[int, _Camera]:
 
 
 def _images_binary(path: Path) -> list[_Image]:
-    data, at = path.read_bytes(), 8
+    data, at = read_bytes(path), 8
     images = []
     for _ in range(struct.unpack_from("<Q", data)[0]):
         values = struct.unpack_from("<i7di", data, at)

@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from hyperplanes.data.catalogue import SPLITS
-from hyperplanes.data.posed import PosedTask
+from hyperplanes.data.posed import Posed, PosedTask
 from hyperplanes.data.recognise import find_catalogue, posed_folder, read_posed_task
 from hyperplanes.data.transforms_json import find_transforms, read_transforms
-from hyperplanes.files import DataError
+from hyperplanes.files import DataError, malformed
 from hyperplanes.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
 
 __all__ = ["Dataset", "Datasets", "open_dataset", "open_datasets", "read_task", "read_views"]
 
 DEFAULT_BUDGET = 2 * 2**30
+EXAMPLES = Path(__file__).parent.parent / "examples"  # a folder a scene, by its name
 
 
 class Dataset:
@@ -31,12 +32,14 @@ class Dataset:
             that was published with these data has them, instead of at the middle of the pictures.
 
     Raises:
-        DataError: nothing that is known lies there.
+        DataError: nothing that is known lies there, or an object that is listed twice.
     """
 
     def __init__(self, folder: str | Path, budget: int = DEFAULT_BUDGET, *, legacy: bool = False) -> None:
         self.folder = Path(folder)
-        self._catalogue = find_catalogue(self.folder, legacy=legacy)
+        with malformed(self.folder, "a data set or posed images"):
+            self._catalogue = find_catalogue(self.folder, legacy=legacy)
+        _check_apart(self.folder, self._catalogue.splits)
         self._cache: LRUCache[PosedTask] = LRUCache(budget)
         self._lock = threading.Lock()
 
@@ -103,7 +106,8 @@ class Dataset:
             known = self.names()
             some = ", ".join(known[:3]) + (", ..." if len(known) > 3 else "")
             raise DataError(self.folder, f"one of its {len(known)} objects ({some})", repr(name), "check the name")
-        task = self._catalogue.read(name)
+        with malformed(f"{self.folder}, {name}", "an object with posed images"):
+            task = self._catalogue.read(name)
         with self._lock:
             self._cache.add(name, task)
         return task
@@ -115,6 +119,17 @@ class Dataset:
     def __iter__(self) -> Iterator[Task]:
         """The tasks of all splits, one after the other."""
         return (self.task(name) for name in self.names())
+
+
+def _check_apart(folder: Path, splits: Mapping[str, Sequence[str]]) -> None:
+    """Nothing, where every object is in one split, once: what is trained on may not be judged by."""
+    seen: dict[str, str] = {}
+    for split, names in splits.items():
+        for name in names:
+            if name in seen:
+                both = f"{name} in {seen[name]} and in {split}" if seen[name] != split else f"{name} twice in {split}"
+                raise DataError(folder, "every object in one split", both, "take it out of one of them")
+            seen[name] = split
 
 
 def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET, *, legacy: bool = False) -> Dataset:
@@ -193,27 +208,38 @@ def read_views(path: str | Path) -> Views:
 
     Args:
         path: a transforms*.json, or a folder that holds some, an SRN object's folder, a COLMAP model, or the .npz of
-            one object. Of a folder with transforms_train, _val and _test files, all are read.
+            one object. Of a folder with transforms_train, _val and _test files, all are read. "example-car" comes with
+            the package.
 
     Returns:
-        The views in the order of the files; masks where the files have alpha.
-
-    Raises:
-        DataError: anything wrong with a file.
+        The views in the order of the files; masks where the files have alpha. Anything wrong with a file is a
+        DataError that names it.
     """
+    path = _located(path)
+    with malformed(path, "posed images of one scene"):
+        return _read_scene(path).views()
+
+
+def _located(path: str | Path) -> Path:
+    """The path, or where a bare name stands for nothing else, the scene of that name that comes with the package."""
+    path = Path(path)
+    packaged = EXAMPLES / path.name
+    return packaged if len(path.parts) == 1 and not path.exists() and packaged.is_dir() else path
+
+
+def _read_scene(path: Path) -> Posed:
     from hyperplanes.data import colmap, npz, srn
 
-    path = Path(path)
     if path.is_file():
-        return (npz.read_npz(path) if path.suffix == ".npz" else read_transforms(path)).views()
+        return npz.read_npz(path) if path.suffix == ".npz" else read_transforms(path)
     if not path.is_dir():
         raise DataError(path, "a transforms*.json or a folder that holds one", "nothing", "check the path")
     if files := find_transforms(path):
-        return read_transforms(files).views()
+        return read_transforms(files)
     if srn.is_srn(path):
-        return srn.read_srn(path).views()
+        return srn.read_srn(path)
     if colmap.find_model(path) is not None:
-        return colmap.read_colmap(path).views()
+        return colmap.read_colmap(path)
     found = ", ".join(sorted(child.name for child in path.iterdir())[:5]) or "an empty folder"
     raise DataError(path, "transforms.json or another layout of one scene", found, "give one object's folder")
 
@@ -224,21 +250,24 @@ def read_task(path: str | Path) -> Task:
     Args:
         path: a folder with transforms_train.json and transforms_test.json, or one transforms.json (whose
             train_filenames and test_filenames decide, else views alternate), or another layout of one scene.
+            "example-car" comes with the package.
 
     Returns:
-        The task; its name is the folder's.
-
-    Raises:
-        DataError: anything wrong with a file.
+        The task; its name is the folder's. Anything wrong with a file is a DataError that names it.
     """
+    path = _located(path)
+    with malformed(path, "posed images of one scene"):
+        return _read_posed_task(path).task()
+
+
+def _read_posed_task(path: Path) -> PosedTask:
     from hyperplanes.data import npz, srn
 
-    path = Path(path)
     if path.is_file() and path.suffix == ".npz":
-        return PosedTask.alternating(npz.read_npz(path), path.stem).task()
+        return PosedTask.alternating(npz.read_npz(path), path.stem)
     if path.is_dir() and srn.is_srn(path):
-        return PosedTask.alternating(srn.read_srn(path), path.name).task()
+        return PosedTask.alternating(srn.read_srn(path), path.name)
     folder = path.parent if path.is_file() else path
     if not folder.is_dir():
         raise DataError(path, "a folder with posed images", "nothing", "check the path")
-    return read_posed_task(folder, posed_folder(folder).splits["test"][0]).task()
+    return read_posed_task(folder, posed_folder(folder).splits["test"][0])

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from hyperplanes.files import DataError
+from hyperplanes.files import DataError, check_regular
 
 __all__ = ["LARGEST_IMAGE", "composite_over_white", "image_size", "read_image"]
 
@@ -81,11 +81,14 @@ def _open(path: Path) -> Image.Image:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            check_regular(path)
             image = Image.open(path)
     except FileNotFoundError as error:
         raise DataError(path, "an image", "nothing", "check the name, or take the frame out") from error
     except Image.DecompressionBombError as error:
         raise DataError(path, f"at most {LARGEST_IMAGE} pixels", "far more", "scale it down") from error
+    except DataError:
+        raise
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(path, "an image", f"something else ({error})", _REMEDY) from error
     if image.height * image.width > LARGEST_IMAGE:

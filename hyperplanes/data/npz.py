@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from hyperplanes.data.catalogue import SPLITS, Catalogue, is_plain
 from hyperplanes.data.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.data.transforms_document import opencv_from_opengl
 from hyperplanes.data.transforms_json import read_transforms, read_transforms_task
-from hyperplanes.files import DataError, read_json
+from hyperplanes.files import MALFORMED, DataError, check_regular, read_json
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["AUTHORS_FOCAL", "catalogue", "read_arrays", "read_npz"]
@@ -88,8 +89,10 @@ def read_arrays(path: str | Path, names: set[str]) -> dict[str, npt.NDArray[Any]
     """
     path = Path(path)
     try:
+        check_regular(path)
         with zipfile.ZipFile(path) as archive:
-            total = sum(entry.file_size for entry in archive.infolist() if entry.filename[:-4] in names)
+            wanted = [entry for entry in archive.infolist() if entry.filename[:-4] in names]
+            total = sum(max(entry.file_size, _claimed_size(archive, entry)) for entry in wanted)
         if total > LARGEST_ARRAY:
             raise DataError(path, f"at most {LARGEST_ARRAY} bytes of arrays", f"{total}", "split it")
         with np.load(path, allow_pickle=False) as arrays:
@@ -98,8 +101,19 @@ def read_arrays(path: str | Path, names: set[str]) -> dict[str, npt.NDArray[Any]
         raise DataError(path, "an .npz file", "nothing", "check the path") from error
     except DataError:
         raise
-    except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError) as error:
+    except MALFORMED + (OSError,) as error:
         raise DataError(path, "an .npz file of plain arrays", str(error), "write or download it again") from error
+
+
+def _claimed_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
+    """The bytes that an array's own header says it has, whatever the archive says."""
+    with archive.open(entry) as member:
+        version = np.lib.format.read_magic(member)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(member)
+    if min(shape, default=0) < 0:
+        raise ValueError(f"an array of shape {shape}")
+    return math.prod(shape) * dtype.itemsize
 
 
 def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -> Catalogue | None:

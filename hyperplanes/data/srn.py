@@ -12,7 +12,7 @@ from hyperplanes.data.bounds import stated_bounds
 from hyperplanes.data.catalogue import Catalogue
 from hyperplanes.data.images import image_size, read_image
 from hyperplanes.data.posed import Posed, PosedTask, check_pose, posed
-from hyperplanes.files import DataError
+from hyperplanes.files import DataError, read_text
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["catalogue", "is_srn", "read_srn"]
@@ -118,7 +118,7 @@ def _white_border(picture: npt.NDArray[np.uint8]) -> bool:
 
 def _numbers(path: Path, count: int) -> npt.NDArray[np.float64]:
     try:
-        values = np.array(path.read_text().split(), dtype=np.float64)
+        values = np.array(read_text(path).split(), dtype=np.float64)
     except FileNotFoundError as error:
         raise DataError(path, f"{count} numbers", "nothing", "download the object again") from error
     except ValueError as error:
@@ -130,7 +130,7 @@ def _numbers(path: Path, count: int) -> npt.NDArray[np.float64]:
 
 def _intrinsics(path: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:
     try:
-        lines = [[float(word) for word in line.split()] for line in path.read_text().splitlines() if line.strip()]
+        lines = [[float(word) for word in line.split()] for line in read_text(path).splitlines() if line.strip()]
         focal, centre_x, centre_y = lines[0][:3]
         height, width = (lines[4] if len(lines) > 4 else lines[-1])[:2]
     except (ValueError, IndexError, UnicodeDecodeError) as error:

@@ -115,7 +115,8 @@ class BakedField:
         rows = self.values[order[order >= 0].long()]
         low, high = rows[:, 1:].aminmax(dim=0) if len(rows) else 2 * (rows.new_zeros(3 * HARMONICS),)
         coefficients = (rows[:, 1:] - low) / (high - low).clamp_min(1e-12) * 255
-        content = {"occupied": packed, "density": rows[:, 0].half(), "coefficients": coefficients.round().byte()}
+        density = rows[:, 0].clamp_max(torch.finfo(torch.float16).max).half()
+        content = {"occupied": packed, "density": density, "coefficients": coefficients.round().byte()}
         content |= {"range": torch.stack([low, high])}
         content |= {"sphere": torch.tensor([*self.bounds.centre, self.bounds.radius])}
         save_tensors(Path(path), content)
@@ -131,7 +132,7 @@ class BakedField:
         found = load_tensors(path)
         if {name: value.dtype for name, value in found.items()} != STORED:
             raise CheckpointError(f"{path}: expected a baked field, found tensors {sorted(found)}; `hyperplanes bake`")
-        bits = found["occupied"][:, None].bitwise_and((2 ** torch.arange(8)).to(torch.uint8)).bool().flatten()
+        bits = found["occupied"].reshape(-1, 1).bitwise_and((2 ** torch.arange(8)).to(torch.uint8)).bool().flatten()
         side, rows, numbers = round(len(bits) ** (1 / 3)), int(bits.sum()), 3 * HARMONICS
         shapes = {"density": (rows,), "coefficients": (rows, numbers), "range": (2, numbers), "sphere": (4,)}
         if side**3 != len(bits) or side > LARGEST_SIDE or any(found[n].shape != shape for n, shape in shapes.items()):
@@ -145,4 +146,6 @@ class BakedField:
         index = torch.full((len(bits),), -1, dtype=torch.int32)
         index[bits] = torch.arange(rows, dtype=torch.int32)
         x, y, z, radius = found["sphere"].tolist()
+        if not radius > 0:
+            raise CheckpointError(f"{path}: expected a sphere of positive radius, found {radius:g}; bake again")
         return cls(index.reshape(side, side, side), values, Sphere((x, y, z), radius))

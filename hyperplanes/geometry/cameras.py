@@ -33,6 +33,7 @@ __all__ = [
     "pinhole",
     "projection_matrices",
     "resized",
+    "scale",
     "select",
     "symmetric_intrinsics",
     "to",
@@ -168,6 +169,22 @@ def centres(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
     """Optical centres in the world: -R^T t."""
     pose = camera_from_world(cameras)
     return -(pose[:, :3, :3].mT @ pose[:, :3, 3:]).squeeze(-1)
+
+
+def scale(cameras: PinholeCamera) -> float:
+    """A length that small distances are compared with: how far the cameras stand from their middle, on average.
+
+    Of cameras in one place it is their distance from the world's origin, and 1 where they stand there.
+
+    >>> scale(pinhole(torch.eye(3), orbit(4, 2.0, 0.0), 1, 1))
+    2.0
+    """
+    if not cameras.batch_size:
+        return 1.0
+    eyes = centres(cameras).detach().double()
+    spread = float((eyes - eyes.mean(0)).norm(dim=-1).mean())
+    distance = float(eyes.norm(dim=-1).mean())
+    return spread if spread > 1e-6 * distance else distance or 1.0
 
 
 def viewing_directions(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry import lookup_torch
 from hyperplanes.geometry.distortion import DistortedCamera, distorted_pixels
-from hyperplanes.geometry.lookup import Lookup, lookup
+from hyperplanes.geometry.inputs import Numbers, as_images, as_indices, as_points
+from hyperplanes.geometry.lookup import Lookup, choose, lookup
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.packed_images import PackedImages, pack
 
@@ -27,7 +27,7 @@ class ImagePlanes:
 
     def __init__(
         self,
-        images: Float[Tensor, "view channel height width"],
+        images: Numbers,
         cameras: PinholeCamera,
         background: float = 1.0,
         *,
@@ -37,8 +37,9 @@ class ImagePlanes:
         """Planes from images and their cameras.
 
         Args:
-            images: any number of channels. Three channels in [0, 1] that need no gradient may be read from a copy
-                packed into 32 bits a pixel, exact for 8-bit images and within 1/2046 for others.
+            images: (view, channel, height, width), any number of channels; 8-bit ones are divided by 255. Three
+                channels in [0, 1] that need no gradient may be read from a copy packed into 32 bits a pixel, exact for
+                8-bit images and within 1/2046 for others.
             cameras: one an image, of the images' size.
             background: colour of points outside an image.
             backend: of the lookup; the fastest available where absent.
@@ -47,8 +48,7 @@ class ImagePlanes:
         Raises:
             ValueError: images of another number or size than the cameras, or of another number of dimensions.
         """
-        if images.ndim != 4:
-            raise ValueError(f"images: expected shape (view, channel, height, width), got {tuple(images.shape)}")
+        images = as_images(images)
         if len(images) != cameras.batch_size:
             raise ValueError(f"images: expected one a camera, {cameras.batch_size}, got {len(images)}")
         if len(images) and camera.image_size(cameras) != tuple(images.shape[2:]):
@@ -60,6 +60,7 @@ class ImagePlanes:
         self.background = background
         self.backend = backend
         self.exact = exact
+        self.nearest = MIN_Z * camera.scale(cameras)
         self._packed: tuple[int, PackedImages | None] | None = None
 
     def __len__(self) -> int:
@@ -67,21 +68,26 @@ class ImagePlanes:
 
     def lookup(
         self,
-        points: Float[Tensor, "point 3"],
-        views: Int[Tensor, "point chosen"] | None = None,
+        points: Numbers,
+        views: Numbers | None = None,
         *,
         return_directions: bool = False,
     ) -> Lookup:
         """Projects every point onto the planes and interpolates the colours there.
 
+        A point counts as behind a camera where z in its frame is below 1e-4 of `cameras.scale`, so that a scene gives
+        the same picture in metres and in micrometres.
+
         Args:
-            points: in the world.
-            views: indices of the planes of each point; all planes where absent.
+            points: (point, 3) in the world.
+            views: (point, chosen), indices of the planes of each point; all planes where absent.
             return_directions: also return the direction and distance from each camera.
 
         Returns:
             Colours, coordinates and validity, differentiable in points, images and cameras.
         """
+        points = as_points(points)
+        views = None if views is None else as_indices(views, points, len(self.images))
         matrices = camera.projection_matrices(self.cameras)
         if isinstance(self.cameras, DistortedCamera):
             found = self._lookup_distorted(points, matrices, views)
@@ -92,6 +98,7 @@ class ImagePlanes:
                 self.images,
                 views,
                 background=self.background,
+                nearest=self.nearest,
                 packed=self._packed_images(points),
                 backend=self.backend,
             )
@@ -106,7 +113,7 @@ class ImagePlanes:
     def _lookup_distorted(self, points: Tensor, matrices: Tensor, views: Tensor | None) -> Lookup:
         """The lookup in plain PyTorch; points that a lens cannot show count as behind the camera."""
         assert isinstance(self.cameras, DistortedCamera)
-        ideal, front = lookup_torch.project(points, matrices.to(points), views)
+        ideal, front = lookup_torch.project(points, matrices.to(points), views, self.nearest)
         pixels, shown = distorted_pixels(self.cameras, ideal, views)
         coordinates, valid = lookup_torch.place(pixels, front & shown, *self.images.shape[2:])
         colours = lookup_torch.interpolate(self.images.to(points), coordinates, views)
@@ -115,6 +122,8 @@ class ImagePlanes:
     def _packed_images(self, points: Tensor) -> PackedImages | None:
         """The packed images, made at the first lookup that can use them and again after the images were changed."""
         if self.exact or self.images.requires_grad or self.images.device.type != "cpu" or points.dtype != torch.float32:
+            return None
+        if torch.compiler.is_compiling() or (self.backend or choose(points, self.images)) != "cpu":
             return None
         version = 0 if self.images.is_inference() else self.images._version
         if self._packed is None or self._packed[0] != version:

@@ -6,10 +6,12 @@ import importlib.util
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hyperplanes.geometry import lookup_torch
+from hyperplanes.geometry.inputs import Numbers, as_images, as_indices, as_matrices, as_points, as_tensor
+from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.packed_images import PackedImages
 
 __all__ = ["Backend", "Lookup", "backends", "choose", "lookup", "sample"]
@@ -25,7 +27,9 @@ class Lookup:
         colours: bilinear colours; the background where `valid` is false.
         coordinates: where the point falls on the plane, (column, row) in [-1, 1] from the first pixel's centre to the
             last one's. Clamped to that range for points outside the image, zero for points behind the camera.
-        valid: the point is in front of the camera and inside its image, borders included.
+        valid: the point is in front of the camera and inside its image: between the centres of the outermost pixels,
+            or beyond them by no more than `lookup_torch.BORDER`, a hundredth of a pixel, as rounding may place a point
+            that lies on them. The colour there is that of the border.
         directions: unit vectors from each camera's centre to the point, in the world, or None.
         distances: from each camera's centre to the point, in world units, or None.
     """
@@ -79,26 +83,31 @@ def choose(points: Tensor, images: Tensor) -> str:
 
 
 def lookup(
-    points: Float[Tensor, "point 3"],
-    matrices: Float[Tensor, "view 3 4"],
-    images: Float[Tensor, "view channel height width"],
-    views: Int[Tensor, "point chosen"] | None = None,
+    points: Numbers,
+    matrices: Numbers,
+    images: Numbers,
+    views: Numbers | None = None,
     *,
     background: float = 1.0,
+    nearest: float = MIN_Z,
     packed: PackedImages | None = None,
     backend: str | None = None,
 ) -> Lookup:
     """Projects every point onto planes and interpolates the colours there.
 
-    Differentiable in points, matrices and images; twice with the torch backend. With u = M (x, 1), the pixel is
-    (u_0 / u_2, u_1 / u_2) in integer pixel centres.
+    Differentiable in points, matrices and images, any number of times: a gradient with `create_graph=True` is computed
+    in plain PyTorch, as is all that happens under forward-mode differentiation and the transforms of `torch.func`,
+    which the kernels do not know. With u = M (x, 1), the pixel is (u_0 / u_2, u_1 / u_2) in integer pixel centres.
 
     Args:
-        points: in the world; float32 or float64 for the fast backends. All computations happen in their dtype.
-        matrices: K [R | t] of each plane.
-        images: the planes, any number of channels, none included.
-        views: indices of the planes of each point, the only ones that are computed; all planes where absent.
+        points: (point, 3) in the world; float32 or float64 for the fast backends. All computations happen in their
+            dtype; whole numbers become float32.
+        matrices: (view, 3, 4), K [R | t] of each plane.
+        images: (view, channel, height, width), any number of channels, none included; 8-bit ones are divided by 255.
+        views: (point, chosen), indices of the planes of each point, the only ones that are computed; all planes where
+            absent.
         background: colour of points outside an image.
+        nearest: z in a camera's frame below which a point counts as behind the camera, in world units.
         packed: the same images in 32 bits a pixel, which the CPU backend reads instead for float32 points when no
             gradient with respect to the images is wanted.
         backend: "torch", "cpu" or "triton"; the fastest that takes these tensors where absent.
@@ -107,7 +116,8 @@ def lookup(
         Tensors (point, view, ...), where the second dimension is that of `views` if that is given.
 
     Raises:
-        ValueError: an unknown backend, one that is not available, or an index in `views` of no plane.
+        ValueError: tensors of other shapes or types, an unknown backend, one that is not available or cannot do what
+            is asked, or an index in `views` of no plane.
 
     >>> ramp = torch.arange(4.0).expand(1, 1, 4, 4)
     >>> matrix = torch.tensor([[[2.0, 0.0, 1.5, 0.0], [0.0, 2.0, 1.5, 0.0], [0.0, 0.0, 1.0, 0.0]]])
@@ -115,28 +125,28 @@ def lookup(
     >>> found.colours.item(), found.valid.item()
     (2.0, True)
     """
+    points, images = as_points(points), as_images(images)
+    matrices, images = as_matrices(matrices, len(images)).to(points), images.to(points)
+    views = None if views is None else as_indices(views, points, len(images))
     name = backend or choose(points, images)
-    matrices, images = matrices.to(points), images.to(points)
-    if views is not None:
-        views = views.long()
-        if views.device.type == "cpu" and views.numel() and not 0 <= views.min() <= views.max() < len(images):
-            raise ValueError(
-                f"views: expected indices of {len(images)} planes, got {int(views.min())} to {int(views.max())}"
-            )
+    if name != "torch" and (unknown := lookup_torch.transform_of(points, matrices, images)):
+        if backend is not None:
+            raise ValueError(f"backend: {backend} has no {unknown}; use backend='torch'")
+        name = "torch"
     if name == "torch":
-        return Lookup(*lookup_torch.lookup(points, matrices, images, views, background))
+        return Lookup(*lookup_torch.lookup(points, matrices, images, views, background, nearest))
     if backend is not None:
         _check(backend, points.device)
     from hyperplanes.geometry.kernels import operators
 
     fits = packed is not None and points.dtype == torch.float32 and not images.requires_grad
     words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
-    return Lookup(*operators.lookup(points, matrices, images, words, bits, views, background))
+    return Lookup(*operators.lookup(points, matrices, images, words, bits, views, nearest, background))
 
 
 def sample(
-    images: Float[Tensor, "view channel height width"],
-    coordinates: Float[Tensor, "point view 2"],
+    images: Numbers,
+    coordinates: Numbers,
     *,
     background: float = 1.0,
     packed: PackedImages | None = None,
@@ -147,13 +157,13 @@ def sample(
     Coordinates are those of `Lookup.coordinates`, Kornia's `normalize_pixel_coordinates` and `grid_sample` with
     `align_corners=True`: (column, row), -1 in the first pixel's centre, 1 in the last one's; along an axis of one pixel
     all are that pixel. Outside of [-1, 1], and for NaN, the colour is the background, without gradient; unlike in
-    `grid_sample` nothing is blended with it. Differentiable in images and coordinates; twice with the torch backend.
+    `grid_sample` nothing is blended with it. Differentiable in images and coordinates, as `lookup` is.
 
     Args:
-        images: any number of channels, none included.
-        coordinates: of any strides; fastest where a view's coordinates lie together in memory, in pairs, as the
-            transpose of (view, point, 2), or columns first, as the lookup returns them. All computations happen in
-            their dtype, float32 or float64 for the fast backend.
+        images: (view, channel, height, width), any number of channels, none included; 8-bit ones are divided by 255.
+        coordinates: (point, view, 2), of any strides; fastest where a view's coordinates lie together in memory, in
+            pairs, as the transpose of (view, point, 2), or columns first, as the lookup returns them. All computations
+            happen in their dtype, float32 or float64 for the fast backend.
         background: colour outside.
         packed: the same images in 32 bits a pixel, which the CPU backend reads instead for float32 coordinates when no
             gradient with respect to the images is wanted.
@@ -163,21 +173,26 @@ def sample(
         Colours, planar in memory: (view, channel, point).
 
     Raises:
-        ValueError: coordinates of another shape or of another number of images, or a backend that does not take them.
+        ValueError: images or coordinates of another shape, or a backend that does not take them.
 
     >>> import torch
     >>> ramp = torch.arange(4.0).expand(1, 1, 4, 4)
     >>> sample(ramp, torch.tensor([[[0.0, 0.0]], [[1.0, -1.0]], [[1.1, 0.0]]]), background=9.0).flatten().tolist()
     [1.5, 3.0, 9.0]
     """
-    if images.ndim != 4:
-        raise ValueError(f"images: expected shape (view, channel, height, width), got {tuple(images.shape)}")
+    images, coordinates = as_images(images), as_tensor("coordinates", coordinates)
+    if not coordinates.is_floating_point():
+        coordinates = coordinates.to(torch.get_default_dtype())
     if coordinates.ndim != 3 or coordinates.shape[1:] != (len(images), 2):
         expected = f"(point, {len(images)}, 2), {len(images)} being the number of images"
         raise ValueError(f"coordinates: expected shape {expected}, got {tuple(coordinates.shape)}")
     images = images.to(coordinates)
     fastest = choose(coordinates, images)
     name = backend or ("cpu" if fastest == "cpu" else "torch")
+    if name == "cpu" and (unknown := lookup_torch.transform_of(images, coordinates)):
+        if backend is not None:
+            raise ValueError(f"backend: cpu has no {unknown}; use backend='torch'")
+        name = "torch"
     if name == "torch":
         return lookup_torch.sample(images, coordinates, background)
     if name != "cpu" or fastest != "cpu":

@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.nn.functional import grid_sample
 
-__all__ = ["MIN_Z", "interpolate", "lookup", "place", "project", "sample"]
+__all__ = ["BORDER", "MIN_Z", "interpolate", "lookup", "place", "project", "sample", "transform_of"]
 
-MIN_Z = 1e-4  # z in the camera's frame, in world units; points below it count as behind the camera
+MIN_Z = 1e-4  # z in the camera's frame, in units of the scene's scale; points below it count as behind the camera
+BORDER = 0.01  # pixels by which a point may miss the centres of the outermost pixels, since projections are rounded
 
 
-def project(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[Tensor, Tensor]:
+def transform_of(*tensors: Tensor) -> str | None:
+    """Which of PyTorch's function transforms these tensors are under: neither kernels nor grid_sample know them."""
+    if torch.compiler.is_compiling():
+        return None
+    if torch._C._are_functorch_transforms_active():
+        return "torch.func transforms"
+    if any(forward_ad.unpack_dual(value).tangent is not None for value in tensors):
+        return "forward-mode derivatives"
+    return None
+
+
+def project(points: Tensor, matrices: Tensor, views: Tensor | None, nearest: float = MIN_Z) -> tuple[Tensor, Tensor]:
     """Pixels (point, view, 2), zero behind the camera, and whether the point is in front (point, view)."""
     if views is None:
         homogeneous = (torch.einsum("vij,pj->vpi", matrices[..., :3], points) + matrices[:, None, :, 3]).transpose(0, 1)
@@ -19,7 +32,7 @@ def project(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[Ten
         chosen = matrices[views]
         homogeneous = torch.einsum("pvij,pj->pvi", chosen[..., :3], points) + chosen[..., 3]
     z = homogeneous[..., 2]
-    front = (z > MIN_Z) & (z < torch.inf)
+    front = (z > nearest) & (z < torch.inf)
     pixels = homogeneous[..., :2] / torch.where(front, z, 1.0)[..., None]
     return torch.where(front[..., None], pixels, 0.0), front
 
@@ -27,7 +40,7 @@ def project(points: Tensor, matrices: Tensor, views: Tensor | None) -> tuple[Ten
 def place(pixels: Tensor, front: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Clamped coordinates (point, view, 2) in [-1, 1], zero behind the camera, and validity (point, view)."""
     last = pixels.new_tensor([width - 1, height - 1])
-    valid = front & ((pixels >= 0) & (pixels <= last)).all(-1)
+    valid = front & ((pixels >= -BORDER) & (pixels <= last + BORDER)).all(-1)
     highest = 2 * last.clamp_max(1) - 1  # an axis of one pixel has the one coordinate -1
     coordinates = (pixels * (2 / last.clamp_min(1)) - 1).clamp(-torch.ones_like(last), highest)
     return torch.where(front[..., None], coordinates, 0.0), valid
@@ -35,6 +48,8 @@ def place(pixels: Tensor, front: Tensor, height: int, width: int) -> tuple[Tenso
 
 def interpolate(images: Tensor, coordinates: Tensor, views: Tensor | None) -> Tensor:
     """Bilinear colours (point, view, channel) at coordinates in [-1, 1] from pixel centre to pixel centre."""
+    if views is None and transform_of(images, coordinates):  # which grid_sample does not know
+        views = torch.arange(len(images), device=images.device)[None]
     if views is None:
         grid = coordinates.transpose(0, 1)[:, :, None]
         sampled = grid_sample(images, grid, align_corners=True, padding_mode="border")[..., 0]
@@ -65,10 +80,15 @@ def sample(images: Tensor, coordinates: Tensor, background: float) -> Tensor:
 
 
 def lookup(
-    points: Tensor, matrices: Tensor, images: Tensor, views: Tensor | None, background: float
+    points: Tensor,
+    matrices: Tensor,
+    images: Tensor,
+    views: Tensor | None,
+    background: float,
+    nearest: float = MIN_Z,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colours (point, view, channel), coordinates (point, view, 2) and validity (point, view)."""
-    pixels, front = project(points, matrices, views)
+    pixels, front = project(points, matrices, views, nearest)
     coordinates, valid = place(pixels, front, *images.shape[2:])
     if not valid.numel() or not images.shape[1]:
         return points.new_empty(*valid.shape, images.shape[1]), coordinates, valid

@@ -15,12 +15,14 @@ from torch.nn.functional import max_pool3d, pad
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
-from hyperplanes.geometry.image_planes import MIN_Z
+from hyperplanes.geometry.inputs import Numbers, as_images
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["Occupancy", "ball_extent", "carve", "full"]
+
+LARGEST_SIDE = 1024  # voxels an axis: 1 GiB
 
 
 @dataclass(frozen=True)
@@ -64,14 +66,18 @@ class Occupancy:
 
 
 def full(bounds: Sphere, side: int = 64, device: torch.device | str | None = None) -> Occupancy:
-    """A grid with every voxel occupied."""
+    """A grid with every voxel occupied.
+
+    Raises:
+        ValueError: a side of less than one voxel, or more than can be allocated.
+    """
+    if not 1 <= side <= LARGEST_SIDE:
+        raise ValueError(f"side: expected 1 to {LARGEST_SIDE} voxels, got {side}")
     return Occupancy(torch.ones(side, side, side, dtype=torch.bool, device=device), bounds)
 
 
 @torch.no_grad()
-def carve(
-    masks: Float[Tensor, "view 1 height width"], cameras: PinholeCamera, bounds: Sphere, side: int = 64
-) -> Occupancy:
+def carve(masks: Numbers, cameras: PinholeCamera, bounds: Sphere, side: int = 64) -> Occupancy:
     """The visual hull: voxels that no mask rules out.
 
     A voxel is cleared where some image contains the whole projection of the voxel's bounding ball and no pixel of the
@@ -79,18 +85,25 @@ def carve(
     resolution and wherever the images end, and does not depend on the order of the views.
 
     Args:
-        masks: opacity in [0, 1].
-        cameras: one a mask.
+        masks: (view, 1, height, width), opacity in [0, 1], boolean, or 8 bits.
+        cameras: one a mask, of the masks' size.
         bounds: the region to carve from.
         side: voxels an axis.
 
     Raises:
-        ValueError: cameras with lens distortion.
+        ValueError: cameras with lens distortion, masks of another number or size than the cameras, or an absurd side.
     """
+    masks = as_images(masks, "masks")
+    expected = (cameras.batch_size, 1, *(camera.image_size(cameras) if cameras.batch_size else masks.shape[2:]))
+    if tuple(masks.shape) != expected:
+        raise ValueError(f"masks: expected shape {expected}, one a camera and of its size, got {tuple(masks.shape)}")
+    if not 1 <= side <= LARGEST_SIDE:
+        raise ValueError(f"side: expected 1 to {LARGEST_SIDE} voxels, got {side}")
     if isinstance(cameras, DistortedCamera):
         raise ValueError("cameras: expected pinholes to carve with, got lens distortion; undistort the masks first")
     matrices, calibrations = camera.projection_matrices(cameras).float(), camera.intrinsics(cameras).float()
-    carver = _carve_compiled if masks.device.type == "cpu" and find_spec("numba") else _carve_torch
+    compiled = masks.device.type == "cpu" and find_spec("numba") and masks[0:1].numel() < 2**30  # pixels in 32 bits
+    carver = _carve_compiled if compiled else _carve_torch
     return Occupancy(carver(masks[:, 0] > 0, matrices, calibrations, bounds, side), bounds)
 
 
@@ -131,8 +144,8 @@ def _carve_torch(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: 
 
 
 def _min_z(grid: Occupancy) -> float:
-    """The least z of a voxel centre whose bounding ball lies in front of the camera."""
-    return max(MIN_Z, grid.voxel)
+    """The least z of a voxel centre whose bounding ball, of 0.87 voxels, lies in front of the camera."""
+    return grid.voxel
 
 
 def ball_extent(

@@ -36,19 +36,26 @@ def look_at(
 ) -> Float[Tensor, "view 4 4"]:
     """camera_from_world of cameras at `eyes` that look at `target`, image top towards `up`.
 
-    Where the viewing direction is parallel to `up`, the world's next axis takes its place.
+    Where the viewing direction is parallel to `up`, the world's axis after the one nearest to `up` takes its place.
 
     Raises:
-        ValueError: an eye at the target.
+        ValueError: an eye at the target, a number that is not finite, or an `up` of length zero.
     """
-    forward = eyes.new_tensor(target) - eyes
+    aim, upward = eyes.new_tensor(target), eyes.new_tensor(up)
+    if not (torch.isfinite(eyes).all() and torch.isfinite(aim).all()):
+        raise ValueError(f"eyes: expected finite positions of eyes and target, got NaN or infinity, target {target}")
+    length = upward.norm()
+    if not 0 < float(length) < math.inf:
+        raise ValueError(f"up: expected a direction, got {up}")
+    forward = aim - eyes
     distance = forward.norm(dim=-1, keepdim=True)
-    if (distance < 1e-9).any():
+    if (distance <= 1e-7 * (eyes.norm(dim=-1, keepdim=True) + aim.norm())).any():
         raise ValueError(f"eyes: expected every eye away from the target {target}, got one at it")
-    forward = forward / distance
-    upward = eyes.new_tensor(up).expand_as(eyes)
-    other = upward.roll(1, dims=-1)
-    vertical = torch.linalg.cross(forward, upward).norm(dim=-1, keepdim=True) < 1e-6
+    forward, upward = forward / distance, upward / length
+    axis = int(upward.abs().argmax())
+    other = torch.zeros_like(upward)
+    other[(axis + 1) % 3] = upward[axis].sign()
+    vertical = torch.linalg.cross(forward, upward.expand_as(eyes)).norm(dim=-1, keepdim=True) < 1e-6
     right = torch.linalg.cross(forward, torch.where(vertical, other, upward))
     right = right / right.norm(dim=-1, keepdim=True)
     down = torch.linalg.cross(forward, right)

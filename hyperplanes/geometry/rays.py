@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera, undistorted_pixels
+from hyperplanes.geometry.inputs import Numbers, as_tensor
 
 __all__ = ["Rays", "Sphere", "cast", "pixel_grid"]
 
@@ -21,11 +23,20 @@ class Sphere:
 
     Attributes:
         centre: in world units.
-        radius: in world units.
+        radius: in world units, not negative.
+
+    Raises:
+        ValueError: numbers that are not finite, or a negative radius.
     """
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     radius: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (all(map(math.isfinite, self.centre)) and 0 <= self.radius < math.inf):
+            raise ValueError(
+                f"sphere: expected finite numbers and no negative radius, got {self.centre}, {self.radius}"
+            )
 
     def normalise(self, points: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point 3"]:
         """Points with the sphere moved to the unit sphere."""
@@ -74,8 +85,8 @@ def pixel_grid(height: int, width: int, device: torch.device | str | None = None
 
 def cast(
     cameras: PinholeCamera,
-    view: Int[Tensor, " ray"],
-    pixels: Float[Tensor, "ray 2"],
+    view: Numbers,
+    pixels: Numbers,
     bounds: Sphere | None = None,
     *,
     span: str = "sphere",
@@ -84,8 +95,8 @@ def cast(
 
     Args:
         cameras: a batch (view,).
-        view: index of the camera of each ray.
-        pixels: (column, row) in the image, integer pixel centres; lens distortion is undone.
+        view: (ray,), index of the camera of each ray.
+        pixels: (ray, 2), (column, row) in the image, integer pixel centres; lens distortion is undone.
         bounds: what near and far are taken from; the unit sphere where absent.
         span: "sphere" clips each ray to the sphere (a miss gets near == far); "constant" gives every ray of a camera
             the same near and far, the distance of the sphere's centre minus and plus its radius, as NeRF does.
@@ -94,9 +105,17 @@ def cast(
         Rays with unit directions, differentiable in the cameras.
 
     Raises:
-        ValueError: an unknown `span`.
+        ValueError: an unknown `span`, or views and pixels of other shapes.
     """
     bounds = bounds or Sphere()
+    view, pixels = as_tensor("view", view), as_tensor("pixels", pixels)
+    if view.ndim != 1 or pixels.shape != (len(view), 2) or view.is_floating_point():
+        raise ValueError(
+            "view, pixels: expected whole numbers (ray,) and pixels (ray, 2), got "
+            f"{view.dtype} {tuple(view.shape)} and {tuple(pixels.shape)}"
+        )
+    view = view.to(cameras.extrinsics.device, torch.int64)
+    pixels = pixels if pixels.is_floating_point() else pixels.to(cameras.extrinsics.dtype)
     pose = camera.camera_from_world(cameras)[view]
     matrix = camera.intrinsics(cameras)[view]
     if isinstance(cameras, DistortedCamera):

@@ -23,11 +23,15 @@ def refine(
 ) -> Occupancy:
     """The voxels of a grid in which a field is not empty.
 
-    The density is evaluated at the centre of every occupied voxel. Voxels above the threshold are dilated by `margin`
-    voxels, since a surface may pass between centres, and never beyond the grid that was given. So a voxel is dropped
-    only where it and all its neighbours are empty at their centres: an object thinner than a voxel may be missed, as
-    samples a voxel apart may miss it. A grid with very many occupied voxels (no masks, so no hull) is evaluated at half
-    its resolution first.
+    The density is evaluated at the centre of every occupied voxel, then, in voxels that are to be dropped, at the
+    centres of their eighths, half a voxel apart. Voxels above the threshold are dilated by `margin` voxels and never
+    beyond the grid that was given. What is kept of an object with sharp borders:
+
+    - in a grid of up to 60,000 occupied voxels, such as a visual hull: whatever is at least half a voxel thick;
+    - in a larger one (no masks, so no hull), which is evaluated at half its resolution first: what is two voxels thick,
+      and whatever is half a voxel thick and connected to that, which is followed from neighbour to neighbour.
+
+    Thinner things may be missed, as samples on a ray may miss them.
 
     The threshold is the density at which a ray across the whole sphere would be `opacity_loss` opaque, so haze in many
     voxels counts as much as in one. On cars of 64 pixels a picture then differs from one without refinement by 68 dB
@@ -42,20 +46,49 @@ def refine(
     Returns:
         A grid of the same side and bounds.
     """
-    if occupancy.occupied.shape[0] >= 64 and int(occupancy.occupied.sum()) > COARSE_FIRST:
-        side = occupancy.occupied.shape[0]
-        coarse = refine(_halved(occupancy), density, opacity_loss=opacity_loss, margin=margin).occupied
-        fine = coarse.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)[:side, :side, :side]
-        occupancy = Occupancy(occupancy.occupied & fine, occupancy.bounds)
     threshold = -math.log1p(-opacity_loss) / (2 * occupancy.bounds.radius)
-    points = occupancy.centres()
-    filled = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    for first in range(0, len(points), CHUNK):
-        filled[first : first + CHUNK] = density(points[first : first + CHUNK]) > threshold
-    grid = torch.zeros_like(occupancy.occupied)
-    grid[occupancy.occupied] = filled
-    grown = Occupancy(grid, occupancy.bounds).dilated(margin)
-    return Occupancy(grown.occupied & occupancy.occupied, occupancy.bounds)
+    side, bounds = occupancy.occupied.shape[0], occupancy.bounds
+    asked, large = occupancy.occupied, side >= 64 and int(occupancy.occupied.sum()) > COARSE_FIRST
+    if large:
+        halved = _halved(occupancy)
+        coarse = _dilated(halved, _filled(halved, halved.occupied, density, threshold, 1), margin)
+        asked = (
+            asked & coarse.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)[:side, :side, :side]
+        )
+    filled = _filled(occupancy, asked, density, threshold, 1)
+    kept, divided = _dilated(occupancy, filled, margin), torch.zeros_like(filled)
+    while True:
+        near = Occupancy(kept, bounds).dilated().occupied if large else occupancy.occupied
+        asked = near & occupancy.occupied & ~kept & ~divided
+        if not asked.any():
+            return Occupancy(kept, bounds)
+        divided |= asked
+        found = _filled(occupancy, asked, density, threshold, 2)
+        if not found.any():
+            return Occupancy(kept, bounds)
+        kept = kept | _dilated(occupancy, found, margin)
+
+
+def _filled(
+    grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor], threshold: float, parts: int
+) -> Tensor:
+    """Which of the asked voxels have density above a threshold at the centre of one of parts^3 equal parts."""
+    points = Occupancy(asked, grid.bounds).centres()
+    steps = ((torch.arange(parts, device=points.device) + 0.5) / parts - 0.5) * grid.voxel
+    offsets = torch.cartesian_prod(steps, steps, steps).reshape(-1, 3)
+    found = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    chunk = CHUNK // len(offsets)
+    for first in range(0, len(points), chunk):
+        part = points[first : first + chunk, None] + offsets
+        found[first : first + chunk] = (density(part.reshape(-1, 3)) > threshold).reshape(part.shape[:2]).any(1)
+    filled = torch.zeros_like(asked)
+    filled[asked] = found
+    return filled
+
+
+def _dilated(grid: Occupancy, filled: Tensor, margin: int) -> Tensor:
+    """Filled voxels grown by some, within the grid."""
+    return Occupancy(filled, grid.bounds).dilated(margin).occupied & grid.occupied
 
 
 def _halved(occupancy: Occupancy) -> Occupancy:

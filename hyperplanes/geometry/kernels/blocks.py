@@ -14,6 +14,7 @@ from numba import njit
 
 from hyperplanes.geometry.kernels.compiling import FASTMATH
 from hyperplanes.geometry.kernels.llvm import load, read, store
+from hyperplanes.geometry.lookup_torch import BORDER
 
 __all__ = [
     "BLOCK",
@@ -80,14 +81,14 @@ def place(s, out, column, row, height, width):
 
     Comparisons are written so that NaN becomes 0.
     """
-    one, zero = s.dtype.type(1), s.dtype.type(0)
+    one, zero, border = s.dtype.type(1), s.dtype.type(0), s.dtype.type(BORDER)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
     per_column = s.dtype.type(2) / s.dtype.type(max(width - 1, 1))
     per_row = s.dtype.type(2) / s.dtype.type(max(height - 1, 1))
     for i in range(BLOCK):
         u, v = load(s, RAW_U + i), load(s, RAW_V + i)
         front = load(s, RECIPROCAL + i) > zero
-        inside = front & (u >= zero) & (u <= right) & (v >= zero) & (v <= bottom)
+        inside = front & (u >= -border) & (u <= right + border) & (v >= -border) & (v <= bottom + border)
         u = u if u > zero else zero
         u = u if u < right else right
         v = v if v > zero else zero
@@ -148,39 +149,37 @@ def unnormalize(s, count, values, at, by, height, width):
 @inner
 @no_type_check
 def start_pull(s, height, width):
-    """Gradients of coordinates in COLUMN, ROW -> GRAD_U, GRAD_V; zero where the coordinates were clamped."""
-    zero = s.dtype.type(0)
-    right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
+    """Gradients of coordinates in COLUMN, ROW -> GRAD_U, GRAD_V."""
     per_column = s.dtype.type(2) / s.dtype.type(max(width - 1, 1))
     per_row = s.dtype.type(2) / s.dtype.type(max(height - 1, 1))
     for i in range(BLOCK):
-        u, v = load(s, RAW_U + i), load(s, RAW_V + i)
-        front = load(s, RECIPROCAL + i) > zero
-        free_u = front & (u >= zero) & (u <= right)
-        free_v = front & (v >= zero) & (v <= bottom)
-        store(s, GRAD_U + i, load(s, COLUMN + i) * per_column if free_u else zero)
-        store(s, GRAD_V + i, load(s, ROW + i) * per_row if free_v else zero)
+        store(s, GRAD_U + i, load(s, COLUMN + i) * per_column)
+        store(s, GRAD_V + i, load(s, ROW + i) * per_row)
 
 
 @inner
 @no_type_check
-def back_project(s, points, at, pitch, matrices, view, gradients, sums):
+def back_project(s, points, at, pitch, matrices, view, height, width, gradients, sums):
     """GRAD_U, GRAD_V -> added to the `gradients` of points, laid out like these, and to the view's row of `sums`.
 
-    With h = M (x, 1) and (u, v) = (h0, h1) / h2: dL/dh = (g_u, g_v, -(g_u u + g_v v)) / h2.
+    What was clamped has no gradient. With h = M (x, 1) and (u, v) = (h0, h1) / h2:
+    dL/dh = (g_u, g_v, -(g_u u + g_v v)) / h2.
     """
     m00, m01, m02 = matrices[view, 0, 0], matrices[view, 0, 1], matrices[view, 0, 2]
     m10, m11, m12 = matrices[view, 1, 0], matrices[view, 1, 1], matrices[view, 1, 2]
     m20, m21, m22 = matrices[view, 2, 0], matrices[view, 2, 1], matrices[view, 2, 2]
     zero = s.dtype.type(0)
+    right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
     s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = s20 = s21 = s22 = s23 = zero
     for i in range(BLOCK):
         x, y, z = load(points, at + i), load(points, at + pitch + i), load(points, at + 2 * pitch + i)
         reciprocal = load(s, RECIPROCAL + i)
-        h0, h1 = load(s, GRAD_U + i) * reciprocal, load(s, GRAD_V + i) * reciprocal
-        # Behind the camera RAW_U may be anything, but h0 is zero there only if it is finite.
-        raw_u = load(s, RAW_U + i) if reciprocal > zero else zero
-        raw_v = load(s, RAW_V + i) if reciprocal > zero else zero
+        # Without a gradient RAW_U may be anything, but h2 is zero there only if it is finite.
+        raw_u, raw_v, front = load(s, RAW_U + i), load(s, RAW_V + i), reciprocal > zero
+        free_u, free_v = front & (raw_u >= zero) & (raw_u <= right), front & (raw_v >= zero) & (raw_v <= bottom)
+        raw_u, raw_v = raw_u if free_u else zero, raw_v if free_v else zero
+        h0 = load(s, GRAD_U + i) * reciprocal if free_u else zero
+        h1 = load(s, GRAD_V + i) * reciprocal if free_v else zero
         h2 = -(h0 * raw_u + h1 * raw_v)
         store(gradients, at + i, load(gradients, at + i) + m00 * h0 + m10 * h1 + m20 * h2)
         store(gradients, at + pitch + i, load(gradients, at + pitch + i) + m01 * h0 + m11 * h1 + m21 * h2)

@@ -6,6 +6,7 @@ import functools
 import hashlib
 import importlib
 import os
+import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -70,12 +71,30 @@ def compile_function(function: Callable[..., Any], signature: str | None = None)
         setattr(config, "CACHE_DIR", previous)  # noqa: B010
 
 
+def _is_private(folder: Path) -> bool:
+    """Whether a folder, and no link to one, belongs to this user and others cannot write to it.
+
+    A folder that is this user's and open to others is closed to them.
+    """
+    if not hasattr(os, "getuid"):
+        return True  # Windows: the profile's folders are private
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+        return False
+    if found.st_mode & 0o077:
+        folder.chmod(0o700)
+    return True
+
+
 @functools.cache
 def _cache_folder() -> str:
     """The folder of cached machine code.
 
     Numba notices a change of the file that a function stands in, not of the files of functions it calls: a hash of all
     sources of this folder is part of the name.
+
+    What numba caches it unpickles, which runs what somebody else might have put there: the folder is this user's alone,
+    and where one of another user stands in its place, a new one for this process is taken.
     """
     from numba.core import config
 
@@ -83,8 +102,12 @@ def _cache_folder() -> str:
     base = getattr(config, "CACHE_DIR", "") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "hyperplanes" / f"kernels-{hashlib.sha256(sources).hexdigest()[:12]}"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return str(folder)
+        folder.parent.parent.mkdir(parents=True, exist_ok=True)
+        for part in (folder.parent, folder):
+            part.mkdir(mode=0o700, exist_ok=True)
+        if all(map(_is_private, (folder.parent, folder))):
+            with tempfile.TemporaryFile(dir=folder):
+                return str(folder)
     except OSError:
-        return tempfile.mkdtemp(prefix="hyperplanes-kernels-")
+        pass
+    return tempfile.mkdtemp(prefix="hyperplanes-kernels-")

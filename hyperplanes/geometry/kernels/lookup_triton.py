@@ -14,11 +14,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyperplanes.geometry.lookup_torch import MIN_Z
+from hyperplanes.geometry.lookup_torch import BORDER, MIN_Z
 
 __all__ = ["lookup", "lookup_backward"]
 
 _BLOCK = 128
+_BORDER = tl.constexpr(BORDER)
 
 
 @triton.jit
@@ -53,7 +54,8 @@ def _project(matrices, view, x, y, z, inside_block, min_z):
 @no_type_check
 def _place(u, v, front, height, width):
     """Clamped pixel, its corner and fractions, and whether it is inside."""
-    inside = front & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    across = (u >= -_BORDER) & (u <= width - 1 + _BORDER)
+    inside = front & across & (v >= -_BORDER) & (v <= height - 1 + _BORDER)
     u = tl.minimum(tl.where(u > 0, u, 0.0), width - 1.0)
     v = tl.minimum(tl.where(v > 0, v, 0.0), height - 1.0)
     column = tl.minimum(u.to(tl.int32), tl.maximum(width - 2, 0))
@@ -120,11 +122,11 @@ def _backward(points, matrices, images, views, grad_colours, grad_coordinates, g
         fx, fy = u - column, v - row
         seen = here & inside
         gu, gv = x * 0.0, y * 0.0
+        free_u = here & front & (raw_u >= 0) & (raw_u <= width - 1)
+        free_v = here & front & (raw_v >= 0) & (raw_v <= height - 1)
         # Gradients with respect to the pixel: of the coordinates, then of the interpolation.
         if GEOMETRY:
             at = wide * q0 + slot * q1
-            free_u = here & front & (raw_u >= 0) & (raw_u <= width - 1)
-            free_v = here & front & (raw_v >= 0) & (raw_v <= height - 1)
             gu = 2 * tl.load(grad_coordinates + at, free_u, 0.0) / tl.maximum(width - 1, 1)
             gv = 2 * tl.load(grad_coordinates + at + q2, free_v, 0.0) / tl.maximum(height - 1, 1)
         for channel in tl.static_range(CHANNELS):
@@ -145,7 +147,7 @@ def _backward(points, matrices, images, views, grad_colours, grad_coordinates, g
                 tl.atomic_add(grad_images + offset + below + right, gradient * fx * fy, seen)
         # From the pixel to point and matrix: dL/dh = (g_u, g_v, -(g_u u + g_v v)) / h2.
         if GEOMETRY:
-            h0, h1 = gu * reciprocal, gv * reciprocal
+            h0, h1 = tl.where(free_u, gu, 0.0) * reciprocal, tl.where(free_v, gv, 0.0) * reciprocal
             h2 = -(h0 * tl.where(front, raw_u, 0.0) + h1 * tl.where(front, raw_v, 0.0))
             m = matrices + view * 12
             gx += tl.load(m, here, 0.0) * h0 + tl.load(m + 4, here, 0.0) * h1 + tl.load(m + 8, here, 0.0) * h2
@@ -186,7 +188,7 @@ def _add_sums(to, h, x, y, z):
 
 
 def lookup(
-    points: Tensor, matrices: Tensor, images: Tensor, views: Tensor | None, background: float
+    points: Tensor, matrices: Tensor, images: Tensor, views: Tensor | None, background: float, nearest: float = MIN_Z
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colours (point, view, channel), coordinates (point, view, 2) and validity (point, view), planar in memory."""
     points, matrices, images = points.contiguous(), matrices.contiguous(), images.contiguous()
@@ -199,14 +201,14 @@ def lookup(
         chosen = points if views is None else views.contiguous()
         _forward[(triton.cdiv(total, _BLOCK),)](  # pyright: ignore[reportIndexIssue]
             points, matrices, images, chosen, colours, coordinates, valid.view(torch.uint8), total, slots, height,
-            width, background, MIN_Z, CHANNELS=channels, CHOSEN=views is not None, BLOCK=_BLOCK,
+            width, background, nearest, CHANNELS=channels, CHOSEN=views is not None, BLOCK=_BLOCK,
         )  # fmt: skip
     return colours.permute(2, 0, 1), coordinates.permute(2, 0, 1), valid.T
 
 
 def lookup_backward(
     points: Tensor, matrices: Tensor, images: Tensor, views: Tensor | None, grad_colours: Tensor | None,
-    grad_coordinates: Tensor | None, geometry: bool, pixels: bool,
+    grad_coordinates: Tensor | None, geometry: bool, pixels: bool, nearest: float = MIN_Z,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients with respect to points, matrices and images; empty where not asked for."""
     points, matrices, images = points.contiguous(), matrices.contiguous(), images.contiguous()
@@ -222,7 +224,7 @@ def lookup_backward(
         chosen = points if views is None else views.contiguous()
         _backward[(triton.cdiv(total, _BLOCK),)](  # pyright: ignore[reportIndexIssue]
             points, matrices, images, chosen, colour, coordinate, grad_points, grad_matrices, grad_images,
-            *colour.stride(), *coordinate.stride(), total, slots, height, width, MIN_Z, CHANNELS=channels,
+            *colour.stride(), *coordinate.stride(), total, slots, height, width, nearest, CHANNELS=channels,
             CHOSEN=views is not None, GEOMETRY=geometry, PIXELS=pixels, BLOCK=_BLOCK,
         )  # fmt: skip
     return grad_points, grad_matrices, grad_images

@@ -2,12 +2,12 @@
 
 Registered with `torch.library`, so that autograd, `torch.compile` and fake tensors know them. This file holds shapes
 and autograd for all device types, and how the CPU calls its kernels; `lookup_triton` has those for CUDA, which has no
-kernel of sampling alone. Second derivatives need the plain torch backend.
+kernel of sampling alone. A gradient that is itself to be differentiated is computed in plain PyTorch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,15 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hyperplanes.geometry import lookup_torch
 from hyperplanes.geometry.kernels import memory
+from hyperplanes.geometry.kernels.checks import check_gradient, check_lookup, check_sample
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
-from hyperplanes.geometry.lookup_torch import MIN_Z
 
 __all__ = ["lookup", "lookup_backward", "sample", "sample_backward"]
 
 _CHUNK = 64 * memory.BLOCK  # points in one call of a kernel
-_PLANES = "Tensor points, Tensor matrices, Tensor images, Tensor? packed, int bits, Tensor? views"
+_PLANES = "Tensor points, Tensor matrices, Tensor images, Tensor? packed, int bits, Tensor? views, float nearest"
 _SAMPLED = "Tensor images, Tensor coordinates, Tensor? packed, int bits"
 _GRADIENTS = "Tensor? grad_colours, Tensor? grad_coordinates, bool geometry, bool pixels"
 _CPU: dict[str, Any] = {"mutates_args": (), "device_types": "cpu"}
@@ -117,9 +118,10 @@ def _grouped(views: np.ndarray, planes: int) -> tuple[np.ndarray, np.ndarray, in
 )
 def lookup(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
-    background: float,
+    nearest: float, background: float,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Colours (point, view, channel), coordinates (point, view, 2) and validity (point, view), planar in memory."""
+    check_lookup(points, matrices, images, packed, bits, views)
     results = _empty(points, images, views)
     if not results[2].numel():
         return results
@@ -130,7 +132,7 @@ def lookup(
         sizes, kinds = (images.shape[1], 2, 1), (number, number, np.uint8)
         outputs = [np.empty(size * where.total, kind) for size, kind in zip(sizes, kinds, strict=True)]
     kernel = compile_kernel("lookup_forward.forward", points.dtype, "projected")
-    fixed = (*where.arguments, *memory.planes(images, packed, bits), number(background), number(MIN_Z), *outputs)
+    fixed = (*where.arguments, *memory.planes(images, packed, bits), number(background), number(nearest), *outputs)
     where.run(lambda part: kernel(*fixed, views is not None, part), len(images), False, packed is not None)
     if views is not None:
         for result, output in zip(results, outputs, strict=True):
@@ -144,10 +146,13 @@ def lookup(
 )
 def lookup_backward(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
-    grad_colours: Tensor | None, grad_coordinates: Tensor | None, geometry: bool, pixels: bool,
+    nearest: float, grad_colours: Tensor | None, grad_coordinates: Tensor | None, geometry: bool, pixels: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients with respect to points, matrices and images; empty where not asked for."""
+    check_lookup(points, matrices, images, packed, bits, views)
     shape = (len(points), len(images) if views is None else views.shape[1])
+    check_gradient("grad_colours", grad_colours, (*shape, images.shape[1]), points)
+    check_gradient("grad_coordinates", grad_coordinates, (*shape, 2), points)
     grad_points, grad_matrices = (value.new_zeros(value.shape if geometry else 0) for value in (points, matrices))
     memory_, grad_images = memory.pixel_gradient(images) if pixels else (None, points.new_empty(0))
     if not (shape[0] and shape[1]):
@@ -159,25 +164,26 @@ def lookup_backward(
         coordinate = where.incoming(zero.expand(*shape, 2) if grad_coordinates is None else grad_coordinates)
         rows = np.zeros_like(where.arguments[0])
         planes = memory.planes(images, packed, bits)
-        sums = _backward(where, planes, colour, coordinate, rows, len(matrices), packed is not None)
+        sums = _backward(where, planes, nearest, colour, coordinate, rows, len(matrices), packed is not None)
         rows = rows.reshape(3, -1)
         if where.position is not None:
             rows = rows[:, where.position].reshape(3, *shape).sum(2)
         grad_points = torch.from_numpy(np.ascontiguousarray(rows[:, : len(points)].T))
         grad_matrices = torch.from_numpy(sums).to(matrices).reshape(matrices.shape)
     if memory_ is not None:
-        _image_backward(where, images, colour, memory_)
+        _image_backward(where, images, nearest, colour, memory_)
     return grad_points, grad_matrices, grad_images
 
 
 @torch.library.custom_op("hyperplanes::sample", schema=f"({_SAMPLED}, float background) -> Tensor", **_CPU)
 def sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bits: int, background: float) -> Tensor:
     """Colours (point, view, channel), planar in memory."""
+    check_sample(images, coordinates, packed, bits)
     colours = _planar(coordinates, coordinates.shape[1], images.shape[1])
     if colours.numel():
         where, number = _Points.given(coordinates), memory.number(coordinates)
         kernel = compile_kernel("lookup_forward.forward", coordinates.dtype, "given")
-        fixed = (*where.arguments, *memory.planes(images, packed, bits), number(background), number(MIN_Z))
+        fixed = (*where.arguments, *memory.planes(images, packed, bits), number(background), number(0))
         fixed += (memory.flat(colours), np.zeros(0, number), np.zeros(0, np.uint8), False)
         where.run(lambda part: kernel(*fixed, part), len(images), False, packed is not None)
     return colours
@@ -193,6 +199,8 @@ def sample_backward(
     pixels: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Gradients with respect to images and coordinates; empty where not asked for."""
+    check_sample(images, coordinates, packed, bits)
+    check_gradient("grad_colours", grad_colours, (*coordinates.shape[:2], images.shape[1]), coordinates)
     memory_, grad_images = memory.pixel_gradient(images) if pixels else (None, images.new_empty(0))
     if not grad_colours.numel():
         return grad_images, coordinates.new_zeros(coordinates.shape if geometry else 0)
@@ -202,19 +210,19 @@ def sample_backward(
     if geometry:
         none = where.incoming(coordinates.new_zeros(()).expand(coordinates.shape))
         planes = memory.planes(images, packed, bits)
-        _backward(where, planes, colour, none, memory.flat(grad_coordinates), 0, packed is not None)
+        _backward(where, planes, 0.0, colour, none, memory.flat(grad_coordinates), 0, packed is not None)
     if memory_ is not None:
-        _image_backward(where, images, colour, memory_)
+        _image_backward(where, images, 0.0, colour, memory_)
     return grad_images, grad_coordinates
 
 
 def _backward(
-    where: _Points, planes: tuple[Any, ...], colour: Any, coordinate: Any, result: np.ndarray, matrices: int,
-    packed: bool,
+    where: _Points, planes: tuple[Any, ...], nearest: float, colour: Any, coordinate: Any, result: np.ndarray,
+    matrices: int, packed: bool,
 ) -> np.ndarray:  # fmt: skip
     """Fills the gradient of points or coordinates; returns that of the matrices, (view, 12)."""
     kernel = compile_kernel("lookup_backward.backward", where.like.dtype, where.kind)
-    fixed = (*where.arguments, *planes, memory.number(where.like)(MIN_Z), *colour, *coordinate, result)
+    fixed = (*where.arguments, *planes, memory.number(where.like)(nearest), *colour, *coordinate, result)
 
     def work(part: np.ndarray) -> np.ndarray:
         sums = np.zeros((matrices, 12))
@@ -224,10 +232,10 @@ def _backward(
     return sum(where.run(work, len(planes[0]), False, packed), np.zeros((matrices, 12)))
 
 
-def _image_backward(where: _Points, images: Tensor, colour: Any, result: np.ndarray) -> None:
+def _image_backward(where: _Points, images: Tensor, nearest: float, colour: Any, result: np.ndarray) -> None:
     """Fills the memory of the gradient of images."""
     kernel = compile_kernel("lookup_backward.image_backward", where.like.dtype, where.kind)
-    fixed = (*where.arguments, *images.shape[2:], memory.number(where.like)(MIN_Z), *colour)
+    fixed = (*where.arguments, *images.shape[2:], memory.number(where.like)(nearest), *colour)
     fixed += (images.shape[1], memory.pixel_pitch(images.shape[1]), result)
     where.run(lambda part: kernel(*fixed, part), len(images), True)
 
@@ -246,11 +254,11 @@ def _planar(points: Tensor, slots: int, numbers: int) -> Tensor:
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    points, matrices, images, packed, bits, views, _ = inputs
+    points, matrices, images, packed, bits, views, nearest, _ = inputs
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(output[-1])
     ctx.save_for_backward(points, matrices, images, packed, views)
-    ctx.bits = bits
+    ctx.bits, ctx.nearest = bits, nearest
 
 
 def _gradients(
@@ -259,12 +267,16 @@ def _gradients(
     points, matrices, images, packed, views = ctx.saved_tensors
     geometry, pixels = ctx.needs_input_grad[0] or ctx.needs_input_grad[1], ctx.needs_input_grad[2]
     if grad_colours is None and grad_coordinates is None:
-        return (None,) * 7
-    found = lookup_backward(
-        points, matrices, images, packed, ctx.bits, views, grad_colours, grad_coordinates, geometry, pixels
-    )
+        return (None,) * 8
     wanted = ctx.needs_input_grad[:3]
-    return *(value if needed else None for value, needed in zip(found, wanted, strict=True)), *(None,) * 4
+    if torch.is_grad_enabled():
+        outputs = lookup_torch.lookup(points, matrices, images, views, 0.0, ctx.nearest)[:2]
+        found = _plain_gradients(outputs, (points, matrices, images), wanted, (grad_colours, grad_coordinates))
+        return *found, *(None,) * 5
+    found = lookup_backward(
+        points, matrices, images, packed, ctx.bits, views, ctx.nearest, grad_colours, grad_coordinates, geometry, pixels
+    )
+    return *(value if needed else None for value, needed in zip(found, wanted, strict=True)), *(None,) * 5
 
 
 def _sample_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -276,8 +288,25 @@ def _sample_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 def _sample_gradients(ctx: Any, grad_colours: Tensor) -> tuple[Tensor | None, ...]:
     images, coordinates, packed = ctx.saved_tensors
     pixels, geometry = ctx.needs_input_grad[:2]
+    if torch.is_grad_enabled():
+        output = lookup_torch.sample(images, coordinates, 0.0)
+        found = _plain_gradients((output,), (images, coordinates), (pixels, geometry), (grad_colours,))
+        return *found, None, None, None
     found = sample_backward(images, coordinates, packed, ctx.bits, grad_colours, geometry, pixels)
     return found[0] if pixels else None, found[1] if geometry else None, None, None, None
+
+
+def _plain_gradients(
+    outputs: tuple[Tensor, ...], inputs: tuple[Tensor, ...], wanted: Sequence[bool], pulls: tuple[Tensor | None, ...]
+) -> list[Tensor | None]:
+    """Gradients that can be differentiated again (`create_graph`), by autograd through the plain backend."""
+    pairs = [(out, pull) for out, pull in zip(outputs, pulls, strict=True) if pull is not None and out.requires_grad]
+    leaves = [value for value, needed in zip(inputs, wanted, strict=True) if needed]
+    if not pairs or not leaves:
+        return [None] * len(inputs)
+    results = [list(each) for each in zip(*pairs, strict=True)]
+    found = iter(torch.autograd.grad(results[0], leaves, results[1], create_graph=True, allow_unused=True))
+    return [next(found) if needed else None for needed in wanted]
 
 
 def _fake_image_gradient(images: Tensor, like: Tensor, pixels: bool) -> Tensor:
@@ -292,12 +321,12 @@ def _fake_image_gradient(images: Tensor, like: Tensor, pixels: bool) -> Tensor:
 
 
 @lookup.register_fake
-def _(points, matrices, images, packed, bits, views, background):
+def _(points, matrices, images, packed, bits, views, nearest, background):
     return _empty(points, images, views)
 
 
 @lookup_backward.register_fake
-def _(points, matrices, images, packed, bits, views, grad_colours, grad_coordinates, geometry, pixels):
+def _(points, matrices, images, packed, bits, views, nearest, grad_colours, grad_coordinates, geometry, pixels):
     last = _fake_image_gradient(images, points, pixels)
     return *(value.new_empty(value.shape if geometry else 0) for value in (points, matrices)), last
 
@@ -318,16 +347,18 @@ sample.register_autograd(_sample_gradients, setup_context=_sample_setup)
 
 
 @lookup.register_kernel("cuda")
-def _(points, matrices, images, packed, bits, views, background):
+def _(points, matrices, images, packed, bits, views, nearest, background):
     from hyperplanes.geometry.kernels import lookup_triton
 
-    return lookup_triton.lookup(points, matrices, images, views, background)
+    check_lookup(points, matrices, images, None, 0, views)
+    return lookup_triton.lookup(points, matrices, images, views, background, nearest)
 
 
 @lookup_backward.register_kernel("cuda")
-def _(points, matrices, images, packed, bits, views, grad_colours, grad_coordinates, geometry, pixels):
+def _(points, matrices, images, packed, bits, views, nearest, grad_colours, grad_coordinates, geometry, pixels):
     from hyperplanes.geometry.kernels import lookup_triton
 
+    check_lookup(points, matrices, images, None, 0, views)
     return lookup_triton.lookup_backward(
-        points, matrices, images, views, grad_colours, grad_coordinates, geometry, pixels
+        points, matrices, images, views, grad_colours, grad_coordinates, geometry, pixels, nearest
     )

@@ -1,0 +1,119 @@
+"""What callers give as points and images, made into tensors that every backend takes, or refused in one sentence."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+__all__ = ["Numbers", "as_images", "as_indices", "as_matrices", "as_points", "as_tensor"]
+
+Numbers: TypeAlias = Tensor | npt.NDArray[Any]
+"""A tensor, or a NumPy array of the same shape."""
+
+
+def as_tensor(name: str, value: Numbers) -> Tensor:
+    """A tensor as it is, a NumPy array as a tensor on the CPU.
+
+    Raises:
+        ValueError: anything else, or numbers that are neither real nor boolean.
+    """
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind not in "fiub":
+            raise ValueError(f"{name}: expected real numbers, got an array of {value.dtype}")
+        value = torch.from_numpy(np.ascontiguousarray(value, value.dtype.newbyteorder("=")))
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name}: expected a tensor or a NumPy array, got {type(value).__name__}")
+    if value.is_complex():
+        raise ValueError(f"{name}: expected real numbers, got {value.dtype}")
+    return value
+
+
+def _floating(value: Tensor) -> Tensor:
+    return value if value.is_floating_point() else value.to(torch.get_default_dtype())
+
+
+def as_points(points: Numbers) -> Tensor:
+    """Points (point, 3) in a floating-point type; whole numbers take PyTorch's default one.
+
+    Raises:
+        ValueError: another shape, or no numbers.
+
+    >>> as_points(np.array([[1, 2, 3]])).dtype
+    torch.float32
+    """
+    points = as_tensor("points", points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        remedy = "; write points[None] for a single point" if points.shape == (3,) else ""
+        raise ValueError(f"points: expected shape (point, 3), got {tuple(points.shape)}{remedy}")
+    return _floating(points)
+
+
+def as_matrices(matrices: Numbers, views: int) -> Tensor:
+    """Projection matrices (view, 3, 4), one a plane.
+
+    Raises:
+        ValueError: another shape, or no numbers.
+    """
+    matrices = as_tensor("matrices", matrices)
+    if matrices.shape != (views, 3, 4):
+        raise ValueError(
+            f"matrices: expected shape ({views}, 3, 4), one K [R | t] an image, got {tuple(matrices.shape)}"
+        )
+    return matrices
+
+
+def as_images(images: Numbers, name: str = "images") -> Tensor:
+    """Images (view, channel, height, width) in a floating-point type; 8-bit ones are divided by 255.
+
+    Args:
+        images: what was given.
+        name: of the argument, for messages.
+
+    Raises:
+        ValueError: another number of dimensions, channels last, no pixel, or whole numbers of more than 8 bits.
+
+    >>> as_images(np.full((1, 3, 2, 2), 255, np.uint8)).max()
+    tensor(1.)
+    """
+    axes = "transpose" if isinstance(images, np.ndarray) else "permute"
+    images = as_tensor(name, images)
+    if images.ndim != 4:
+        raise ValueError(f"{name}: expected shape (view, channel, height, width), got {tuple(images.shape)}")
+    if images.shape[3] in (1, 3, 4) and images.shape[1] > 4 and images.shape[2] > 4:
+        raise ValueError(
+            f"{name}: expected channels before rows, (view, channel, height, width), got {tuple(images.shape)}; "
+            f"write {name}.{axes}(0, 3, 1, 2)"
+        )
+    if len(images) and not (images.shape[2] and images.shape[3]):
+        raise ValueError(f"{name}: expected at least one pixel, got {tuple(images.shape)}")
+    if images.dtype == torch.uint8:
+        return images.to(torch.get_default_dtype()) / 255
+    if not images.is_floating_point() and images.dtype != torch.bool:
+        raise ValueError(f"{name}: expected floating-point numbers or 8-bit ones, got {images.dtype}")
+    return _floating(images)
+
+
+def as_indices(views: Numbers, points: Tensor, planes: int) -> Tensor:
+    """Indices of planes (point, chosen), on the points' device.
+
+    The shape is checked here; the kernels and PyTorch's own indexing are given checked indices outside of
+    `torch.compile` and `torch.func` only, where values cannot be looked at.
+
+    Raises:
+        ValueError: another shape, no whole numbers, or the index of no plane.
+    """
+    views = as_tensor("views", views)
+    if views.is_floating_point() or views.dtype == torch.bool:
+        raise ValueError(f"views: expected whole numbers, got {views.dtype}")
+    if views.ndim != 2 or len(views) != len(points):
+        raise ValueError(f"views: expected shape ({len(points)}, chosen), a row a point, got {tuple(views.shape)}")
+    views = views.to(points.device, torch.int64)
+    if not torch.compiler.is_compiling() and not torch._C._are_functorch_transforms_active() and views.numel():
+        least, most = (int(value) for value in torch.aminmax(views))
+        if least < 0 or most >= planes:
+            raise ValueError(f"views: expected indices of {planes} planes, got {least} to {most}")
+    return views

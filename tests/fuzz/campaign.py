@@ -1,0 +1,117 @@
+"""Damage a file, read it, and see that it is read or refused in one line, soon and in little memory.
+
+Case number i of a seed is always the same: `python -m tests.fuzz --seed SEED --only i` repeats it.
+"""
+
+import random
+import shutil
+import signal
+import warnings
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from hyperplanes.checkpoints import CheckpointError
+from hyperplanes.files import DataError
+from tests.fuzz.corpus import CORPUS
+from tests.fuzz.mutations import mutate
+
+SECONDS = 20  # of processor time, after which a reader counts as hanging
+
+
+class Hang(BaseException):
+    """A reader that did not come back."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A damaged file that was neither read nor refused as it should be."""
+
+    case: int
+    kind: str
+    file: str
+    what: str
+
+    def __str__(self):
+        return f"case {self.case}: {self.kind}, {self.file}: {self.what}"
+
+
+@contextmanager
+def time_limit():
+    def stop(*_):
+        raise Hang
+
+    before = signal.signal(signal.SIGVTALRM, stop)
+    signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.signal(signal.SIGVTALRM, before)
+
+
+def judge(read, folder):
+    """What is wrong with the answer to this input; nothing where it was read, or refused in one line."""
+    from data_gen.meshes.files import MeshError
+
+    try:
+        with time_limit(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            read(folder)
+    except Hang:
+        return f"not done after {SECONDS} s"
+    except (DataError, CheckpointError, MeshError) as error:
+        text = str(error)
+        return f"several lines: {text!r}" if "\n" in text else None if text else "an empty message"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+def prepare(home):
+    """The whole inputs, each in a folder of its own, and each checked to be read."""
+    made = {}
+    for kind, (make, pattern, read) in CORPUS.items():
+        folder = home / kind
+        make(folder)
+        files = sorted(path.relative_to(folder) for path in folder.glob(pattern) if path.is_file())
+        made[kind] = (folder, files, read)
+        if (wrong := judge_whole(read, folder)) is not None:
+            raise AssertionError(f"{kind}: a whole input was not read: {wrong}")
+    return made
+
+
+def judge_whole(read, folder):
+    try:
+        read(folder)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+def run_campaign(cases, seed, home: Path):
+    """Failures of these cases.
+
+    Args:
+        cases: their numbers.
+        seed: of the campaign.
+        home: an empty folder to work in.
+
+    Returns:
+        One `Failure` for each case that went wrong.
+    """
+    made = prepare(home / "whole")
+    failures = []
+    for case in cases:
+        draw = random.Random(f"{seed} {case}")
+        kind = draw.choice(sorted(made))
+        folder, files, read = made[kind]
+        file = draw.choice(files)
+        before = (folder / file).read_bytes()
+        (folder / file).write_bytes(mutate(before, file.name, draw))
+        wrong = judge(read, folder)
+        if wrong is not None:
+            failures.append(Failure(case, kind, str(file), wrong))
+            shutil.copy(folder / file, home / f"case-{case}-{file.name}")
+        (folder / file).write_bytes(before)
+    return failures

@@ -1,0 +1,97 @@
+"""Damage to files: of their bytes, of numbers and values in their text, of members of their archives."""
+
+import io
+import re
+import zipfile
+
+NUMBERS = ["-1", "0", "1e309", "-1e-300", "NaN", "9223372036854775808", "4294967296", "1" * 400, "0.5", "2"]
+VALUES = [*NUMBERS, "null", "true", '""', "[]", "{}", '"../../x"', '"\\u0000"', "[[[[1]]]]", '{"a": 1}']
+TOKEN = re.compile(rb'-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?|"(?:[^"\\]|\\.)*"|true|false|null')
+
+
+def flip(data, draw):
+    """Some bits."""
+    data = bytearray(data)
+    for _ in range(draw.choice([1, 1, 2, 8, 64])):
+        data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+    return bytes(data)
+
+
+def overwrite(data, draw):
+    """A few bytes by extreme ones, which makes extreme lengths and counts in binary files."""
+    at, size = draw.randrange(len(data)), draw.choice([1, 2, 4, 8])
+    value = draw.choice([b"\x00", b"\xff", b"\x7f", b"\x80"]) * size
+    return data[:at] + value + data[at + size :]
+
+
+def cut(data, draw):
+    """The end, or a part of the middle, away."""
+    first, second = sorted(draw.randrange(len(data) + 1) for _ in range(2))
+    return data[:first] if draw.random() < 0.5 else data[:first] + data[second:]
+
+
+def repeat(data, draw):
+    """A part twice."""
+    first, second = sorted(draw.randrange(len(data) + 1) for _ in range(2))
+    return data[:second] + data[first:]
+
+
+def empty(data, draw):
+    """Nothing, or nothing but noise."""
+    return draw.choice([b"", draw.randbytes(len(data)), b"\0" * len(data), b"\xff\xfe", b"[" * 100_000])
+
+
+def change_value(data, draw):
+    """One value of a text by another, often of another type."""
+    tokens = list(TOKEN.finditer(data))
+    if not tokens:
+        return flip(data, draw) if data else data
+    token = draw.choice(tokens)
+    return data[: token.start()] + draw.choice(VALUES).encode() + data[token.end() :]
+
+
+def change_number(data, draw):
+    """One number of a text by another."""
+    tokens = [token for token in TOKEN.finditer(data) if token[0][:1] in b"-0123456789"]
+    if not tokens:
+        return overwrite(data, draw) if data else data
+    token = draw.choice(tokens)
+    return data[: token.start()] + draw.choice(NUMBERS).encode() + data[token.end() :]
+
+
+def change_member(data, draw):
+    """One member of a ZIP archive damaged, encrypted by its flags, or compressed in a way that nobody knows."""
+    if not zipfile.is_zipfile(io.BytesIO(data)):
+        return change_value(data, draw)
+    way = draw.randrange(3)
+    if way:
+        at = draw.choice([found.start() for found in re.finditer(rb"PK\x01\x02|PK\x03\x04", data)])
+        offset = (8 if data[at + 2] == 1 else 6) + 2 * (way == 2)
+        return data[: at + offset] + bytes([data[at + offset] ^ 1, data[at + offset + 1]]) + data[at + offset + 2 :]
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+    except Exception:  # damaged before
+        return overwrite(data, draw)
+    if not members:
+        return data
+    name = draw.choice(sorted(members))
+    members[name] = draw.choice([flip, overwrite, cut, change_number])(members[name], draw)
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for each, content in members.items():
+            archive.writestr(each, content)
+    return out.getvalue()
+
+
+TEXT = (flip, cut, repeat, empty, change_value, change_value, change_value, change_number, change_number)
+BINARY = (flip, overwrite, overwrite, cut, repeat, empty, change_number, change_member, change_member)
+
+
+def mutate(data, name, draw):
+    """The content of a file with one to three damages that suit its kind."""
+    kinds = TEXT if name.endswith((".json", ".txt", ".obj", ".off", ".mtl", ".ply")) else BINARY
+    for _ in range(draw.choice([1, 1, 1, 2, 3])):
+        if data:
+            data = draw.choice(kinds)(data, draw)
+    return data

@@ -1,0 +1,40 @@
+"""Where machine code is cached: numba unpickles it, so nobody else may have written there."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("numba", reason="needs numba")
+
+
+@pytest.fixture
+def cache_folder(tmp_path, monkeypatch):
+    from numba.core import config
+
+    from hyperplanes.geometry.kernels import compiling
+
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path), raising=False)
+    return compiling._cache_folder.__wrapped__
+
+
+def test_the_cache_is_this_users_alone(tmp_path, cache_folder):
+    open_to_all = tmp_path / "hyperplanes"
+    open_to_all.mkdir()
+    open_to_all.chmod(0o777)
+    found = Path(cache_folder())
+    assert found.parent == open_to_all
+    for part in (found, found.parent):
+        assert part.stat().st_mode & 0o777 == 0o700
+        assert part.stat().st_uid == os.getuid()
+
+
+def test_a_link_or_a_folder_of_another_user_is_not_used(tmp_path, cache_folder, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "hyperplanes").symlink_to(tmp_path / "elsewhere")
+    assert Path(cache_folder()).name.startswith("hyperplanes-kernels-")
+    (tmp_path / "hyperplanes").unlink()
+    (tmp_path / "hyperplanes").mkdir()
+    owner = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    assert Path(cache_folder()).name.startswith("hyperplanes-kernels-")

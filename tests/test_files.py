@@ -1,0 +1,153 @@
+"""Source of truth: the operating system: pipes, locks and signals made on purpose."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_gen.datasets.generate import Procedural, generate
+from hyperplanes.checkpoints import CheckpointError, load_tensors
+from hyperplanes.cli import _terminable, main
+from hyperplanes.data import open_dataset
+from hyperplanes.data.images import read_image
+from hyperplanes.data.npz import read_npz
+from hyperplanes.files import DataError, malformed, one_writer, read_bytes, read_json
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.mark.parametrize("read", [read_json, read_bytes, read_image, read_npz, load_tensors])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path, read):
+    path = tmp_path / "file"
+    os.mkfifo(path)
+    with pytest.raises((DataError, CheckpointError), match=r"file: expected a regular file, found a pipe; copy"):
+        read(path)
+
+
+def test_devices_and_too_large_files_are_refused_unread(tmp_path):
+    with pytest.raises(DataError, match="expected a regular file, found a device"):
+        read_bytes("/dev/zero")
+    large = tmp_path / "model.json"
+    with open(large, "wb") as file:
+        file.truncate(2**40)  # sparse: it takes no room
+    with pytest.raises(DataError, match=rf"expected at most 268435456 bytes, found {2**40}"):
+        read_json(large)
+    with pytest.raises(DataError, match="expected at most"):
+        read_bytes(large)
+
+
+@pytest.mark.parametrize("number", ["9223372036854775808", "-9223372036854775809", "1" * 5000])
+def test_whole_numbers_beyond_64_bits_are_refused(tmp_path, number):
+    path = tmp_path / "transforms.json"
+    path.write_text(f'{{"w": {number}}}')
+    with pytest.raises(DataError, match="expected valid JSON, found a whole number of"):
+        read_json(path)
+
+
+def test_what_a_parser_did_not_expect_is_one_line_about_the_file():
+    for error in (KeyError("a"), TypeError("b"), OverflowError("c"), RuntimeError("d\nd"), IndexError()):
+        with pytest.raises(DataError, match=r"^x: expected a thing, found something else: \w+.*; write") as caught:
+            with malformed("x", "a thing"):
+                raise error
+        assert "\n" not in str(caught.value)
+    with pytest.raises(DataError, match="^the first one$"), malformed("x", "a thing"):
+        raise DataError("the first one")
+    with pytest.raises(PermissionError), malformed("x", "a thing"):
+        raise PermissionError
+
+
+def test_a_folder_has_one_writer(tmp_path):
+    """Property: of many who try at once each works alone, and nothing is left behind."""
+    folder, working, most, refused = tmp_path / "out", [], [], []
+
+    def work():
+        try:
+            with one_writer(folder):
+                working.append(1)
+                most.append(len(working))
+                threading.Event().wait(0.002)
+                working.pop()
+        except DataError as error:
+            refused.append(str(error))
+
+    for _ in range(10):
+        threads = [threading.Thread(target=work) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert max(most) == 1
+    assert len(most) + len(refused) == 80
+    assert refused[0].endswith("another hyperplanes at work there; wait for it, or name another folder")
+    assert list(folder.iterdir()) == []
+
+
+def test_every_verb_that_writes_locks_its_folder_and_names_a_file_in_its_place(tmp_path, capsys):
+    out, scene = tmp_path / "out", str(tmp_path)
+    (tmp_path / "file").write_text("")
+    verbs = {
+        "train": ["--data", scene],
+        "adapt": ["--checkpoint", scene, "--views", scene],
+        "render": ["--checkpoint", scene, "--views", scene],
+        "export": ["--checkpoint", scene, "--views", scene],
+        "demo": [],
+    }
+    with one_writer(out):
+        for verb, options in verbs.items():
+            assert main([verb, *options, "--out", str(out)]) == 2
+            assert "found another hyperplanes at work there" in capsys.readouterr().err
+        bake = ["bake", *verbs["render"], "--out", str(out / "car.safetensors")]
+        assert main(bake) == 2
+        assert "found another hyperplanes at work there" in capsys.readouterr().err
+    for verb, options in verbs.items():
+        assert main([verb, *options, "--out", str(tmp_path / "file")]) == 2
+        assert "file: expected a folder to write into, found a file; name another one" in capsys.readouterr().err
+
+
+def test_a_lock_ends_with_its_process(tmp_path):
+    code = f"import os; from hyperplanes.files import one_writer\nwith one_writer({str(tmp_path)!r}): os.abort()"
+    assert (
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL).returncode == -signal.SIGABRT
+    )
+    assert (tmp_path / ".lock").exists()
+    with one_writer(tmp_path):
+        pass
+
+
+def test_sigterm_ends_as_ctrl_c_does():
+    before, ended = signal.getsignal(signal.SIGTERM), []
+    with pytest.raises(KeyboardInterrupt), _terminable(ended):
+        signal.raise_signal(signal.SIGTERM)
+    assert ended == [signal.SIGTERM]
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_absurd_count_is_refused_at_once(tmp_path):
+    with pytest.raises(ValueError, match="count: expected at most 1000000 objects, got 1000000000"):
+        generate(Procedural("car", 10**9), tmp_path / "x")
+
+
+def test_an_object_in_two_splits_is_refused(tmp_path):
+    manifest = '{"format": "hyperplanes-dataset", "version": 1, "splits": {"train": ["a", "b"], "test": ["b"]}}'
+    (tmp_path / "manifest.json").write_text(manifest)
+    with pytest.raises(DataError, match="expected every object in one split, found b in train and in test; take"):
+        open_dataset(tmp_path)
+    (tmp_path / "manifest.json").write_text(manifest.replace('"a", "b"', '"a", "a"'))
+    with pytest.raises(DataError, match="found a twice in train"):
+        open_dataset(tmp_path)
+
+
+def test_an_array_that_claims_more_than_there_is_is_refused(tmp_path):
+    import zipfile
+
+    path = tmp_path / "50_car.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }\n"
+        archive.writestr("images.npy", np.lib.format.magic(1, 0) + len(header).to_bytes(2, "little") + header)
+    with pytest.raises(DataError, match="expected at most 2147483648 bytes of arrays, found 8000000000000"):
+        read_npz(path)
