@@ -139,7 +139,7 @@ def orbit_cameras(
     if count < 1:
         raise ValueError(f"count: expected at least one camera, got {count}")
     cameras, centre = views.cameras, torch.tensor(views.bounds.centre)
-    standpoints = camera.centres(cameras).cpu() - centre
+    standpoints = camera.centres(cameras).cpu().float() - centre
     up = torch.tensor(upward(cameras))
     front = standpoints[0] - (standpoints[0] @ up) * up
     if float(front.norm()) < 1e-6:
@@ -153,7 +153,7 @@ def orbit_cameras(
     x, y, z = up.tolist()
     pose = camera.look_at(eyes, views.bounds.centre, (x, y, z)).to(cameras.extrinsics)
     height, width = views.size
-    batch = camera.pinhole(camera.intrinsics(cameras)[:1], pose, height, width)
+    batch = camera.with_poses(camera.select(cameras, [0] * count), pose)
     if size is None:
         return batch
     scale = size / max(height, width)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +11,7 @@ from typing import Any
 
 from hyperplanes.data.catalogue import SPLITS
 from hyperplanes.data.posed import PosedTask
-from hyperplanes.data.recognise import find_catalogue, posed_folder, read_posed_task
-from hyperplanes.data.transforms_json import find_transforms, read_transforms
+from hyperplanes.data.recognise import find_catalogue, read_posed, read_posed_task
 from hyperplanes.files import DataError
 from hyperplanes.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
@@ -84,7 +84,7 @@ class Dataset:
             name: one of `names()`.
 
         Returns:
-            The pictures with their cameras.
+            The pictures with their cameras. A UserWarning names what was left out, turned or scaled.
 
         Raises:
             DataError: no such object, or anything wrong with its files.
@@ -97,6 +97,7 @@ class Dataset:
             some = ", ".join(known[:3]) + (", ..." if len(known) > 3 else "")
             raise DataError(self.folder, f"one of its {len(known)} objects ({some})", repr(name), "check the name")
         task = self._catalogue.read(name)
+        warn_of(task.notes, self.folder / name if len(self) > 1 else self.folder)
         with self._lock:
             self._cache.add(name, task)
         return task
@@ -170,57 +171,42 @@ def open_datasets(paths: Sequence[str | Path]) -> Dataset | Datasets:
     return Datasets({name: open_dataset(path) for name, path in zip(names, paths, strict=True)})
 
 
-def read_views(path: str | Path) -> Views:
+def read_views(path: str | Path, downscale: int | None = None) -> Views:
     """All posed images of one scene, over white.
 
     Args:
-        path: a transforms*.json, or a folder that holds some, an SRN object's folder, a COLMAP model, or the .npz of
-            one object. Of a folder with transforms_train, _val and _test files, all are read.
+        path: a transforms*.json, or a folder that holds some, an SRN object's folder, a COLMAP model, a scene in the
+            layout of LLFF, IDR or NSVF, or the .npz of one object. Of a folder with transforms_train, _val and _test
+            files, all are read.
+        downscale: take the mean of so many by so many pixels; None: photographs of more than a megapixel get as many
+            as leave one at most.
 
     Returns:
-        The views in the order of the files; masks where the files have alpha.
-
-    Raises:
-        DataError: anything wrong with a file.
+        The views in the order of the files; masks where the files have alpha. Where pictures were left out, turned or
+        scaled, a UserWarning says which. As `recognise.read_posed`, it raises DataError.
     """
-    from hyperplanes.data import colmap, npz, srn
-
-    path = Path(path)
-    if path.is_file():
-        return (npz.read_npz(path) if path.suffix == ".npz" else read_transforms(path)).views()
-    if not path.is_dir():
-        raise DataError(path, "a transforms*.json or a folder that holds one", "nothing", "check the path")
-    if files := find_transforms(path):
-        return read_transforms(files).views()
-    if srn.is_srn(path):
-        return srn.read_srn(path).views()
-    if colmap.find_model(path) is not None:
-        return colmap.read_colmap(path).views()
-    found = ", ".join(sorted(child.name for child in path.iterdir())[:5]) or "an empty folder"
-    raise DataError(path, "transforms.json or another layout of one scene", found, "give one object's folder")
+    scene = read_posed(path, downscale)
+    warn_of(scene.notes, path)
+    return scene.views()
 
 
-def read_task(path: str | Path) -> Task:
+def read_task(path: str | Path, downscale: int | None = None) -> Task:
     """The support and query views of one scene.
 
     Args:
         path: a folder with transforms_train.json and transforms_test.json, or one transforms.json (whose
             train_filenames and test_filenames decide, else views alternate), or another layout of one scene.
+        downscale: as in `read_views`.
 
     Returns:
-        The task; its name is the folder's.
-
-    Raises:
-        DataError: anything wrong with a file.
+        The task; its name is the folder's. It warns as `read_views`, and raises DataError.
     """
-    from hyperplanes.data import npz, srn
+    task = read_posed_task(path, downscale)
+    warn_of(task.notes, path)
+    return task.task()
 
-    path = Path(path)
-    if path.is_file() and path.suffix == ".npz":
-        return PosedTask.alternating(npz.read_npz(path), path.stem).task()
-    if path.is_dir() and srn.is_srn(path):
-        return PosedTask.alternating(srn.read_srn(path), path.name).task()
-    folder = path.parent if path.is_file() else path
-    if not folder.is_dir():
-        raise DataError(path, "a folder with posed images", "nothing", "check the path")
-    return read_posed_task(folder, posed_folder(folder).splits["test"][0]).task()
+
+def warn_of(notes: Sequence[str], path: str | Path) -> None:
+    """A UserWarning for each note of a reading."""
+    for note in notes:
+        warnings.warn(f"{path}: {note}", stacklevel=3)

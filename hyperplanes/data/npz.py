@@ -160,7 +160,7 @@ def _learnit(
             homes |= {name: _home(folder, name, file) for name in names}
 
     def read(name: str) -> PosedTask:
-        return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, flat=True)
+        return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, flat=True, complete=True)
 
     return Catalogue("learnit-128", splits, read, manifest)
 
