@@ -47,8 +47,7 @@ class BakedScene:
         """The pictures of the cameras, by a kernel on a CPU with numba and by `Marched` elsewhere."""
         bounds = self.field.bounds
         if compiled_caster() is None or self.field.index.device.type != "cpu":
-            sampling = Marched(self.steps, 1e-3)
-            return AdaptedField(self.field, self.field.occupancy, sampling).render(cameras, sampling)
+            return self.adapted.render(cameras, self.adapted.sampling)
         step = 2 * bounds.radius / self.steps
 
         def render_rays(rays: Rays) -> Rendered:
@@ -56,6 +55,11 @@ class BakedScene:
             return render_voxels(self.field.index, self.field.values, bounds, rays, basis, step=step, empty=self._empty)
 
         return render_images(cameras, bounds, render_rays, occupancy=self._coarse_occupancy)
+
+    @cached_property
+    def adapted(self) -> AdaptedField:
+        """The voxels as any other field of one object."""
+        return AdaptedField(self.field, self.field.occupancy, Marched(self.steps, 1e-3))
 
     @cached_property
     def _empty(self) -> UInt8[Tensor, "cell_x cell_y cell_z"]:

@@ -15,11 +15,13 @@ import torch
 from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from hyperplanes.adaptation.base import AdaptedField, Renderable
 from hyperplanes.colour import linear_from_srgb
 from hyperplanes.files import encode_png, write_whole
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.views import Views
 
 if TYPE_CHECKING:
@@ -29,18 +31,25 @@ __all__ = [
     "MESH_FORMATS",
     "TURNTABLE_FORMATS",
     "Surface",
+    "choose_level",
+    "density_grid",
     "encode_animation",
     "extract_mesh",
     "orbit_cameras",
     "save_images",
     "save_mesh",
     "save_turntable",
+    "silhouette_overlap",
     "to_pixels",
     "upward",
 ]
 
 MESH_FORMATS = ("ply", "glb", "obj")
 TURNTABLE_FORMATS = ("webp", "gif")
+
+SILHOUETTE = 64  # pixels along the longer side of the silhouettes that surfaces are compared by
+LEVEL_VIEWS = 8
+LEVELS = 60
 
 
 def to_pixels(images: Float[Tensor, "view 3 height width"]) -> npt.NDArray[np.uint8]:
@@ -139,7 +148,7 @@ def orbit_cameras(
     if count < 1:
         raise ValueError(f"count: expected at least one camera, got {count}")
     cameras, centre = views.cameras, torch.tensor(views.bounds.centre)
-    standpoints = camera.centres(cameras).cpu() - centre
+    standpoints = camera.centres(cameras).cpu().float() - centre
     up = torch.tensor(upward(cameras))
     front = standpoints[0] - (standpoints[0] @ up) * up
     if float(front.norm()) < 1e-6:
@@ -153,7 +162,7 @@ def orbit_cameras(
     x, y, z = up.tolist()
     pose = camera.look_at(eyes, views.bounds.centre, (x, y, z)).to(cameras.extrinsics)
     height, width = views.size
-    batch = camera.pinhole(camera.intrinsics(cameras)[:1], pose, height, width)
+    batch = camera.with_poses(camera.select(cameras, [0] * count), pose)
     if size is None:
         return batch
     scale = size / max(height, width)
@@ -203,27 +212,23 @@ class Surface:
 
 
 @torch.no_grad()
-def extract_mesh(field: AdaptedField, *, voxels: int = 128, level: float | None = None) -> Surface:
-    """The surface on which the density crosses a level, by marching cubes.
+def density_grid(field: AdaptedField, voxels: int = 128) -> Float[Tensor, "x y z"]:
+    """The density of a field at the corners of a grid, zero where its occupancy is empty.
 
     Args:
-        field: asked on a grid, only where its occupancy may hold something.
-        voxels: along each side of the cube around the scene.
-        level: density per world unit; where absent, what makes 1/64 of the scene's diameter half opaque.
+        field: asked only where its occupancy may hold something.
+        voxels: points along each side of the cube around the scene; the outer ones lie on its faces.
 
     Returns:
-        The surface, closed at the border of the cube too.
+        Density per world unit.
 
     Raises:
-        ValueError: fewer than 8 voxels, or a density that never reaches the level.
+        ValueError: fewer than 8 voxels.
     """
-    from skimage.measure import marching_cubes
-
     if voxels < 8:
         raise ValueError(f"voxels: expected at least 8, got {voxels}")
     occupancy = field.occupancy
     bounds, device = occupancy.bounds, occupancy.occupied.device
-    level = level if level is not None else 32 * math.log(2) / bounds.radius
     axis = torch.linspace(-1, 1, voxels, device=device)
     grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     points = grid * bounds.radius + torch.tensor(bounds.centre, device=device)
@@ -231,17 +236,138 @@ def extract_mesh(field: AdaptedField, *, voxels: int = 128, level: float | None 
     density = torch.zeros(len(points), device=device)
     for part in live.split(1 << 16):
         density[part] = field.density(points[part])
+    return density.reshape(voxels, voxels, voxels)
+
+
+@torch.no_grad()
+def choose_level(field: AdaptedField, density: Float[Tensor, "x y z"], cameras: PinholeCamera) -> float:
+    """The density at which the surface has most nearly the silhouettes that the field is rendered with.
+
+    A ray meets the surface of a level where the greatest density along it is above the level, so one pass over the
+    rays judges every level. A fixed level leaves holes where walls are opaque by being thick, not dense.
+
+    Args:
+        field: rendered by its own sampler.
+        density: of `density_grid`.
+        cameras: up to eight of them are used, at 64 pixels.
+
+    Returns:
+        Density per world unit: the level with the largest mean overlap (intersection over union).
+
+    Raises:
+        ValueError: a field that is empty everywhere.
+    """
+    top = float(density.max())
+    if not top > 0:
+        raise ValueError("field: expected some density, got one that is empty everywhere; train longer, or check masks")
+    small = _small_cameras(cameras, LEVEL_VIEWS)
+    wanted = field.render(small).opacity.flatten(1) > 0.5
+    greatest = _greatest_density(density, field.occupancy.bounds, small)
+    best, chosen = -1.0, top / 2
+    for level in np.geomspace(top * 1e-4, top * 0.9, LEVELS).tolist():
+        overlap = _overlap(greatest > level, wanted)
+        if overlap > best:
+            best, chosen = overlap, level
+    return chosen
+
+
+@torch.no_grad()
+def silhouette_overlap(surface: Surface, field: AdaptedField, cameras: PinholeCamera) -> float:
+    """How well a surface covers the pixels that the field's pictures cover: mean intersection over union.
+
+    Args:
+        surface: rays are cast at its triangles.
+        field: rendered by its own sampler; a pixel counts where it is more than half opaque.
+        cameras: all of them, at 64 pixels.
+
+    Returns:
+        From 0 to 1.
+    """
+    small = _small_cameras(cameras, cameras.batch_size)
+    wanted = field.render(small).opacity.flatten(1).cpu() > 0.5
+    origins, directions = _pixel_rays(small)
+    mesh = _mesh(surface.vertices, surface.faces)
+    hit = mesh.ray.intersects_any(origins.reshape(-1, 3).numpy(), directions.reshape(-1, 3).numpy())
+    return _overlap(torch.from_numpy(hit).reshape(wanted.shape), wanted)
+
+
+@torch.no_grad()
+def extract_mesh(
+    field: AdaptedField,
+    *,
+    voxels: int = 128,
+    level: float | None = None,
+    density: Float[Tensor, "x y z"] | None = None,
+) -> Surface:
+    """The surface on which the density crosses a level, by marching cubes.
+
+    Args:
+        field: asked on a grid, only where its occupancy may hold something.
+        voxels: along each side of the cube around the scene.
+        level: density per world unit; where absent, what makes 1/64 of the scene's diameter half opaque. `choose_level`
+            finds the one whose silhouettes agree with the rendered ones.
+        density: of `density_grid`, where it was computed before; `voxels` does not count then.
+
+    Returns:
+        The surface, closed at the border of the cube too.
+
+    Raises:
+        ValueError: a density that never reaches the level; fewer than 8 voxels.
+    """
+    from skimage.measure import marching_cubes
+
+    bounds, device = field.occupancy.bounds, field.occupancy.occupied.device
+    density = density_grid(field, voxels) if density is None else density
+    level = level if level is not None else 32 * math.log(2) / bounds.radius
     if not float(density.max()) > level:
         raise ValueError(
             f"level: expected less than the highest density, {float(density.max()):.3g}, got {level:.3g}; "
             "give a lower one, or a model that was trained longer"
         )
-    volume = np.pad(density.reshape(voxels, voxels, voxels).cpu().numpy(), 1)
+    volume = np.pad(density.cpu().numpy(), 1)
     vertices, faces, _, _ = marching_cubes(volume, level)  # pyright: ignore[reportGeneralTypeIssues]
-    unit = (vertices - 1) * (2 / (voxels - 1)) - 1
+    unit = (vertices - 1) * (2 / (len(density) - 1)) - 1
     world = (unit * bounds.radius + np.asarray(bounds.centre)).astype(np.float32)
     faces = faces[:, ::-1].astype(np.int64)
     return Surface(world, faces, _colours(field, _mesh(world, faces), device))
+
+
+def _small_cameras(cameras: PinholeCamera, most: int) -> PinholeCamera:
+    """Some of the cameras, spread over all, at SILHOUETTE pixels along the longer side, on the CPU."""
+    chosen = torch.linspace(0, cameras.batch_size - 1, min(most, cameras.batch_size)).round().long()
+    cameras = camera.to(camera.select(cameras, chosen.to(cameras.extrinsics.device)), "cpu", torch.float32)
+    height, width = camera.image_size(cameras)
+    scale = SILHOUETTE / max(height, width)
+    return camera.resized(cameras, max(1, round(height * scale)), max(1, round(width * scale)))
+
+
+def _pixel_rays(cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
+    """Origins and directions (view, pixel, 3) of the rays through all pixels."""
+    pixels = pixel_grid(*camera.image_size(cameras))
+    rays = [
+        cast(cameras, torch.full((len(pixels),), view, dtype=torch.long), pixels) for view in range(cameras.batch_size)
+    ]
+    return torch.stack([each.origins for each in rays]), torch.stack([each.directions for each in rays])
+
+
+def _greatest_density(density: Tensor, bounds: Sphere, cameras: PinholeCamera) -> Float[Tensor, "view pixel"]:
+    """The greatest density along the ray of each pixel, trilinear between the grid's points, half a voxel apart."""
+    origins, directions = (part.to(density.device) for part in _pixel_rays(cameras))
+    start = bounds.normalise(origins)
+    middle = -(start * directions).sum(-1, keepdim=True)
+    along = torch.linspace(-(3**0.5), 3**0.5, 2 * len(density), device=density.device)
+    result = []
+    for view in range(len(origins)):
+        points = start[view, :, None] + (middle[view] + along)[..., None] * directions[view, :, None]
+        values = grid_sample(density[None, None], points.flip(-1)[None, None], align_corners=True)
+        result.append(values[0, 0, 0].amax(-1))
+    return torch.stack(result).cpu()
+
+
+def _overlap(seen: Tensor, wanted: Tensor) -> float:
+    """Mean intersection over union of masks (view, pixel); views that show nothing in either count as 1."""
+    union = (seen | wanted).sum(1)
+    return float(torch.where(union > 0, (seen & wanted).sum(1) / union.clamp_min(1), 1.0).mean())
 
 
 def _mesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) -> trimesh.Trimesh:

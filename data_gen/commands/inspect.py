@@ -24,7 +24,7 @@ from hyperplanes.commands.options import OptionalFolder
 if TYPE_CHECKING:
     from hyperplanes.adaptation.diagnostics import Diagnostics
 
-__all__ = ["Arguments", "checkpoint_lines", "recorded_diagnostics", "run"]
+__all__ = ["Arguments", "baked_lines", "checkpoint_lines", "recorded_diagnostics", "run"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Arguments:
     """What to look at.
 
     Attributes:
-        path: A data set in any layout, a folder of posed images, or a checkpoint.
+        path: A data set in any layout, a folder of posed images, a checkpoint, or a baked file.
         out: Where the pictures go; runs/inspect/NAME when not given.
         objects: How many objects to look at closely.
         checksums: Compare every file with its checksum in the manifest, too.
@@ -75,6 +75,23 @@ def checkpoint_lines(folder: Path) -> list[str]:
     return lines
 
 
+def baked_lines(path: Path) -> list[str]:
+    """What a baked file holds, a line a fact."""
+    from hyperplanes.fields.baked import BakedField
+
+    field = BakedField.load(path)
+    (x, y, z), radius = field.bounds.centre, field.bounds.radius
+    density, rows = field.values[:, 0], len(field.values)
+    return [
+        f"baked object: {rows:,} of {field.side}^3 voxels, {path.stat().st_size / 2**20:.1f} MiB",
+        f"bounds: sphere of radius {radius:.3g} around ({x:.3g}, {y:.3g}, {z:.3g}), y up",
+        f"density: {float(density.median()):.3g} a world unit in the median, {float(density.max()):.3g} at most"
+        if rows
+        else "density: none, the object is empty",
+        "`hyperplanes render` and `export` take it as --checkpoint, with --views for the poses",
+    ]
+
+
 def recorded_diagnostics(folder: Path) -> Diagnostics | None:
     """The diagnostics that the training of a checkpoint recorded last, beside its weights."""
     from hyperplanes.adaptation.diagnostics import Diagnostics
@@ -88,6 +105,10 @@ def recorded_diagnostics(folder: Path) -> Diagnostics | None:
 def run(arguments: Arguments) -> int:
     """Describe it; 1 when a data set is not as it should be."""
     console = Console()
+    if arguments.path.suffix == ".safetensors" and arguments.path.is_file():
+        for line in baked_lines(arguments.path):
+            console.say(line)
+        return 0
     packaged = len(arguments.path.parts) == 1 and not arguments.path.exists()
     if packaged or (arguments.path / "model.json").exists():
         for line in checkpoint_lines(arguments.path):

@@ -10,14 +10,13 @@ Example:
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import Free, Steps, Up
-from hyperplanes.commands.render import after_steps, read_scene
-from hyperplanes.formatting import format_duration
+from hyperplanes.commands.fields import adapt_to, refuse_baked
+from hyperplanes.commands.options import Free, OptionalInt, Steps, ViewsUp
+from hyperplanes.commands.scene import read_scene
 
 __all__ = ["Arguments", "run"]
 
@@ -34,7 +33,10 @@ class Arguments:
             single forward pass.
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         all_views: Show the model every view, not only the support half.
-        up: The axis that points up in the world of the views: y as in training data, z as in Blender.
+        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
+            0,0.1,1, or auto: as the cameras are held.
+        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
+            leave one at most when not given.
         device: auto, cpu or cuda.
     """
 
@@ -44,7 +46,8 @@ class Arguments:
     steps: Steps = 0
     fine_tune: Free = "weights"
     all_views: bool = False
-    up: Up = "y"
+    up: ViewsUp = "auto"
+    downscale: OptionalInt = None
     device: str = "auto"
 
 
@@ -57,20 +60,29 @@ def run(arguments: Arguments) -> int:
 
 
 def _run(arguments: Arguments) -> int:
+    from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.pretrained import adapted_model, load_model
     from hyperplanes.devices import choose_device
 
     console, device = Console(), choose_device(arguments.device)
+    refuse_baked(arguments.checkpoint, "adapt")
     model = load_model(arguments.checkpoint).to(device)
-    task = read_scene(arguments.views, arguments.all_views, arguments.up)
-    started = time.perf_counter()
-    settings, taken = FineTuning(free=arguments.fine_tune), []
-    field = model.fine_tune(task.support.to(device), arguments.steps, settings, on_step=taken.append)
-    seconds = time.perf_counter() - started
+    task, up = read_scene(
+        arguments.views,
+        console,
+        all_views=arguments.all_views,
+        up=arguments.up,
+        downscale=arguments.downscale,
+    )
+    settings = FineTuning(free=arguments.fine_tune)
+    field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)
+    assert isinstance(field, AdaptedField)
     adapted_model(model, field).save(arguments.out)
-    how = f"in {format_duration(seconds)}{after_steps(taken)}"
-    console.say(f"{arguments.out}: adapted to {len(task.support)} views of {task.name} {how}")
-    up = "" if arguments.up == "y" else f" --up {arguments.up}"
-    console.say(f"next: hyperplanes render --checkpoint {arguments.out} --views {arguments.views}{up} --out new-views")
+    more = "" if up == "y" else f" --up={up}"
+    more += "" if arguments.downscale is None else f" --downscale {arguments.downscale}"
+    console.say(f"{arguments.out}: the weights of {task.name}")
+    console.say(
+        f"next: hyperplanes render --checkpoint {arguments.out} --views {arguments.views}{more} --out new-views"
+    )
     return 0

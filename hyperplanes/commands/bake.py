@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalInt, Up, optional
-from hyperplanes.commands.render import read_scene
+from hyperplanes.commands.fields import adapt_to, refuse_baked
+from hyperplanes.commands.options import OptionalInt, ViewsUp, optional
+from hyperplanes.commands.scene import read_scene
 from hyperplanes.formatting import format_duration
 
 if TYPE_CHECKING:
@@ -41,8 +42,10 @@ class Arguments:
         size: Pixels along the longer side of the turntable; as the images when not given.
         turntable: The format of the turntable.
         all_views: Show the model every view, not only the support half.
-        up: The axis that points up in the world of the views: y as in training data, z as in Blender. What is written
-            has y up.
+        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
+            0,0.1,1, or auto: as the cameras are held. What is written has y up.
+        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
+            leave one at most when not given.
         device: What adapts and bakes: auto, cpu or cuda.
     """
 
@@ -55,7 +58,8 @@ class Arguments:
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"
     all_views: bool = False
-    up: Up = "y"
+    up: ViewsUp = "auto"
+    downscale: OptionalInt = None
     device: str = "auto"
 
 
@@ -76,6 +80,7 @@ def run(arguments: Arguments) -> int:
 
 
 def _run(arguments: Arguments) -> int:
+    from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.adaptation.pretrained import load_model
     from hyperplanes.baking import BakedScene, bake
     from hyperplanes.devices import choose_device
@@ -85,11 +90,18 @@ def _run(arguments: Arguments) -> int:
     from hyperplanes.metrics import psnr
 
     console, device = Console(), choose_device(arguments.device)
+    refuse_baked(arguments.checkpoint, "bake")
     model = load_model(arguments.checkpoint).to(device)
-    task = read_scene(arguments.views, arguments.all_views, arguments.up)
+    task, _ = read_scene(
+        arguments.views,
+        console,
+        all_views=arguments.all_views,
+        up=arguments.up,
+        downscale=arguments.downscale,
+    )
     shown, query = task.support.to(device), task.query
-    field = model.fine_tune(shown, arguments.steps)
-    console.say(f"adapted to {len(shown)} views of {task.name}")
+    field, _ = adapt_to(model, shown, task.name, console, steps=arguments.steps)
+    assert isinstance(field, AdaptedField)
     started = time.perf_counter()
     baked = bake(field, side=arguments.voxels)
     baked.save(arguments.out)

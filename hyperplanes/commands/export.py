@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalInt, Up, optional
-from hyperplanes.commands.render import read_scene
+from hyperplanes.commands.fields import adapt_to, load_source, render_views
+from hyperplanes.commands.options import OptionalInt, ViewsUp, optional
+from hyperplanes.commands.scene import read_scene
 
 __all__ = ["Arguments", "run"]
 
@@ -26,7 +27,7 @@ class Arguments:
     """What to write.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote.
+        checkpoint: What `train`, `adapt` or `demo` wrote, or a file that `bake` wrote.
         views: The posed images of the object.
         out: The folder to write to.
         what: Any of the three.
@@ -36,10 +37,12 @@ class Arguments:
         turntable: The format of the turntable.
         mesh_format: The format of the mesh.
         voxels: Along each side of the grid that the mesh is cut from.
-        level: Density at the surface; half opaque within 1/64 of the scene when not given.
+        level: Density at the surface; the one whose silhouettes agree best with the rendered ones when not given.
         all_views: Show the model every view, not only the support half.
-        up: The axis that points up in the world of the views: y as in training data, z as in Blender. What is written
-            has y up.
+        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
+            0,0.1,1, or auto: as the cameras are held. What is written has y up.
+        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
+            leave one at most when not given.
         device: auto, cpu or cuda.
     """
 
@@ -55,8 +58,12 @@ class Arguments:
     voxels: int = 128
     level: Annotated[float | None, optional("DENSITY")] = None
     all_views: bool = False
-    up: Up = "y"
+    up: ViewsUp = "auto"
+    downscale: OptionalInt = None
     device: str = "auto"
+
+
+GOOD_OVERLAP = 0.9
 
 
 def run(arguments: Arguments) -> int:
@@ -68,26 +75,48 @@ def run(arguments: Arguments) -> int:
 
 
 def _run(arguments: Arguments) -> int:
-    from hyperplanes.adaptation.pretrained import load_model
+    from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.devices import choose_device
-    from hyperplanes.export import extract_mesh, save_images, save_mesh, save_turntable
+    from hyperplanes.export import (
+        choose_level,
+        density_grid,
+        extract_mesh,
+        save_images,
+        save_mesh,
+        save_turntable,
+        silhouette_overlap,
+    )
 
     console, device, out = Console(), choose_device(arguments.device), arguments.out
-    model = load_model(arguments.checkpoint).to(device)
-    task = read_scene(arguments.views, arguments.all_views, arguments.up)
-    shown = task.support.to(device)
-    field = model.fine_tune(shown, arguments.steps)
-    console.say(f"adapted to {len(shown)} views of {task.name}")
+    source = load_source(arguments.checkpoint, device)
+    task, _ = read_scene(
+        arguments.views,
+        console,
+        all_views=arguments.all_views,
+        up=arguments.up,
+        downscale=arguments.downscale,
+    )
+    shown, query = task.support.to(device), task.query.to(device)
+    field, _ = adapt_to(source, shown, task.name, console, steps=arguments.steps)
     if "images" in arguments.what:
-        query = task.query.to(device)
-        paths = save_images(field.render(query.cameras).images, out / "images", query.names)
+        paths = save_images(render_views(field, query.cameras, console).images, out / "images", query.names)
         console.say(f"{out / 'images'}: {len(paths)} pictures of the query poses")
     if "turntable" in arguments.what:
         path = out / f"turntable.{arguments.turntable}"
         save_turntable(field, shown, path, frames=arguments.frames, size=arguments.size)
         console.say(f"{path}: {arguments.frames} frames")
     if "mesh" in arguments.what:
-        surface = extract_mesh(field, voxels=arguments.voxels, level=arguments.level)
+        solid = field if isinstance(field, AdaptedField) else field.adapted
+        density = density_grid(solid, arguments.voxels)
+        level = arguments.level if arguments.level is not None else choose_level(solid, density, shown.cameras)
+        surface = extract_mesh(solid, level=level, density=density)
+        overlap = silhouette_overlap(surface, solid, query.cameras)
         path = save_mesh(surface, out / f"mesh.{arguments.mesh_format}")
         console.say(f"{path}: {len(surface.vertices):,} vertices, {len(surface.faces):,} faces")
+        console.say(
+            f"{path}: its silhouettes overlap the rendered ones of {len(query)} query views by {overlap:.1%} "
+            f"(intersection over union), cut at density {level:.3g}"
+        )
+        if overlap < GOOD_OVERLAP:
+            console.warn(f"{path}: parts are missing or too large; more --voxels, another --level, or --steps 100")
     return 0

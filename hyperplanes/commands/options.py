@@ -18,6 +18,7 @@ __all__ = [
     "Steps",
     "Trainable",
     "Up",
+    "ViewsUp",
     "optional",
 ]
 
@@ -49,4 +50,7 @@ Free = Literal["weights", "hypernetwork"]
 """What fine-tuning optimises."""
 
 Up = Literal["y", "z"]
-"""The axis that points up in the world of posed images."""
+"""The axis that points up in the world of a data set."""
+
+ViewsUp = Annotated[str, tyro.conf.arg(metavar="{auto,y,z,x,-y,-z,-x}")]
+"""The axis that points up in the world of photographs, three numbers, or auto: as the cameras are held."""

@@ -1,8 +1,8 @@
 """New views of one object from a few posed images: the model adapts to them in one step, or some more with --steps.
 
-The images come as a folder with transforms.json (Blender's, nerfstudio's), a COLMAP model, or an object of any data
-set. The model is shown the support half of the views and asked for the other half, so that the result can be compared
-with the truth; --orbit asks for a round about the object instead.
+The images come as a folder with transforms.json (Blender's, nerfstudio's), a COLMAP model, a scene of LLFF, IDR or
+NSVF, or an object of any data set. The model is shown the support half of the views and asked for the other half, so
+that the result can be compared with the truth; --orbit asks for a round about the object instead.
 
 Example:
     hyperplanes render --checkpoint runs/demo --views photos/ --out new-views
@@ -12,19 +12,17 @@ Example:
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, Up, optional
+from hyperplanes.commands.fields import adapt_to, load_source, render_views
+from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, ViewsUp, optional
+from hyperplanes.commands.scene import read_scene
 from hyperplanes.formatting import format_duration
 
-if TYPE_CHECKING:
-    from hyperplanes.views import Task
-
-__all__ = ["Arguments", "after_steps", "read_scene", "run"]
+__all__ = ["Arguments", "run"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class Arguments:
     """What to look at, and from where.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote.
+        checkpoint: What `train`, `adapt` or `demo` wrote, or a file that `bake` wrote.
         views: The posed images of the object.
         out: The folder for the pictures.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
@@ -42,7 +40,10 @@ class Arguments:
         size: Pixels along the longer side of an orbit's pictures; as the images when not given.
         turntable: The format of the turntable.
         all_views: Show the model every view, not only the support half.
-        up: The axis that points up in the world of the views: y as in training data, z as in Blender.
+        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
+            0,0.1,1, or auto: as the cameras are held.
+        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
+            leave one at most when not given.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or fast.
         device: auto, cpu or cuda.
     """
@@ -56,35 +57,10 @@ class Arguments:
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"
     all_views: bool = False
-    up: Up = "y"
+    up: ViewsUp = "auto"
+    downscale: OptionalInt = None
     protocol: Protocol = "default"
     device: str = "auto"
-
-
-def read_scene(path: Path, all_views: bool, up: str = "y") -> Task:
-    """The views to show and the views to ask for; the same ones where all are shown.
-
-    Args:
-        path: of the posed images.
-        all_views: whether all are shown.
-        up: the axis that points up in their world; they are turned so that it is y.
-
-    Returns:
-        Views of a world with y up.
-    """
-    from hyperplanes.data import read_task, read_views
-    from hyperplanes.data.upright import upright, upright_task
-    from hyperplanes.views import Task
-
-    if not all_views:
-        return upright_task(read_task(path), up)
-    views = upright(read_views(path), up)
-    return Task(views, views, path.resolve().name)
-
-
-def after_steps(taken: Sequence[int]) -> str:
-    """How many fine-tuning steps were taken, as the end of a sentence; nothing where there were none to take."""
-    return f", {taken[-1]} fine-tuning steps" if any(taken) else ""
 
 
 def run(arguments: Arguments) -> int:
@@ -97,7 +73,9 @@ def run(arguments: Arguments) -> int:
 
 def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.fine_tuning import FineTuning
-    from hyperplanes.adaptation.pretrained import load_model
+    from hyperplanes.adaptation.nearest_view import NearestView
+    from hyperplanes.baking import BakedScene
+    from hyperplanes.commands.suitability import left_out_check, worse_than_copying
     from hyperplanes.devices import choose_device
     from hyperplanes.export import encode_animation, orbit_cameras, save_images, to_pixels
     from hyperplanes.files import write_whole
@@ -105,32 +83,50 @@ def _run(arguments: Arguments) -> int:
     from hyperplanes.presets import PROTOCOLS
 
     console, device = Console(), choose_device(arguments.device)
-    model = load_model(arguments.checkpoint).to(device)
-    task = read_scene(arguments.views, arguments.all_views, arguments.up)
+    source = load_source(arguments.checkpoint, device)
+    task, _ = read_scene(
+        arguments.views,
+        console,
+        all_views=arguments.all_views,
+        up=arguments.up,
+        downscale=arguments.downscale,
+    )
     shown, asked = task.support.to(device), task.query.to(device)
-    started = time.perf_counter()
-    settings, taken = FineTuning(free=arguments.fine_tune), []
-    field = model.fine_tune(shown, arguments.steps, settings, on_step=taken.append)
-    seconds = time.perf_counter() - started
-    console.say(f"adapted to {len(shown)} views of {task.name} in {format_duration(seconds)}{after_steps(taken)}")
+    settings = FineTuning(free=arguments.fine_tune)
+    field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
     cameras = asked.cameras
     if arguments.orbit is not None:
         cameras = orbit_cameras(shown, arguments.orbit, size=arguments.size)
     started = time.perf_counter()
-    pictures = field.render(cameras, PROTOCOLS[arguments.protocol])
+    pictures = render_views(field, cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / cameras.batch_size
+    scores = None
     if arguments.orbit is None:
         paths = save_images(pictures.images, arguments.out, asked.names)
-        images = pictures.images.clamp(0, 1)
-        quality = f"{float(psnr(images, asked.images).mean()):.2f} dB PSNR"
+        images = pictures.images.clamp(0, 1).to(asked.images.device)
+        value = float(psnr(images, asked.images).mean())
+        quality = f"{value:.2f} dB PSNR"
         if min(asked.size) >= 11:
             quality += f", {float(ssim(images, asked.images).mean()):.3f} SSIM"
         known = "shown to the model as well" if arguments.all_views else "never shown to the model"
         console.say(f"against the {len(asked)} true views, {known}: {quality}")
+        if not arguments.all_views:
+            copied = NearestView().adapt(shown).render(cameras).images
+            scores = value, float(psnr(copied, asked.images).mean())
     else:
         paths = save_images(pictures.images, arguments.out)
         animation = arguments.out / f"turntable.{arguments.turntable}"
         write_whole(animation, encode_animation(to_pixels(pictures.images), arguments.turntable))
         console.say(f"{animation}: the turntable")
+    if scores is None and not isinstance(source, BakedScene) and (arguments.steps == 0 or warned):
+        scores = left_out_check(source, shown)
+        if scores is not None:
+            console.say(
+                f"without fine-tuning, on support views left out for this: {scores[0]:.2f} dB PSNR, "
+                f"copying the nearest view {scores[1]:.2f} dB"
+            )
+            scores = scores if arguments.steps == 0 else None
+    for line in worse_than_copying(*scores, arguments.steps) if scores else []:
+        console.warn(f"{task.name}: {line}")
     console.say(f"{arguments.out}: {len(paths)} pictures, {format_duration(seconds)} each")
     return 0

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.geometry.rays import Sphere
 
@@ -25,21 +26,29 @@ MOST_MASKS = 24  # the hull of fewer views is only larger
 LARGEST_MASK = 256
 
 
-def estimate_bounds(cameras: PinholeCamera, alpha: UInt8[Tensor, "view 1 height width"] | None = None) -> Sphere:
+def estimate_bounds(
+    cameras: PinholeCamera,
+    alpha: UInt8[Tensor, "view 1 height width"] | None = None,
+    depths: Float[Tensor, "view 2"] | None = None,
+) -> Sphere:
     """A sphere that holds what the cameras look at.
 
     From the cameras alone: the centre is the point nearest to all optical axes; the radius is what the narrowest
     camera still sees whole at that distance, r = d sin(half the opening angle), taken over the cameras' median and
     never reaching a camera. With masks of three views or more, the visual hull is carved inside that sphere (twice,
     the second time inside the sphere around the first hull); the result is the sphere around its voxels, 5 % larger,
-    and never larger than the one from the cameras.
+    and never larger than the one from the cameras. Where the cameras look past each other, as forward-facing ones do,
+    the centre lies ahead of them, in the middle of the depths that are known.
+
+    Masks seen through a lens are not carved with: the sphere is then the one from the cameras.
 
     Args:
         cameras: of one scene.
         alpha: their masks, or None where the pictures have none.
+        depths: nearest and farthest distance of what each camera shows, or None.
     """
-    outer = _from_cameras(cameras)
-    if alpha is None or len(alpha) < FEWEST_MASKS or not alpha.any():
+    outer = _from_cameras(cameras, depths)
+    if alpha is None or isinstance(cameras, DistortedCamera) or len(alpha) < FEWEST_MASKS or not alpha.any():
         return outer
     chosen = torch.linspace(0, len(alpha) - 1, min(len(alpha), MOST_MASKS)).round().long()
     masks, small = _reduced(alpha[chosen], camera.select(cameras, chosen))
@@ -94,9 +103,12 @@ def nearest_point(centres: Float[Tensor, "view 3"], directions: Float[Tensor, "v
     return (middle + (torch.linalg.pinv(across.sum(0), rtol=1e-6, hermitian=True) @ right).squeeze(-1)).to(centres)
 
 
-def _from_cameras(cameras: PinholeCamera) -> Sphere:
+def _from_cameras(cameras: PinholeCamera, depths: Tensor | None) -> Sphere:
     eyes, axes = camera.centres(cameras), camera.viewing_directions(cameras)
     centre = nearest_point(eyes, axes)
+    if depths is not None and _look_past_it(centre, eyes, axes, depths):
+        middle = 2 / (1 / depths.to(eyes).clamp_min(1e-6)).sum(1, keepdim=True)  # halfway in the pictures: in disparity
+        centre = (eyes + axes * middle).median(0).values
     distance = (eyes - centre).norm(dim=-1)
     height, width = camera.image_size(cameras)
     focal = camera.intrinsics(cameras)[:, [0, 1], [0, 1]]
@@ -106,6 +118,13 @@ def _from_cameras(cameras: PinholeCamera) -> Sphere:
     if nearest < 1e-6 or radius < 1e-6:  # all cameras in one place: look a unit ahead
         return Sphere(tuple((eyes + axes).mean(0).tolist()), 1.0)
     return Sphere(tuple(centre.tolist()), min(radius, 0.95 * nearest))
+
+
+def _look_past_it(centre: Tensor, eyes: Tensor, axes: Tensor, depths: Tensor) -> bool:
+    """Whether for a quarter of the cameras or more the centre is not within the depths that they show."""
+    ahead = ((centre - eyes) * axes).sum(-1)
+    low, high = depths.to(eyes).unbind(1)
+    return float(((ahead < low) | (ahead > high)).float().mean()) >= 0.25
 
 
 def _smallest_ball(points: Tensor) -> Sphere:
@@ -126,9 +145,4 @@ def _reduced(alpha: Tensor, cameras: PinholeCamera) -> tuple[Tensor, PinholeCame
     size = -(-height // factor), -(-width // factor)
     padded = torch.nn.functional.pad(alpha, (0, size[1] * factor - width, 0, size[0] * factor - height))
     masks = torch.nn.functional.max_pool2d(padded.float(), factor)
-    return masks, camera.resized(_cropped(cameras, size[0] * factor, size[1] * factor), *size)
-
-
-def _cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
-    """The cameras with the right and lower borders moved."""
-    return camera.pinhole(camera.intrinsics(cameras), camera.camera_from_world(cameras), height, width)
+    return masks, camera.resized(camera.cropped(cameras, size[0] * factor, size[1] * factor), *size)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.images import image_size, read_image
-from hyperplanes.data.posed import Posed, check_pose, posed
-from hyperplanes.data.undistort import undistort
+from hyperplanes.data.frames import Frame, assemble
+from hyperplanes.data.masks import find_masks
+from hyperplanes.data.posed import Posed, check_pose
 from hyperplanes.files import DataError, inside, read_bytes, read_text
 from hyperplanes.geometry.rays import Sphere
 
@@ -29,6 +30,7 @@ _MODELS = {
 }
 _PARAMETERS = dict(_MODELS.values())
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_PLACES = ("sparse", "dense/sparse", "dense", "distorted/sparse", "colmap/sparse", "colmap")
 _REMEDY = "export the model again with COLMAP"
 
 
@@ -47,34 +49,44 @@ class _Image:
 
 
 def find_model(folder: str | Path) -> Path | None:
-    """The folder with cameras and images files: the folder itself, its sparse/0, sparse or colmap/sparse/0.
+    """The folder with cameras and images files, where COLMAP and the tools around it put it; None where there is none.
+
+    That is the folder itself, or sparse/0 of it (sparse/1, ...), sparse, dense/sparse, dense, distorted/sparse/0 and
+    colmap/sparse/0. Of the parts of a reconstruction that fell into several, the one with most pictures.
 
     >>> find_model("no such folder") is None
     True
     """
-    for place in (".", "sparse/0", "sparse", "colmap/sparse/0"):
-        for suffix in (".bin", ".txt"):
-            if all((Path(folder) / place / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
-                return Path(folder) / place
+    folder = Path(folder)
+    if _is_model(folder):
+        return folder
+    for place in _PLACES:
+        parts = [path for path in sorted((folder / place).glob("[0-9]*")) if _is_model(path)]
+        if parts:
+            return max(parts, key=_count)
+        if _is_model(folder / place):
+            return folder / place
     return None
 
 
-def read_colmap(folder: str | Path, *, bounds: Sphere | None = None) -> Posed:
+def read_colmap(folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None) -> Posed:
     """The posed pictures of a COLMAP reconstruction.
 
     COLMAP's world and its OpenCV axes are kept; its principal point counts from the pictures' borders. Pictures lie in
-    images/ beside sparse/, or beside the model. Cameras with distortion (SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV)
-    keep their calibration, their pictures are resampled.
+    images/ or input/ beside sparse/, above it, or beside the model. Cameras with distortion (SIMPLE_RADIAL, RADIAL,
+    OPENCV, FULL_OPENCV) keep their calibration, their pictures are resampled. Masks may lie in masks/ beside the
+    pictures' folder.
 
     Args:
         folder: the project, or the model itself.
         bounds: of the scene; estimated when None.
+        downscale: as in `assemble`.
 
     Returns:
         The pictures, sorted by name.
 
     Raises:
-        DataError: no model, a camera model that is not read (fisheye), a truncated file, or pictures of several sizes.
+        DataError: no model, a camera model that is not read (fisheye), a truncated file, or pictures that are missing.
     """
     folder = Path(folder)
     model = find_model(folder)
@@ -98,29 +110,57 @@ def read_colmap(folder: str | Path, *, bounds: Sphere | None = None) -> Posed:
     absent = [image.name for image in images if image.camera not in cameras]
     if absent:
         raise DataError(paths[0], f"the camera of {absent[0]}", "none", _REMEDY)
-    home = next((home for home in (folder / "images", model / "images", model) if home.is_dir()), folder)
-    home = next((parent / "images" for parent in (model, *model.parents[:3]) if (parent / "images").is_dir()), home)
-    size = image_size(inside(home, images[0].name, paths[1]))
-    pictures, alphas = [], []
+    home = _pictures_folder(folder, model, images, paths[1])
+    frames = []
     for image in images:
         seen = cameras[image.camera]
-        picture, alpha = read_image(inside(home, image.name, paths[1]), size)
-        if seen.size != size:
-            found = f"{size[1]} x {size[0]}"
-            raise DataError(home / image.name, f"{seen.size[1]} x {seen.size[0]} pixels", found, "use COLMAP's images")
-        if any(seen.coefficients):
-            picture = undistort(picture, seen.matrix, seen.coefficients, opaque=not alpha)
-        pictures.append(picture)
-        alphas.append(alpha)
-    return posed(
-        pictures,
-        np.stack([check_pose(image.camera_from_world, paths[1], image.name) for image in images]),
-        np.stack([cameras[image.camera].matrix for image in images]),
-        has_alpha=any(alphas),
-        bounds=bounds,
-        names=tuple(image.name for image in images),
-        source=model,
+        frames.append(
+            Frame(
+                inside(home, image.name, paths[1]),
+                image.name,
+                check_pose(image.camera_from_world, paths[1], image.name),
+                partial(_scaled, seen),
+                seen.size,
+                seen.coefficients,
+            )
+        )
+    masks = find_masks(home.parent / "masks", [frame.path for frame in frames])
+    if masks:
+        frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
+    return assemble(frames, paths[1], bounds=bounds, downscale=downscale)[0]
+
+
+def _is_model(folder: Path) -> bool:
+    return any(
+        all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")) for suffix in (".bin", ".txt")
     )
+
+
+def _count(model: Path) -> int:
+    """How large a part of a reconstruction is: the bytes of its file of images."""
+    return max((model / name).stat().st_size for name in ("images.bin", "images.txt") if (model / name).is_file())
+
+
+def _pictures_folder(folder: Path, model: Path, images: list[_Image], source: Path) -> Path:
+    """The folder that holds most of the pictures: images or input, beside the model or up to four folders above."""
+    roots = [folder, model, *list(model.absolute().parents)[:4]]
+    homes = [root / name for root in roots for name in ("images", "input")] + [folder, model]
+    homes = list(dict.fromkeys(home for home in homes if home.is_dir()))
+    chosen = [image.name for image in images[:: max(1, len(images) // 20)]]
+
+    def present(home: Path) -> int:
+        return sum((home / inside(home, name, source).relative_to(home)).is_file() for name in chosen)
+
+    return max(homes, key=present)
+
+
+def _scaled(seen: _Camera, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """The calibration of a camera for pictures of another size: the borders stay in place."""
+    scale = np.array([size[1] / seen.size[1], size[0] / seen.size[0]])
+    matrix = seen.matrix.copy()
+    matrix[[0, 1], [0, 1]] *= scale
+    matrix[:2, 2] = scale * (matrix[:2, 2] + 0.5) - 0.5
+    return matrix
 
 
 def _camera(model: str, width: int, height: int, values: list[float], path: Path) -> _Camera:

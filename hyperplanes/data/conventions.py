@@ -97,8 +97,7 @@ def _flip_rows(camera_from_world: Tensor) -> Tensor:
 
 
 def _overlap(masks: Tensor, cameras: PinholeCamera, pose: Tensor) -> float:
-    height, width = masks.shape[2:]
-    candidate = camera.pinhole(camera.intrinsics(cameras), pose, height, width)
+    candidate = camera.with_poses(cameras, pose)
     sphere = estimate_bounds(candidate)
     ahead = camera.camera_from_world(candidate)[:, 2] @ pose.new_tensor([*sphere.centre, 1.0])
     if (ahead > 0).float().mean() < 0.5:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from hyperplanes.data.catalogue import SPLITS
-from hyperplanes.data.posed import Posed, PosedTask
-from hyperplanes.data.recognise import find_catalogue, posed_folder, read_posed_task
-from hyperplanes.data.transforms_json import find_transforms, read_transforms
+from hyperplanes.data.posed import PosedTask
+from hyperplanes.data.recognise import find_catalogue, read_posed, read_posed_task
 from hyperplanes.files import DataError, malformed
 from hyperplanes.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
@@ -94,7 +94,7 @@ class Dataset:
             name: one of `names()`.
 
         Returns:
-            The pictures with their cameras.
+            The pictures with their cameras. A UserWarning names what was left out, turned or scaled.
 
         Raises:
             DataError: no such object, or anything wrong with its files.
@@ -108,6 +108,7 @@ class Dataset:
             raise DataError(self.folder, f"one of its {len(known)} objects ({some})", repr(name), "check the name")
         with malformed(f"{self.folder}, {name}", "an object with posed images"):
             task = self._catalogue.read(name)
+        warn_of(task.notes, self.folder / name if len(self) > 1 else self.folder)
         with self._lock:
             self._cache.add(name, task)
         return task
@@ -203,21 +204,26 @@ def open_datasets(
     return Datasets({name: open_dataset(path, share, legacy=legacy) for name, path in zip(names, paths, strict=True)})
 
 
-def read_views(path: str | Path) -> Views:
+def read_views(path: str | Path, downscale: int | None = None) -> Views:
     """All posed images of one scene, over white.
 
     Args:
-        path: a transforms*.json, or a folder that holds some, an SRN object's folder, a COLMAP model, or the .npz of
-            one object. Of a folder with transforms_train, _val and _test files, all are read. "example-car" comes with
-            the package.
+        path: a transforms*.json, or a folder that holds some, an SRN object's folder, a COLMAP model, a scene in the
+            layout of LLFF, IDR or NSVF, or the .npz of one object. Of a folder with transforms_train, _val and _test
+            files, all are read. "example-car" comes with the package.
+        downscale: take the mean of so many by so many pixels; None: photographs of more than a megapixel get as many
+            as leave one at most.
 
     Returns:
-        The views in the order of the files; masks where the files have alpha. Anything wrong with a file is a
-        DataError that names it.
+        The views in the order of the files; masks where the files have alpha. Where pictures were left out, turned or
+        scaled, a UserWarning says which. As `recognise.read_posed`, it raises DataError.
     """
     path = _located(path)
     with malformed(path, "posed images of one scene"):
-        return _read_scene(path).views()
+        scene = read_posed(path, downscale)
+        views = scene.views()
+    warn_of(scene.notes, path)
+    return views
 
 
 def _located(path: str | Path) -> Path:
@@ -227,47 +233,27 @@ def _located(path: str | Path) -> Path:
     return packaged if len(path.parts) == 1 and not path.exists() and packaged.is_dir() else path
 
 
-def _read_scene(path: Path) -> Posed:
-    from hyperplanes.data import colmap, npz, srn
-
-    if path.is_file():
-        return npz.read_npz(path) if path.suffix == ".npz" else read_transforms(path)
-    if not path.is_dir():
-        raise DataError(path, "a transforms*.json or a folder that holds one", "nothing", "check the path")
-    if files := find_transforms(path):
-        return read_transforms(files)
-    if srn.is_srn(path):
-        return srn.read_srn(path)
-    if colmap.find_model(path) is not None:
-        return colmap.read_colmap(path)
-    found = ", ".join(sorted(child.name for child in path.iterdir())[:5]) or "an empty folder"
-    raise DataError(path, "transforms.json or another layout of one scene", found, "give one object's folder")
-
-
-def read_task(path: str | Path) -> Task:
+def read_task(path: str | Path, downscale: int | None = None) -> Task:
     """The support and query views of one scene.
 
     Args:
         path: a folder with transforms_train.json and transforms_test.json, or one transforms.json (whose
             train_filenames and test_filenames decide, else views alternate), or another layout of one scene.
             "example-car" comes with the package.
+        downscale: as in `read_views`.
 
     Returns:
-        The task; its name is the folder's. Anything wrong with a file is a DataError that names it.
+        The task; its name is the folder's. It warns as `read_views`, and raises DataError.
     """
     path = _located(path)
     with malformed(path, "posed images of one scene"):
-        return _read_posed_task(path).task()
+        task = read_posed_task(path, downscale)
+        made = task.task()
+    warn_of(task.notes, path)
+    return made
 
 
-def _read_posed_task(path: Path) -> PosedTask:
-    from hyperplanes.data import npz, srn
-
-    if path.is_file() and path.suffix == ".npz":
-        return PosedTask.alternating(npz.read_npz(path), path.stem)
-    if path.is_dir() and srn.is_srn(path):
-        return PosedTask.alternating(srn.read_srn(path), path.name)
-    folder = path.parent if path.is_file() else path
-    if not folder.is_dir():
-        raise DataError(path, "a folder with posed images", "nothing", "check the path")
-    return read_posed_task(folder, posed_folder(folder).splits["test"][0])
+def warn_of(notes: Sequence[str], path: str | Path) -> None:
+    """A UserWarning for each note of a reading."""
+    for note in notes:
+        warnings.warn(f"{path}: {note}", stacklevel=3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +15,100 @@ from torch import Tensor
 
 from hyperplanes.files import DataError, check_regular
 
-__all__ = ["LARGEST_IMAGE", "composite_over_white", "image_size", "read_image"]
+__all__ = [
+    "LARGEST_IMAGE",
+    "PICTURE_SUFFIXES",
+    "Header",
+    "Pixels",
+    "composite_over_white",
+    "image_header",
+    "image_size",
+    "read_image",
+    "reduced",
+    "resized",
+    "turned",
+]
 
 LARGEST_IMAGE = 64 * 10**6
 """Pixels above which an image is refused before it is decoded."""
 
+PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
+"""Endings, in small letters, of the files that are taken for pictures."""
+
+Pixels = npt.NDArray[np.uint8]
+
 _REMEDY = "render, export or download it again"
+_ORIENTATION = 0x0112  # of EXIF: 1 is upright, 2 to 8 are the other turns and mirrorings
+_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+
+
+@dataclass(frozen=True)
+class Header:
+    """What an image says of itself before it is decoded.
+
+    Attributes:
+        size: (height, width) of the pixels as they are stored.
+        orientation: EXIF's number: 1 where they are stored upright, or where nothing is said.
+    """
+
+    size: tuple[int, int]
+    orientation: int
+
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        """(height, width) after the turn that EXIF asks for."""
+        height, width = self.size
+        return (width, height) if self.orientation >= 5 else self.size
+
+
+def image_header(path: str | Path) -> Header:
+    """The header of an image; DataError when there is none, or one of an absurd size."""
+    with _open(Path(path)) as image:
+        orientation = 1
+        if "exif" in image.info:  # asking without it would decode a whole PNG
+            try:
+                orientation = int(image.getexif().get(_ORIENTATION, 1))
+            except (TypeError, ValueError, SyntaxError, OSError):
+                orientation = 1  # a damaged tag says nothing
+        return Header((image.height, image.width), orientation if orientation in _TURNS else 1)
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
     """(height, width) of an image, from its header alone; DataError when there is none, or an absurd one."""
-    with _open(Path(path)) as image:
-        return image.height, image.width
+    return image_header(path).size
+
+
+def turned(picture: Pixels, orientation: int) -> Pixels:
+    """A picture (height, width, 4) turned and mirrored as EXIF's orientation asks for."""
+    return picture if orientation == 1 else np.array(Image.fromarray(picture).transpose(_TURNS[orientation]))
+
+
+def resized(picture: Pixels, size: tuple[int, int]) -> Pixels:
+    """A picture (height, width, 4) of straight alpha scaled to another size, its borders staying in place."""
+    if picture.shape[:2] == size:
+        return picture
+    scaled = Image.fromarray(picture).convert("RGBa").resize((size[1], size[0]), Image.Resampling.BILINEAR)
+    return np.array(scaled.convert("RGBA"))
+
+
+def reduced(picture: Pixels, factor: int) -> Pixels:
+    """A picture (height, width, 4) of straight alpha, the mean of every factor x factor pixels one pixel.
+
+    Rows and columns at the end that fill no whole pixel are left out.
+    """
+    if factor == 1:
+        return picture
+    height, width = picture.shape[0] // factor, picture.shape[1] // factor
+    image = Image.fromarray(picture).convert("RGBa").reduce(factor, (0, 0, width * factor, height * factor))
+    return np.array(image.convert("RGBA"))
 
 
 def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[npt.NDArray[np.uint8], bool]:

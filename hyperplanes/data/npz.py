@@ -185,9 +185,9 @@ def _learnit(
 
     def read(name: str) -> PosedTask:
         if manifest:
-            return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, flat=True)
-        scene = read_transforms(homes[name] / "transforms.json", legacy=legacy, bounds=bounds, flat=True)
-        return PosedTask.halves(scene, name)
+            return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, flat=True, complete=True)
+        file = homes[name] / "transforms.json"
+        return PosedTask.halves(read_transforms(file, legacy=legacy, bounds=bounds, flat=True, complete=True), name)
 
     return Catalogue("learnit-128", splits, read, manifest, tuple(skipped))
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.data.bounds import estimate_bounds
-from hyperplanes.data.images import composite_over_white
+from hyperplanes.data.images import composite_over_white, reduced
 from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
@@ -32,15 +33,26 @@ class Posed:
         rgba: straight alpha, 255 where the file had none.
         cameras: one a picture, OpenCV axes, integer pixel centres.
         has_alpha: whether alpha means anything.
-        bounds: the sphere that holds the scene.
+        stated_bounds: the sphere that the files state, or None.
         names: of the files, relative to their folder.
+        depths: (view, 2), the nearest and farthest distance that the files state, or None.
+        notes: what a person should know of the reading, a sentence each: what was left out, turned or scaled.
     """
 
     rgba: UInt8[Tensor, "view 4 height width"]
     cameras: PinholeCamera
     has_alpha: bool
-    bounds: Sphere
+    stated_bounds: Sphere | None
     names: tuple[str, ...]
+    depths: Float[Tensor, "view 2"] | None = None
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def bounds(self) -> Sphere:
+        """The sphere that holds the scene: the stated one, or an estimate from these views."""
+        if self.stated_bounds is not None:
+            return self.stated_bounds
+        return estimate_bounds(self.cameras, self.rgba[:, 3:] if self.has_alpha else None, self.depths)
 
     def __len__(self) -> int:
         return len(self.rgba)
@@ -51,13 +63,34 @@ class Posed:
         return Views(images, self.cameras, masks if self.has_alpha else None, self.bounds, self.names)
 
     def select(self, index: list[int]) -> Posed:
-        """The pictures at `index`, in that order; the bounds stay."""
-        return Posed(
-            self.rgba[index],
-            camera.select(self.cameras, index),
-            self.has_alpha,
-            self.bounds,
-            tuple(self.names[i] for i in index),
+        """The pictures at `index`, in that order; stated bounds stay, others are estimated from these alone."""
+        return replace(
+            self,
+            rgba=self.rgba[index],
+            cameras=camera.select(self.cameras, index),
+            names=tuple(self.names[i] for i in index),
+            depths=None if self.depths is None else self.depths[index],
+        )
+
+    def downscaled(self, factor: int | None) -> Posed:
+        """The pictures with the mean of every factor x factor pixels as one pixel; None leaves them as they are."""
+        if factor is None or factor == 1:
+            return self
+        height, width = self.rgba.shape[2] // factor, self.rgba.shape[3] // factor
+        if not height or not width:
+            raise DataError(
+                self.names[0],
+                f"pictures of {factor} pixels or more to scale down by {factor}",
+                f"{self.rgba.shape[3]} x {self.rgba.shape[2]}",
+                "give a smaller --downscale",
+            )
+        pictures = [reduced(picture, factor) for picture in self.rgba.permute(0, 2, 3, 1).numpy()]
+        whole = camera.cropped(self.cameras, height * factor, width * factor)
+        return replace(
+            self,
+            rgba=torch.from_numpy(np.ascontiguousarray(np.stack(pictures).transpose(0, 3, 1, 2))),
+            cameras=camera.resized(whole, height, width),
+            notes=(*self.notes, f"scaled down by {factor}, to {width} x {height} pixels"),
         )
 
     @property
@@ -89,17 +122,32 @@ class PosedTask:
         """Memory of the pictures in bytes."""
         return self.support.nbytes + self.query.nbytes
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know of the reading."""
+        return self.support.notes
+
+    @classmethod
+    def split(cls, scene: Posed, support: list[int], query: list[int], name: str) -> PosedTask:
+        """Some views of a scene as support and others as query; bounds are estimated from the support alone."""
+        shown = scene.select(support)
+        return cls(shown, replace(scene.select(query), stated_bounds=shown.bounds), name)
+
     @classmethod
     def halves(cls, scene: Posed, name: str) -> PosedTask:
         """The first half of the views as support, the rest as query."""
         index = list(range(len(scene)))
-        return cls(scene.select(index[: len(index) // 2]), scene.select(index[len(index) // 2 :]), name)
+        return cls.split(scene, index[: len(index) // 2], index[len(index) // 2 :], name)
 
     @classmethod
     def alternating(cls, scene: Posed, name: str) -> PosedTask:
         """Every other view from the first on as support, the rest as query."""
         index = list(range(len(scene)))
-        return cls(scene.select(index[::2]), scene.select(index[1::2]), name)
+        return cls.split(scene, index[::2], index[1::2], name)
+
+    def downscaled(self, factor: int | None) -> PosedTask:
+        """Both halves as `Posed.downscaled`."""
+        return PosedTask(self.support.downscaled(factor), self.query.downscaled(factor), self.name)
 
 
 def posed(
@@ -111,6 +159,8 @@ def posed(
     bounds: Sphere | None,
     names: tuple[str, ...],
     source: str | Path,
+    depths: Float[Tensor, "view 2"] | None = None,
+    notes: tuple[str, ...] = (),
 ) -> Posed:
     """Put together what a reader found.
 
@@ -122,6 +172,8 @@ def posed(
         bounds: of the scene, or None to estimate them.
         names: one a picture.
         source: the file, for messages.
+        depths: nearest and farthest distance of what each picture shows, where the files say.
+        notes: as in `Posed`.
 
     Returns:
         The scene.
@@ -137,9 +189,7 @@ def posed(
         )
     except ValueError as error:
         raise DataError(source, "usable cameras", str(error), "export the cameras again") from error
-    if bounds is None:
-        bounds = estimate_bounds(cameras, rgba[:, 3:] if has_alpha else None)
-    return Posed(rgba, cameras, has_alpha, bounds, names)
+    return Posed(rgba, cameras, has_alpha, bounds, names, depths, notes)
 
 
 def check_pose(matrix: object, source: str | Path, frame: str) -> npt.NDArray[np.float64]:

@@ -16,8 +16,9 @@ import numpy.typing as npt
 from hyperplanes.axes import flip_camera_axes
 from hyperplanes.files import DataError
 
-__all__ = ["calibration", "opencv_from_opengl", "transforms_document"]
+__all__ = ["calibration", "opencv_from_opengl", "stated_size", "transforms_document"]
 
+_NOT_PERSPECTIVE = ("is_fisheye", "ortho")  # fields by which instant-ngp marks other cameras
 _NO_DISTORTION = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL"}
 
 
@@ -101,15 +102,16 @@ def calibration(
         The matrix in float64.
 
     Raises:
-        DataError: no focal length, one that is not positive, or a camera model that is not a pinhole's.
+        DataError: no focal length, one that is not positive, or a camera that is no pinhole.
     """
     height, width = size
     model = fields.get("camera_model", "OPENCV")
     if model not in _NO_DISTORTION and model != "FULL_OPENCV":
         raise DataError(str(source), "a perspective camera_model", repr(model), "undistort the images first")
-    stated = (_number(fields, "w", width, source), _number(fields, "h", height, source))
-    if min(stated) <= 0:
-        raise DataError(str(source), "positive w and h", f"{stated[0]:g} x {stated[1]:g}", "correct the file")
+    for name in _NOT_PERSPECTIVE:
+        if fields.get(name):
+            raise DataError(str(source), f"perspective cameras, without {name}", "it set", "undistort the images first")
+    stated = _stated(fields, size, source)
     scale = (width / stated[0], height / stated[1])
     if "fl_x" in fields:
         focal_x = _number(fields, "fl_x", 0.0, source) * scale[0]
@@ -129,6 +131,30 @@ def calibration(
     centre_y = _number(fields, "cy", stated[1] / 2, source) * scale[1]
     shift = 0.0 if legacy else 0.5
     return np.array([[focal_x, 0.0, centre_x - shift], [0.0, focal_y, centre_y - shift], [0.0, 0.0, 1.0]])
+
+
+def stated_size(fields: dict[str, Any], source: object) -> tuple[int, int] | None:
+    """(height, width) of the pictures for which a file's numbers were made, None where it does not say both.
+
+    Args:
+        fields: as in `calibration`.
+        source: the file, for messages.
+
+    Returns:
+        Whole pixels. A size that is no positive number is a DataError.
+    """
+    if "w" not in fields or "h" not in fields:
+        return None
+    width, height = _stated(fields, (1, 1), source)
+    return max(1, round(height)), max(1, round(width))
+
+
+def _stated(fields: dict[str, Any], size: tuple[int, int], source: object) -> tuple[float, float]:
+    """Stated width and height, those of the picture where absent."""
+    stated = _number(fields, "w", size[1], source), _number(fields, "h", size[0], source)
+    if min(stated) <= 0:
+        raise DataError(str(source), "positive w and h", f"{stated[0]:g} x {stated[1]:g}", "correct the file")
+    return stated
 
 
 def _numbers(matrix: npt.NDArray[np.float64]) -> dict[str, float]:

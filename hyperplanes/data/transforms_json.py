@@ -3,31 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from hyperplanes.data.bounds import stated_bounds
-from hyperplanes.data.images import image_size, read_image
-from hyperplanes.data.posed import Posed, PosedTask, check_pose, posed
-from hyperplanes.data.transforms_document import calibration, opencv_from_opengl
-from hyperplanes.data.undistort import distortion, undistort
+from hyperplanes.data.frames import Frame, assemble
+from hyperplanes.data.masks import find_masks
+from hyperplanes.data.posed import Posed, PosedTask, check_pose
+from hyperplanes.data.transforms_document import calibration, opencv_from_opengl, stated_size
+from hyperplanes.data.undistort import distortion
 from hyperplanes.files import DataError, inside, read_json
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["find_transforms", "read_transforms", "read_transforms_task"]
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".webp")
-
-
-@dataclass(frozen=True)
-class _Frame:
-    fields: dict[str, Any]
-    name: str
-    path: Path
 
 
 def find_transforms(folder: str | Path) -> list[Path]:
@@ -46,57 +37,47 @@ def find_transforms(folder: str | Path) -> list[Path]:
 def read_transforms(
     path: str | Path | Sequence[Path],
     *,
-    only: Sequence[str] | None = None,
     legacy: bool = False,
     bounds: Sphere | None = None,
     flat: bool = False,
+    downscale: int | None = None,
+    complete: bool = False,
+    root: Path | None = None,
 ) -> Posed:
     """The posed pictures of one scene.
 
     Distorted pictures (k1, k2, k3, p1, p2 not zero) are undistorted with the same calibration. An alpha channel, or the
-    pictures that `mask_path` names, become the masks.
+    pictures that `mask_path` names, or those of a folder masks/ beside the file, become the masks.
 
     Args:
         path: a transforms file, or several of one folder that are read as one scene.
-        only: the `file_path`s to read, in this order; all when None.
         legacy: as in `calibration`.
         bounds: of the scene; "scene_sphere" of the file, else an estimate, when None.
         flat: take only the last part of each `file_path`, beside the file, as learnit's data have it.
+        downscale: as in `assemble`.
+        complete: as in `assemble`.
+        root: no picture may lie outside of it, symbolic links followed; the file's folder when None.
 
     Returns:
         The pictures of all frames in the order of the files. Anything wrong with a file is a DataError that names it.
     """
     paths = [Path(path)] if isinstance(path, (str, Path)) else list(path)
-    documents = [read_json(one) for one in paths]
-    frames = [frame for one, document in zip(paths, documents, strict=True) for frame in _frames(one, document, flat)]
-    if only is not None:
-        frames = _chosen(frames, only, paths[0])
-    source = frames[0].path.parent if len(paths) > 1 else paths[0]
-    size = image_size(frames[0].path)
-    pictures, alphas, matrices, poses = [], [], [], []
-    for frame in frames:
-        poses.append(check_pose(frame.fields.get("transform_matrix"), paths[0], frame.name))
-        matrix = calibration(frame.fields, size, paths[0], legacy=legacy)
-        picture, alpha = _picture(frame, size, paths[0].parent)
-        coefficients = distortion(frame.fields, paths[0])
-        if any(coefficients):
-            picture = undistort(picture, matrix, coefficients, opaque=not alpha)
-        pictures.append(picture)
-        matrices.append(matrix)
-        alphas.append(alpha)
-    return posed(
-        pictures,
-        opencv_from_opengl(np.stack(poses)),
-        np.stack(matrices),
-        has_alpha=any(alphas),
-        bounds=bounds or stated_bounds(documents[0], paths[0]),
-        names=tuple(frame.name for frame in frames),
-        source=source,
-    )
+    document, frames, _ = _listed_frames(paths, legacy, flat, root)
+    source = paths[0] if len(paths) == 1 else paths[0].parent
+    bounds = bounds or stated_bounds(document, paths[0])
+    return assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)[0]
 
 
 def read_transforms_task(
-    folder: str | Path, name: str, *, legacy: bool = False, bounds: Sphere | None = None, flat: bool = False
+    folder: str | Path,
+    name: str,
+    *,
+    legacy: bool = False,
+    bounds: Sphere | None = None,
+    flat: bool = False,
+    downscale: int | None = None,
+    complete: bool = False,
+    root: Path | None = None,
 ) -> PosedTask:
     """Support and query of one scene.
 
@@ -107,8 +88,11 @@ def read_transforms_task(
         folder: what holds the files.
         name: of the object.
         legacy: as in `calibration`.
-        bounds: as in `read_transforms`; an estimate uses all views of the support.
+        bounds: as in `read_transforms`; an estimate uses the views of the support alone.
         flat: as in `read_transforms`.
+        downscale: as in `assemble`.
+        complete: as in `assemble`.
+        root: as in `read_transforms`.
 
     Returns:
         The two halves with the same bounds.
@@ -119,73 +103,99 @@ def read_transforms_task(
     files = find_transforms(folder)
     if not files:
         raise DataError(folder, "transforms.json or transforms_train.json", "neither", "check the path")
-    settings: dict[str, Any] = {"legacy": legacy, "flat": flat}
-    if len(files) > 1:
-        support = read_transforms(files[0], bounds=bounds, **settings)
-        query = read_transforms(files[-1], bounds=support.bounds, **settings)
-        return _same_size(PosedTask(support, query, name), folder)
-    document = read_json(files[0])
-    halves = [document.get(f"{half}_filenames") for half in ("train", "test")]
-    if not document.get("test_filenames") and isinstance(document.get("val_filenames"), list):
-        halves[1] = document["val_filenames"]
-    if not all(isinstance(half, list) and half for half in halves):
-        scene = read_transforms(files[0], bounds=bounds, **settings)
+    paths = files if len(files) == 1 else [files[0], files[-1]]
+    document, frames, counts = _listed_frames(paths, legacy, flat, root)
+    query = range(counts[0], len(frames))
+    if len(paths) == 1:
+        frames, query = _split_by_names(document, frames, files[0])
+    bounds = bounds or stated_bounds(document, files[0])
+    source = files[0] if len(paths) == 1 else folder
+    scene, kept = assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)
+    if query is None:
         if len(scene) < 2:
             raise DataError(files[0], "two frames or more", f"{len(scene)}", "add views to support or to query")
         return PosedTask.alternating(scene, name)
-    names = [*halves[0], *halves[1]]  # type: ignore[misc]
-    if len(set(names)) < len(names):
+    halves = [[at for at, index in enumerate(kept) if (index in query) == asked] for asked in (False, True)]
+    if not all(halves):
+        found = f"{len(halves[0])} to train and {len(halves[1])} to test on"
+        raise DataError(source, "pictures of both splits", found, "copy the pictures to where the files name them")
+    return PosedTask.split(scene, halves[0], halves[1], name)
+
+
+def _split_by_names(document: dict[str, Any], frames: list[Frame], path: Path) -> tuple[list[Frame], range | None]:
+    """The frames that train_filenames and test_filenames name, and which of them are the query; None: no such lists."""
+    halves = [document.get(f"{half}_filenames") for half in ("train", "test")]
+    if not document.get("test_filenames") and isinstance(document.get("val_filenames"), list):
+        halves[1] = document["val_filenames"]
+    support, query = halves
+    if not (isinstance(support, list) and support and isinstance(query, list) and query):
+        return frames, None
+    names = [*support, *query]
+    if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
         raise DataError(
-            files[0], "train_filenames and test_filenames without common or repeated files", "some", "correct the file"
+            path, "train_filenames and test_filenames without common or repeated files", "some", "correct the file"
         )
-    scene = read_transforms(files[0], only=names, bounds=bounds, **settings)
-    count = len(halves[0])  # type: ignore[arg-type]
-    return PosedTask(scene.select(list(range(count))), scene.select(list(range(count, len(names)))), name)
+    return _chosen(frames, names, path), range(len(support), len(names))
 
 
-def _frames(path: Path, document: dict[str, Any], flat: bool) -> list[_Frame]:
+def _listed_frames(
+    paths: list[Path], legacy: bool, flat: bool, root: Path | None
+) -> tuple[dict[str, Any], list[Frame], list[int]]:
+    """The first document, the frames of all, and how many each has."""
+    documents = [read_json(one) for one in paths]
+    parts = [_frames(path, document, legacy, flat, root) for path, document in zip(paths, documents, strict=True)]
+    return documents[0], [frame for part in parts for frame in part], [len(part) for part in parts]
+
+
+def _frames(path: Path, document: dict[str, Any], legacy: bool, flat: bool, root: Path | None) -> list[Frame]:
     listed = document.get("frames")
     if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
         found = f"{len(listed)} of them" if isinstance(listed, list) else repr(listed)[:40]
         raise DataError(path, "frames, a list of one or more objects", found, "export the file again")
     common = {key: value for key, value in document.items() if key != "frames"}
-    return [_frame(path, common, frame, flat) for frame in listed]
+    frames = [_frame(path, common | frame, legacy, flat, root or path.parent) for frame in listed]
+    if any(frame.mask is not None for frame in frames):
+        return frames
+    masks = find_masks(path.parent / "masks", [frame.path for frame in frames])
+    return [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)] if masks else frames
 
 
-def _frame(path: Path, common: dict[str, Any], frame: dict[str, Any], flat: bool) -> _Frame:
-    written = frame.get("file_path")
+def _frame(path: Path, fields: dict[str, Any], legacy: bool, flat: bool, root: Path) -> Frame:
+    written = fields.get("file_path")
     if not isinstance(written, str) or not written:
         raise DataError(path, "a file_path in every frame", repr(written), "export the file again")
-    located = inside(path.parent, PurePosixPath(written.replace("\\", "/")).name if flat else written, path)
+    name = PurePosixPath(written.replace("\\", "/")).name if flat else written
+    located = _located(path, name, root)
     if not located.is_file():
         with_suffix = [located.with_name(located.name + suffix) for suffix in _SUFFIXES]
         located = next((candidate for candidate in with_suffix if candidate.is_file()), located)
-    return _Frame(common | frame, written, located)
+    pose = check_pose(fields.get("transform_matrix"), path, written)
+    mask = fields.get("mask_path")
+    return Frame(
+        located,
+        written,
+        opencv_from_opengl(pose[None])[0],
+        lambda size: calibration(fields, size, path, legacy=legacy),
+        stated_size(fields, path),
+        distortion(fields, path),
+        None if mask is None else _located(path, mask, root),
+    )
 
 
-def _chosen(frames: list[_Frame], only: Sequence[str], path: Path) -> list[_Frame]:
+def _located(path: Path, name: object, root: Path) -> Path:
+    """Where a name that a file writes leads to; names stay below its folder, links below the root."""
+    text = name.replace("\\", "/") if isinstance(name, str) else ""
+    if ".." in PurePosixPath(text).parts or root == path.parent:
+        return inside(path.parent, name, path)  # type: ignore[arg-type]
+    return inside(root, str(path.parent.relative_to(root) / text) if text else "", path)
+
+
+def _chosen(frames: list[Frame], only: Sequence[str], path: Path) -> list[Frame]:
     by_name = {str(PurePosixPath(frame.name)): frame for frame in frames}
     chosen = []
     for name in only:
-        frame = by_name.get(str(PurePosixPath(name))) if isinstance(name, str) else None
+        frame = by_name.get(str(PurePosixPath(name)))
         if frame is None:
             raise DataError(path, f"a frame for {name!r} of train_filenames, test_filenames", "none", "correct it")
         chosen.append(frame)
     return chosen
-
-
-def _picture(frame: _Frame, size: tuple[int, int], folder: Path) -> tuple[npt.NDArray[np.uint8], bool]:
-    picture, alpha = read_image(frame.path, size)
-    mask = frame.fields.get("mask_path")
-    if mask is not None and not alpha:
-        values, _ = read_image(inside(folder, mask, folder), size)
-        picture[..., 3] = values[..., :3].max(-1)
-        alpha = True
-    return picture, alpha
-
-
-def _same_size(task: PosedTask, folder: str | Path) -> PosedTask:
-    sizes = task.support.rgba.shape[2:], task.query.rgba.shape[2:]
-    if sizes[0] != sizes[1]:
-        raise DataError(folder, "train and test pictures of one size", f"{sizes}", "scale one of them")
-    return task

@@ -11,11 +11,15 @@ import torch
 from torch.nn.functional import grid_sample
 
 from hyperplanes.files import DataError
+from hyperplanes.geometry.distortion import inverse_distortion, turning_radius
 
-__all__ = ["COEFFICIENTS", "distort", "distortion", "undistort"]
+__all__ = ["COEFFICIENTS", "check_lens", "distort", "distortion", "undistort"]
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's names, in OpenCV's order."""
+
+GRID = 41  # places across the picture at which the lens is checked
+MOST_FOLDED = 0.02  # of them; polynomials fitted to the corners often turn just inside them
 
 Array = npt.NDArray[np.float64]
 
@@ -61,6 +65,36 @@ def distort(points: Array, coefficients: tuple[float, ...]) -> Array:
     )
 
 
+def check_lens(matrix: Array, coefficients: tuple[float, ...], size: tuple[int, ...], source: object) -> None:
+    """Refuse a lens that maps no direction to a part of the picture, or several: it folds.
+
+    Args:
+        matrix: (3, 3) calibration, integer pixel centres.
+        coefficients: of COEFFICIENTS.
+        size: (height, width).
+        source: the file and the frame, for the message.
+
+    Raises:
+        DataError: more than 2 % of the picture are beyond the fold.
+    """
+    rows, columns = (np.linspace(-0.5, extent - 0.5, GRID) for extent in size)
+    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    points = torch.from_numpy((pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]])
+    lens = torch.tensor([coefficients], dtype=torch.float64)
+    limit = turning_radius(lens)
+    tolerance = 0.01 / float(matrix[[0, 1], [0, 1]].max())
+    _, found = inverse_distortion(points, lens.expand(len(points), -1), limit.expand(len(points)), tolerance)
+    folded = 1 - float(found.double().mean())
+    if folded > MOST_FOLDED:
+        stated = ", ".join(f"{n} = {v:g}" for n, v in zip(COEFFICIENTS, coefficients, strict=True) if v)
+        raise DataError(
+            str(source),
+            "a lens that shows every pixel once",
+            f"{stated}, which folds {folded:.0%} of the picture",
+            "calibrate again, or undistort the images first",
+        )
+
+
 def undistort(
     picture: npt.NDArray[np.uint8], matrix: Array, coefficients: tuple[float, ...], *, opaque: bool = False
 ) -> npt.NDArray[np.uint8]:
@@ -79,7 +113,13 @@ def undistort(
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     focal, centre = matrix[[0, 1], [0, 1]], matrix[:2, 2]
     ideal = (np.stack([columns, rows], -1).reshape(-1, 2) - centre) / focal
+    limit = float(turning_radius(torch.tensor([coefficients], dtype=torch.float64)))
+    radius = np.hypot(*ideal.T)
+    beyond = radius >= limit  # no lens shows what the polynomial folds back
+    ideal[beyond] *= (limit / radius[beyond])[:, None]
     pixels = distort(ideal, coefficients) * focal + centre
+    if not opaque:
+        pixels[beyond] = -2.0  # outside of the picture
     grid = pixels / [max(width - 1, 1) / 2, max(height - 1, 1) / 2] - 1
     straight = torch.from_numpy(picture.astype(np.float32)).permute(2, 0, 1)[None]
     premultiplied = torch.cat([straight[:, :3] * straight[:, 3:] / 255, straight[:, 3:]], 1)

@@ -2,43 +2,98 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
 from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, Views
 
-__all__ = ["UPS", "upright", "upright_task", "y_up_from"]
+__all__ = ["UPS", "guess_up", "upright", "upright_task", "y_up_from"]
 
-UPS = ("y", "z")
-"""Axes that may be up in a world."""
+UPS = ("y", "z", "x", "-y", "-z", "-x")
+"""Axes that may be up in a world; three numbers with commas between them are another direction."""
+
+LEVEL = 0.1  # sine of the tilt, root mean square over the cameras, up to which they count as held level
+
+
+def guess_up(cameras: PinholeCamera) -> str | None:
+    """The direction that is up in the world, as people and programs hold cameras: level, and not upside down.
+
+    The horizontal axis of a level camera is perpendicular to it. An axis of the world goes first; else it is the
+    direction that all horizontal axes are most nearly perpendicular to.
+
+    Args:
+        cameras: of one scene.
+
+    Returns:
+        One of UPS, or three numbers as `y_up_from` takes them; None where the cameras do not tell.
+
+    >>> guess_up(camera.pinhole(camera.symmetric_intrinsics(4, 4, 0.7), camera.orbit(9, 3.0), 4, 4))
+    'y'
+    """
+    pose = camera.camera_from_world(cameras).detach().double().cpu()
+    right, upward = pose[:, 0, :3], -pose[:, 1, :3].mean(0)
+    found = {}
+    for name in UPS:
+        axis = _direction(name)
+        if float((right @ axis).square().mean().sqrt()) < LEVEL and float(upward @ axis) > LEVEL:
+            found[name] = float(upward @ axis)
+    if found:
+        return max(found, key=lambda name: found[name])
+    values, vectors = torch.linalg.eigh(right.T @ right / len(right))
+    axis = vectors[:, 0] * torch.sign(upward @ vectors[:, 0])
+    if values[0].clamp_min(0).sqrt() > LEVEL or values[1] < 4 * LEVEL**2 or float(upward @ axis) <= LEVEL:
+        return None
+    return ",".join(f"{value:.4f}" for value in axis.tolist())
+
+
+def _direction(up: str) -> Float[Tensor, " 3"]:
+    """The unit vector that a name of UPS, or three numbers, stand for.
+
+    Raises:
+        ValueError: neither.
+    """
+    if up in UPS:
+        axis = torch.zeros(3, dtype=torch.float64)
+        axis["xyz".index(up[-1])] = -1.0 if up[0] == "-" else 1.0
+        return axis
+    try:
+        numbers = [float(word) for word in up.split(",")]
+    except ValueError:
+        numbers = []
+    length = math.hypot(*numbers)
+    if len(numbers) != 3 or not 0 < length < math.inf:
+        raise ValueError(f"up: expected one of {', '.join(UPS)}, or three numbers such as 0,0.1,1, got {up!r}")
+    return torch.tensor(numbers, dtype=torch.float64) / length
 
 
 def y_up_from(up: str) -> Float[Tensor, "4 4"]:
-    """The rotation that takes a world with that axis up to one with y up; x stays where it is.
+    """The smallest rotation that takes a world with that direction up to one with y up.
 
     Args:
-        up: one of UPS.
+        up: one of UPS, or three numbers with commas between them.
 
     Returns:
-        A rotation of 0 or -90 degrees about x, in float64.
-
-    Raises:
-        ValueError: another axis.
+        A rigid transform in float64; about x where `up` is z or -y. Another `up` is a ValueError.
 
     >>> (y_up_from("z") @ torch.tensor([1.0, 2.0, 3.0, 1.0], dtype=torch.float64)).tolist()
     [1.0, 3.0, -2.0, 1.0]
     """
-    if up not in UPS:
-        raise ValueError(f"up: expected one of {', '.join(UPS)}, got {up!r}")
-    if up == "y":
-        return torch.eye(4, dtype=torch.float64)
-    rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-    return torch.tensor(rows, dtype=torch.float64)
+    x, y, z = _direction(up).tolist()
+    turn = torch.eye(4, dtype=torch.float64)
+    if y < -1 + 1e-12:
+        turn[1, 1] = turn[2, 2] = -1.0
+        return turn
+    a, b = 1 / (1 + y), -x * z / (1 + y)  # Rodrigues' formula about the axis up x (0, 1, 0)
+    rows = [[1 - x * x * a, -x, b], [x, y, z], [b, -z, 1 - z * z * a]]
+    turn[:3, :3] = torch.tensor(rows, dtype=torch.float64) + 0.0
+    return turn
 
 
 def upright(views: Views, up: str) -> Views:
@@ -46,7 +101,7 @@ def upright(views: Views, up: str) -> Views:
 
     Args:
         views: of a world in which `up` points up.
-        up: one of UPS.
+        up: as in `y_up_from`.
 
     Returns:
         The views; images and masks are shared with the ones given.

@@ -23,6 +23,7 @@ __all__ = [
     "camera_from_world",
     "centres",
     "concatenate",
+    "cropped",
     "fibonacci_sphere",
     "image_size",
     "intrinsics",
@@ -237,6 +238,17 @@ def to(
 def with_poses(cameras: PinholeCamera, camera_from_world: Float[Tensor, "view 4 4"]) -> PinholeCamera:
     """The cameras at other poses, with the same calibration and distortion."""
     bare = pinhole(intrinsics(cameras), camera_from_world, *image_size(cameras))
+    return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
+
+
+def cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
+    """The cameras of images whose right and lower borders were moved; calibration and distortion stay."""
+    bare = PinholeCamera(
+        cameras.intrinsics,
+        cameras.extrinsics,
+        torch.full_like(cameras.height, height),
+        torch.full_like(cameras.width, width),
+    )
     return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
 
 

@@ -118,8 +118,9 @@ def cast(
     pixels = pixels if pixels.is_floating_point() else pixels.to(cameras.extrinsics.dtype)
     pose = camera.camera_from_world(cameras)[view]
     matrix = camera.intrinsics(cameras)[view]
+    shown = None
     if isinstance(cameras, DistortedCamera):
-        pixels = undistorted_pixels(cameras, view, pixels)
+        pixels, shown = undistorted_pixels(cameras, view, pixels)
     y = (pixels[:, 1] - matrix[:, 1, 2]) / matrix[:, 1, 1]
     x = (pixels[:, 0] - matrix[:, 0, 2] - matrix[:, 0, 1] * y) / matrix[:, 0, 0]
     local = torch.stack([x, y, torch.ones_like(x)], -1)
@@ -128,11 +129,13 @@ def cast(
     to_centre = origins.new_tensor(bounds.centre) - origins
     if span == "constant":
         distance = to_centre.norm(dim=-1)
-        return Rays(origins, directions, (distance - bounds.radius).clamp_min(0), distance + bounds.radius)
+        near = (distance - bounds.radius).clamp_min(0)
+        far = distance + bounds.radius
+        return Rays(origins, directions, near, far if shown is None else torch.where(shown, far, near))
     if span != "sphere":
         raise ValueError(f"span: expected 'sphere' or 'constant', got {span!r}")
     middle = (to_centre * directions).sum(-1)
     square = bounds.radius**2 - to_centre.square().sum(-1) + middle.square()
-    hit = square > 0
+    hit = square > 0 if shown is None else (square > 0) & shown
     half = torch.where(hit, torch.where(hit, square, 1.0).sqrt(), 0.0)  # no sqrt at 0: its gradient is infinite
     return Rays(origins, directions, (middle - half).clamp_min(0), (middle + half).clamp_min(0))

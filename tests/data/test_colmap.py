@@ -109,6 +109,42 @@ def test_a_distorted_view_becomes_a_pinholes(scene, tmp_path):
     assert torch.allclose(again.images, views.images.flip(0), atol=1.5 / 255)
 
 
+@pytest.mark.parametrize(
+    ("model", "pictures", "given"),
+    [
+        ("sparse/0", "input", "."),
+        ("dense/sparse", "dense/images", "."),
+        ("dense", "dense/images", "dense"),
+        ("distorted/sparse/0", "input", "."),
+        ("colmap/sparse/0", "images", "colmap"),
+        ("sparse/0", "images", "sparse/0"),
+    ],
+)
+def test_models_and_pictures_in_their_usual_places(scene, tmp_path, model, pictures, given):
+    whole = write(scene, tmp_path / "whole")
+    project = tmp_path / "project"
+    (project / model).mkdir(parents=True)
+    (project / pictures).parent.mkdir(parents=True, exist_ok=True)
+    for path in (whole / "sparse/0").iterdir():
+        path.rename(project / model / path.name)
+    (project / "photographs").mkdir()
+    for path in (whole / "images").iterdir():
+        path.rename(project / "photographs" / path.name)
+    (project / pictures).symlink_to(project / "photographs")
+    assert len(read_views(project / given)) == 8
+
+
+def test_the_largest_part_of_a_reconstruction_is_read(scene, tmp_path):
+    project = write(scene, tmp_path / "project")
+    small = project / "sparse/1"
+    small.mkdir()
+    (small / "cameras.txt").write_text((project / "sparse/0/cameras.txt").read_text())
+    (small / "images.txt").write_text("".join((project / "sparse/0/images.txt").read_text().splitlines(True)[:3]))
+    assert len(read_views(project)) == 8
+    (project / "sparse/0").rename(project / "sparse/2")
+    assert len(read_views(project)) == 8
+
+
 def test_broken_models_are_named(scene, tmp_path):
     folder = write(scene, tmp_path / "project", binary=True)
     path = folder / "sparse/0/images.bin"

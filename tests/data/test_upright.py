@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from hyperplanes.data.upright import upright, upright_task, y_up_from
+from hyperplanes.data.upright import _direction, guess_up, upright, upright_task, y_up_from
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, Views
@@ -46,5 +46,34 @@ def test_y_up_is_left_alone_and_another_axis_is_refused():
     assert upright(views, "y") is views
     task = upright_task(Task(views[:2], views[2:], "x"), "z")
     assert (len(task.support), len(task.query), task.name) == (2, 3, "x")
-    with pytest.raises(ValueError, match="one of y, z, got 'x'"):
-        upright(views, "x")
+    for wrong in ("w", "1,2", "0,0,0", "nan,0,1", ""):
+        with pytest.raises(ValueError, match=f"up: expected one of y, z, .* got '{wrong}'"):
+            upright(views, wrong)
+
+
+@pytest.mark.parametrize("up", ["y", "z", "x", "-y", "-z", "-x", "0.3,0.8,-0.5"])
+def test_up_is_guessed_from_level_cameras_and_becomes_y(up):
+    """Cameras that look at one place, held level in a world with that direction up; the turn is a rotation."""
+    x, y, z = axis = _direction(up).tolist()
+    generator = torch.Generator().manual_seed(1)
+    eyes = torch.nn.functional.normalize(torch.randn(12, 3, generator=generator), dim=-1) * 3
+    cameras = camera.pinhole(
+        camera.symmetric_intrinsics(4, 4, 0.7), camera.look_at(eyes, (0.1, 0.0, 0.2), (x, y, z)), 4, 4
+    )
+    guessed = guess_up(cameras)
+    assert _direction(guessed).tolist() == pytest.approx(axis, abs=1e-3)
+    assert guessed == up or up[0] == "0"
+    turn = y_up_from(up)
+    assert (turn[:3, :3] @ _direction(up)).tolist() == pytest.approx([0, 1, 0])
+    assert torch.allclose(turn[:3, :3] @ turn[:3, :3].T, torch.eye(3, dtype=torch.float64))
+    assert float(torch.linalg.det(turn)) == pytest.approx(1)
+
+
+def test_up_is_not_guessed_where_cameras_do_not_tell():
+    """Cameras rolled at random about their axes: no direction is level for all of them."""
+    generator = torch.Generator().manual_seed(2)
+    rotation = torch.linalg.qr(torch.randn(20, 3, 3, generator=generator))[0]
+    rotation = rotation * torch.linalg.det(rotation)[:, None, None]
+    pose = torch.eye(4).repeat(20, 1, 1)
+    pose[:, :3, :3] = rotation
+    assert guess_up(camera.pinhole(camera.symmetric_intrinsics(4, 4, 0.7), pose, 4, 4)) is None

@@ -54,14 +54,25 @@ def test_a_truncated_picture(scene, tmp_path):
         refused(read_views, tmp_path, match=r"003\.png: expected (an image|a whole image), found")
 
 
-def test_a_missing_picture(scene, tmp_path):
-    (scene.write(tmp_path) / scene.names[2]).unlink()
-    refused(read_views, tmp_path, match=r"002\.png: expected an image, found nothing")
+def test_missing_pictures(scene, tmp_path):
+    scene.write(tmp_path)
+    for name in scene.names[2:5]:
+        (tmp_path / name).unlink()
+    refused(read_views, tmp_path, match=r"of its 8 frames, or of two thirds of them, found 5 \(.*002\.png and 2 others")
 
 
-def test_a_picture_of_another_size(scene, tmp_path):
-    Image.new("RGBA", (30, 24)).save(scene.write(tmp_path) / scene.names[5])
-    refused(read_views, tmp_path, match=r"005\.png: expected 32 x 24 pixels, found 30 x 24; give all images")
+def test_a_missing_picture_of_a_generated_object(scene, tmp_path):
+    manifest = {"format": FORMAT, "version": 1, "splits": {"train": ["a"]}}
+    (scene.write(tmp_path / "a") / scene.names[2]).unlink()
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    refused(Dataset(tmp_path).task, "a", match=r"002\.png: expected an image, found nothing; generate or copy")
+
+
+def test_pictures_of_two_shapes(scene, tmp_path):
+    scene.write(tmp_path)
+    for name in scene.names[:3]:
+        Image.new("RGBA", (24, 32)).save(tmp_path / name)
+    refused(read_views, tmp_path, match=r"of one shape, or two thirds of them, found 5 of 32 x 24, 3 of 24 x 32")
 
 
 def chunk(kind, data):

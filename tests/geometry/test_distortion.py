@@ -5,10 +5,21 @@ import numpy as np
 import pytest
 import torch
 
+from hyperplanes.data.bounds import estimate_bounds
+from hyperplanes.data.conventions import check_conventions
+from hyperplanes.data.undistort import distort
 from hyperplanes.data.upright import upright, y_up_from
+from hyperplanes.export import orbit_cameras
 from hyperplanes.geometry import ImagePlanes, Sphere, cameras, carve, cast
-from hyperplanes.geometry.distortion import DistortedCamera, distorted
+from hyperplanes.geometry.distortion import (
+    DistortedCamera,
+    distorted,
+    distorted_pixels,
+    turning_radius,
+    undistorted_pixels,
+)
 from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import pixel_grid
 from hyperplanes.rendering import Marched, render
 from hyperplanes.views import Views
 from tests.reference_rendering import ring
@@ -43,6 +54,82 @@ def test_rays_undo_the_lens_as_opencv_does():
     local = np.concatenate([ideal, np.ones((50, 1))], 1)
     expected = (local / np.linalg.norm(local, axis=1, keepdims=True)) @ poses()[2, :3, :3].numpy()
     np.testing.assert_allclose(rays.directions.numpy(), expected, atol=1e-7)
+
+
+def test_rays_through_strong_lenses_come_back_to_their_pixels():
+    """Property: `distorted_pixels` after the inverse is the identity wherever the inverse says that it is there."""
+    matrix = torch.tensor([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    bare = cameras.pinhole(matrix, torch.eye(4, dtype=torch.float64)[None], 48, 64)
+    pixels = pixel_grid(48, 64).double()
+    view = torch.zeros(len(pixels), dtype=torch.long)
+    for lens, everywhere in (
+        ([-0.9, 0.5, 0.0, 0.0, 0.0], True),
+        ([0.1, 0.3, 0.01, -0.02, 0.0], True),
+        ([-1.2, 0.0, 0.0, 0.0, 0.0], False),
+        ([0.0, -3690.0, 0.0, 0.0, 0.0], False),
+    ):
+        ours = distorted(bare, torch.tensor(lens, dtype=torch.float64))
+        ideal, found = undistorted_pixels(ours, view, pixels)
+        again, shown = distorted_pixels(ours, ideal[:, None])
+        assert bool(found.all()) == everywhere
+        assert shown[found].all()
+        assert (again[:, 0] - pixels)[found].abs().max() < 1e-9
+        assert ideal.isfinite().all()
+
+
+def test_pixels_beyond_the_fold_have_no_ray():
+    """Closed form: r - r^3 / 3 grows to 2 / 3 at r = 1: no direction is seen farther than 2 / 3 from the centre."""
+    matrix = torch.tensor([[10.0, 0.0, 20.0], [0.0, 10.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    bare = cameras.pinhole(matrix, torch.eye(4, dtype=torch.float64)[None], 41, 41)
+    ours = distorted(bare, torch.tensor([-1 / 3, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    pixels = torch.tensor([[20.0, 20.0], [26.6, 20.0], [26.7, 20.0], [0.0, 0.0]], dtype=torch.float64)
+    rays = cast(ours, torch.zeros(4, dtype=torch.long), pixels, Sphere((0.0, 0.0, 1.0), 0.9))
+    assert (rays.far > rays.near).tolist()[2:] == [False, False]
+    assert rays.directions[3] @ torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64) < 0  # not cast to the other side
+    constant = cast(ours, torch.zeros(4, dtype=torch.long), pixels, span="constant")
+    assert (constant.far > constant.near).tolist() == [True, True, False, False]
+    points = ours.unproject(pixels[None], torch.ones(1, 4, 1, dtype=torch.float64))[0]
+    assert points.isnan().any(1).tolist() == [False, False, True, True]
+    x = float(points[1, 0])
+    assert x - x**3 / 3 == pytest.approx(0.66)
+
+
+def test_the_inverse_has_the_gradient_of_finite_differences():
+    lens = LENS.clone().requires_grad_(True)
+    pixels = torch.tensor([[3.0, 4.0], [60.0, 20.0]], dtype=torch.float64, requires_grad=True)
+    bare = cameras.select(cameras.pinhole(K, poses(), HEIGHT, WIDTH), [0])
+    view = torch.zeros(2, dtype=torch.long)
+
+    def inverse(lens, pixels):
+        return undistorted_pixels(DistortedCamera(bare, lens[None]), view, pixels)[0]
+
+    assert torch.autograd.gradcheck(inverse, (lens, pixels))
+
+
+def test_the_fold_of_the_rational_model():
+    """Brute force: the first place at which the radius stops growing, on a fine grid."""
+    lens = (0.3, -0.5, 0.0, 0.0, 0.02, 0.8, 0.1, 0.05)
+    radius = torch.linspace(0, 4, 400_001, dtype=torch.float64)
+    across = distort(torch.stack([radius, 0 * radius], 1).numpy(), lens)[:, 0]
+    turn = float(radius[int(np.argmax(np.diff(across) <= 0))])
+    assert float(turning_radius(torch.tensor([lens], dtype=torch.float64))) == pytest.approx(turn, abs=2e-5)
+
+
+def test_cameras_that_are_rebuilt_keep_their_lenses():
+    """An orbit is seen through the lens of the views; poses tried out keep it, and carving says that it cannot."""
+    views = Views(torch.zeros(6, 3, HEIGHT, WIDTH, dtype=torch.float64), lenses())
+    orbit = orbit_cameras(views, 3, size=32)
+    assert isinstance(orbit, DistortedCamera)
+    torch.testing.assert_close(orbit.distortion, LENS.expand(3, 5))
+    alpha = torch.full((6, 1, HEIGHT, WIDTH), 255, dtype=torch.uint8)
+    assert estimate_bounds(lenses(), alpha) == estimate_bounds(lenses())
+    masked = Views(views.images, lenses(), torch.zeros(6, 1, HEIGHT, WIDTH, dtype=torch.float64))
+    masked.masks[:, :, 10:20, 10:20] = 1.0
+    with pytest.raises(ValueError, match="undistort the masks first"):
+        check_conventions(masked)
+    small = cameras.cropped(lenses(), 7, 9)
+    assert isinstance(small, DistortedCamera)
+    assert cameras.image_size(small) == (7, 9)
 
 
 def test_what_the_polynomial_folds_back_is_not_seen():

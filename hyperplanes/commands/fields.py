@@ -1,0 +1,138 @@
+"""The field that a verb renders: adapted to the views by a model, or read from a baked file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from hyperplanes.formatting import format_duration
+
+if TYPE_CHECKING:
+    import torch
+    from kornia.geometry.camera import PinholeCamera
+
+    from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable
+    from hyperplanes.adaptation.fine_tuning import FineTuning
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+    from hyperplanes.baking import BakedScene
+    from hyperplanes.commands.console import Console
+    from hyperplanes.rendering.renderer import Sampler
+    from hyperplanes.views import Views
+
+__all__ = ["adapt_to", "load_source", "refuse_baked", "render_views"]
+
+
+def load_source(path: Path, device: torch.device) -> HyperPlanes | BakedScene:
+    """The model of a checkpoint, or the scene of a file that `bake` wrote.
+
+    Args:
+        path: a folder, the name of a packaged model, or a file.
+        device: where the model goes; a baked scene is rendered on the CPU.
+    """
+    if path.is_file():
+        from hyperplanes.baking import BakedScene
+        from hyperplanes.fields.baked import BakedField
+
+        return BakedScene(BakedField.load(path))
+    from hyperplanes.adaptation.pretrained import load_model
+
+    return load_model(path).to(device)
+
+
+def refuse_baked(path: Path, verb: str) -> None:
+    """One line where a verb that needs a model is given a file.
+
+    Raises:
+        ValueError: a file.
+    """
+    if path.is_file():
+        raise ValueError(
+            f"{path}: expected a checkpoint's folder to {verb} with, got a file; a baked file holds one finished "
+            "object, which `render`, `export` and `inspect` take"
+        )
+
+
+def adapt_to(
+    source: HyperPlanes | BakedScene,
+    shown: Views,
+    name: str,
+    console: Console,
+    *,
+    steps: int | Literal["auto"] = 0,
+    settings: FineTuning | None = None,
+) -> tuple[AdaptedField | BakedScene, Sequence[str]]:
+    """The field of one object, with a line on how it was made and warnings where it may not be what was hoped.
+
+    Args:
+        source: a model, or a baked scene, which is done already.
+        shown: the views of the object.
+        name: of the object.
+        console: where it is said.
+        steps: as in `HyperPlanes.fine_tune`.
+        settings: as in `HyperPlanes.fine_tune`.
+
+    Returns:
+        The field, and what was warned about before.
+
+    Raises:
+        ValueError: fine-tuning steps of a baked scene.
+    """
+    from hyperplanes.baking import BakedScene
+    from hyperplanes.commands.suitability import misgivings
+
+    if isinstance(source, BakedScene):
+        if steps != 0:
+            raise ValueError(
+                f"steps: expected 0 with a baked file, which is finished, got {steps}; fine-tune, then bake"
+            )
+        console.say(f"{len(source.field.values):,} baked voxels, shown from the poses of {name}")
+        return source, []
+    warned = misgivings(source, shown)
+    for line in warned:
+        console.warn(f"{name}: {line}")
+    started, taken = time.perf_counter(), []
+    total = None if steps == "auto" else steps
+    with console.bar("fine-tuning") as bar:
+
+        def count(done: int) -> None:
+            taken.append(done)
+            if total:
+                bar.show(done, total, "steps")
+
+        field = source.fine_tune(shown, steps, settings, on_step=count)
+    how = f", {taken[-1]} fine-tuning steps" if any(taken) else ""
+    seconds = format_duration(time.perf_counter() - started)
+    console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")
+    return field, warned
+
+
+def render_views(
+    field: Renderable, cameras: PinholeCamera, console: Console, sampling: Sampler | None = None
+) -> Pictures:
+    """The pictures of cameras, one after the other, with a progress line.
+
+    Args:
+        field: what is seen.
+        cameras: any number.
+        console: where the progress is shown.
+        sampling: another sampler than the field's own, for one that was adapted.
+    """
+    import torch
+
+    from hyperplanes.adaptation.base import AdaptedField, Pictures
+    from hyperplanes.geometry import cameras as camera
+
+    parts = []
+    with console.bar("rendering") as bar:
+        for view in range(cameras.batch_size):
+            one = camera.select(cameras, [view])
+            parts.append(field.render(one, sampling) if isinstance(field, AdaptedField) else field.render(one))
+            bar.show(view + 1, cameras.batch_size, "views")
+    return Pictures(
+        torch.cat([part.images for part in parts]),
+        torch.cat([part.opacity for part in parts]),
+        torch.cat([part.depth for part in parts]),
+        sum(part.samples for part in parts),
+    )

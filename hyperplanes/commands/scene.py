@@ -1,0 +1,55 @@
+"""The posed images that a verb is given: read, turned upright, and what there is to say about them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hyperplanes.commands.console import Console
+    from hyperplanes.views import Task
+
+__all__ = ["read_scene"]
+
+
+def read_scene(
+    path: Path, console: Console, *, all_views: bool = False, up: str = "auto", downscale: int | None = None
+) -> tuple[Task, str]:
+    """The views to show and the views to ask for; the same ones where all are shown.
+
+    What was left out, turned or scaled is a warning; which way is up, where it was guessed, a line.
+
+    Args:
+        path: of the posed images.
+        console: where it is said.
+        all_views: whether all are shown.
+        up: the direction that points up in their world, as in `y_up_from`, or auto: as the cameras are held.
+        downscale: as in `read_views`.
+
+    Returns:
+        Views of a world with y up, and the direction that was up before.
+    """
+    from hyperplanes.data.recognise import read_posed, read_posed_task
+    from hyperplanes.data.upright import guess_up, upright_task
+    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.views import Task
+
+    if all_views:
+        scene = read_posed(path, downscale)
+        views, notes = scene.views(), scene.notes
+        task = Task(views, views, path.resolve().name)
+    else:
+        posed = read_posed_task(path, downscale)
+        task, notes = posed.task(), posed.notes
+    for note in notes:
+        console.warn(f"{path}: {note}")
+    if up == "auto":
+        parts = [task.support.cameras] if all_views else [task.support.cameras, task.query.cameras]
+        guessed = guess_up(camera.concatenate(parts))
+        up = guessed or "y"
+        console.say(
+            f"up: {up}, as the cameras are held; --up says otherwise"
+            if guessed
+            else "up: y; the cameras do not tell, --up says otherwise"
+        )
+    return upright_task(task, up), up

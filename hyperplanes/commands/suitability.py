@@ -1,0 +1,114 @@
+"""Whether a model can be expected to do well on some views, and whether it did: warnings before and after."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hyperplanes.adaptation.base import Renderable
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+    from hyperplanes.views import Views
+
+__all__ = ["left_out_check", "misgivings", "worse_than_copying"]
+
+COVERED = 0.95  # mean opacity above which masks say no more than none
+UNLIKE = 3.0  # deviations of the codes; held-out objects of a trained class have 0.7 to 2, other classes 3.3 to 8
+ELSEWHERE = 30.0  # degrees between standpoints, on average, above which planes stand in for others
+JUDGED = 4  # left-out views, and pixels along their longer side
+JUDGED_SIZE = 64
+
+
+def misgivings(model: HyperPlanes, shown: Views) -> list[str]:
+    """What speaks against good pictures, a sentence each, before anything has been adapted.
+
+    Args:
+        model: what will adapt.
+        shown: the views it will be shown.
+    """
+    found = []
+    covered = 1.0 if shown.masks is None else float(shown.masks.mean())
+    if covered > COVERED:
+        what = "no alpha and no masks" if shown.masks is None else f"masks that cover {covered:.0%}"
+        found.append(
+            f"the views have {what}, and the model was trained on objects over white: it takes the background for the "
+            "object; cut the object out (RGBA images, or a folder masks/)"
+        )
+    planes = model.config.network.planes
+    if len(shown) < planes:
+        found.append(f"{len(shown)} views are shown and the model was trained with {planes}: some stand for several")
+    unlike, angle = _unlikeness(model, shown)
+    if unlike is not None and unlike > UNLIKE:
+        found.append(
+            f"the views are unlike those of the training: their codes deviate {unlike:.1f} times as much as those did; "
+            "--steps 100 adapts to them"
+        )
+    if angle > ELSEWHERE and len(shown) >= planes:
+        found.append(f"the cameras stand {angle:.0f} degrees from where those of the training stood, on average")
+    return found
+
+
+def worse_than_copying(rendered: float, copied: float, steps: object) -> list[str]:
+    """A sentence where the pictures of a field are worse than the nearest view, copied.
+
+    Args:
+        rendered: PSNR of the field in decibels.
+        copied: PSNR of the nearest view.
+        steps: fine-tuning steps that were asked for.
+    """
+    if rendered >= copied:
+        return []
+    advice = "--steps 100 adapts the model to the views" if steps == 0 else "check masks, poses and --up"
+    return [f"worse than copying the nearest view: {rendered:.2f} dB against {copied:.2f} dB; {advice}"]
+
+
+def left_out_check(model: HyperPlanes, shown: Views) -> tuple[float, float] | None:
+    """PSNR of a field on support views that it was not shown, and of the nearest view copied, in one forward pass.
+
+    Up to four views are left out, and rendered at 64 pixels.
+
+    Args:
+        model: what adapts.
+        shown: the views, of which some are left out.
+
+    Returns:
+        Both figures in decibels; None with fewer than four views.
+    """
+    import torch
+
+    from hyperplanes.adaptation.nearest_view import NearestView
+    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.metrics import psnr
+
+    if len(shown) < 4:
+        return None
+    left_out = torch.linspace(0, len(shown) - 1, min(JUDGED, len(shown) // 2) + 2)[1:-1].round().long()
+    rest = [index for index in range(len(shown)) if index not in left_out.tolist()]
+    judged, remaining = shown[left_out], shown[rest]
+    scale = min(1.0, JUDGED_SIZE / max(judged.size))
+    size = max(1, round(judged.size[0] * scale)), max(1, round(judged.size[1] * scale))
+    truth = torch.nn.functional.interpolate(judged.images, size, mode="area")
+    cameras = camera.resized(judged.cameras, *size)
+    fields: list[Renderable] = [model.adapt(remaining), NearestView().adapt(remaining)]
+    first, second = (float(psnr(each.render(cameras).images.clamp(0, 1), truth).mean()) for each in fields)
+    return first, second
+
+
+def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
+    """Root mean square of the standardised codes, None without such, and the mean angle between standpoints."""
+    import torch
+
+    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.hypernetwork.standardisation import RunningStandardisation
+
+    with torch.no_grad():
+        views = model.prepare(shown, carved=False).views
+        centre = model.rig.new_tensor(views.bounds.centre)
+        standing = torch.nn.functional.normalize(camera.centres(views.cameras).to(centre) - centre, dim=-1)
+        angle = float(torch.rad2deg(torch.acos((standing * model.rig).sum(-1).clamp(-1, 1))).mean())
+        network = model.hypernetwork
+        if network is None or not isinstance(network.code_normalisation, RunningStandardisation):
+            return None, angle
+        chosen = model.hyperplanes()
+        directions = camera.viewing_directions(views.cameras)[chosen]
+        codes = network.encode(views.images[chosen][None], directions[None])
+    return float(codes.square().mean().sqrt()), angle

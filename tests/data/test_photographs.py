@@ -1,0 +1,217 @@
+"""Source of truth: the ball of conftest, its files changed as cameras, phones and people change them."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from hyperplanes.data import DataError, read_task, read_views
+from hyperplanes.data.posed import Posed
+from hyperplanes.geometry import cameras as camera
+
+
+def jpeg(path, picture, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(picture).convert("RGB").save(path, quality=95, exif=exif)
+
+
+def balls(views, masks):
+    """How far the centre of each mask is from where the ball's centre is projected, in pixels."""
+    centre = torch.tensor([[[0.1, 0.2, 0.0]]]).expand(len(views), 1, 3)
+    for mask, pixel in zip(masks, views.cameras.project(centre), strict=True):
+        rows, columns = torch.nonzero(mask, as_tuple=True)
+        yield float((torch.stack([columns.float().mean(), rows.float().mean()]) - pixel[0]).abs().max())
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_are_turned_where_the_stated_size_says_so(scene, tmp_path, orientation):
+    """The stored pixels are the upright ones turned back by NumPy; the file states the upright or the stored size."""
+    (tmp_path / "images").mkdir()
+    document = scene.document(w=32, h=24)
+    back = {
+        1: lambda a: a,
+        2: lambda a: a[:, ::-1],
+        3: lambda a: a[::-1, ::-1],
+        4: lambda a: a[::-1],
+        5: lambda a: a.swapaxes(0, 1),
+        6: lambda a: np.rot90(a),
+        7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
+        8: lambda a: np.rot90(a, -1),
+    }[orientation]
+    for frame, picture in zip(document["frames"], scene.pictures, strict=True):
+        flat = np.where(picture[..., 3:] > 0, [220, 30, 30, 255], [20, 20, 200, 255]).astype(np.uint8)
+        stored = np.ascontiguousarray(back(flat) if orientation >= 5 else flat)
+        frame["file_path"] = frame["file_path"].replace(".png", ".jpg")
+        jpeg(tmp_path / frame["file_path"], stored, orientation)
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    if orientation >= 5:
+        with pytest.warns(UserWarning, match="8 pictures turned as their EXIF orientation says: images/000.jpg"):
+            views = read_views(tmp_path)
+    else:
+        views = read_views(tmp_path)  # as COLMAP and nerfstudio: the pixels as they are stored
+    assert max(balls(views, views.images[:, 0] > 0.5)) < 0.6
+    del document["w"], document["h"]
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    if orientation > 1:
+        with pytest.raises(
+            DataError, match=rf"000\.jpg: expected pixels stored upright, .*EXIF orientation {orientation}"
+        ):
+            read_views(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("fields", "match"),
+    [
+        (
+            {"w": 24, "h": 32},
+            r"000\.png: expected the shape of the 24 x 32 pixels that transforms.json states, found 32",
+        ),
+        ({"w": 64, "h": 64}, "expected the shape of the 64 x 64 pixels"),
+        ({"is_fisheye": True}, "expected perspective cameras, without is_fisheye, found it set; undistort"),
+        ({"ortho": True}, "without ortho, found it set"),
+        (
+            {"k2": -3690.0},
+            "frame images/000.png: expected a lens that shows every pixel once, found k2 = -3690, which fold",
+        ),
+    ],
+)
+def test_what_cannot_be_right_is_refused_by_name(scene, tmp_path, fields, match):
+    with pytest.raises(DataError, match=match):
+        read_views(scene.write(tmp_path, scene.document(**fields)))
+
+
+def test_masks_of_a_folder_are_found_by_name(scene, tmp_path):
+    document = scene.document()
+    folder = scene.write(tmp_path, document, mode="RGB")
+    (tmp_path / "masks").mkdir()
+    for index, picture in enumerate(scene.pictures):
+        name = f"{index:03d}.png" if index % 2 else f"{index:03d}.png.png"
+        Image.fromarray(picture[..., 3]).save(tmp_path / "masks" / name)
+    assert torch.allclose(read_views(folder).images, scene.over_white(), atol=1e-6)
+    (tmp_path / "masks/003.png").unlink()
+    with pytest.raises(
+        DataError, match=r"masks: expected a mask for each of the 8 pictures, found 7, none for 003.png"
+    ):
+        read_views(folder)
+
+
+def test_frames_that_are_missing_are_left_out_and_named(scene, tmp_path):
+    document = scene.document(train_filenames=scene.names[:5], test_filenames=scene.names[5:])
+    folder = scene.write(tmp_path, document)
+    for name in (scene.names[1], scene.names[6]):
+        (tmp_path / name).unlink()
+    said = "6 of 8 frames have a picture, 2 are missing: images/001.png, images/006.png"
+    with pytest.warns(UserWarning, match=re.escape(said)):
+        task = read_task(folder)
+    assert task.support.names == tuple(scene.names[at] for at in (0, 2, 3, 4))
+    assert task.query.names == (scene.names[5], scene.names[7])
+    pose = torch.from_numpy(scene.camera_from_world[[5, 7]]).float()
+    assert torch.allclose(camera.camera_from_world(task.query.cameras), pose, atol=1e-6)
+
+
+def test_pictures_of_several_sizes_become_one(scene, tmp_path):
+    """Property: the ball's centre still projects onto the middle of every silhouette."""
+    folder = scene.write(tmp_path)
+    for name in scene.names[:2]:
+        with Image.open(tmp_path / name) as image:
+            large = image.resize((96, 72), Image.Resampling.BICUBIC)
+        large.save(tmp_path / name)
+    Image.new("RGBA", (24, 32)).save(tmp_path / scene.names[4])
+    with pytest.warns(
+        UserWarning, match=r"1 of 8 pictures have another shape and are left out: images/004\.png"
+    ) as said:
+        views = read_views(folder)
+    assert any("2 pictures of other sizes scaled to 32 x 24 pixels" in str(w.message) for w in said)
+    assert len(views) == 7
+    assert max(balls(views, views.masks[:, 0] > 0.5)) < 0.6
+
+
+def test_scaling_down_keeps_the_geometry(scene, tmp_path):
+    """By hand: 33 x 25 pixels by 4 are 8 x 6, f / 4, and (c + 1/2) / 4 - 1/2; colours are means over white."""
+    big = type(scene)(size=(25, 33))
+    folder = big.write(tmp_path)
+    with pytest.warns(UserWarning, match="scaled down by 4, to 8 x 6 pixels"):
+        small = read_views(folder, downscale=4)
+    matrix = camera.intrinsics(small.cameras)[0].numpy()
+    assert matrix[0, 0] == pytest.approx(big.matrix[0, 0] / 4)
+    np.testing.assert_allclose(matrix[:2, 2], (big.matrix[:2, 2] + 0.5) / 4 - 0.5, rtol=1e-6)
+    expected = torch.nn.functional.avg_pool2d(big.over_white()[:, :, :24, :32], 4)
+    assert (small.images - expected).abs().max() < 3 / 255
+    with pytest.raises(DataError, match="expected a downscale from 1 to 25, found 40"):
+        read_views(folder, downscale=40)
+
+
+def test_more_than_a_megapixel_is_scaled_down(scene, tmp_path):
+    (tmp_path / "images").mkdir()
+    for name in scene.names[:2]:
+        Image.new("RGB", (1600, 1200)).save(tmp_path / name)
+    document = scene.document()
+    (tmp_path / "transforms.json").write_text(json.dumps(document | {"frames": document["frames"][:2]}))
+    with pytest.warns(UserWarning, match="scaled down by 2, to 800 x 600 pixels; --downscale 1 keeps every pixel"):
+        assert read_views(tmp_path).size == (600, 800)
+
+
+def test_bounds_are_those_of_the_support(scene, tmp_path):
+    """Property: masks of the query views do not change the bounds."""
+    whole = read_task(scene.write(tmp_path / "a"))
+    other = type(scene)()
+    for index in range(1, 8, 2):
+        other.pictures[index] = np.full_like(other.pictures[index], 255)
+    task = read_task(other.write(tmp_path / "b"))
+    assert task.support.bounds == whole.support.bounds == task.query.bounds
+    from hyperplanes.data.recognise import read_posed
+
+    scene_of_all = read_posed(tmp_path / "a")
+    assert isinstance(scene_of_all, Posed)
+    assert scene_of_all.bounds != whole.support.bounds
+
+
+@pytest.mark.parametrize("place", [".", "images", "input"])
+def test_photographs_without_poses_are_told_how_to_get_them(scene, tmp_path, place):
+    (tmp_path / place).mkdir(exist_ok=True)
+    for index in range(3):
+        Image.fromarray(scene.pictures[index]).convert("RGB").save(tmp_path / place / f"{index}.JPG", "JPEG")
+    from hyperplanes.data import open_dataset
+
+    for action in (read_views, read_task, open_dataset):
+        with pytest.raises(
+            DataError, match=r"found 3 photographs and no poses; find them with COLMAP .*ns-process-data"
+        ):
+            action(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("files", "name"),
+    [
+        (["keyframes/cameras/1.json", "keyframes/images/1.jpg"], "an export of Polycam; .*ns-process-data polycam"),
+        (["metadata", "rgbd/0.jpg"], "an export of Record3D; .*ns-process-data record3d"),
+        (["scan.r3d"], "an export of Record3D"),
+    ],
+)
+def test_capture_apps_are_named(tmp_path, files, name):
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text("{}")
+    with pytest.raises(DataError, match=name):
+        read_task(tmp_path)
+
+
+def test_a_linked_folder_of_pictures_inside_the_tree_is_followed(scene, tmp_path):
+    """The tree given holds scenes; the pictures of one lie beside it. Given alone, the scene's link leads out of it."""
+    from hyperplanes.data import open_dataset
+
+    document = scene.document()
+    for frame in document["frames"]:
+        frame["file_path"] = frame["file_path"].replace("images", "linked")
+    scene.write(tmp_path / "shared", document)
+    (tmp_path / "shared/transforms.json").unlink()
+    (tmp_path / "car").mkdir()
+    (tmp_path / "car/transforms.json").write_text(json.dumps(document))
+    (tmp_path / "car/linked").symlink_to(tmp_path / "shared/images")
+    assert len(open_dataset(tmp_path).task("car").support) == 4
+    with pytest.raises(DataError, match="expected file names inside"):
+        read_views(tmp_path / "car")
