@@ -25,6 +25,8 @@ REQUIRED = {
     "PIL": "pillow",
     "rich": "rich",
     "tyro": "tyro",
+    "cattrs": "cattrs",
+    "yaml": "pyyaml",
     "charset_normalizer": "charset-normalizer",
 }
 """What everything needs: modules and the packages they come from."""
