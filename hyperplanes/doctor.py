@@ -33,6 +33,7 @@ REQUIRED = {
 
 OPTIONAL = {
     "matplotlib": "plots of benchmarks and cameras",
+    "tensorboard": "train --tensorboard",
     "ray": "data generation on a cluster",
 }
 """What some things need: modules, each the package of its name, and what for."""
