@@ -178,8 +178,10 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
         chosen = changed(chosen, parse_options(arguments.settings))
     except SettingsError as error:
         raise ValueError(f"--{error.path.replace('_', '-')}: {error.problem}") from None
-    method = arguments.method or given.get("method")
-    return method or ("hyperplanes" if chosen.model.hypernetwork else chosen.model.target), chosen
+    method = arguments.method or given.get("method", "hyperplanes")
+    if method == "hyperplanes" and chosen.model.hypernetwork is None:  # a setting has left it out
+        method = chosen.model.target
+    return method, chosen
 
 
 def run(arguments: Arguments) -> int:
