@@ -25,12 +25,15 @@ REQUIRED = {
     "PIL": "pillow",
     "rich": "rich",
     "tyro": "tyro",
+    "cattrs": "cattrs",
+    "yaml": "pyyaml",
     "charset_normalizer": "charset-normalizer",
 }
 """What everything needs: modules and the packages they come from."""
 
 OPTIONAL = {
     "matplotlib": "plots of benchmarks and cameras",
+    "tensorboard": "train --tensorboard",
     "ray": "data generation on a cluster",
 }
 """What some things need: modules, each the package of its name, and what for."""

@@ -1,15 +1,19 @@
 """Settings from files and options. Source of truth: the dataclasses themselves, and what people write by hand."""
 
 import json
+import re
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import EntryPoint, EntryPoints
+from pathlib import Path
 
 import pytest
 import yaml
 from small_demo import demo_folder
 
 from hyperplanes import entry_points
-from hyperplanes.adaptation import ModelConfig, NearestView
+from hyperplanes.adaptation import HyperPlanes, ModelConfig, NearestView
+from hyperplanes.adaptation.fine_tuned import FineTuned
+from hyperplanes.adaptation.pretrained import find_checkpoints
 from hyperplanes.cli import main
 from hyperplanes.commands.train import Arguments, resolve
 from hyperplanes.experiment import changed, document, parse_options, read_experiment, write_experiment
@@ -19,6 +23,8 @@ from hyperplanes.methods import Method, describe_method, make_method
 from hyperplanes.presets import PRESETS, configure, preset
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.settings import SettingsError, structure
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def leaves(value, prefix=""):
@@ -222,12 +228,14 @@ def test_a_field_of_another_package_is_trained_saved_and_loaded(other_package, t
     assert find_targets()["constant"] is Constant
     chosen = preset("quick").by_method("constant")
     assert (chosen.model.target, chosen.model.hypernetwork) == ("constant", None)
-    from hyperplanes.adaptation import HyperPlanes
-
     model = HyperPlanes(replace(chosen.model, network=replace(chosen.model.network, width=8)))
     assert isinstance(model.networks["fine"], Constant)
     model.save(tmp_path)
     assert isinstance(HyperPlanes.from_pretrained(tmp_path).networks["fine"], Constant)
+    made = make_method("constant_10", find_checkpoints([tmp_path]))
+    assert isinstance(made, FineTuned)
+    assert isinstance(made.model.networks["fine"], Constant)
+    assert describe_method("constant_10") == "constant after 10 fine-tuning steps"
 
 
 def test_a_method_of_another_package_is_made_and_described(other_package):
@@ -241,3 +249,14 @@ def test_an_entry_point_that_cannot_be_loaded_names_its_package(other_package, m
     monkeypatch.setitem(BROUGHT, "hyperplanes.fields", {"lost": "no.such.module:Field"})
     with pytest.raises(ValueError, match="other-package: expected no.such.module:Field for hyperplanes.fields 'lost'"):
         find_targets()
+
+
+def test_every_option_that_the_documents_name_is_one():
+    bases = [preset("quick"), preset("quick").by_protocol("paper")]
+    known = {"model.hypernetwork"}
+    for base in bases:
+        known |= {path for path, _ in leaves({"model": base.model.as_json(), "training": asdict(base.training)})}
+    pages = [*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]
+    named = {name for page in pages for name in re.findall(r"--((?:model|training)\.[\w.-]+)", page.read_text())}
+    assert len(named) > 15
+    assert {name.replace("-", "_") for name in named} <= known

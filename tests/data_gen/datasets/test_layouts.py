@@ -1,6 +1,7 @@
 """Source of truth: the pictures and the rig that went in; what other projects' loaders do, in a few lines each."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,11 @@ from data_gen import rigs
 from data_gen.datasets.layouts import LAYOUTS, RenderedObject, over_white
 from data_gen.datasets.sources import Item
 from data_gen.rigs import fixed
+from hyperplanes.cli import main
 from hyperplanes.data import mesh_path, open_dataset, read_channel, read_task, read_views
+from hyperplanes.data.dataset import open_datasets
 from hyperplanes.data.npz import catalogue
+from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
 
@@ -140,6 +144,27 @@ def test_the_authors_own_files_are_read_without_our_additions(tmp_path):
     assert camera.intrinsics(opened.cameras)[0, :2, 2].tolist() == [100.0, 100.0]
     assert np.allclose(camera.centres(opened.cameras), centres[VIEWS // 2 :], atol=1e-5)
     assert len(read_views(next((tmp_path / "cars/sampled").iterdir()))) == VIEWS
+
+
+def test_learnits_own_files_are_split_as_its_notebook_does_and_missing_objects_are_counted(tmp_path, capsys):
+    original = write("learnit-128", tmp_path, manifest=False)[0]
+    shutil.rmtree(tmp_path / "cars" / "car_00001")
+    data = open_dataset(tmp_path)
+    assert (data.names("train"), data.names("test")) == (["car_00000"], ["car_test_00000"])
+    assert data.skipped == (
+        f"{tmp_path / 'car_splits.json'}: skipped 1 of 2 objects of train without a folder, as car_00001",
+    )
+    for legacy, centre in ((False, 9.5), (True, 10.0)):  # 20 pixels: W / 2 at integer pixel centres, or the middle
+        task = open_datasets([tmp_path], legacy=legacy).task("car_00000")
+        for views, part in ((task.support, slice(0, VIEWS // 2)), (task.query, slice(VIEWS // 2, None))):
+            assert np.allclose(camera.centres(views.cameras), original.rig.camera_centres[part], atol=1e-5)
+            assert camera.intrinsics(views.cameras)[0, :2, 2].tolist() == pytest.approx([centre, centre])
+    assert main(["evaluate", "--method", "nearest_view", "--data", str(tmp_path), "--legacy"]) == 0
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line == data.skipped[0]
+    shutil.rmtree(tmp_path / "cars")
+    with pytest.raises(DataError, match="expected the objects that its splits name, found none of their folders"):
+        open_dataset(tmp_path)
 
 
 def test_srns_loader_finds_what_it_reads(tmp_path):
