@@ -90,5 +90,5 @@ def _interval(values: Sequence[float]) -> tuple[float | None, float | None, floa
     if max(values) - min(values) <= 1e-12 * max(map(abs, values)):
         return values[0], values[0], 1.0 if values[0] == 0 else 0.0
     found = ttest_1samp(values, 0.0)
-    interval = found.confidence_interval(CONFIDENCE)
-    return float(interval.low), float(interval.high), float(found.pvalue)
+    low, high = found.confidence_interval(CONFIDENCE)
+    return float(low), float(high), float(tuple(found)[1])
