@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from jaxtyping import Int
 from torch import Tensor
@@ -28,6 +29,13 @@ class Episode:
     prepared: Prepared
     query: Views
     live: Int[Tensor, " pixel"] | None
+
+    @cached_property
+    def support_live(self) -> Int[Tensor, " pixel"] | None:
+        """Flat indices of the pixels of the planes that look into the hull; None where all are drawn from."""
+        if self.live is None:
+            return None
+        return footprint(self.prepared.occupancy, self.prepared.views.cameras).flatten().nonzero()[:, 0]
 
     @property
     def nbytes(self) -> int:

@@ -10,11 +10,14 @@ from pathlib import Path
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Renderable
-from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromScratch, random_model
 from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
+from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.initialisation import LEARNED, shuffled
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.presets import configure
 from hyperplanes.rendering.samplers import Sampler
 from hyperplanes.views import Views
 
@@ -22,18 +25,29 @@ __all__ = ["METHODS", "at_steps", "WithSampler", "describe_method", "make_method
 
 METHODS: dict[str, str] = {
     "nearest_view": "the nearest support view, copied",
+    "hull_blend": "support views blended on the visual hull",
     "nerf": "NeRF, one set of weights for all objects",
     "multiplane": "MultiPlaneNeRF, one set of weights for all objects",
     "point_multiplane": "PointMultiPlaneNeRF, one set of weights for all objects",
     "hyperplanes": "HyperPlanes in one step",
     "hyperplanes_swapped": "HyperPlanes with the update of another object",
+    "autoencoder": "a field that reads the code of an encoder",
     "scratch": "the same field from random weights",
+    "nerf_scratch": "NeRF of one object from random weights",
+    "multiplane_scratch": "MultiPlaneNeRF of one object from random weights",
+    "point_multiplane_scratch": "PointMultiPlaneNeRF of one object from random weights",
+    "standard": "random weights, optimised as the learned initialisations are",
+    "mv_shuffled": "the weights of mv_meta in random order",
+    **LEARNED,
 }
-"""Names and what they stand for. All but nearest_view and hyperplanes_swapped take _N, N gradient steps on the support
-views, or _auto, as many as serve views that are left out; scratch needs one of the two."""
+"""Names and what they stand for. All but nearest_view, hull_blend and hyperplanes_swapped take _N, N gradient steps on
+the support views, or _auto, as many as serve views that are left out. Those with "scratch" need one of the two; an
+initialisation without is optimised for as many steps as its checkpoint says."""
 
 _NAME = re.compile(r"(?P<base>.+?)(?:_(?P<steps>\d+|auto))?")
-_WITHOUT_STEPS = ("nearest_view", "hyperplanes_swapped")
+_WITHOUT_STEPS = ("nearest_view", "hull_blend", "hyperplanes_swapped")
+_INITIALISATIONS = ("standard", "mv_shuffled", *LEARNED)
+_NEED_STEPS = ("scratch", "nerf_scratch", "multiplane_scratch", "point_multiplane_scratch")
 
 
 def _parse(name: str) -> tuple[str, Steps | None]:
@@ -44,27 +58,29 @@ def _parse(name: str) -> tuple[str, Steps | None]:
     """
     match = _NAME.fullmatch(name)
     base, steps = (match["base"], match["steps"]) if match else (name, None)
-    if base not in METHODS or (steps and base in _WITHOUT_STEPS) or (base == "scratch" and not steps):
-        known = ", ".join(f"{each}_N" if each == "scratch" else each for each in METHODS)
+    if base not in METHODS or (steps and base in _WITHOUT_STEPS) or (base in _NEED_STEPS and not steps):
+        known = ", ".join(f"{each}_N" if each in _NEED_STEPS else each for each in METHODS)
         raise ValueError(
-            f"method: expected one of {known}, with _N or _auto after it for so many fine-tuning steps, got {name!r}"
+            f"method: expected one of {known}, with _N or _auto after it for so many gradient steps, got {name!r}"
         )
     return base, steps if steps in (None, "auto") else int(steps)
 
 
 def at_steps(name: str, steps: Sequence[int]) -> list[str]:
-    """The names of a method after each of some numbers of fine-tuning steps; itself where it takes none.
+    """The names of a method after each of some numbers of gradient steps; itself where it takes none.
 
     >>> at_steps("hyperplanes", [0, 10])
     ['hyperplanes', 'hyperplanes_10']
 
     Args:
         name: without steps, or it stays alone.
-        steps: 0 is the method itself; "scratch" has no such row.
+        steps: 0 is the method itself, of an initialisation its weights as they are; "scratch" has no such row.
     """
     if not steps or name in _WITHOUT_STEPS or _NAME.fullmatch(name)["steps"]:  # pyright: ignore[reportOptionalSubscript]
         return [name]
-    return [f"{name}_{count}" if count else name for count in steps if count or name != "scratch"]
+    if name in _INITIALISATIONS:
+        return [f"{name}_{count}" for count in steps]
+    return [f"{name}_{count}" if count else name for count in steps if count or name not in _NEED_STEPS]
 
 
 def describe_method(name: str) -> str:
@@ -80,8 +96,10 @@ def describe_method(name: str) -> str:
     if steps is None:
         return METHODS[base]
     about = METHODS[base].removesuffix(" in one step").replace(", one set of weights for all objects", "")
+    if base in _NEED_STEPS or base in _INITIALISATIONS:
+        return f"{about}, {'as many steps as left-out views ask for' if steps == 'auto' else f'{steps} steps'}"
     count = "as many fine-tuning steps as left-out views ask for" if steps == "auto" else f"{steps} fine-tuning steps"
-    return f"{about}, {steps} steps" if base == "scratch" and steps != "auto" else f"{about} after {count}"
+    return f"{about} after {count}"
 
 
 def make_method(
@@ -91,38 +109,85 @@ def make_method(
     device: torch.device | str = "cpu",
     settings: FineTuning | None = None,
     objects: Iterable[Views] = (),
+    preset: str = "quick",
+    protocol: str = "default",
 ) -> Adapter:
     """The adapter behind a method's name.
 
     Args:
         name: one of METHODS, perhaps with a number of steps.
-        checkpoints: folders by "hyperplanes", "point_multiplane" and so on.
+        checkpoints: folders by the names of the methods that trained them, such as "hyperplanes".
         device: where its weights go.
         settings: of fine-tuning.
         objects: the support views of the objects that will be asked for; "hyperplanes_swapped" reads them.
+        preset: the shape of the fields that need no checkpoint.
+        protocol: how those are sampled while they are optimised, as in `presets.configure`.
 
     Returns:
-        An adapter.
-
-    Raises:
-        ValueError: an unknown name, or a checkpoint that the method needs and that is not given.
+        An adapter; ValueError for an unknown name, or a checkpoint that the method needs and that is not given.
     """
     base, steps = _parse(name)
     settings = settings or FineTuning()
     if base == "nearest_view":
         return NearestView()
+    if base == "hull_blend":
+        return HullBlend()
+    if base.endswith("_scratch"):
+        assert steps is not None
+        config = configure(preset, base.removesuffix("_scratch"), protocol=protocol).model
+        return FieldFromScratch(config, steps, settings, device)
+    if base in _INITIALISATIONS:
+        return _initialisation(name, checkpoints, device, settings, preset, protocol)
     family = "hyperplanes" if base == "hyperplanes_swapped" else base
     if base == "scratch":  # the architecture of any checkpoint that there is
         family = next((each for each in ("hyperplanes", *checkpoints) if each in checkpoints), "hyperplanes")
-    if family not in checkpoints:
-        raise ValueError(f"method {name}: expected a checkpoint of {family}, got none; `hyperplanes train` makes one")
-    model = HyperPlanes.from_pretrained(checkpoints[family]).to(device)
+    model = _load(name, family, checkpoints).to(device)
     if base == "hyperplanes_swapped":
         return Swapped(model, objects)
     if base == "scratch":
         assert steps is not None
         return FromScratch(model, steps, settings)
     return model if steps is None else FineTuned(model, steps, settings)
+
+
+def _initialisation(
+    name: str,
+    checkpoints: Mapping[str, Path],
+    device: torch.device | str,
+    settings: FineTuning,
+    preset: str,
+    protocol: str,
+) -> FineTuned:
+    """Gradient descent from learned weights, or from those that they are compared with."""
+    base, steps = _parse(name)
+    if base == "standard":  # the architecture of the initialisations that it stands beside
+        family = next((each for each in LEARNED if each in checkpoints), None)
+        if family is None:
+            config, rig = replace(configure(preset, "mv_meta", protocol=protocol).model, order="file"), None
+        else:
+            trained = _load(name, family, checkpoints)
+            config, rig = trained.config, trained.rig
+        model = random_model(config, settings.seed)
+        if rig is not None:
+            model.rig.copy_(rig)
+    else:
+        model = _load(name, "mv_meta" if base == "mv_shuffled" else base, checkpoints)
+        config = model.config
+        if base == "mv_shuffled":
+            model = shuffled(model, settings.seed)
+    assert config.initialisation is not None
+    steps = config.initialisation.steps if steps is None else steps
+    return FineTuned(model.to(device), steps, config.initialisation.descent(given=settings))
+
+
+def _load(name: str, family: str, checkpoints: Mapping[str, Path]) -> HyperPlanes:
+    """The model of a checkpoint that a method needs."""
+    if family not in checkpoints:
+        more = "" if name.split("_")[0] != "scratch" else f"; or name the field, as point_multiplane_{name}"
+        raise ValueError(
+            f"method {name}: expected a checkpoint of {family}, got none; `hyperplanes train` makes one{more}"
+        )
+    return HyperPlanes.from_pretrained(checkpoints[family])
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Optimisers: Muon for the weight matrices of hidden layers, Adam for everything else."""
+"""Optimisers: Muon for the weight matrices of hidden layers and Adam for everything else, or plain gradient descent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 __all__ = ["OPTIMISERS", "Muon", "make_optimisers", "orthogonalise"]
 
-OPTIMISERS = ("adam", "muon")
+OPTIMISERS = ("adam", "muon", "sgd")
 
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of the quintic Newton-Schulz iteration of Jordan et al. 2024
 NARROWEST = 16  # matrices with fewer rows or columns, such as the heads of colour and density, are left to Adam
@@ -83,8 +83,8 @@ def make_optimisers(
 
     Args:
         variables: the parameters.
-        name: "adam", or "muon" for the matrices of hidden layers and Adam for the rest.
-        adam_rate: learning rate of Adam.
+        name: "adam", "muon" for the matrices of hidden layers and Adam for the rest, or "sgd", without momentum.
+        adam_rate: learning rate of Adam, or of plain gradient descent.
         muon_rate: learning rate of Muon.
         betas: of Adam.
 
@@ -96,6 +96,8 @@ def make_optimisers(
     """
     if name not in OPTIMISERS:
         raise ValueError(f"optimiser: expected one of {', '.join(map(repr, OPTIMISERS))}, got {name!r}")
+    if name == "sgd":
+        return [torch.optim.SGD(list(variables), adam_rate)]
     hidden = [name == "muon" and value.ndim == 2 and min(value.shape) >= NARROWEST for value in variables]
     matrices = [value for value, chosen in zip(variables, hidden, strict=True) if chosen]
     others = [value for value, chosen in zip(variables, hidden, strict=True) if not chosen]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from hyperplanes.adaptation.hyperplanes import ModelConfig
-from hyperplanes.fields.base import TargetConfig
-from hyperplanes.hypernetwork.hypernetwork import HyperNetworkConfig
+from hyperplanes.adaptation.initialisation import LEARNED, InitialisationConfig
+from hyperplanes.fields import TARGETS, TargetConfig
+from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import TrainingConfig
 
@@ -26,12 +27,18 @@ class Preset:
         training: the procedure.
         resolution: pixels a side of the images it is meant for.
         about: one line for the list of presets.
+        initialisation: how initialisations are learned at this scale; its method does not count.
+        outer_rate: of Adam on an initialisation.
+        autoencoder: the shape of the autoencoder at this scale.
     """
 
     model: ModelConfig
     training: TrainingConfig
     resolution: int
     about: str
+    initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
+    outer_rate: float = 5e-5
+    autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
 
     def by_protocol(self, name: str) -> Preset:
         """The same model sampled by another protocol: "paper" is 64 coarse and 128 fine samples on every ray.
@@ -47,6 +54,34 @@ class Preset:
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
         return replace(self, model=replace(self.model, hypernetwork=None))
+
+    def with_autoencoder(self) -> Preset:
+        """The same target with the code of an encoder as an input, in place of a hypernetwork."""
+        return replace(self, model=replace(self.model, hypernetwork=None, autoencoder=self.autoencoder))
+
+    def learning_initialisation(self, method: str) -> Preset:
+        """The same target as a learned initialisation: one object a step, Adam on the initialisation, no schedule.
+
+        Args:
+            method: one of LEARNED.
+        """
+        changes: dict[str, int] = {"inner_steps": MAML_STEPS} if method.startswith("maml") else {}
+        initialisation = replace(self.initialisation, method=method, **changes)
+        training = replace(self.training, optimiser="adam", learning_rate=self.outer_rate)
+        if method == "mv_matched":
+            training = replace(training, learning_rate=MATCHING_RATE)
+        else:
+            training = replace(training, tasks=1, rays=128, warmup=0, final=1.0)
+        return replace(
+            self, model=replace(self.model, hypernetwork=None, initialisation=initialisation), training=training
+        )
+
+
+MAML_STEPS = 4
+"""Inner steps of MAML, which keeps the graph of all of them."""
+
+MATCHING_RATE = 1e-3
+"""Of Adam on random weights that are matched to an initialisation."""
 
 
 ALL_LAYERS = HyperNetworkConfig(
@@ -77,6 +112,8 @@ PRESETS: dict[str, Preset] = {
         ),
         64,
         "64x64, minutes on two cores: what `make demo` trains",
+        InitialisationConfig(inner_steps=16, steps=200, test_rays=256),
+        outer_rate=1e-3,
     ),
     "small": Preset(
         ModelConfig(
@@ -144,12 +181,18 @@ def preset(name: str) -> Preset:
     return PRESETS[name]
 
 
-TRAINABLE = ("hyperplanes", "point_multiplane", "multiplane", "nerf")
-"""Methods that `train` knows; all but the first are one set of weights for all objects."""
+TRAINABLE = ("hyperplanes", *reversed(TARGETS), "autoencoder", *LEARNED)
+"""Methods that `train` knows; those that are named as a field are one set of weights for all objects."""
 
 
 def configure(
-    name: str, method: str = "hyperplanes", *, steps: int | None = None, seed: int = 0, protocol: str = "default"
+    name: str,
+    method: str = "hyperplanes",
+    *,
+    steps: int | None = None,
+    seed: int = 0,
+    protocol: str = "default",
+    target: str | None = None,
 ) -> Preset:
     """The configuration of a method at the scale of a preset.
 
@@ -159,22 +202,30 @@ def configure(
         steps: other than the preset's.
         seed: of the training.
         protocol: a name in PROTOCOLS: how rays are sampled.
+        target: one of TARGETS; where absent that of the preset, or of an initialisation "nerf" (Tancik et al. 2021).
 
     Returns:
         Model and training.
 
     Raises:
-        ValueError: an unknown preset, method or protocol, or no step.
+        ValueError: an unknown preset, method, protocol or target, no step, or a target beside a method that is another.
     """
     if method not in TRAINABLE:
         raise ValueError(f"method: expected one of {', '.join(TRAINABLE)}, got {method!r}")
     if steps is not None and steps < 1:
         raise ValueError(f"steps: expected at least 1, got {steps}")
+    if target is not None and (target not in TARGETS or (method in TARGETS and method != target)):
+        expected = repr(method) if method in TARGETS else f"one of {', '.join(TARGETS)}"
+        raise ValueError(f"target: expected {expected}, got {target!r}")
     chosen = preset(name).by_protocol(protocol)
-    if method != "hyperplanes":
-        chosen = chosen.without_hypernetwork()
+    if method in TARGETS:
+        chosen, target = chosen.without_hypernetwork(), method
+    elif method == "autoencoder":
+        chosen = chosen.with_autoencoder()
+    elif method in LEARNED:
+        chosen, target = chosen.learning_initialisation(method), target or "nerf"
     return replace(
         chosen,
-        model=chosen.model if method == "hyperplanes" else replace(chosen.model, target=method),
+        model=replace(chosen.model, target=target or chosen.model.target),
         training=replace(chosen.training, steps=steps or chosen.training.steps, seed=seed),
     )

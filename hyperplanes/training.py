@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -51,6 +51,8 @@ class TrainingConfig:
         hypernetwork_learning_rate: of the hypernetwork.
         warmup: steps in which the learning rates rise from zero.
         final: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
+        alternating: theta and the hypernetwork move in turns, theta first, instead of both in every step. The paper
+            speaks of separate gradient steps; its code moves both.
         evaluate_every: steps between looks at held-out objects.
         held_out: how many of them are looked at: objects of the "val" split, or where there is none of "test".
         checkpoint_every: steps between checkpoints.
@@ -68,6 +70,7 @@ class TrainingConfig:
     hypernetwork_learning_rate: float = 1e-4
     warmup: int = 0
     final: float = 1.0
+    alternating: bool = False
     evaluate_every: int = 250
     held_out: int = 4
     checkpoint_every: int = 500
@@ -129,6 +132,7 @@ class Trainer:
         self._held_out: dict[str, Episode] = {}
         theta = list(model.networks.parameters())
         self.optimisers = make_optimisers(theta, config.optimiser, config.learning_rate, config.muon_learning_rate)
+        self._of_theta = len(self.optimisers)
         if model.hypernetwork is not None:
             rate = config.hypernetwork_learning_rate
             self.optimisers += make_optimisers(list(model.hypernetwork.parameters()), "adam", rate, 0.0)
@@ -164,20 +168,53 @@ class Trainer:
                 self.save()
             if not report:
                 continue
-            rays = (step - reported[1]) * self.config.rays * self.config.tasks / max(now - reported[0], 1e-9)
+            rays = (step - reported[1]) * self.rays_per_step / max(now - reported[0], 1e-9)
             left = (time.perf_counter() - started) / (step - first) * (self.config.steps - step)
             reported = (time.perf_counter(), step)
             yield Progress(step, self.config.steps, loss, rays, quality, left, diagnostics)
 
     def take_step(self) -> float:
-        """One step of both optimisers on freshly drawn objects and rays; returns the loss."""
+        """One step of the optimisers on freshly drawn objects and rays; returns the loss."""
         config = self.config
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + self.step)
         self.model.train()
-        total = torch.zeros(())
+        for optimiser in self.optimisers:
+            optimiser.zero_grad(set_to_none=True)
         drawn = [self.names[index] for index in self._draw(generator)]
         with record_function("step:data"):
             episodes = [self._episode(name) for name in drawn]
+        loss = self.gradients(drawn, episodes, generator)
+        if not math.isfinite(loss):
+            raise ValueError(
+                f"step {self.step + 1}, on {', '.join(drawn)}: expected a finite loss, got {loss}; the last checkpoint "
+                "is kept; check the images of these objects, or train with lower rates"
+            )
+        for index, (optimiser, rate) in enumerate(zip(self.optimisers, self.rates, strict=True)):
+            optimiser.param_groups[0]["lr"] = rate * self._schedule()
+            if not config.alternating or (index < self._of_theta) == (self.step % 2 == 0):
+                with record_function("step:optimisers"):
+                    optimiser.step()
+        self.step += 1
+        return loss
+
+    @property
+    def rays_per_step(self) -> int:
+        """Rays of all objects of a step."""
+        return self.config.rays * self.config.tasks
+
+    def gradients(self, drawn: Sequence[str], episodes: Sequence[Episode], generator: torch.Generator) -> float:
+        """Set the gradients of a step.
+
+        Args:
+            drawn: names of the objects.
+            episodes: the objects.
+            generator: of rays and samples.
+
+        Returns:
+            The loss.
+        """
+        config = self.config
+        total = torch.zeros(())
         with record_function("step:update"):
             updates = self.model.updates([episode.prepared for episode in episodes])
         for name, episode, update in zip(drawn, episodes, updates, strict=True):
@@ -191,22 +228,9 @@ class Trainer:
                 with record_function("step:emptiness"):
                     total = total + self._emptiness(field, generator)
             total = total + ray_loss(seen, truth)
-        loss = float(total.detach()) / config.tasks
-        if not math.isfinite(loss):
-            raise ValueError(
-                f"step {self.step + 1}, on {', '.join(drawn)}: expected a finite loss, got {loss}; the last checkpoint "
-                "is kept; check the images of these objects, or train with lower rates"
-            )
-        for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
-            optimiser.param_groups[0]["lr"] = rate * self._schedule()
-            optimiser.zero_grad(set_to_none=True)
         with record_function("step:gradients"):
             (total / config.tasks).backward()
-        with record_function("step:optimisers"):
-            for optimiser in self.optimisers:
-                optimiser.step()
-        self.step += 1
-        return loss
+        return float(total.detach()) / config.tasks
 
     def _draw(self, generator: torch.Generator) -> list[int]:
         """Indices of the objects of a step, different ones while there are enough."""
@@ -241,7 +265,7 @@ class Trainer:
         self.model.eval()
         try:
             if self.model.hypernetwork is None or len(episodes) < 2:
-                fields = [self.model.adapt(each) for each in prepared]
+                fields = [self._adapted(each) for each in episodes]
                 pictures = [f.render(q.cameras).images for f, q in zip(fields, queries, strict=True)]
                 values = [psnr(image, query.images) for image, query in zip(pictures, queries, strict=True)]
                 return float(torch.cat(values).mean()), None
@@ -249,6 +273,10 @@ class Trainer:
             return quality, replace(diagnose(self.model, prepared), swap_gap=gap)
         finally:
             self.model.train(training)
+
+    def _adapted(self, episode: Episode) -> AdaptedField:
+        """The field of a held-out object."""
+        return self.model.adapt(episode.prepared)
 
     def save(self) -> None:
         """Write model and training state to the folder, where there is one; whole or not at all."""
@@ -314,7 +342,12 @@ def train(
 
 
 def start_training(
-    config: ModelConfig, training: TrainingConfig, data: Tasks, folder: Path, device: torch.device | str = "cpu"
+    config: ModelConfig,
+    training: TrainingConfig,
+    data: Tasks,
+    folder: Path,
+    device: torch.device | str = "cpu",
+    reference: Path | None = None,
 ) -> Trainer:
     """A new training, or the one that was interrupted in `folder`.
 
@@ -324,9 +357,17 @@ def start_training(
         data: tasks with a "train" split.
         folder: for checkpoints.
         device: where to compute.
+        reference: the checkpoint of mv_meta that mv_matched is to match.
 
     Returns:
         A trainer; its `step` says how far it is. CheckpointError where the folder holds another model or training.
     """
-    model = HyperPlanes(config, training.seed).to(device)
-    return Trainer(model, TasksOnDevice(data, torch.device(device)), training, folder)
+    matching = config.initialisation is not None and config.initialisation.method == "mv_matched"
+    model = HyperPlanes(config, training.seed + matching).to(device)  # not the weights that mv_meta began with
+    tasks = TasksOnDevice(data, torch.device(device))
+    if config.initialisation is None:
+        return Trainer(model, tasks, training, folder)
+    from hyperplanes.meta_training import initialisation_trainer
+
+    matched = None if reference is None else HyperPlanes.from_pretrained(reference)
+    return initialisation_trainer(model, tasks, training, folder, matched)

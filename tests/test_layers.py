@@ -18,6 +18,8 @@ LAYERS = {
     "data_gen.datasets": 5.4,
     "hyperplanes.training": 4,
     "hyperplanes.training_state": 4,
+    "hyperplanes.meta_training": 4,
+    "hyperplanes.support": 4,
     "hyperplanes.episodes": 4,
     "hyperplanes.evaluation": 4,
     "hyperplanes.methods": 4,

@@ -1,8 +1,19 @@
 import pytest
 import torch
 
-from hyperplanes.adaptation import FineTuned, FineTuning, FromScratch, NearestView, Swapped
+from hyperplanes.adaptation import (
+    Adapter,
+    FineTuned,
+    FineTuning,
+    FromScratch,
+    InitialisationConfig,
+    NearestView,
+    Swapped,
+)
+from hyperplanes.adaptation.initialisation import LEARNED
+from hyperplanes.adaptation.pretrained import find_checkpoints
 from hyperplanes.evaluation import evaluate
+from hyperplanes.hypernetwork import AutoencoderConfig
 from hyperplanes.methods import METHODS, at_steps, describe_method, make_method
 from tests.reference_rendering import Balls, awaken, small_model
 
@@ -12,13 +23,23 @@ def folders(tmp_path):
     full, plain = tmp_path / "full", tmp_path / "plain"
     awaken(small_model()).save(full)
     small_model(hypernetwork=None).save(plain)
-    return {"hyperplanes": full} | dict.fromkeys(("nerf", "multiplane", "point_multiplane"), plain)
+    autoencoder = AutoencoderConfig(views=2, code=8, latent=8)
+    small_model(hypernetwork=None, autoencoder=autoencoder).save(tmp_path / "autoencoder")
+    for name in LEARNED:
+        initialisation = InitialisationConfig(name, inner_steps=2, steps=3)
+        small_model(hypernetwork=None, initialisation=initialisation).save(tmp_path / name)
+    found = find_checkpoints([full, tmp_path / "autoencoder", *(tmp_path / name for name in LEARNED)])
+    return found | dict.fromkeys(("nerf", "multiplane", "point_multiplane"), plain)
 
 
 def test_methods_by_name(folders):
     data = Balls(test=2)
     objects = [data.task(name).support for name in data.names("test")]
-    made = {name: make_method(name, folders, objects=objects) for name in METHODS if name != "scratch"}
+    made = {name: make_method(name, folders, objects=objects) for name in METHODS if not name.endswith("scratch")}
+    assert all(isinstance(each, Adapter) for each in made.values())
+    assert {name: made[name].steps for name in (*LEARNED, "standard", "mv_shuffled")} == dict.fromkeys(
+        (*LEARNED, "standard", "mv_shuffled"), 3
+    )
     assert isinstance(made["nearest_view"], NearestView)
     assert isinstance(made["hyperplanes_swapped"], Swapped)
     assert made["point_multiplane"].hypernetwork is None
@@ -50,8 +71,9 @@ def test_missing_checkpoints_are_named(name, family):
 
 
 def test_every_method_in_words():
-    names = [*METHODS, "scratch_100", "hyperplanes_100", "hyperplanes_auto", "point_multiplane_10"]
-    words = {name: describe_method(name) for name in names if name != "scratch"}
+    names = [f"{name}_100" if name.endswith("scratch") else name for name in METHODS]
+    names += ["hyperplanes_100", "hyperplanes_auto", "point_multiplane_10", "mv_meta_10"]
+    words = {name: describe_method(name) for name in names}
     assert len(set(words.values())) == len(words)
     assert words["scratch_100"] == "the same field from random weights, 100 steps"
     assert words["hyperplanes_auto"] == "HyperPlanes after as many fine-tuning steps as left-out views ask for"
@@ -62,6 +84,8 @@ def test_a_row_for_each_number_of_steps():
     assert at_steps("nearest_view", [0, 10]) == ["nearest_view"]
     assert at_steps("hyperplanes_5", [0, 10]) == ["hyperplanes_5"]
     assert at_steps("hyperplanes", []) == ["hyperplanes"]
+    assert at_steps("nerf_scratch", [0, 10]) == ["nerf_scratch_10"]
+    assert at_steps("mv_meta", [0, 10]) == ["mv_meta_0", "mv_meta_10"]
 
 
 def test_swapped_objects_have_the_update_of_the_next_one_and_everything_else_of_their_own():
@@ -97,7 +121,7 @@ def test_no_method_reads_a_pixel_of_the_query_views(folders):
 
     data.task = poisoned
     objects = [data.task(name).support for name in data.names("test")]
-    for name in ("hyperplanes", "hyperplanes_swapped", "hyperplanes_2", "point_multiplane_2", "scratch_2"):
+    for name in (f"{name}_2" if name.endswith("scratch") else name for name in METHODS):
         adapter = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))
         evaluate(name, adapter, data, ["test0"], lambda score, task, pictures: read.append(pictures.images))
         again = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))

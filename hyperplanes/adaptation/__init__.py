@@ -2,9 +2,11 @@
 
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Renderable
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
-from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import FineTuning
+from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig, Prepared
+from hyperplanes.adaptation.initialisation import InitialisationConfig
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
 
@@ -12,10 +14,13 @@ __all__ = [
     "AdaptedField",
     "Adapter",
     "Diagnostics",
+    "FieldFromScratch",
     "FineTuned",
     "FineTuning",
     "FromScratch",
+    "HullBlend",
     "HyperPlanes",
+    "InitialisationConfig",
     "ModelConfig",
     "NearestView",
     "Pictures",

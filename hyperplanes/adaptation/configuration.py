@@ -8,12 +8,15 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
+from hyperplanes.adaptation.initialisation import InitialisationConfig
 from hyperplanes.checkpoints import CheckpointError, read_json
 from hyperplanes.fields import TargetConfig
-from hyperplanes.hypernetwork.hypernetwork import HyperNetworkConfig
+from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 
-__all__ = ["ModelConfig", "checkpoint_folder"]
+__all__ = ["ORDERS", "ModelConfig", "checkpoint_folder"]
+
+ORDERS = ("matched", "file")
 
 PACKAGED = Path(__file__).parent.parent / "pretrained"  # a folder a model, by its name
 
@@ -24,6 +27,9 @@ LARGEST = {
     "depth": 256,
     "width": 8192,
     "code": 8192,
+    "latent": 8192,
+    "inner_steps": 16384,
+    "test_rays": 1 << 20,
     "rank": 1024,
     "planes": 1024,
     "views": 1024,
@@ -44,17 +50,40 @@ class ModelConfig:
         target: which field: "point_multiplane", "multiplane" or "nerf".
         network: the shape of the target.
         hypernetwork: the shape of the hypernetwork, or None for one set of weights for all objects.
+        autoencoder: the shape of an encoder whose code the target reads, in place of a hypernetwork.
+        initialisation: how the weights were learned as an initialisation, if they were.
         coarse_network: whether a second network of the same shape proposes where to sample (NeRF's coarse network).
         sampling: how fields are rendered by default, in training too.
         hull_side: voxels an axis of the visual hull.
+        order: which support view a plane is: the one "matched" to the standpoint that it had in training, or views in
+            the order of their "file", as the paper takes them.
     """
 
     target: str = "point_multiplane"
     network: TargetConfig = field(default_factory=TargetConfig)
     hypernetwork: HyperNetworkConfig | None = field(default_factory=HyperNetworkConfig)
+    autoencoder: AutoencoderConfig | None = None
+    initialisation: InitialisationConfig | None = None
     coarse_network: bool = False
     sampling: Hierarchical | Marched = field(default_factory=Marched)
     hull_side: int = 64
+    order: str = "matched"
+
+    def __post_init__(self) -> None:
+        if self.order not in ORDERS:
+            raise ValueError(f"order: expected one of {', '.join(map(repr, ORDERS))}, got {self.order!r}")
+        chosen = [name for name in ("hypernetwork", "autoencoder", "initialisation") if getattr(self, name) is not None]
+        if len(chosen) > 1:
+            raise ValueError(f"model: expected at most one way to find weights, got {' and '.join(chosen)}")
+
+    @property
+    def method(self) -> str:
+        """The name of the method that such a model is: "hyperplanes", "autoencoder", "mv_meta", "nerf" and so on."""
+        if self.hypernetwork is not None:
+            return "hyperplanes"
+        if self.autoencoder is not None:
+            return "autoencoder"
+        return self.target if self.initialisation is None else self.initialisation.method
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""
@@ -77,12 +106,18 @@ class ModelConfig:
         try:
             rest = dict(value)
             sampling = {"hierarchical": Hierarchical, "marched": Marched}[rest.pop("protocol")]
-            hyper = rest.pop("hypernetwork")
+            kinds = {
+                "hypernetwork": HyperNetworkConfig,
+                "autoencoder": AutoencoderConfig,
+                "initialisation": InitialisationConfig,
+            }
+            found = {"hypernetwork": rest.pop("hypernetwork")}
+            found |= {name: rest.pop(name, None) for name in kinds if name not in found}
             parts = {
                 "network": _made(TargetConfig, rest.pop("network")),
                 "sampling": _made(sampling, rest.pop("sampling")),
-                "hypernetwork": None if hyper is None else _made(HyperNetworkConfig, hyper),
             }
+            parts |= {name: None if found[name] is None else _made(kind, found[name]) for name, kind in kinds.items()}
             return _made(cls, rest, parts)
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
 from hyperplanes.checkpoints import CheckpointError
-from hyperplanes.hypernetwork.hypernetwork import HyperNetwork
+from hyperplanes.hypernetwork import Autoencoder, HyperNetwork
 from hyperplanes.metrics import psnr
 from hyperplanes.views import Views
 
@@ -135,7 +135,9 @@ def swap_gap(model: HyperPlanes, prepared: Sequence[Prepared], queries: Sequence
     return own, own - quality(1)
 
 
-def _activated(hypernetwork: HyperNetwork) -> list[torch.nn.Module]:
+def _activated(hypernetwork: HyperNetwork | Autoencoder) -> list[torch.nn.Module]:
     """The modules whose outputs go through an activation function."""
+    if isinstance(hypernetwork, Autoencoder):
+        return [hypernetwork.latent]
     codes = [hypernetwork.code_normalisation] if hypernetwork.config.code_activation != "none" else []
     return [*codes, *hypernetwork.head]

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import torch
+
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
-from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.views import Views
 
-__all__ = ["SCRATCH_RATES", "FineTuned", "FromScratch"]
+__all__ = ["SCRATCH_RATES", "FieldFromScratch", "FineTuned", "FromScratch", "random_model"]
 
 SCRATCH_RATES = {"learning_rate": 4e-3, "muon_learning_rate": 0.05}
 """Of Adam and of Muon from random weights: higher than those of fine-tuning, docs/adaptation.md."""
@@ -54,11 +56,43 @@ class FromScratch:
 
     def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
         """The field after so many steps from random weights."""
-        fresh = HyperPlanes(replace(self.model.config, hypernetwork=None), seed=self.settings.seed)
+        fresh = random_model(self.model.config, self.settings.seed)
         fresh.rig.copy_(self.model.rig)
-        settings = replace(
-            self.settings,
-            free="weights",
-            **{name: rate for name, rate in SCRATCH_RATES.items() if getattr(self.settings, name) is None},
-        )
-        return fresh.to(self.model.rig.device).fine_tune(support, self.steps, settings, on_step=on_step)
+        return fresh.to(self.model.rig.device).fine_tune(support, self.steps, _rated(self.settings), on_step=on_step)
+
+
+@dataclass(frozen=True)
+class FieldFromScratch:
+    """A target network of its own for every object, optimised on its support views from random weights.
+
+    No checkpoint is needed: there is one ImagePlane a support view, in the order of the views.
+
+    Attributes:
+        config: which field, of which shape; its number of planes does not count.
+        steps: of optimising an object, or "auto".
+        settings: as those of `FromScratch`.
+        device: where to compute.
+    """
+
+    config: ModelConfig
+    steps: Steps
+    settings: FineTuning = field(default_factory=FineTuning)
+    device: torch.device | str = "cpu"
+
+    def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
+        """The field after so many steps from random weights."""
+        network = replace(self.config.network, planes=len(support))
+        fresh = random_model(replace(self.config, network=network, order="file"), self.settings.seed).to(self.device)
+        return fresh.fine_tune(support, self.steps, _rated(self.settings), on_step=on_step)
+
+
+def random_model(config: ModelConfig, seed: int) -> HyperPlanes:
+    """The target network of a model with random weights, without what finds better ones."""
+    return HyperPlanes(replace(config, hypernetwork=None, autoencoder=None, initialisation=None), seed=seed)
+
+
+def _rated(settings: FineTuning) -> FineTuning:
+    """The settings with all weights free and, where they state no rate, the rates of SCRATCH_RATES."""
+    stated = {name: getattr(settings, name) for name in SCRATCH_RATES}
+    rates = {name: SCRATCH_RATES[name] if rate is None else rate for name, rate in stated.items()}
+    return replace(settings, free="weights", **rates)

@@ -39,8 +39,8 @@ class FineTuning:
         free: what is optimised: "weights", theta + delta itself, or "hypernetwork", a copy of the hypernetwork while
             theta is frozen, as in the paper.
         rays: a step, drawn from all support views.
-        optimiser: "muon" or "adam"; the best for what is free, see RATES, where None.
-        learning_rate: of Adam at the first step; that of RATES where None.
+        optimiser: "muon", "adam" or "sgd"; the best for what is free, see RATES, where None.
+        learning_rate: of Adam or of plain gradient descent at the first step; that of RATES where None.
         muon_learning_rate: of Muon at the first step; that of RATES where None.
         final: what the rates fall to along half a cosine, as a fraction.
         longest: the most steps that "auto" may choose.
@@ -50,7 +50,7 @@ class FineTuning:
 
     free: Literal["weights", "hypernetwork"] = "weights"
     rays: int = 1024
-    optimiser: Literal["adam", "muon"] | None = None
+    optimiser: Literal["adam", "muon", "sgd"] | None = None
     learning_rate: float | None = None
     muon_learning_rate: float | None = None
     final: float = 0.1

@@ -23,7 +23,7 @@ from hyperplanes.files import write_json
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy, full
-from hyperplanes.hypernetwork.hypernetwork import HyperNetwork
+from hyperplanes.hypernetwork import Autoencoder, HyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views
@@ -69,10 +69,9 @@ class HyperPlanes(nn.Module):
         if config.target not in TARGETS:
             raise ValueError(f"target: expected one of {sorted(TARGETS)}, got {config.target!r}")
         planes = config.network.planes
-        if config.hypernetwork and config.hypernetwork.views > planes:
-            raise ValueError(
-                f"views: expected at most as many HyperPlanes as planes, {planes}, got {config.hypernetwork.views}"
-            )
+        reader = config.hypernetwork or config.autoencoder
+        if reader and reader.views > planes:
+            raise ValueError(f"views: expected at most as many HyperPlanes as planes, {planes}, got {reader.views}")
         self.config = config
         make = TARGETS[config.target]
         with torch.random.fork_rng(devices=[]):
@@ -81,7 +80,12 @@ class HyperPlanes(nn.Module):
             if config.coarse_network:
                 self.networks["coarse"] = make(config.network)
             shapes = {name: value.shape for name, value in self.networks.named_parameters()}
-            self.hypernetwork = HyperNetwork(config.hypernetwork, shapes) if config.hypernetwork else None
+            self.hypernetwork: HyperNetwork | Autoencoder | None = None
+            if config.hypernetwork:
+                self.hypernetwork = HyperNetwork(config.hypernetwork, shapes)
+            elif config.autoencoder:
+                read = cast(Target, self.networks["fine"]).reading_layers
+                self.hypernetwork = Autoencoder(config.autoencoder, shapes, read)
         self.register_buffer("rig", torch.zeros(planes, 3))
 
     @property
@@ -102,7 +106,8 @@ class HyperPlanes(nn.Module):
     def arrange(self, support: Views) -> Views:
         """One support view a plane, each the nearest to where the training rig has one.
 
-        More views than planes: the best matching ones, none twice. Fewer: some stand for several planes.
+        More views than planes: the best matching ones, none twice. Fewer: some stand for several planes. With order
+        "file" the views stay in their order: the first ones, and again from the first where there are too few.
 
         Raises:
             ValueError: no view, or a model that was never shown its rig.
@@ -111,6 +116,8 @@ class HyperPlanes(nn.Module):
 
         if not len(support):
             raise ValueError("support: expected at least one view, got none")
+        if self.config.order == "file":
+            return support[torch.arange(len(self.rig), device=support.images.device) % len(support)]
         cost = (1 - self._known_rig() @ _standpoints(support).cpu().T).double().numpy()
         repeats = -(-len(self.rig) // len(support))
         _, column = linear_sum_assignment(np.tile(cost, (1, repeats)))
@@ -133,11 +140,13 @@ class HyperPlanes(nn.Module):
         return Prepared(views, ImagePlanes(views.images, views.cameras), region)
 
     def hyperplanes(self) -> Int[Tensor, " k"]:
-        """Which planes the hypernetwork reads: k of the rig, spread as far apart as they can be.
+        """Which planes the hypernetwork reads: k of the rig, spread as far apart as they can be, or the first k.
 
         A model that was never shown its rig raises ValueError.
         """
         count = self.hypernetwork.config.views if self.hypernetwork else 0
+        if self.hypernetwork and self.hypernetwork.config.choice == "first":
+            return torch.arange(count, device=self.rig.device)
         rig = self._known_rig()
         chosen = [0]
         nearest = rig @ rig[0]
@@ -159,7 +168,7 @@ class HyperPlanes(nn.Module):
         """The views where the weights are, in their precision or at least single."""
         return support.to(self.rig.device, torch.promote_types(self.rig.dtype, torch.float32))
 
-    def update(self, prepared: Prepared, hypernetwork: HyperNetwork | None = None) -> Parameters:
+    def update(self, prepared: Prepared, hypernetwork: HyperNetwork | Autoencoder | None = None) -> Parameters:
         """The update of theta, in one forward pass (HyperPlanes, Eq. 7); empty without a hypernetwork.
 
         Args:
@@ -171,7 +180,9 @@ class HyperPlanes(nn.Module):
         """
         return self.updates([prepared], hypernetwork)[0]
 
-    def updates(self, prepared: Sequence[Prepared], hypernetwork: HyperNetwork | None = None) -> list[Parameters]:
+    def updates(
+        self, prepared: Sequence[Prepared], hypernetwork: HyperNetwork | Autoencoder | None = None
+    ) -> list[Parameters]:
         """The updates of several objects, whose HyperPlanes are encoded in one batch; as `update`."""
         theta = self.theta if hypernetwork is None else self.theta.detach()
         hypernetwork = hypernetwork or self.hypernetwork
@@ -202,7 +213,7 @@ class HyperPlanes(nn.Module):
 
     def fine_tune(
         self,
-        support: Views,
+        support: Views | Prepared,
         steps: Steps,
         settings: FineTuning | None = None,
         *,
@@ -214,7 +225,7 @@ class HyperPlanes(nn.Module):
         paper, a copy of the hypernetwork while theta is frozen (HyperPlanes, section 3, fine-tuning).
 
         Args:
-            support: the views of the object.
+            support: the views of the object; of one that is prepared, those that are planes.
             steps: gradient steps on rays of the support views, or "auto": as many, up to `settings.longest`, as show
                 support views best that were left out for the purpose; 0 where every step made those worse.
             settings: what is optimised, rates, rays and seed.
@@ -232,9 +243,9 @@ class HyperPlanes(nn.Module):
             raise ValueError("fine_tune: expected a model with a hypernetwork, got one without")
         if steps != "auto" and steps < 0:
             raise ValueError(f"steps: expected 0 or more, or 'auto', got {steps}")
-        support = self._to_own(support)
+        given, support = support, support.views if isinstance(support, Prepared) else self._to_own(support)
         schedule, stop = (settings.longest, self._best_stop(support, settings)) if steps == "auto" else (steps, steps)
-        prepared = self.prepare(support)
+        prepared = given if isinstance(given, Prepared) else self.prepare(support)
         field, variables = self._tunable(prepared, settings)
         pixels = self._live_pixels(prepared, support)
         for done in minimise(field, variables, support, schedule, settings, pixels=pixels):

@@ -24,7 +24,7 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
         folders: each a checkpoint, a folder of checkpoints such as `runs/demo`, or the name of a packaged model.
 
     Returns:
-        Folders by "hyperplanes", "point_multiplane" and so on; the first of a kind counts.
+        Folders by the names of their methods, such as "hyperplanes"; the first of a name counts.
 
     Raises:
         CheckpointError: a folder that neither is nor holds a checkpoint.
@@ -39,8 +39,7 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
                 "`hyperplanes train` writes one, `hyperplanes demo` makes a small one in minutes"
             )
         for path in inside:
-            config = ModelConfig.load(path)
-            found.setdefault("hyperplanes" if config.hypernetwork else config.target, path)
+            found.setdefault(ModelConfig.load(path).method, path)
     return found
 
 
@@ -70,7 +69,7 @@ def adapted_model(model: HyperPlanes, adapted: AdaptedField) -> HyperPlanes:
     Raises:
         ValueError: a field that is no network of this model.
     """
-    result = HyperPlanes(replace(model.config, hypernetwork=None))
+    result = HyperPlanes(replace(model.config, hypernetwork=None, autoencoder=None, initialisation=None))
     result.rig.copy_(model.rig)
     for name, field in (("fine", adapted.field), ("coarse", adapted.proposal)):
         if name not in result.networks:

@@ -15,6 +15,7 @@ Example:
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method hyperplanes scratch --steps 10 100
     hyperplanes evaluate --data photos/ --checkpoint runs/demo --method hyperplanes --json photos.json
     hyperplanes evaluate --data data/cars --checkpoint runs/cars-{seed} --seeds 5 --markdown cars.md --boxes cars.png
+    hyperplanes evaluate --data photos/ --method nearest_view hull_blend point_multiplane_scratch_300
 """
 
 from __future__ import annotations
@@ -46,9 +47,11 @@ class Arguments:
 
     Attributes:
         data: A data set or one posed scene.
-        method: nearest_view, nerf, multiplane, point_multiplane, hyperplanes, hyperplanes_swapped (each object with the
-            update of another) or scratch (random weights); all but the first and hyperplanes_swapped may be followed by
-            _N or _auto for fine-tuning steps.
+        method: nearest_view and hull_blend (nothing is learned); nerf, multiplane, point_multiplane, hyperplanes,
+            hyperplanes_swapped (each object with the update of another), autoencoder; scratch_N (the field of a
+            checkpoint from random weights), nerf_scratch_N, multiplane_scratch_N, point_multiplane_scratch_N (no
+            checkpoint is needed); standard, mv_matched, mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but
+            the first two and hyperplanes_swapped may be followed by _N or _auto for gradient steps.
         checkpoint: Folders that `train` wrote, or folders of them such as runs/demo; {seed} stands for each seed.
         json: Write the table here too, with every object, every seed and every pair of methods.
         csv: Write every object's numbers here, a line each.
@@ -62,6 +65,8 @@ class Arguments:
         lpips: Measure LPIPS with these weights, a safetensors file; see `hyperplanes.perceptual` for how to make it.
         split: Which objects.
         objects: Only the first so many.
+        support: Support views an object; more than there are go on with the query views.
+        preset: The shape of fields that need no checkpoint.
         up: The axis that points up in the data's world: y as in training data, z as in Blender.
         protocol: How fields are sampled: as they were trained, or 64 + 128 times a ray as in the paper.
         device: auto, cpu or cuda.
@@ -82,6 +87,8 @@ class Arguments:
     lpips: Annotated[Path | None, optional("FILE")] = None
     split: Literal["test", "val", "train", "all"] = "test"
     objects: OptionalInt = None
+    support: OptionalInt = None
+    preset: str = "quick"
     up: Up = "y"
     protocol: Protocol = "default"
     device: str = "auto"
@@ -151,6 +158,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.methods import WithSampler, at_steps, make_method
     from hyperplanes.perceptual import LPIPS
     from hyperplanes.presets import PROTOCOLS
+    from hyperplanes.support import WithSupport
 
     if arguments.curve is not None and len(arguments.steps) < 2:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
@@ -158,7 +166,9 @@ def run(arguments: Arguments) -> int:
         raise ValueError(f"--seeds: expected at least 1, got {arguments.seeds}")
     console, device = Console(), choose_device(arguments.device)
     checkpoints = [find_checkpoints(with_seed(arguments.checkpoint, seed)) for seed in range(arguments.seeds)]
-    data = TasksOnDevice(open_dataset(arguments.data), device, arguments.up)
+    opened = open_dataset(arguments.data)
+    tasks = opened if arguments.support is None else WithSupport(opened, arguments.support)
+    data = TasksOnDevice(tasks, device, arguments.up)
     names = data.names(arguments.split)[: arguments.objects]
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
@@ -167,17 +177,23 @@ def run(arguments: Arguments) -> int:
 
     def make(name: str, seed: int) -> WithSampler:
         objects = (data.task(each).support for each in names)
-        settings = FineTuning(free=arguments.fine_tune, seed=seed)
-        made = make_method(name, checkpoints[seed], device=device, settings=settings, objects=objects)
+        made = make_method(
+            name,
+            checkpoints[seed],
+            device=device,
+            settings=FineTuning(free=arguments.fine_tune, seed=seed),
+            objects=objects,
+            preset=arguments.preset,
+            protocol=arguments.protocol,
+        )
         return WithSampler(made, sampling)
 
     chosen = list(dict.fromkeys(each for name in arguments.method for each in at_steps(name, arguments.steps)))
-    for name in chosen:
-        make(name, 0)  # a wrong name or a missing checkpoint is found before the first object is adapted to
+    first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to
     pictures = _Pictures()
     with console.bar("evaluating") as bar:
         scores = evaluate_all(
-            {name: lambda seed, name=name: make(name, seed) for name in chosen},
+            {name: lambda seed, name=name: make(name, seed) if seed else first[name] for name in chosen},
             data,
             names,
             bar.show,

@@ -9,12 +9,14 @@ import tyro
 
 __all__ = [
     "Free",
+    "OptionalField",
     "OptionalFolder",
     "OptionalInt",
     "OptionalName",
     "OptionalNumber",
     "Protocol",
     "Steps",
+    "Trainable",
     "Up",
     "optional",
 ]
@@ -26,6 +28,7 @@ def optional(metavar: str, **options: Any) -> Any:
 
 
 OptionalFolder = Annotated[Path | None, optional("FOLDER")]
+OptionalField = Annotated[Literal["nerf", "multiplane", "point_multiplane"] | None, optional("FIELD")]
 OptionalInt = Annotated[int | None, optional("INT")]
 OptionalName = Annotated[str | None, optional("NAME")]
 OptionalNumber = Annotated[int | float | None, optional("NUMBER")]
@@ -35,6 +38,12 @@ Protocol = Literal["default", "paper"]
 
 Steps = int | Literal["auto"]
 """Fine-tuning steps, or as many as show left-out views best."""
+
+Trainable = Literal[
+    "hyperplanes", "point_multiplane", "multiplane", "nerf", "autoencoder", "mv_meta", "sv_meta", "maml",
+    "maml_first_order", "mv_matched",
+]  # fmt: skip
+"""A name in `hyperplanes.presets.TRAINABLE`."""
 
 Free = Literal["weights", "hypernetwork"]
 """What fine-tuning optimises."""

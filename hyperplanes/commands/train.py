@@ -6,6 +6,7 @@ same command goes on from the last one. Pressing Ctrl-C once stops after a check
 Example:
     hyperplanes train --data data/cars --preset quick --out runs/cars
     hyperplanes train --data data/cars --preset quick --method point_multiplane --out runs/cars-baseline
+    hyperplanes train --data data/cars --preset quick --method mv_meta --field nerf --out runs/cars-meta
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from __future__ import annotations
 import signal
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from hyperplanes.commands.console import Bar, Console
-from hyperplanes.commands.options import OptionalInt, Protocol
+from hyperplanes.commands.options import OptionalField, OptionalFolder, OptionalInt, Protocol, Trainable
 from hyperplanes.formatting import format_duration, format_rate
 
 if TYPE_CHECKING:
@@ -35,7 +36,11 @@ class Arguments:
         data: The data set, or several whose objects are drawn alike.
         out: The folder for checkpoints; a training that was interrupted there goes on.
         preset: One of `hyperplanes presets`: how large the model is and how long it is trained.
-        method: HyperPlanes, or a target network alone with one set of weights for all objects.
+        method: HyperPlanes, a target network alone with one set of weights for all objects, an autoencoder, or a
+            learned initialisation (Reptile from many views or a single one, MAML, or random weights matched to one).
+        field: Which target network: the preset's, or for learned initialisations NeRF, when not given.
+        support: Support views and ImagePlanes an object; more than there are go on with the query views.
+        checkpoint: What mv_matched is to match: a checkpoint of mv_meta.
         protocol: How rays are sampled: as the preset says, or 64 + 128 times each as in the paper.
         steps: Other than the preset's.
         seed: Of the first weights and of every draw.
@@ -45,7 +50,10 @@ class Arguments:
     data: tuple[Path, ...]
     out: Path
     preset: str = "quick"
-    method: Literal["hyperplanes", "point_multiplane", "multiplane", "nerf"] = "hyperplanes"
+    method: Trainable = "hyperplanes"
+    field: OptionalField = None
+    support: OptionalInt = None
+    checkpoint: OptionalFolder = None
     protocol: Protocol = "default"
     steps: OptionalInt = None
     seed: int = 0
@@ -115,14 +123,21 @@ def follow(trainer: Trainer, bar: Bar) -> None:
 
 def run(arguments: Arguments) -> int:
     """Train, from the start or from where it was interrupted."""
+    from hyperplanes.adaptation.pretrained import find_checkpoints
     from hyperplanes.data.dataset import open_datasets
     from hyperplanes.devices import choose_device
     from hyperplanes.presets import configure
+    from hyperplanes.support import WithSupport
     from hyperplanes.training import start_training
 
     console = Console()
     chosen = configure(
-        arguments.preset, arguments.method, steps=arguments.steps, seed=arguments.seed, protocol=arguments.protocol
+        arguments.preset,
+        arguments.method,
+        steps=arguments.steps,
+        seed=arguments.seed,
+        protocol=arguments.protocol,
+        target=arguments.field,
     )
     data, shown = open_datasets(arguments.data), " ".join(map(str, arguments.data))
     if not data.names("train"):
@@ -130,7 +145,15 @@ def run(arguments: Arguments) -> int:
             f"{shown}: expected objects to train on, found none in its train split; "
             "a single scene can only be rendered or evaluated"
         )
-    trainer = start_training(chosen.model, chosen.training, data, arguments.out, choose_device(arguments.device))
+    model, tasks = chosen.model, data
+    if arguments.support is not None:
+        model = replace(model, network=replace(model.network, planes=arguments.support))
+        tasks = WithSupport(data, arguments.support)
+    reference = None
+    if arguments.checkpoint is not None:
+        reference = find_checkpoints([arguments.checkpoint]).get("mv_meta", arguments.checkpoint)
+    device = choose_device(arguments.device)
+    trainer = start_training(model, chosen.training, tasks, arguments.out, device, reference)
     held_out = len(data.names("test"))
     console.say(
         f"{arguments.method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "

@@ -69,6 +69,11 @@ class Target(nn.Module):
         nn.init.constant_(self.density.bias, -2.0)
 
     @property
+    def reading_layers(self) -> tuple[str, ...]:
+        """The names of the layers that read a point: the first one and that of the skip connection."""
+        return ("layers.0",) if self.skip == 0 else ("layers.0", f"layers.{self.skip}")
+
+    @property
     def input_size(self) -> int:
         """How many numbers the first layer reads of a point."""
         raise TypeError(f"{type(self).__name__} does not say what it reads")

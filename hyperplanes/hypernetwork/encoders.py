@@ -6,15 +6,23 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
-__all__ = ["ENCODERS", "ConvNet", "ResNet101"]
+__all__ = ["CHOICES", "ENCODERS", "NORMALISATIONS", "ConvNet", "ResNet101"]
+
+CHOICES = ("farthest", "first")
+"""Which k of n planes an encoder reads."""
+
+NORMALISATIONS = ("batch", "batch_statistics", "group")
 
 
 def _normalisation(name: str, channels: int) -> nn.Module:
     if name == "batch":
         return nn.BatchNorm2d(channels)
+    if name == "batch_statistics":
+        return nn.BatchNorm2d(channels, track_running_stats=False)
     if name == "group":
         return nn.GroupNorm(8, channels)
-    raise ValueError(f"normalisation: expected 'batch' or 'group', got {name!r}")
+    expected = ", ".join(map(repr, NORMALISATIONS))
+    raise ValueError(f"normalisation: expected one of {expected}, got {name!r}")
 
 
 class ConvNet(nn.Module):

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import relu, silu
 
-from hyperplanes.hypernetwork.encoders import ENCODERS
+from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
 from hyperplanes.hypernetwork.standardisation import RunningStandardisation
 from hyperplanes.hypernetwork.updates import UPDATES
 from hyperplanes.hypernetwork.weights import LowRankReader
@@ -30,8 +30,10 @@ class HyperNetworkConfig:
 
     Attributes:
         views: k, the number of HyperPlanes it reads.
+        choice: which k of the n planes they are: the "farthest" apart, or the "first".
         encoder: "convnet" (ShapeNet 128) or "resnet101" (ShapeNet 200).
-        normalisation: of the encoder: "batch" as in the paper, or "group", which does the same in training and use.
+        normalisation: of the encoder: "batch" as in the paper, by running statistics in use; "batch_statistics", by the
+            statistics of the HyperPlanes at hand in use too, as the published code does; or "group", image by image.
         code: length of the code of one image.
         code_activation: applied to the codes: "none", or "relu".
         code_normalisation: of the codes before that: "running" standardises them by running statistics over objects,
@@ -55,6 +57,7 @@ class HyperNetworkConfig:
     """
 
     views: int = 5
+    choice: str = "farthest"
     encoder: str = "convnet"
     normalisation: str = "batch"
     code: int = 128
@@ -75,7 +78,9 @@ class HyperNetworkConfig:
 
     def __post_init__(self) -> None:
         for name, known in (
+            ("choice", CHOICES),
             ("encoder", ENCODERS),
+            ("normalisation", NORMALISATIONS),
             ("code_activation", ACTIVATIONS),
             ("code_normalisation", CODE_NORMALISATIONS),
             ("join", JOINS),

@@ -54,11 +54,12 @@ def configuration(experiment: Experiment, trained: Trained, scale: Scale, object
     steps = scale.steps if scale.steps is not None else experiment.epochs_of(trained.on) * objects
     changes = {**scale.changes, **trained.changes, "training.steps": steps}
     changes["model.network.planes"] = scale.planes(trained.planes)
-    views = trained.changes.get(
-        "model.hypernetwork.views", chosen.model.hypernetwork and chosen.model.hypernetwork.views
-    )
-    if isinstance(views, int):
-        changes["model.hypernetwork.views"] = scale.planes(views)
+    for part in ("hypernetwork", "autoencoder"):
+        reader, name = getattr(chosen.model, part), f"model.{part}.views"
+        if reader is not None:
+            views = trained.changes.get(name, reader.views)
+            assert isinstance(views, int)
+            changes[name] = scale.planes(views)
     return change(chosen, changes)
 
 

@@ -23,7 +23,7 @@ from hyperplanes.presets import PROTOCOLS, Preset
 from hyperplanes.reproduce.configurations import configuration
 from hyperplanes.reproduce.experiments import Cell, Experiment, Trained
 from hyperplanes.reproduce.scales import Scale
-from hyperplanes.reproduce.unified import Unified
+from hyperplanes.support import WithSupport
 from hyperplanes.views import Tasks
 
 __all__ = ["Outcome", "Runner"]
@@ -136,7 +136,7 @@ class Runner:
                 folder = self.checkpoint(experiment, cell.trained, seed)
                 curve = read_json(folder / "training.json").get("curve", [])
                 curves.setdefault(_curve_name(experiment, cell), {})[str(folder), seed] = curve
-                score = self.score(cell, folder, seed)
+                score = self.score(experiment, cell, folder, seed)
                 scores.setdefault((cell.row, cell.column), []).append(score)
         return Outcome(
             experiment,
@@ -156,8 +156,10 @@ class Runner:
         """The folder of a finished training."""
         data = self.tasks(trained.on)
         chosen = self.configuration(experiment, trained, seed)
+        reference = trained.reference and self.checkpoint(experiment, trained.reference, seed)
         settings = {
             "data": list(data.names("train")),
+            "reference": "" if reference is None else reference.name,
             "method": trained.method,
             "model": chosen.model.as_json(),
             "training": asdict(chosen.training),
@@ -169,15 +171,14 @@ class Runner:
             self.say(
                 f"training {trained.method} on {trained.on}, seed {seed}, {chosen.training.steps:,} steps: {folder}"
             )
-            reference = trained.reference and self.checkpoint(experiment, trained.reference, seed)
             self.train(trained.method, chosen, self.arranged(trained, chosen), folder, reference)
         return folder
 
     def arranged(self, trained: Trained, chosen: Preset) -> Tasks:
         """The data of a training, with as many support views as its model has planes."""
-        return Unified(self.tasks(trained.on), chosen.model.network.planes)
+        return WithSupport(self.tasks(trained.on), chosen.model.network.planes)
 
-    def score(self, cell: Cell, checkpoint: Path, seed: int) -> Score:
+    def score(self, experiment: Experiment, cell: Cell, checkpoint: Path, seed: int) -> Score:
         """The evaluation of a cell with one seed."""
         method = self.scale.method(cell.method)
         names = self.names(cell.on, cell.split)
@@ -191,16 +192,25 @@ class Runner:
         }
         path = self.out / "evaluations" / f"{_name(f'{cell.on}-{method}-{seed}', settings)}.json"
         if not path.exists():
-            score = self._evaluate(cell, method, checkpoint, names, seed)
+            score = self._evaluate(experiment, cell, method, checkpoint, names, seed)
             write_json(path, {"settings": settings, "score": score.as_json()})
         return Score.of_json(method, read_json(path)["score"])
 
-    def _evaluate(self, cell: Cell, method: str, checkpoint: Path, names: list[str], seed: int) -> Score:
+    def _evaluate(
+        self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, names: list[str], seed: int
+    ) -> Score:
         checkpoints = find_checkpoints([checkpoint])
         settings = FineTuning(free=cell.free if "hyperplanes" in checkpoints else "weights", seed=seed)
         planes = read_json(checkpoint / "model.json")["network"]["planes"]
-        tasks = Unified(self.tasks(cell.on), planes)
-        adapter = make_method(method, checkpoints, device=self.device, settings=settings)
+        tasks = WithSupport(self.tasks(cell.on), planes)
+        adapter = make_method(
+            method,
+            checkpoints,
+            device=self.device,
+            settings=settings,
+            preset=self.scale.presets[experiment.size],
+            protocol=self.scale.protocol,
+        )
         heading = f"{cell.row}, {cell.column}, seed {seed}"
 
         def show(score: ObjectScore, *_: Any) -> None:

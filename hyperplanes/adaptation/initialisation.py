@@ -1,0 +1,89 @@
+"""Learned initialisations: weights from which a few gradient steps on one object go far (Tancik et al. 2021)."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from hyperplanes.adaptation.fine_tuning import FineTuning
+
+if TYPE_CHECKING:
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+
+__all__ = ["LEARNED", "InitialisationConfig", "shuffled"]
+
+LEARNED: dict[str, str] = {
+    "mv_meta": "an initialisation learned by Reptile from all support views of every object",
+    "sv_meta": "an initialisation learned by Reptile from a single view of every object",
+    "maml": "an initialisation learned by MAML",
+    "maml_first_order": "an initialisation learned by MAML without second derivatives",
+    "mv_matched": "random weights trained to the outputs of mv_meta",
+}
+"""The initialisations that are trained, by the names of their methods."""
+
+
+@dataclass(frozen=True)
+class InitialisationConfig:
+    """How an initialisation is learned, and how a field is optimised from it.
+
+    The defaults are those of Tancik et al. 2021 for ShapeNet: plain gradient descent at a rate of 0.5, 32 steps on an
+    object in training, 2,000 steps of 64 rays on a new object. `TrainingConfig` has the rays of a step in training (128
+    there) and the rate of Adam on the initialisation (5e-5 there). MAML keeps the graph of all its inner steps, so it
+    takes few of them; Finn et al. 2017 take 5.
+
+    Attributes:
+        method: one of LEARNED.
+        inner_steps: gradient steps on each object in training.
+        inner_rate: of plain gradient descent, in training and on a new object.
+        steps: gradient steps on a new object, where the name of the method does not say how many.
+        test_rays: a step on a new object.
+    """
+
+    method: str = "mv_meta"
+    inner_steps: int = 32
+    inner_rate: float = 0.5
+    steps: int = 2000
+    test_rays: int = 64
+
+    def __post_init__(self) -> None:
+        if self.method not in LEARNED:
+            raise ValueError(f"method: expected one of {', '.join(LEARNED)}, got {self.method!r}")
+
+    def descent(self, rays: int | None = None, given: FineTuning | None = None) -> FineTuning:
+        """Plain gradient descent at a constant rate.
+
+        Args:
+            rays: a step; those of a new object where absent.
+            given: settings whose optimiser and rates, where they state any, and whose seed are kept.
+        """
+        given = given or FineTuning()
+        stated = given.optimiser is not None or given.learning_rate is not None
+        return replace(
+            given,
+            free="weights",
+            rays=rays or self.test_rays,
+            optimiser=given.optimiser if stated else "sgd",
+            learning_rate=given.learning_rate if stated else self.inner_rate,
+            final=given.final if stated else 1.0,
+        )
+
+
+@torch.no_grad()
+def shuffled(model: HyperPlanes, seed: int = 0) -> HyperPlanes:
+    """The model with the entries of every weight matrix and of every bias in random order ("Shuffled" there).
+
+    Each keeps its mean and its variance and loses everything else that was learned.
+
+    Args:
+        model: left as it is.
+        seed: of the order.
+    """
+    result = copy.deepcopy(model)
+    generator = torch.Generator().manual_seed(seed)
+    for value in result.networks.parameters():
+        order = torch.randperm(value.numel(), generator=generator).to(value.device)
+        value.copy_(value.flatten()[order].reshape(value.shape))
+    return result

@@ -1,0 +1,105 @@
+"""The autoencoder: k images become one code, and the code is an input of the field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import silu
+
+from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
+from hyperplanes.parameters import Parameters
+
+__all__ = ["Autoencoder", "AutoencoderConfig"]
+
+
+@dataclass(frozen=True)
+class AutoencoderConfig:
+    """The shape of an encoder whose code the field reads (HyperPlanes, Table 5, names it and says no more about it).
+
+    Attributes:
+        views: number of images it reads.
+        choice: which of the planes they are: "farthest" apart, or the "first".
+        encoder: "convnet" or "resnet101".
+        normalisation: of the encoder, as in `HyperNetworkConfig`.
+        code: length of the code of one image.
+        latent: length of the code of an object.
+    """
+
+    views: int = 5
+    choice: str = "farthest"
+    encoder: str = "convnet"
+    normalisation: str = "group"
+    code: int = 128
+    latent: int = 128
+
+    def __post_init__(self) -> None:
+        known = {"choice": CHOICES, "encoder": ENCODERS, "normalisation": NORMALISATIONS}
+        for name, values in known.items():
+            if getattr(self, name) not in values:
+                expected = ", ".join(map(repr, values))
+                raise ValueError(f"{name}: expected one of {expected}, got {getattr(self, name)!r}")
+
+
+class Autoencoder(nn.Module):
+    """E(I_1..I_k, d_1..d_k) = z, which every layer that reads a point reads beside it: F(x, z, d; theta).
+
+    All objects share theta, and no update is added to it. A layer that reads [x, z] computes
+    W [x, z] + b = W_x x + (W_z z + b), so the code is handed to the field as what it adds to the bias of such a layer.
+    Where the images differ in nothing, so do the fields.
+    """
+
+    def __init__(self, config: AutoencoderConfig, shapes: Mapping[str, torch.Size], inputs: tuple[str, ...]) -> None:
+        """An encoder and the weights by which the field reads its code.
+
+        Args:
+            config: its shape.
+            shapes: of the field's parameters by name.
+            inputs: names of the layers that read a point, such as "layers.0".
+        """
+        super().__init__()
+        self.config = config
+        self.encoder = ENCODERS[config.encoder](config.code, config.normalisation)
+        self.latent = nn.Linear(config.views * (config.code + 3), config.latent)
+        self.biases = tuple(name for name in shapes if any(name.endswith(f".{layer}.bias") for layer in inputs))
+        readers = [nn.Linear(config.latent, shapes[name].numel(), bias=False) for name in self.biases]
+        for reader in readers:
+            nn.init.normal_(reader.weight, std=config.latent**-0.5)
+        self.readers = nn.ModuleList(readers)
+
+    def forward(
+        self,
+        images: Float[Tensor, "*object view 3 height width"],
+        directions: Float[Tensor, "*object view 3"],
+        theta: Mapping[str, Tensor],
+    ) -> Parameters | list[Parameters]:
+        """W_z z for every layer that reads a point, named as its bias.
+
+        Args:
+            images: of one object, or of each of several, RGB in [0, 1].
+            directions: their unit viewing directions in the world.
+            theta: not read; a hypernetwork has it as an input.
+
+        Returns:
+            What is added to the biases; a list of those for several objects.
+        """
+        several = images.ndim == 5
+        if not several:
+            images, directions = images[None], directions[None]
+        codes = self.encode(images, directions)
+        read = [reader(codes) for reader in self.readers]
+        results = [
+            Parameters((name, shift[index]) for name, shift in zip(self.biases, read, strict=True))
+            for index in range(len(images))
+        ]
+        return results if several else results[0]
+
+    def encode(
+        self, images: Float[Tensor, "object view 3 height width"], directions: Float[Tensor, "object view 3"]
+    ) -> Float[Tensor, "object latent"]:
+        """The code z of each object."""
+        codes = self.encoder(images.flatten(0, 1)).unflatten(0, images.shape[:2])
+        return silu(self.latent(torch.cat([codes, directions], -1).flatten(1)))

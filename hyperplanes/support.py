@@ -1,0 +1,80 @@
+"""Tasks with other support views: more or fewer of them, or a single one."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.views import Task, Tasks, Views
+
+__all__ = ["SingleView", "WithSupport"]
+
+
+@dataclass(frozen=True)
+class WithSupport:
+    """Tasks with another number of support views.
+
+    Where there are more than an object has, its query views follow, in their order: support and query unified, as the
+    paper does to have up to 50 ImagePlanes. They stay query views, too, so a method is then judged by views that it was
+    shown.
+
+    Attributes:
+        data: where the tasks come from.
+        count: support views of every object.
+    """
+
+    data: Tasks
+    count: int
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ValueError(f"support: expected at least 1 view, got {self.count}")
+
+    def names(self, split: str) -> Sequence[str]:
+        """The objects of a split."""
+        return self.data.names(split)
+
+    def task(self, name: str) -> Task:
+        """One object.
+
+        Raises:
+            ValueError: it has fewer views.
+        """
+        task = self.data.task(name)
+        total = len(task.support) + len(task.query)
+        if self.count > total:
+            raise ValueError(f"{name}: expected {self.count} views for the support, got {total}")
+        more = self.count - len(task.support)
+        support = task.support[: self.count] if more <= 0 else _joined(task.support, task.query[:more])
+        return replace(task, support=support)
+
+
+@dataclass(frozen=True)
+class SingleView:
+    """Tasks of which one support view is left, always the same of an object."""
+
+    data: Tasks
+
+    def names(self, split: str) -> Sequence[str]:
+        """The objects of a split."""
+        return self.data.names(split)
+
+    def task(self, name: str) -> Task:
+        """One object with the view that its name decides on."""
+        task = self.data.task(name)
+        chosen = zlib.crc32(name.encode()) % len(task.support)
+        return replace(task, support=task.support[[chosen]])
+
+
+def _joined(first: Views, second: Views) -> Views:
+    """Two sets of views of one scene as one; the sphere of the first counts."""
+    masks = None
+    if first.masks is not None and second.masks is not None:
+        masks = torch.cat([first.masks, second.masks])
+    names = first.names + second.names if first.names and second.names else ()
+    cameras = camera.concatenate([first.cameras, second.cameras])
+    return Views(torch.cat([first.images, second.images]), cameras, masks, first.bounds, names)
