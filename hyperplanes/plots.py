@@ -60,7 +60,7 @@ def draw_lines(
         if not points:
             continue
         x, y = np.array(points, dtype=np.float64).T
-        axes.plot(x, y, "o-" if marks else "-", ms=4, color=colour, label=name)
+        axes.plot(x, y, "o-" if marks or len(x) < 3 else "-", ms=4, color=colour, label=name)
         if deviations and name in deviations:
             spread = np.array(deviations[name])
             axes.fill_between(x, y - spread, y + spread, color=colour, alpha=0.18, linewidth=0)

@@ -102,7 +102,8 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.training import start_training
 
     console, device = Console(), choose_device(arguments.device)
-    experiment, scale = EXPERIMENTS[arguments.name], SCALES[arguments.scale]
+    scale = SCALES[arguments.scale]
+    experiment = scale.applied(EXPERIMENTS[arguments.name])
     seeds = scale.seeds(experiment) if arguments.seeds is None else arguments.seeds
     if seeds < 1:
         raise ValueError(f"--seeds: expected at least 1, got {seeds}")

@@ -71,9 +71,9 @@ def deviations(experiment: Experiment, scale: Scale) -> list[str]:
         scale: that it is run at.
 
     Returns:
-        Names and values such as "model.network.width 128 (paper 256)", none at the scale of the paper.
+        Names and values of HyperPlanes such as "model.network.width 128 (paper 256)", none at the scale of the paper.
     """
-    first = experiment.trainings[0]
+    first = next(each for each in experiment.trainings if each.method == "hyperplanes")
     name = {128: "paper-128", 200: "paper-200"}[experiment.size]
     paper = configure(name, first.method, protocol="paper")
     ours = configuration(experiment, first, scale, 1, 0)

@@ -109,15 +109,15 @@ class Runner:
             self.generate(class_name, folder)
         return folder
 
-    def names(self, class_name: str, split: str) -> list[str]:
-        """The objects of a class that are trained on or evaluated; ValueError where there are none."""
+    def names(self, class_name: str, split: str, most: int | None = None) -> list[str]:
+        """The objects of a class that are evaluated, `most` at the most; ValueError where there are none."""
         tasks = self.tasks(class_name)
         found = list(tasks.names(split))
         if not found:
             raise ValueError(f"data: expected {class_name} objects in the {split} split, got none")
         if split == "train" and self.scale.held_out:  # as many as held-out ones
             found = found[: self.scale.held_out]
-        return found[: self.scale.evaluated]
+        return found[: self.scale.evaluated][:most]
 
     def run(self, experiment: Experiment, seeds: int) -> Outcome:
         """All trainings and evaluations of an experiment.
@@ -181,7 +181,7 @@ class Runner:
     def score(self, experiment: Experiment, cell: Cell, checkpoint: Path, seed: int) -> Score:
         """The evaluation of a cell with one seed."""
         method = self.scale.method(cell.method)
-        names = self.names(cell.on, cell.split)
+        names = self.names(cell.on, cell.split, experiment.objects)
         settings = {
             "checkpoint": checkpoint.name,
             "method": method,

@@ -55,7 +55,7 @@ def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
         evaluation = 0.0
         for cell in experiment.cells:
             if cell.trained == trained:
-                names = runner.names(cell.on, cell.split)
+                names = runner.names(cell.on, cell.split, experiment.objects)
                 task = runner.tasks(cell.on).task(names[0])
                 tuning = re.search(r"_(\d+)$", runner.scale.method(cell.method))
                 steps = step * int(tuning[1]) if tuning else 0.0

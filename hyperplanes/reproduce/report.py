@@ -94,6 +94,8 @@ def what_differs(outcome: Outcome) -> list[str]:
         lines.append(f"Training: {scale.steps:,} steps of each model. Paper: epochs, {paper}.")
     if scale.tuning is not None and any(scale.method(cell.method) != cell.method for cell in experiment.cells):
         lines.append(f"At most {scale.tuning} gradient steps on the support views of an object.")
+    if experiment.figure == "steps" and scale.longest is not None:
+        lines.append(f"At most {scale.longest:,} gradient steps on the support views of an object.")
     lines.append(
         f"Seeds: {outcome.seeds}, each that of a training and of the fine-tuning of its evaluations"
         f"{'; ± is the standard deviation over them' if outcome.seeds > 1 else ''}. Paper: {experiment.runs}."

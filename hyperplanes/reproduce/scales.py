@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from hyperplanes.reproduce.experiments import Experiment
+from hyperplanes.reproduce.experiments import Cell, Experiment
 
 __all__ = ["SCALES", "Scale"]
 
@@ -28,6 +28,7 @@ class Scale:
         views: an object, half support and half query. Numbers of planes and of HyperPlanes are in proportion to it.
         steps: of every training; None for the paper's epochs, a step an object.
         tuning: the most gradient steps on the support views of an object.
+        longest: the same where PSNR is drawn over their number.
         evaluated: objects a class and split; None for all.
         trainings: about as many a table; where one seed of all models takes fewer, more seeds are run.
         changes: of the configuration, by dotted names, for every model.
@@ -43,6 +44,7 @@ class Scale:
     views: int
     steps: int | None
     tuning: int | None
+    longest: int | None
     evaluated: int | None
     trainings: int | None
     changes: Mapping[str, object] = field(default_factory=dict)
@@ -52,6 +54,17 @@ class Scale:
         if self.trainings is None:
             return experiment.runs
         return min(experiment.runs, max(1, self.trainings // len(experiment.trainings)))
+
+    def applied(self, experiment: Experiment) -> Experiment:
+        """The experiment with columns of so many steps only as the scale allows, where columns are numbers of steps."""
+        if experiment.figure != "steps" or self.longest is None:
+            return experiment
+        cells: dict[tuple[str, str], Cell] = {}
+        for cell in experiment.cells:
+            count = min(int(cell.column), self.longest)
+            method = cell.method.removesuffix(cell.column) + (str(count) if count else "")
+            cells.setdefault((cell.row, str(count)), replace(cell, column=str(count), method=method))
+        return replace(experiment, cells=tuple(cells.values()))
 
     def planes(self, count: int) -> int:
         """A number of the paper's planes, in proportion to the views an object."""
@@ -64,7 +77,7 @@ class Scale:
         'hyperplanes_2'
         """
         match = re.fullmatch(r"(.+)_(\d+)", name)
-        if match is None or self.tuning is None:
+        if match is None or self.tuning is None or "_scratch_" in name:
             return name
         return f"{match[1]}_{min(int(match[2]), self.tuning)}"
 
@@ -83,6 +96,7 @@ SCALES: dict[str, Scale] = {
             12,
             2,
             2,
+            3,
             1,
             1,
             {
@@ -112,7 +126,8 @@ SCALES: dict[str, Scale] = {
             5,
             50,
             800,
-            300,
+            2000,
+            10_000,
             None,
             15,
         ),
@@ -125,6 +140,7 @@ SCALES: dict[str, Scale] = {
             0,
             0,
             50,
+            None,
             None,
             None,
             None,

@@ -74,7 +74,5 @@ def test_white_is_silence():
 
 
 def test_an_unknown_normalisation_is_refused():
-    with pytest.raises(
-        ValueError, match="normalisation: expected one of 'batch', .*, 'group', got 'layer'"
-    ):
+    with pytest.raises(ValueError, match="normalisation: expected one of 'batch', .*, 'group', got 'layer'"):
         ConvNet(4, "layer")
