@@ -88,13 +88,13 @@ class Runner:
     def tasks(self, class_name: str) -> Tasks:
         """The data set of a class, generated where none was given; ValueError where the scale generates none."""
         if class_name not in self._tasks:
-            folder = self.given.get(class_name)
-            if folder is None:
-                folder = self._generated(class_name)
-            self._tasks[class_name] = TasksOnDevice(open_dataset(folder), self.device)
+            self._tasks[class_name] = TasksOnDevice(open_dataset(self.folder(class_name)), self.device)
         return self._tasks[class_name]
 
-    def _generated(self, class_name: str) -> Path:
+    def folder(self, class_name: str) -> Path:
+        """The folder of the data set of a class; as `tasks`."""
+        if class_name in self.given:
+            return self.given[class_name].resolve()
         scale = self.scale
         if scale.resolution is None:
             raise ValueError(
@@ -163,9 +163,9 @@ class Runner:
             "method": trained.method,
             "model": chosen.model.as_json(),
             "training": asdict(chosen.training),
-            "given": str(self.given.get(trained.on, "")),
+            "given": str(self.folder(trained.on)) if trained.on in self.given else "",
         }
-        folder = self.out / "trainings" / _name(f"{trained.on}-{trained.method}-{seed}", settings)
+        folder = self.out / "trainings" / _name(f"{self.folder(trained.on).name}-{trained.method}-{seed}", settings)
         state = folder / "training.json"
         if not state.exists() or read_json(state)["step"] < chosen.training.steps:
             self.say(
@@ -185,12 +185,12 @@ class Runner:
         settings = {
             "checkpoint": checkpoint.name,
             "method": method,
-            "on": cell.on,
+            "on": str(self.folder(cell.on)) if cell.on in self.given else self.folder(cell.on).name,
             "objects": names,
             "free": cell.free if method != cell.trained.method else "",
             "seed": seed,
         }
-        path = self.out / "evaluations" / f"{_name(f'{cell.on}-{method}-{seed}', settings)}.json"
+        path = self.out / "evaluations" / f"{_name(f'{self.folder(cell.on).name}-{method}-{seed}', settings)}.json"
         if not path.exists():
             score = self._evaluate(experiment, cell, method, checkpoint, names, seed)
             write_json(path, {"settings": settings, "score": score.as_json()})

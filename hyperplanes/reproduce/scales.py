@@ -93,7 +93,7 @@ SCALES: dict[str, Scale] = {
             16,
             4,
             2,
-            12,
+            8,
             2,
             2,
             3,
@@ -114,6 +114,7 @@ SCALES: dict[str, Scale] = {
                 "training.tasks": 2,
                 "training.rays": 16,
                 "training.warmup": 0,
+                "training.held_out": 1,
             },
         ),
         Scale(
