@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "draw_bars", "draw_boxes", "draw_grid", "draw_lines", "new_figure", "save_figure"]
+__all__ = [
+    "COLOURS",
+    "draw_bars",
+    "draw_boxes",
+    "draw_grid",
+    "draw_lines",
+    "encode_figure",
+    "new_figure",
+    "save_figure",
+    "set_counts",
+]
 
 COLOURS = ("#b4450e", "#2f6f8f", "#6b7f2a", "#7a4f9a", "#c08a1e", "#4a4a4a", "#b03a6a", "#2a8f7a")
 
@@ -36,16 +46,31 @@ def save_figure(figure: Figure, path: Path) -> None:
     Raises:
         ValueError: an ending that matplotlib does not know.
     """
-    import matplotlib
-
     kind = path.suffix.removeprefix(".").lower()
     known = sorted(figure.canvas.get_supported_filetypes())
     if kind not in known:
         raise ValueError(f"{path}: expected a name that ends in one of {', '.join(known)}, got {path.name!r}")
+    write_whole(path, encode_figure(figure, kind))
+
+
+def encode_figure(figure: Figure, kind: str) -> bytes:
+    """A figure as a file of a kind, such as "svg", whose words stay words; the same figure, the same bytes."""
+    import matplotlib
+
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "hyperplanes", "svg.fonttype": "none"}):
         figure.savefig(buffer, format=kind, dpi=110, metadata={"Date": None} if kind == "svg" else None)
-    write_whole(path, buffer.getvalue())
+    return buffer.getvalue()
+
+
+def set_counts(axes: Axes, counts: Iterable[float]) -> None:
+    """A horizontal axis of growing numbers that may begin at 0: logarithmic from 1 on, a tick a number."""
+    from matplotlib.ticker import NullLocator
+
+    axes.set_xscale("symlog", linthresh=1)
+    places = sorted(counts)
+    axes.set_xticks(places, [f"{count:,.0f}" for count in places])
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def draw_lines(

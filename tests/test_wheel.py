@@ -40,7 +40,7 @@ def test_it_holds_the_packages_and_nothing_else(wheel):
         if path.suffix == ".py" and (path.parent / "__init__.py").exists()
     }
     models = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/pretrained").glob("*/*.*")}
-    assert found == there | {"hyperplanes/demo/style.css", *PACKAGED} | models
+    assert found == there | {"hyperplanes/demo/style.css", "hyperplanes/demo/report.html", *PACKAGED} | models
 
 
 def test_its_metadata(wheel):

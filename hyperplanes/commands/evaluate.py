@@ -276,7 +276,7 @@ def _draw_boxes(scores: Sequence[Score], path: Path) -> None:
 def _draw_curve(scores: Sequence[Score], methods: Sequence[str], steps: Sequence[int], path: Path) -> None:
     """PSNR over fine-tuning steps of every method; of one that takes none, a level."""
     from hyperplanes.methods import at_steps
-    from hyperplanes.plots import draw_lines, new_figure, save_figure
+    from hyperplanes.plots import draw_lines, new_figure, save_figure, set_counts
 
     quality = {score.method: score.mean("psnr") for score in scores}
     curves = {}
@@ -286,8 +286,7 @@ def _draw_curve(scores: Sequence[Score], methods: Sequence[str], steps: Sequence
     figure = new_figure(6.0, 3.6)
     axes = figure.subplots()
     draw_lines(axes, curves, marks=True)
-    axes.set_xscale("symlog", linthresh=1)
-    axes.set_xticks(sorted(steps), [f"{count:,}" for count in sorted(steps)])
+    set_counts(axes, steps)
     axes.set(xlabel="fine-tuning steps", ylabel="PSNR (dB)")
     save_figure(figure, path)
 
