@@ -135,6 +135,16 @@ def test_a_rate_of_zero_freezes_its_part_alone(frozen):
     assert moved == ({"hypernetwork"} if frozen == "theta" else {"networks"})
 
 
+def test_theta_and_the_hypernetwork_move_in_turns_when_asked_to():
+    model = small_model()
+    trainer = Trainer(model, Balls(), with_(alternating=True))
+    for moving in ("networks", "hypernetwork", "networks"):
+        before = {name: value.clone() for name, value in model.named_parameters()}
+        trainer.take_step()
+        moved = {name.split(".")[0] for name, value in model.named_parameters() if not torch.equal(value, before[name])}
+        assert moved == {moving}
+
+
 def test_muon_moves_the_hidden_matrices_by_its_own_rate():
     model = small_model()
     before = state_of(model)

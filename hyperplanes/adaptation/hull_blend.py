@@ -18,6 +18,7 @@ from hyperplanes.views import Views
 __all__ = ["HullBlend"]
 
 OPAQUE = 1e4  # density within the hull, per radius of the scene
+WHOLE = 0.98  # opacity of a mask from which on no background is mixed into the colour
 SOLID = 0.5  # opacity of a mask from which on a pixel shows the object
 
 
@@ -109,7 +110,8 @@ class _Blend(_Hull):
         assert seen.distances is not None
         angle = torch.acos((seen.directions * directions[:, None]).sum(-1).clamp(-1, 1)).clamp_min(1e-3)
         depth = self.depths.lookup(points).colours[..., 0]
-        hidden = (seen.distances > depth + self.tolerance) | ~seen.valid
+        covered = self.masks.lookup(points).colours[..., 0]
+        hidden = (seen.distances > depth + self.tolerance) | (covered < WHOLE) | ~seen.valid
         penalty = angle + 10 * hidden  # views that see the point go first
         chosen, index = penalty.topk(min(self.nearest + 1, penalty.shape[1]), largest=False)
         limit = chosen[:, -1:] if chosen.shape[1] > self.nearest else chosen[:, -1:] * 2

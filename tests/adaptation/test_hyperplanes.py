@@ -4,14 +4,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HyperPlanes, ModelConfig, configuration
+from hyperplanes.adaptation import HyperPlanes, InitialisationConfig, ModelConfig, configuration
 from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import camera_from_world, centres, look_at, pinhole, viewing_directions
 from hyperplanes.geometry.cameras import intrinsics as calibration
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering import Hierarchical
 from hyperplanes.views import Views
 from tests.reference_rendering import awaken, ball_views, ring, small_model
@@ -132,6 +132,30 @@ def test_hyperplanes_are_k_different_planes(count):
     assert len(set(chosen)) == len(chosen) == count
 
 
+def test_the_first_hyperplanes_are_read_when_asked_for(support):
+    config = HyperNetworkConfig(views=3, choice="first", normalisation="group", code=8, depth=2, width=16)
+    first, farthest = small_model(hypernetwork=config), small_model(hypernetwork=replace(config, choice="farthest"))
+    assert first.hyperplanes().tolist() == [0, 1, 2]
+    assert all(torch.equal(value, farthest.state_dict()[name]) for name, value in first.state_dict().items())
+    for model, chosen in ((first, [0, 1, 2]), (farthest, farthest.hyperplanes().tolist())):
+        seen = []
+        model.hypernetwork.register_forward_pre_hook(lambda module, given, seen=seen: seen.append(given[0]))
+        model.update(model.prepare(support))
+        assert torch.equal(seen[0][0], support.images[chosen])
+
+
+@pytest.mark.parametrize(("count", "expected"), [(4, [3, 1, 0, 2]), (6, [3, 1, 0, 2]), (3, [3, 1, 0, 3])])
+def test_planes_in_the_order_of_their_file_are_the_first_views(count, expected):
+    whole = ball_views(ring(6))
+    views = whole[[3, 1, 0, 2, 5, 4][:count]]
+    filed, matched = small_model(order="file").prepare(views), small_model().prepare(views)
+    assert torch.equal(filed.views.images, whole.images[expected])
+    assert not torch.equal(matched.views.images, filed.views.images)
+    assert torch.equal(filed.occupancy.occupied, matched.occupancy.occupied)
+    with pytest.raises(ValueError, match="order: expected one of 'matched', 'file', got 'random'"):
+        ModelConfig(order="random")
+
+
 def test_no_view_at_all_is_refused(model, support):
     with pytest.raises(ValueError, match="support: expected at least one view, got none"):
         model.adapt(support[:0])
@@ -178,6 +202,8 @@ def test_a_saved_model_is_the_same_model(model, support, tmp_path):
         ModelConfig(),
         ModelConfig(hypernetwork=None, sampling=Hierarchical(3, 4), coarse_network=True),
         ModelConfig(target="nerf", hypernetwork=HyperNetworkConfig(layers=("0", "colour")), hull_side=7),
+        ModelConfig(hypernetwork=None, autoencoder=AutoencoderConfig(views=3, latent=9), order="file"),
+        ModelConfig(hypernetwork=None, initialisation=InitialisationConfig("maml", inner_steps=2)),
     ],
 )
 def test_a_configuration_survives_json(config):
@@ -316,6 +342,11 @@ def test_a_model_that_was_never_shown_its_rig_is_refused(support):
     for call in (fresh.hyperplanes, lambda: fresh.adapt(support)):
         with pytest.raises(ValueError, match="rig: expected the standpoints of the training's views, got none"):
             call()
+
+
+def test_weights_are_found_in_one_way():
+    with pytest.raises(ValueError, match="expected at most one way to find weights, got hypernetwork and autoencoder"):
+        ModelConfig(autoencoder=AutoencoderConfig())
 
 
 def test_more_hyperplanes_than_planes_are_refused():

@@ -67,6 +67,17 @@ def test_batch_normalisation_codes_each_image_by_itself_only_in_use():
 
 
 @torch.no_grad()
+def test_batch_statistics_are_those_at_hand_in_use_too():
+    torch.manual_seed(0)
+    images, encoder = torch.rand(4, 3, 24, 24), ConvNet(8, "batch_statistics")
+    torch.testing.assert_close(encoder.eval()(images), encoder.train()(images))
+    running = ConvNet(8, "batch")
+    running.load_state_dict(encoder.state_dict(), strict=False)
+    assert set(dict(running.named_parameters())) == set(dict(encoder.named_parameters()))
+    torch.testing.assert_close(running.train()(images), encoder(images))
+    assert not torch.allclose(running.eval()(images), encoder(images), atol=1e-3)
+
+
 def test_white_is_silence():
     # a convolution without bias sees nothing in a white image, border included: codes are those of the head alone
     network = ConvNet(5, "batch").eval()

@@ -90,6 +90,22 @@ def test_directions_and_weights_can_be_left_out():
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("join", ["concatenate", "mean"])
+def test_an_input_that_is_left_out_is_zero_and_nothing_else_changes(join):
+    # the same weights, and the update of a network that sees everything where the input it does not see is zero
+    (images, directions, theta), config = inputs(), replace(CONFIG, join=join)
+    whole = make(config)
+    nothing = {name: torch.zeros_like(value) for name, value in theta.items()}
+    for change, given in (
+        ({"see_directions": False}, (images, torch.zeros_like(directions), theta)),
+        ({"see_weights": False}, (images, directions, nothing)),
+    ):
+        blind = make(replace(config, **change))
+        assert all(torch.equal(value, blind.state_dict()[name]) for name, value in whole.state_dict().items())
+        assert not differs(blind(images, directions, theta), whole(*given))
+
+
+@torch.no_grad()
 def test_gain_multiplies_the_update():
     one, three = make()(*inputs()), make(replace(CONFIG, gain=3.0))(*inputs())
     for name in one:
