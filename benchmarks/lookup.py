@@ -24,7 +24,8 @@ import torch
 from benchmarks._timing import copy_bandwidth, interleaved, peak_bytes, ratio, table
 from benchmarks.lookup_plot import plot
 from benchmarks.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
-from benchmarks.reporting import Row, environment
+from benchmarks.reporting import Row
+from hyperplanes.environment import environment
 
 __all__ = ["main"]
 

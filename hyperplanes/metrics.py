@@ -1,4 +1,4 @@
-"""How good a picture is: PSNR and SSIM, one number an image."""
+"""How good pictures are: PSNR of each, of all, of the object alone, and SSIM."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["psnr", "ssim"]
+__all__ = ["foreground_psnr", "pooled_psnr", "psnr", "ssim"]
 
 
 def psnr(
@@ -21,6 +21,38 @@ def psnr(
     """
     _check(predicted, truth)
     return -10 * torch.log10((predicted - truth).square().flatten(1).mean(1))
+
+
+def pooled_psnr(
+    predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
+) -> Float[Tensor, ""]:
+    """PSNR in dB of the squared error of all images together; never above the mean of `psnr`.
+
+    >>> truth = torch.zeros(2, 3, 4, 4)
+    >>> pooled_psnr(truth + torch.tensor([0.1, 0.0]).view(2, 1, 1, 1), truth).round(decimals=2).item()
+    23.01
+    """
+    _check(predicted, truth)
+    return -10 * torch.log10((predicted - truth).square().mean())
+
+
+def foreground_psnr(
+    predicted: Float[Tensor, "view 3 height width"],
+    truth: Float[Tensor, "view 3 height width"],
+    masks: Float[Tensor, "view 1 height width"],
+) -> Float[Tensor, " view"]:
+    """PSNR in dB of each image where the true mask is above one half; NaN where it is nowhere.
+
+    Background that both leave white counts for nothing here, so it does not depend on how much of it there is.
+
+    >>> truth, masks = torch.zeros(1, 3, 2, 2), torch.tensor([[[[1.0, 0.0], [0.0, 0.0]]]])
+    >>> foreground_psnr(truth + torch.tensor([[0.1, 1.0], [1.0, 1.0]]), truth, masks).round(decimals=2).tolist()
+    [20.0]
+    """
+    _check(predicted, truth)
+    inside = (masks > 0.5).to(truth)
+    error = ((predicted - truth).square().mean(1, keepdim=True) * inside).flatten(1).sum(1)
+    return -10 * torch.log10(error / inside.flatten(1).sum(1))
 
 
 def ssim(

@@ -14,10 +14,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from small_demo import demo_folder, first_object
 
 from data_gen.rendering.renderers import RendererError
+from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
@@ -246,10 +248,48 @@ def test_psnr_over_fine_tuning_steps_is_a_table_and_a_chart(tmp_path, capsys):
     shown = capsys.readouterr().out
     for name in ("nearest_view", "hyperplanes", "hyperplanes_1", "hyperplanes_3", "scratch_1", "scratch_3"):
         assert re.search(rf"^{name}  ", shown, re.MULTILINE), name
-    root = ElementTree.fromstring(chart.read_text())
-    assert len(root.findall("{http://www.w3.org/2000/svg}polyline")) == 2 + 1  # nearest_view is a flat line
+    texts = [each.text for each in ElementTree.fromstring(chart.read_text()).iter("{http://www.w3.org/2000/svg}text")]
+    assert {"nearest_view", "hyperplanes", "scratch", "fine-tuning steps", "PSNR (dB)"} <= set(texts)
     assert main([*command, *methods, "3"]) == 2
     assert "at least two numbers of --steps" in complaint(capsys)
+
+
+def test_seeds_of_trainings_and_of_gradient_steps_in_every_kind_of_file(tmp_path, capsys):
+    """Source of truth: the evaluation of each checkpoint alone, and arithmetic."""
+    demo, data = demo_folder(), ["--data", str(demo_folder() / "data")]
+    kinds = {"json": "table.json", "csv": "table.csv", "markdown": "table.md", "grid": "grid.png", "boxes": "boxes.svg"}
+    shutil.copytree(demo / "hyperplanes", tmp_path / "run-0")
+    shutil.copytree(demo / "hyperplanes", tmp_path / "run-1")
+    other = HyperPlanes.from_pretrained(demo / "hyperplanes")
+    torch.nn.init.normal_(other.networks["fine"].colour.weight)
+    other.save(tmp_path / "run-1")
+    files = [word for kind, name in kinds.items() for word in (f"--{kind}", str(tmp_path / name))]
+    methods = ["--method", "nearest_view", "hyperplanes", "hyperplanes_2"]
+    seeded = ["--checkpoint", str(tmp_path / "run-{seed}"), "--seeds", "2"]
+    assert main(["evaluate", *data, *methods, *seeded, *files]) == 0
+    assert "± is the standard deviation over 2 seeds of trainings" in capsys.readouterr().out
+    table = json.loads((tmp_path / "table.json").read_text())
+    single = []
+    for seed in (0, 1):
+        alone = ["--checkpoint", str(tmp_path / f"run-{seed}"), "--method", "hyperplanes"]
+        assert main(["evaluate", *data, *alone, "--json", str(tmp_path / "one.json")]) == 0
+        single.append(json.loads((tmp_path / "one.json").read_text())["hyperplanes"]["psnr"])
+    assert table["hyperplanes"]["psnr"] == pytest.approx(sum(single) / 2, abs=1e-4)
+    assert table["hyperplanes"]["deviation"]["psnr"] == pytest.approx(abs(single[0] - single[1]) / 2**0.5, abs=1e-4)
+    assert table["nearest_view"]["deviation"]["psnr"] == 0
+    assert [run["psnr"] for run in table["hyperplanes"]["seeds"]] == pytest.approx(single, abs=1e-4)
+    assert table["nearest_view"]["psnr_pooled"] <= table["nearest_view"]["psnr"]
+    assert table["nearest_view"]["psnr_foreground"] < table["nearest_view"]["psnr"]
+    assert sum(len(row.get("differences", {})) for row in table.values()) == 3
+    lines = (tmp_path / "table.csv").read_text().splitlines()
+    assert len(lines) == 1 + 3 * 2 * 2
+    assert lines[0].startswith("method,seed,object,psnr,")
+    assert (tmp_path / "table.md").read_text().count("| nearest_view |") == 1
+    assert pixels(tmp_path / "grid.png").std() > 10
+    texts = [each.text for each in ElementTree.fromstring((tmp_path / "boxes.svg").read_text()).iter()]
+    assert {"nearest_view", "hyperplanes", "hyperplanes_2"} <= set(texts)
+    assert main(["evaluate", *data, *methods, *seeded[:2], "--seeds", "0"]) == 2
+    assert "--seeds: expected at least 1, got 0" in complaint(capsys)
 
 
 def test_inspect_tells_what_the_hypernetwork_does(capsys):

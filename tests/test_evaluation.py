@@ -6,7 +6,7 @@ import torch
 
 from hyperplanes.adaptation import NearestView, Pictures
 from hyperplanes.evaluation import ObjectScore, Score, evaluate
-from hyperplanes.metrics import psnr, ssim
+from hyperplanes.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 from tests.reference_rendering import Balls, small_model
 
 
@@ -50,6 +50,10 @@ def test_scores_are_means_over_the_query_views():
     images = NearestView().adapt(task.support).render(task.query.cameras).images
     assert score.objects[0].psnr == pytest.approx(psnr(images, task.query.images).mean().item())
     assert score.objects[0].ssim == pytest.approx(ssim(images, task.query.images).mean().item())
+    assert score.objects[0].psnr_pooled == pytest.approx(pooled_psnr(images, task.query.images).item())
+    inside = foreground_psnr(images, task.query.images, task.query.masks).mean().item()
+    assert score.objects[0].psnr_foreground == pytest.approx(inside)
+    assert score.objects[0].image_seconds == score.objects[0].adapt_seconds + score.objects[0].render_seconds
 
 
 def test_pictures_are_clamped_before_they_are_compared():

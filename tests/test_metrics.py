@@ -6,7 +6,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from hyperplanes.metrics import psnr, ssim
+from hyperplanes.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 
 
 def pairs(size=(24, 31), noise=0.1):
@@ -64,6 +64,26 @@ def test_ssim_refuses_images_smaller_than_its_window():
     with pytest.raises(ValueError, match="images: expected at least 11 x 11 pixels, got 10 x 20"):
         ssim(torch.rand(1, 3, 10, 20), torch.rand(1, 3, 10, 20))
     assert torch.isfinite(ssim(torch.rand(1, 3, 11, 11), torch.rand(1, 3, 11, 11))).all()
+
+
+def test_the_pooled_psnr_is_scikit_images_of_all_pixels():
+    predicted, truth = pairs()
+    expected = peak_signal_noise_ratio(truth.double().numpy(), predicted.double().numpy(), data_range=1)
+    assert pooled_psnr(predicted, truth).item() == pytest.approx(expected, abs=1e-4)
+    assert pooled_psnr(predicted, truth) < psnr(predicted, truth).mean()
+
+
+def test_the_foreground_psnr_counts_pixels_of_the_mask_alone():
+    predicted, truth = pairs()
+    masks = torch.zeros(3, 1, *truth.shape[2:])
+    masks[0, :, 3:9, 5:20] = 0.7
+    masks[1] = 0.5  # not above one half
+    masks[2, :, 4:, 2:] = 1.0
+    found = foreground_psnr(predicted, truth, masks)
+    parts = [(0, slice(3, 9), slice(5, 20)), (2, slice(4, None), slice(2, None))]
+    expected = [psnr(predicted[i : i + 1, :, a, b], truth[i : i + 1, :, a, b]).item() for i, a, b in parts]
+    assert found[[0, 2]].tolist() == pytest.approx(expected, abs=1e-4)
+    assert found[1].isnan()
 
 
 @pytest.fixture

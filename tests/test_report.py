@@ -3,7 +3,9 @@
 import base64
 import io
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,8 +13,9 @@ from PIL import Image
 from small_demo import demo_folder
 
 from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
-from hyperplanes.demo.charts import line_chart, ticks
+from hyperplanes.demo.charts import line_chart
 from hyperplanes.demo.pictures import ERROR_SCALE, colour_scale, error_map
+from hyperplanes.environment import find_commit
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 
@@ -42,7 +45,7 @@ def report(title="A <title> & more"):
     generator = np.random.default_rng(0)
     look = Look(*(generator.integers(0, 256, (8, 8, 3), np.uint8),), {"hyperplanes": np.zeros((8, 8, 3), np.uint8)})
     exhibit = Exhibit("car", generator.integers(0, 256, (4, 8, 8, 3), np.uint8), [2, 0], [look], {"hyperplanes": 20.0})
-    row = Row("hyperplanes", "one step", 20.0, 1.5, 0.5, "1 s", "2 s")
+    row = Row("hyperplanes", "one step", 20.0, 1.5, 17.25, 0.5, "1 s", "2 s")
     curve = [{"step": 25, "loss": 0.1}, {"step": 50, "loss": 0.01, "psnr": 20.0}]
     return Report(
         title,
@@ -81,6 +84,7 @@ def test_its_pictures_are_those_that_went_in():
     found = [
         np.asarray(Image.open(io.BytesIO(base64.b64decode(source.partition(",")[2]))))
         for source in checked(render_page(content)).sources
+        if not source.startswith("data:image/svg")
     ]
     (exhibit,) = content.exhibits
     np.testing.assert_array_equal(np.stack(found[:4]), exhibit.support[[2, 0, 1, 3]])
@@ -109,22 +113,41 @@ def test_the_scale_never_turns_back():
     assert (np.diff(lightness) < 0).all()
 
 
+def drawn(source):
+    kind, _, content = source.partition(",")
+    assert kind == "data:image/svg+xml;base64"
+    return ElementTree.fromstring(base64.b64decode(content))
+
+
 def test_a_line_goes_where_its_points_are():
-    svg = line_chart({"a": [(0, 1.0), (50, 3.0), (100, 2.0)], "none": []}, "title", "dB")
-    (points,) = re.findall(r'points="([^"]+)"', svg)
-    (x0, y0), (x1, y1), (x2, y2) = (tuple(map(float, pair.split(","))) for pair in points.split())
+    root = drawn(line_chart({"first": [(0, 1.0), (50, 3.0), (100, 2.0)], "none": []}, "dB"))
+    lines = [each for each in root.iter("{http://www.w3.org/2000/svg}path") if "#b4450e" in each.get("style", "")]
+    found = [re.findall(r"[ML] (\S+) (\S+)", line.get("d")) for line in lines]
+    (points,) = (each for each in found if len(each) == 3)  # the other is the legend's
+    (x0, y0), (x1, y1), (x2, y2) = (tuple(map(float, pair)) for pair in points)
     assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2)
     assert y1 < y2 < y0
     assert y0 - y2 == pytest.approx(y2 - y1, abs=0.2)
-    assert "nothing was recorded" in line_chart({"a": []}, "title", "dB")
+    words = {each.text for each in root.iter("{http://www.w3.org/2000/svg}text")}
+    assert {"first", "dB", "steps"} <= words
+    assert "none" not in words
+    assert line_chart({"a": []}, "dB") == ""
 
 
-@pytest.mark.parametrize("span", [(0.0, 7.0), (-3.0, 20_000.0), (1e-4, 3e-4)])
-def test_ticks_are_few_and_inside(span):
-    found = ticks(*span)
-    assert 3 <= len(found) <= 8
-    assert all(span[0] <= tick <= span[1] for tick in found)
-    np.testing.assert_allclose(np.diff(found), found[1] - found[0], rtol=1e-6)
+def test_counts_of_steps_have_a_tick_each():
+    root = drawn(line_chart({"a": [(0, 1.0), (1, 3.0), (300, 2.0)]}, "dB", counts=True))
+    words = [each.text for each in root.iter("{http://www.w3.org/2000/svg}text")]
+    assert [word for word in words if word.isdigit()][:3] == ["0", "1", "300"]
+
+
+def test_the_table_has_spread_and_foreground():
+    page = render_page(report())
+    assert "20.00 &plusmn; 1.50 dB" in page
+    assert "17.25 dB" in page
+    empty = report()
+    assert "nothing was recorded" in render_page(replace(empty, tuning={}))
+    plain = replace(empty, table=[replace(empty.table[0], foreground=None)])
+    assert "17.25" not in render_page(plain)
 
 
 def test_the_page_of_a_demonstration():
@@ -133,3 +156,5 @@ def test_the_page_of_a_demonstration():
     assert any(source.startswith("data:image/webp") for source in parser.sources)
     for name in ("nearest_view", "point_multiplane", "hyperplanes", "hyperplanes_10"):
         assert f"<small>{name}</small>" in page
+    assert "arXiv 2402.01524" in page
+    assert find_commit() in page

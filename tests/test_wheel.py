@@ -41,7 +41,8 @@ def test_it_holds_the_packages_and_nothing_else(wheel):
     }
     models = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/pretrained").glob("*/*.*")}
     examples = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/examples").rglob("*.*")}
-    assert found == there | {"hyperplanes/demo/style.css", *PACKAGED} | models | examples
+    page = {"hyperplanes/demo/style.css", "hyperplanes/demo/report.html"}
+    assert found == there | page | {*PACKAGED} | models | examples
 
 
 def test_the_example_is_whole_and_small(wheel):

@@ -27,6 +27,7 @@ class Verb:
 
 
 VERBS: dict[str, str] = {
+    "reproduce": "a table or figure of the paper, beside the paper's numbers",
     "demo": "everything once, small: data, training, new views and a report, in minutes",
     "train": "train a model on a data set",
     "evaluate": "compare methods on objects they have never seen, as one table",

@@ -1,4 +1,4 @@
-"""Compare methods on objects that none of them was trained on: mean PSNR and SSIM over the query views, as one table.
+"""Compare methods on objects that none of them was trained on: PSNR and SSIM over the query views, as one table.
 
 Every method goes through the same code: it is shown the support views of an object and judged by the others. The data
 set may be one that `generate` wrote or a single posed scene, such as a folder with transforms.json.
@@ -6,16 +6,21 @@ set may be one that `generate` wrote or a single posed scene, such as a folder w
 A method's name may end in a number of fine-tuning steps on the support views of each object, or in _auto. With --steps
 every method that can be fine-tuned is evaluated at each of those numbers, and --curve draws its PSNR over them.
 
+With --seeds N everything is done N times with the seeds 0 to N - 1, and the table has means and standard deviations
+over them. A seed is that of gradient steps on the support views and of random weights; where a --checkpoint has {seed}
+in its name, it is that of the training, too. Methods are compared in pairs over the objects, by a paired t-test.
+
 Example:
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method nearest_view hyperplanes hyperplanes_swapped
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method hyperplanes scratch --steps 10 100
     hyperplanes evaluate --data photos/ --checkpoint runs/demo --method hyperplanes --json photos.json
+    hyperplanes evaluate --data data/cars --checkpoint runs/cars-{seed} --seeds 5 --markdown cars.md --boxes cars.png
     hyperplanes evaluate --data photos/ --method nearest_view hull_blend point_multiplane_scratch_300
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -25,11 +30,15 @@ from hyperplanes.commands.options import Free, OptionalInt, Protocol, Up, option
 from hyperplanes.formatting import format_duration
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from hyperplanes.comparison import Comparison
     from hyperplanes.evaluation import Score
 
-__all__ = ["HEADINGS", "Arguments", "rows", "run"]
+__all__ = ["Arguments", "as_json", "compared_rows", "headings", "rows", "run", "with_seed"]
 
-HEADINGS = ("method", "PSNR", "SSIM", "to adapt", "to render a view")
+SEED = "{seed}"
+LARGEST_TABLE = 12  # pairs shown in the terminal; all are in the files
 
 
 @dataclass(frozen=True)
@@ -43,11 +52,17 @@ class Arguments:
             checkpoint from random weights), nerf_scratch_N, multiplane_scratch_N, point_multiplane_scratch_N (no
             checkpoint is needed); standard, mv_matched, mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but
             the first two and hyperplanes_swapped may be followed by _N or _auto for gradient steps.
-        checkpoint: Folders that `train` wrote, or folders of them such as runs/demo.
-        json: Write the table here too, with every object.
+        checkpoint: Folders that `train` wrote, or folders of them such as runs/demo; {seed} stands for each seed.
+        json: Write the table here too, with every object, every seed and every pair of methods.
+        csv: Write every object's numbers here, a line each.
+        markdown: Write the tables of methods and of their pairs here.
+        grid: Draw the truth beside every method's picture here: a view of each of the first objects (PNG, SVG or PDF).
+        boxes: Draw the objects' PSNR here, a box a method.
         steps: Evaluate methods after so many fine-tuning steps, each number a row; 0 is the method itself.
-        curve: Draw PSNR over --steps into this SVG file.
+        curve: Draw PSNR over --steps into this file.
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
+        seeds: How many seeds.
+        lpips: Measure LPIPS with these weights, a safetensors file; see `hyperplanes.perceptual` for how to make it.
         split: Which objects.
         objects: Only the first so many.
         support: Support views an object; more than there are go on with the query views.
@@ -62,9 +77,15 @@ class Arguments:
     method: tuple[str, ...] = ("nearest_view", "hyperplanes")
     checkpoint: tuple[Path, ...] = ()
     json: Annotated[Path | None, optional("FILE")] = None
+    csv: Annotated[Path | None, optional("FILE")] = None
+    markdown: Annotated[Path | None, optional("FILE")] = None
+    grid: Annotated[Path | None, optional("FILE")] = None
+    boxes: Annotated[Path | None, optional("FILE")] = None
     steps: tuple[int, ...] = ()
     curve: Annotated[Path | None, optional("FILE")] = None
     fine_tune: Free = "weights"
+    seeds: int = 1
+    lpips: Annotated[Path | None, optional("FILE")] = None
     split: Literal["test", "val", "train", "all"] = "test"
     objects: OptionalInt = None
     support: OptionalInt = None
@@ -75,36 +96,78 @@ class Arguments:
     device: str = "auto"
 
 
+COLUMNS = {"psnr": "PSNR", "psnr_foreground": "inside mask", "psnr_pooled": "pooled", "ssim": "SSIM", "lpips": "LPIPS"}
+
+
+def headings(scores: Sequence[Score]) -> list[str]:
+    """Those of `rows`: of the numbers that every method has."""
+    found = ["method", "PSNR", "over objects"]
+    found += [label for name, label in COLUMNS.items() if name != "psnr" and _all_have(scores, name)]
+    return [*found, "to adapt", "to render a view"]
+
+
 def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
-    """The table as text, one row a method."""
+    """The table as text, one row a method; ± is over seeds, "over objects" the standard deviation over them."""
+    table = []
+    for score in scores:
+        row = [score.method, _shown(score, "psnr"), f"± {score.spread('psnr'):.2f} dB"]
+        row += [_shown(score, name) for name in COLUMNS if name != "psnr" and _all_have(scores, name)]
+        row += [format_duration(score.mean(name)) for name in ("adapt_seconds", "render_seconds")]
+        table.append(tuple(row))
+    return table
+
+
+def _all_have(scores: Sequence[Score], quantity: str) -> bool:
+    return all(quantity in score.quantities for score in scores)
+
+
+def _shown(score: Score, quantity: str) -> str:
+    decimals, unit = (2, " dB") if quantity.startswith("psnr") else (3, "")
+    deviation = score.deviation(quantity)
+    spread = "" if deviation is None else f" ± {deviation:.{decimals}f}"
+    return f"{score.mean(quantity):.{decimals}f}{spread}{unit}"
+
+
+def compared_rows(pairs: Sequence[Comparison]) -> list[tuple[str, ...]]:
+    """Pairs of methods as text."""
     return [
         (
-            score.method,
-            f"{score.mean('psnr'):.2f} dB",
-            f"{score.mean('ssim'):.3f}",
-            format_duration(score.mean("adapt_seconds")),
-            format_duration(score.mean("render_seconds")),
+            f"{pair.first} - {pair.second}",
+            f"{pair.mean:+.2f} dB",
+            "-" if pair.low is None or pair.high is None else f"{pair.low:+.2f} to {pair.high:+.2f}",
+            "-" if pair.p is None else f"{pair.p:.2g}",
         )
-        for score in scores
+        for pair in pairs
     ]
 
 
+PAIR_HEADINGS = ("paired over objects, PSNR", "difference", "95 % interval", "p")
+
+
+def with_seed(folders: Sequence[Path], seed: int) -> list[Path]:
+    """Checkpoints of one seed."""
+    return [Path(str(folder).replace(SEED, str(seed))) for folder in folders]
+
+
 def run(arguments: Arguments) -> int:
-    """Evaluate all methods and print the table."""
+    """Evaluate all methods, print the table and write what was asked for."""
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.pretrained import find_checkpoints
+    from hyperplanes.comparison import compare_all
     from hyperplanes.data import open_dataset
     from hyperplanes.devices import TasksOnDevice, choose_device
     from hyperplanes.evaluation import evaluate_all
-    from hyperplanes.files import write_json
     from hyperplanes.methods import WithSampler, at_steps, make_method
+    from hyperplanes.perceptual import LPIPS
     from hyperplanes.presets import PROTOCOLS
     from hyperplanes.support import WithSupport
 
     if arguments.curve is not None and len(arguments.steps) < 2:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
+    if arguments.seeds < 1:
+        raise ValueError(f"--seeds: expected at least 1, got {arguments.seeds}")
     console, device = Console(), choose_device(arguments.device)
-    checkpoints = find_checkpoints(arguments.checkpoint)
+    checkpoints = [find_checkpoints(with_seed(arguments.checkpoint, seed)) for seed in range(arguments.seeds)]
     opened = open_dataset(arguments.data, legacy=arguments.legacy)
     for line in opened.skipped:
         console.warn(line)
@@ -113,45 +176,144 @@ def run(arguments: Arguments) -> int:
     names = data.names(arguments.split)[: arguments.objects]
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
-    sampling, settings = PROTOCOLS[arguments.protocol], FineTuning(free=arguments.fine_tune)
+    sampling = PROTOCOLS[arguments.protocol]
+    lpips = None if arguments.lpips is None else LPIPS(arguments.lpips, device)
 
-    def make(name: str) -> WithSampler:
+    def make(name: str, seed: int) -> WithSampler:
         objects = (data.task(each).support for each in names)
         made = make_method(
             name,
-            checkpoints,
+            checkpoints[seed],
             device=device,
-            settings=settings,
+            settings=FineTuning(free=arguments.fine_tune, seed=seed),
             objects=objects,
             preset=arguments.preset,
             protocol=arguments.protocol,
         )
         return WithSampler(made, sampling)
 
-    chosen = [each for name in arguments.method for each in at_steps(name, arguments.steps)]
-    methods = {name: make(name) for name in dict.fromkeys(chosen)}
+    chosen = list(dict.fromkeys(each for name in arguments.method for each in at_steps(name, arguments.steps)))
+    first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to
+    pictures = _Pictures()
     with console.bar("evaluating") as bar:
-        scores = evaluate_all(methods, data, names, bar.show)
-    if arguments.json is not None:
-        write_json(arguments.json, {score.method: score.as_json() for score in scores})
-    if arguments.curve is not None:
-        _draw(scores, arguments.method, arguments.steps, arguments.curve)
-        console.say(f"{arguments.curve}: PSNR over fine-tuning steps")
-    console.table(HEADINGS, rows(scores))
-    console.say(f"{len(names)} objects of {arguments.data}")
+        scores = evaluate_all(
+            {name: lambda seed, name=name: make(name, seed) if seed else first[name] for name in chosen},
+            data,
+            names,
+            bar.show,
+            seeds=arguments.seeds,
+            on_object=pictures.keep if arguments.grid is not None else None,
+            lpips=lpips,
+        )
+    pairs = compare_all(scores)
+    _write(arguments, scores, pairs)
+    if arguments.grid is not None:
+        pictures.draw(arguments.grid)
+    for path in (arguments.curve, arguments.boxes, arguments.grid, arguments.csv, arguments.markdown, arguments.json):
+        if path is not None:
+            console.say(f"written: {path}")
+    console.table(headings(scores), rows(scores))
+    if len(names) > 1 and pairs:
+        console.table(PAIR_HEADINGS, compared_rows(pairs[:LARGEST_TABLE]))
+    console.say(f"{len(names)} objects of {arguments.data}{_of_seeds(arguments)}")
     return 0
 
 
-def _draw(scores: Sequence[Score], methods: Sequence[str], steps: Sequence[int], path: Path) -> None:
-    """PSNR over fine-tuning steps of every method that was evaluated at several."""
-    from hyperplanes.demo.charts import line_chart, standalone
-    from hyperplanes.files import write_whole
+def _of_seeds(arguments: Arguments) -> str:
+    if arguments.seeds == 1:
+        return ""
+    trained = any(SEED in str(folder) for folder in arguments.checkpoint)
+    what = (
+        "of trainings and of gradient steps" if trained else "of gradient steps and random weights, the same training"
+    )
+    return f"; ± is the standard deviation over {arguments.seeds} seeds {what}"
+
+
+def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Comparison]) -> None:
+    """Every file but the grid of pictures."""
+    from hyperplanes.evaluation import QUANTITIES
+    from hyperplanes.files import write_json, write_whole
+    from hyperplanes.tables import csv_table, markdown_table
+
+    if arguments.json is not None:
+        write_json(arguments.json, as_json(scores, pairs))
+    if arguments.csv is not None:
+        lines = [
+            (score.method, seed, each.name, *(getattr(each, name) for name in QUANTITIES))
+            for score in scores
+            for seed, run in enumerate(score.seeds or (score,))
+            for each in run.objects
+        ]
+        write_whole(arguments.csv, csv_table(("method", "seed", "object", *QUANTITIES), lines).encode())
+    if arguments.markdown is not None:
+        text = markdown_table(headings(scores), rows(scores))
+        if pairs:
+            text += "\n" + markdown_table(PAIR_HEADINGS, compared_rows(pairs))
+        objects = f"{len(scores[0].objects)} objects of {arguments.data}"
+        write_whole(arguments.markdown, f"{text}\n{objects}{_of_seeds(arguments)}.\n".encode())
+    if arguments.curve is not None:
+        _draw_curve(scores, arguments.method, arguments.steps, arguments.curve)
+    if arguments.boxes is not None:
+        _draw_boxes(scores, arguments.boxes)
+
+
+def as_json(scores: Sequence[Score], pairs: Sequence[Comparison]) -> Mapping[str, object]:
+    """What `--json` writes: the numbers by method, and under "differences" those to the methods that are worse."""
+    table = {score.method: score.as_json() for score in scores}
+    for pair in pairs:
+        table[pair.first].setdefault("differences", {})[pair.second] = pair.as_json()
+    return table
+
+
+def _draw_boxes(scores: Sequence[Score], path: Path) -> None:
+    """The objects' PSNR, a box a method."""
+    from hyperplanes.plots import draw_boxes, new_figure, save_figure
+
+    figure = new_figure(max(5.0, 1.4 * len(scores)), 4.0)
+    axes = figure.subplots()
+    draw_boxes(axes, {score.method: [each.psnr for each in score.objects] for score in scores})
+    axes.set(ylabel="PSNR of an object (dB)")
+    axes.tick_params(axis="x", labelrotation=20)
+    save_figure(figure, path)
+
+
+def _draw_curve(scores: Sequence[Score], methods: Sequence[str], steps: Sequence[int], path: Path) -> None:
+    """PSNR over fine-tuning steps of every method; of one that takes none, a level."""
     from hyperplanes.methods import at_steps
+    from hyperplanes.plots import draw_lines, new_figure, save_figure, set_counts
 
     quality = {score.method: score.mean("psnr") for score in scores}
     curves = {}
     for method in methods:
         named = [(count, name) for count in steps for name in at_steps(method, [count])]
         curves[method] = [(float(count), quality[name]) for count, name in named]
-    chart = line_chart(curves, "PSNR over fine-tuning steps", "dB", horizontal="fine-tuning steps", dense=True)
-    write_whole(path, standalone(chart).encode())
+    figure = new_figure(6.0, 3.6)
+    axes = figure.subplots()
+    draw_lines(axes, curves, marks=True)
+    set_counts(axes, steps)
+    axes.set(xlabel="fine-tuning steps", ylabel="PSNR (dB)")
+    save_figure(figure, path)
+
+
+class _Pictures:
+    """A query view of each of the first objects, by the first seed of every method."""
+
+    rows = 6
+
+    def __init__(self) -> None:
+        self.seen: dict[str, dict[str, np.ndarray]] = {}
+
+    def keep(self, method: str, seed: int, task, pictures) -> None:
+        from hyperplanes.export import to_pixels
+
+        if seed or (task.name not in self.seen and len(self.seen) >= self.rows):
+            return
+        view = len(task.query) // 4
+        found = self.seen.setdefault(task.name, {"truth": to_pixels(task.query.images[view : view + 1])[0]})
+        found[method] = to_pixels(pictures.images[view : view + 1])[0]
+
+    def draw(self, path: Path) -> None:
+        from hyperplanes.plots import draw_grid, save_figure
+
+        columns = list(next(iter(self.seen.values())))
+        save_figure(draw_grid([list(row.values()) for row in self.seen.values()], columns, list(self.seen)), path)

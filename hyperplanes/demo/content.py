@@ -46,6 +46,11 @@ class Exhibit:
     psnr: Mapping[str, float]
     turntable: bytes = b""
 
+    @property
+    def order(self) -> list[int]:
+        """The support views as they are shown, those that the hypernetwork reads first."""
+        return [*self.read, *(index for index in range(len(self.support)) if index not in self.read)]
+
 
 @dataclass(frozen=True)
 class Row:
@@ -56,6 +61,7 @@ class Row:
         about: what it is, in a few words.
         psnr: dB, mean over objects.
         deviation: dB, standard deviation over objects.
+        foreground: dB inside the true masks, mean over objects; None without masks.
         ssim: mean over objects.
         adapt: how long it took from images to a field, as text.
         render: how long a view took, as text.
@@ -65,6 +71,7 @@ class Row:
     about: str
     psnr: float
     deviation: float
+    foreground: float | None
     ssim: float
     adapt: str
     render: str

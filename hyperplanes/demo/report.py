@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
 
 from hyperplanes.adaptation.diagnostics import Diagnostics
@@ -20,6 +17,7 @@ from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
 from hyperplanes.demo.content import Pixels
 from hyperplanes.demo.pipeline import METHODS, MODELS, DemoSettings, describe_row
 from hyperplanes.demo.stages import Stages
+from hyperplanes.environment import environment
 from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.files import encode_png, write_whole
 from hyperplanes.formatting import format_duration
@@ -98,6 +96,7 @@ def describe(
             describe_row(row),
             found["psnr"],
             statistics.pstdev(each["psnr"] for each in found["objects"].values()),
+            found.get("psnr_foreground"),
             found["ssim"],
             format_duration(found["adapt_seconds"]),
             format_duration(found["render_seconds"]),
@@ -148,7 +147,7 @@ def describe(
 
 def how_it_was_made(settings: DemoSettings, folder: Path, manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Data, training, machine and time, label and value."""
-    done = Stages(folder)
+    done, where = Stages(folder), environment()
     steps = read_json(folder / "hyperplanes" / "training.json")["step"]
     trained = settings.objects - settings.held_out
     times = ", ".join(
@@ -163,17 +162,10 @@ def how_it_was_made(settings: DemoSettings, folder: Path, manifest: Mapping[str,
         ("renderer of the data", str(manifest.get("renderer", "unknown"))),
         ("training", f"{steps:,} steps of each model, preset {settings.preset}, seed {settings.seed}"),
         ("time", times),
-        ("machine", f"{_processor()}, {len(os.sched_getaffinity(0))} cores, torch {torch.__version__}"),
+        ("machine", f"{where['gpu'] or where['processor']}, {where['cores']} cores, torch {where['torch']}"),
+        ("commit", str(where["commit"])),
+        ("paper", "Batorski et al., HyperPlanes: Hypernetwork Approach to Rapid NeRF Adaptation, arXiv 2402.01524"),
     ]
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return named[0] if named else platform.processor() or platform.machine()
 
 
 def overview(exhibits: Sequence[Exhibit], rounds: Sequence[Pixels], side: int, columns: int = 7) -> Pixels:

@@ -1,0 +1,56 @@
+"""What a figure depends on beside the command: the commit, the machine, the versions."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from pathlib import Path
+
+__all__ = ["environment", "find_commit", "find_processor"]
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def find_commit() -> str:
+    """The commit of this code as `git describe` puts it, or the version of the installed package."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    def ask(*words: str) -> str:
+        answer = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+        return answer.stdout.strip()
+
+    try:
+        if Path(ask("rev-parse", "--show-toplevel") or os.sep).resolve() == ROOT:
+            return ask("describe", "--always", "--dirty") or "unknown"
+    except OSError:  # no git here
+        pass
+    try:
+        return f"version {version('hyperplanes')}"
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def find_processor() -> str:
+    """The processor in words."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return named[0] if named else platform.processor() or platform.machine()
+
+
+def environment() -> dict[str, object]:
+    """The commit, the processor and the versions, as they stand in the JSON files of results."""
+    import torch
+
+    return {
+        "commit": find_commit(),
+        "processor": find_processor(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }

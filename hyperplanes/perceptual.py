@@ -1,0 +1,91 @@
+"""LPIPS, the perceptual distance of Zhang et al. 2018, by AlexNet and with weights that the user brings.
+
+The weights are the state of the `lpips` package's network, written once, where that package is installed, by
+
+    import lpips, safetensors.torch
+    state = lpips.LPIPS(net="alex").state_dict()
+    safetensors.torch.save_file({name: value.clone() for name, value in state.items()}, "lpips-alex.safetensors")
+
+The package itself is no dependency: it brings torchvision, and with it another build of torch.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import conv2d, max_pool2d, relu
+
+from hyperplanes.checkpoints import check_tensors, load_tensors
+
+__all__ = ["LPIPS"]
+
+# of the five convolutions: name in the file, output and input channels, kernel, stride, padding, whether pooled before
+CONVOLUTIONS = (
+    ("net.slice1.0", 64, 3, 11, 4, 2, False),
+    ("net.slice2.3", 192, 64, 5, 1, 2, True),
+    ("net.slice3.6", 384, 192, 3, 1, 1, True),
+    ("net.slice4.8", 256, 384, 3, 1, 1, False),
+    ("net.slice5.10", 256, 256, 3, 1, 1, False),
+)
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of RGB in [-1, 1], as the package has them
+SMALLEST = 32  # pixels: two poolings of a quarter of them
+
+
+class LPIPS:
+    """The distance of two pictures in the features of AlexNet, weighted to agree with people's judgments.
+
+    Args:
+        path: the weights as safetensors, see above.
+        device: where to compute.
+
+    Raises:
+        CheckpointError: no such file, or tensors that are missing or of another shape.
+    """
+
+    def __init__(self, path: Path, device: torch.device | str = "cpu") -> None:
+        expected: dict[str, Tensor] = {}
+        for index, (name, out, into, kernel, *_) in enumerate(CONVOLUTIONS):
+            expected[f"{name}.weight"] = torch.empty(out, into, kernel, kernel, device="meta")
+            expected[f"{name}.bias"] = torch.empty(out, device="meta")
+            expected[f"lin{index}.model.1.weight"] = torch.empty(1, out, 1, 1, device="meta")
+        found = {name: value for name, value in load_tensors(path).items() if name in expected}
+        check_tensors(path, found, expected)
+        self.weights = {name: value.float().to(device) for name, value in found.items()}
+
+    @torch.no_grad()
+    def __call__(
+        self, predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
+    ) -> Float[Tensor, " view"]:
+        """The distance of each picture to the truth, both RGB in [0, 1]; 0 for equal ones.
+
+        Raises:
+            ValueError: pictures smaller than 32 x 32.
+        """
+        if min(truth.shape[2:]) < SMALLEST:
+            expected = f"at least {SMALLEST} x {SMALLEST} pixels for LPIPS"
+            raise ValueError(f"images: expected {expected}, got {truth.shape[2]} x {truth.shape[3]}")
+        first, second = self._scaled(predicted), self._scaled(truth)
+        total = torch.zeros(len(truth), device=first.device)
+        for index, (name, _, _, _, stride, padding, pooled) in enumerate(CONVOLUTIONS):
+            weight, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
+            first, second = (
+                relu(conv2d(max_pool2d(each, 3, 2) if pooled else each, weight, bias, stride, padding))
+                for each in (first, second)
+            )
+            difference = (_unit(first) - _unit(second)).square()
+            total = total + conv2d(difference, self.weights[f"lin{index}.model.1.weight"]).mean((1, 2, 3))
+        return total.to(truth.device)
+
+    def _scaled(self, images: Tensor) -> Tensor:
+        """RGB in [0, 1] as AlexNet was trained on it."""
+        images = images.float().to(next(iter(self.weights.values())).device)
+        shift, scale = (images.new_tensor(each).view(1, 3, 1, 1) for each in (SHIFT, SCALE))
+        return (2 * images - 1 - shift) / scale
+
+
+def _unit(features: Tensor) -> Tensor:
+    """Features of length one in every place."""
+    return features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)

@@ -1,0 +1,229 @@
+"""Runs an experiment: data, trainings and evaluations, each made once and kept in the output folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hyperplanes.adaptation.fine_tuning import FineTuning
+from hyperplanes.adaptation.pretrained import find_checkpoints
+from hyperplanes.checkpoints import read_json
+from hyperplanes.data import open_dataset
+from hyperplanes.devices import TasksOnDevice
+from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
+from hyperplanes.files import encode_json, write_json
+from hyperplanes.methods import WithSampler, make_method
+from hyperplanes.presets import PROTOCOLS, Preset
+from hyperplanes.reproduce.configurations import configuration
+from hyperplanes.reproduce.experiments import Cell, Experiment, Trained
+from hyperplanes.reproduce.scales import Scale
+from hyperplanes.support import WithSupport
+from hyperplanes.views import Tasks
+
+__all__ = ["Outcome", "Runner"]
+
+Curve = list[dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an experiment has found.
+
+    Attributes:
+        experiment: what was run.
+        scale: how large.
+        scores: by (row, column), over all seeds.
+        curves: of the trainings, by row and then by seed.
+        seeds: how many.
+        objects: trained on, by class.
+    """
+
+    experiment: Experiment
+    scale: Scale
+    scores: Mapping[tuple[str, str], Score]
+    curves: Mapping[str, list[Curve]]
+    seeds: int
+    objects: Mapping[str, int]
+
+
+class Runner:
+    """Makes what is not made yet, in a folder that all experiments share.
+
+    A data set lies in data/, a training in trainings/, an evaluation in evaluations/, under names that hold a checksum
+    of everything that decides them: two experiments that need the same training share it, and after an interruption the
+    same call goes on.
+
+    Args:
+        out: the folder.
+        scale: how large.
+        given: data sets by class, instead of generated ones.
+        generate: called with a class and the folder its data set is to lie in; goes on where it stopped.
+        train: called with a method's name, its configuration, the data, the folder of the checkpoint and that of the
+            training it reads, if any; goes on where it was interrupted.
+        say: called with a line about what is done.
+        device: where to compute.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        scale: Scale,
+        *,
+        given: Mapping[str, Path],
+        generate: Callable[[str, Path], None],
+        train: Callable[[str, Preset, Tasks, Path, Path | None], None],
+        say: Callable[[str], None],
+        device: torch.device,
+    ) -> None:
+        self.out, self.scale, self.given = out, scale, given
+        self.generate, self.train, self.say, self.device = generate, train, say, device
+        self._tasks: dict[str, TasksOnDevice] = {}
+
+    def tasks(self, class_name: str) -> Tasks:
+        """The data set of a class, generated where none was given; ValueError where the scale generates none."""
+        if class_name not in self._tasks:
+            self._tasks[class_name] = TasksOnDevice(open_dataset(self.folder(class_name)), self.device)
+        return self._tasks[class_name]
+
+    def folder(self, class_name: str) -> Path:
+        """The folder of the data set of a class; as `tasks`."""
+        if class_name in self.given:
+            return self.given[class_name].resolve()
+        scale = self.scale
+        if scale.resolution is None:
+            raise ValueError(
+                f"data: expected --data {class_name}=FOLDER, as the scale {scale.name} takes data sets as they were "
+                "published, got none; or take --scale small"
+            )
+        settings = {"class": class_name} | {
+            name: getattr(scale, name) for name in ("resolution", "objects", "held_out", "views")
+        }
+        folder = self.out / "data" / _name(class_name, settings)
+        if not (folder / "manifest.json").exists():
+            self.generate(class_name, folder)
+        return folder
+
+    def names(self, class_name: str, split: str, most: int | None = None) -> list[str]:
+        """The objects of a class that are evaluated, `most` at the most; ValueError where there are none."""
+        tasks = self.tasks(class_name)
+        found = list(tasks.names(split))
+        if not found:
+            raise ValueError(f"data: expected {class_name} objects in the {split} split, got none")
+        if split == "train" and self.scale.held_out:  # as many as held-out ones
+            found = found[: self.scale.held_out]
+        return found[: self.scale.evaluated][:most]
+
+    def run(self, experiment: Experiment, seeds: int) -> Outcome:
+        """All trainings and evaluations of an experiment.
+
+        Args:
+            experiment: which.
+            seeds: how many, from 0: each is that of a training and of the fine-tuning of its evaluations.
+
+        Returns:
+            All that tables and figures are made of.
+        """
+        scores: dict[tuple[str, str], list[Score]] = {}
+        curves: dict[str, dict[tuple[str, int], Curve]] = {}
+        for seed in range(seeds):
+            for cell in experiment.cells:
+                folder = self.checkpoint(experiment, cell.trained, seed)
+                curve = read_json(folder / "training.json").get("curve", [])
+                curves.setdefault(_curve_name(experiment, cell), {})[str(folder), seed] = curve
+                score = self.score(experiment, cell, folder, seed)
+                scores.setdefault((cell.row, cell.column), []).append(score)
+        return Outcome(
+            experiment,
+            self.scale,
+            {place: merge_seeds(found) for place, found in scores.items()},
+            {name: list(found.values()) for name, found in curves.items()},
+            seeds,
+            {each.on: len(self.tasks(each.on).names("train")) for each in experiment.trainings},
+        )
+
+    def configuration(self, experiment: Experiment, trained: Trained, seed: int) -> Preset:
+        """Model and training, as configured for the objects that there are."""
+        objects = len(self.tasks(trained.on).names("train"))
+        return configuration(experiment, trained, self.scale, objects, seed)
+
+    def checkpoint(self, experiment: Experiment, trained: Trained, seed: int) -> Path:
+        """The folder of a finished training."""
+        data = self.tasks(trained.on)
+        chosen = self.configuration(experiment, trained, seed)
+        reference = trained.reference and self.checkpoint(experiment, trained.reference, seed)
+        settings = {
+            "data": list(data.names("train")),
+            "reference": "" if reference is None else reference.name,
+            "method": trained.method,
+            "model": chosen.model.as_json(),
+            "training": asdict(chosen.training),
+            "given": str(self.folder(trained.on)) if trained.on in self.given else "",
+        }
+        folder = self.out / "trainings" / _name(f"{self.folder(trained.on).name}-{trained.method}-{seed}", settings)
+        state = folder / "training.json"
+        if not state.exists() or read_json(state)["step"] < chosen.training.steps:
+            self.say(
+                f"training {trained.method} on {trained.on}, seed {seed}, {chosen.training.steps:,} steps: {folder}"
+            )
+            self.train(trained.method, chosen, self.arranged(trained, chosen), folder, reference)
+        return folder
+
+    def arranged(self, trained: Trained, chosen: Preset) -> Tasks:
+        """The data of a training, with as many support views as its model has planes."""
+        return WithSupport(self.tasks(trained.on), chosen.model.network.planes)
+
+    def score(self, experiment: Experiment, cell: Cell, checkpoint: Path, seed: int) -> Score:
+        """The evaluation of a cell with one seed."""
+        method = self.scale.method(cell.method)
+        names = self.names(cell.on, cell.split, experiment.objects)
+        settings = {
+            "checkpoint": checkpoint.name,
+            "method": method,
+            "on": str(self.folder(cell.on)) if cell.on in self.given else self.folder(cell.on).name,
+            "objects": names,
+            "free": cell.free if method != cell.trained.method else "",
+            "seed": seed,
+        }
+        path = self.out / "evaluations" / f"{_name(f'{self.folder(cell.on).name}-{method}-{seed}', settings)}.json"
+        if not path.exists():
+            score = self._evaluate(experiment, cell, method, checkpoint, names, seed)
+            write_json(path, {"settings": settings, "score": score.as_json()})
+        return Score.of_json(method, read_json(path)["score"])
+
+    def _evaluate(
+        self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, names: list[str], seed: int
+    ) -> Score:
+        checkpoints = find_checkpoints([checkpoint])
+        settings = FineTuning(free=cell.free if "hyperplanes" in checkpoints else "weights", seed=seed)
+        planes = read_json(checkpoint / "model.json")["network"]["planes"]
+        tasks = WithSupport(self.tasks(cell.on), planes)
+        adapter = make_method(
+            method,
+            checkpoints,
+            device=self.device,
+            settings=settings,
+            preset=self.scale.presets[experiment.size],
+            protocol=self.scale.protocol,
+        )
+        heading = f"{cell.row}, {cell.column}, seed {seed}"
+
+        def show(score: ObjectScore, *_: Any) -> None:
+            self.say(f"{heading}: {score.name} {score.psnr:.2f} dB")
+
+        return evaluate(method, WithSampler(adapter, PROTOCOLS[self.scale.protocol]), tasks, names, show)
+
+
+def _name(start: str, settings: Mapping[str, Any]) -> str:
+    """A readable name with a checksum of what decides the content."""
+    return f"{start}-{hashlib.sha256(encode_json(json.loads(json.dumps(settings)))).hexdigest()[:10]}"
+
+
+def _curve_name(experiment: Experiment, cell: Cell) -> str:
+    """What a training is called in a figure: the row or the column that tells it from others."""
+    return cell.column if len(experiment.columns) > 1 else cell.row

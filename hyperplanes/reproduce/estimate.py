@@ -1,0 +1,102 @@
+"""How long an experiment will take, from a few measured steps of each of its models."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from hyperplanes.formatting import format_duration, format_rate
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.reproduce.engine import Runner
+from hyperplanes.reproduce.experiments import Experiment, Trained
+from hyperplanes.training import Trainer
+
+__all__ = ["Estimate", "estimate"]
+
+STEPS = 2  # measured, after one that is not
+SIDE = 32  # pixels of the view that is rendered
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The time of all trainings and evaluations of an experiment on this machine.
+
+    Attributes:
+        rows: a line a model, as text.
+        seconds: of all of it.
+        headings: of the rows.
+    """
+
+    rows: Sequence[tuple[str, ...]]
+    seconds: float
+    headings: tuple[str, ...] = ("training", "steps", "rays/s", "to train", "to evaluate")
+
+
+def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
+    """Take a few steps of every training and render a small view with its field.
+
+    Args:
+        runner: with the data sets.
+        experiment: which.
+        seeds: of every training and evaluation.
+
+    Returns:
+        The time of all trainings and evaluations, whatever of them is done already.
+    """
+    rows, whole = [], 0.0
+    for trained in experiment.trainings:
+        chosen = runner.configuration(experiment, trained, 0)
+        step, pixel = _measure(runner, experiment, trained)
+        training = step * chosen.training.steps
+        evaluation = 0.0
+        for cell in experiment.cells:
+            if cell.trained == trained:
+                names = runner.names(cell.on, cell.split, experiment.objects)
+                task = runner.tasks(cell.on).task(names[0])
+                tuning = re.search(r"_(\d+)$", runner.scale.method(cell.method))
+                steps = step * int(tuning[1]) if tuning else 0.0
+                evaluation += len(names) * (steps + pixel * len(task.query) * task.query.size[0] * task.query.size[1])
+        rate = chosen.training.tasks * chosen.training.rays / step
+        rows.append(
+            (
+                f"{trained.method} on {trained.on}" + "".join(f", {n} {v}" for n, v in trained.changes.items()),
+                f"{seeds} x {chosen.training.steps:,}",
+                format_rate(rate),
+                format_duration(seeds * training),
+                format_duration(seeds * evaluation),
+            )
+        )
+        whole += seeds * (training + evaluation)
+    return Estimate(rows, whole)
+
+
+def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> tuple[float, float]:
+    """Seconds of a training step and of a rendered pixel."""
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+
+    chosen = runner.configuration(experiment, trained, 0)
+    data = runner.arranged(trained, chosen)
+    trainer = Trainer(HyperPlanes(chosen.model).to(runner.device), data, chosen.training)
+    trainer.take_step()
+    _wait()
+    started = time.perf_counter()
+    for _ in range(STEPS):
+        trainer.take_step()
+    _wait()
+    step = (time.perf_counter() - started) / STEPS
+    task = data.task(trainer.names[0])
+    field = trainer.model.adapt(task.support)
+    view = camera.resized(camera.select(task.query.cameras, [0]), SIDE, SIDE)
+    started = time.perf_counter()
+    field.render(view)
+    _wait()
+    return step, (time.perf_counter() - started) / SIDE**2
+
+
+def _wait() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()

@@ -1,0 +1,160 @@
+"""What an experiment has found beside what the paper says, as Markdown, CSV and JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from statistics import fmean, pstdev
+from typing import Any
+
+from hyperplanes.environment import environment
+from hyperplanes.evaluation import Score
+from hyperplanes.reproduce.configurations import deviations
+from hyperplanes.reproduce.engine import Outcome
+from hyperplanes.reproduce.experiments import Cell
+from hyperplanes.tables import csv_table, markdown_table
+
+__all__ = ["as_csv", "as_json", "as_markdown", "headings", "rows", "value", "what_differs"]
+
+DECIMALS = {"psnr": 2, "ssim": 3, "image_seconds": 2}
+
+
+def value(score: Score, quantity: str) -> tuple[float, float | None]:
+    """A number of the table and its deviation: over seeds, where there are several; of seconds over objects."""
+    if quantity == "image_seconds":
+        seconds = [each.image_seconds for each in score.objects]
+        return fmean(seconds), pstdev(seconds)
+    return score.mean(quantity), score.deviation(quantity)
+
+
+def headings(outcome: Outcome) -> list[str]:
+    """The heading of the rows, then of every column: ours, and the paper's where it has one."""
+    found = [""]
+    for column in outcome.experiment.columns:
+        found.append(column)
+        if _published_column(outcome, column):
+            found.append("paper")
+    return found
+
+
+def rows(outcome: Outcome) -> list[list[str]]:
+    """The table as text."""
+    experiment = outcome.experiment
+    cells = {(cell.row, cell.column): cell for cell in experiment.cells}
+    table = []
+    for row in experiment.rows:
+        line = [row]
+        for column in experiment.columns:
+            cell = cells.get((row, column))
+            line.append("-" if cell is None else _ours(outcome, cell))
+            if _published_column(outcome, column):
+                line.append(_theirs(outcome, row, column))
+        table.append(line)
+    return table
+
+
+def _published_column(outcome: Outcome, column: str) -> bool:
+    published = outcome.experiment.published
+    return published is not None and column in published.columns
+
+
+def _shown(number: float, deviation: float | None, decimals: int) -> str:
+    spread = "" if deviation is None else f" ± {deviation:.{decimals}f}"
+    return f"{number:.{decimals}f}{spread}"
+
+
+def _ours(outcome: Outcome, cell: Cell) -> str:
+    return _shown(*value(outcome.scores[cell.row, cell.column], cell.quantity), DECIMALS[cell.quantity])
+
+
+def _theirs(outcome: Outcome, row: str, column: str) -> str:
+    published = outcome.experiment.published
+    number = published and published.value(row, column)
+    if published is None or number is None:
+        return "-"
+    return _shown(number, published.deviation(row, column), 3 if row == "SSIM" else 2)
+
+
+def what_differs(outcome: Outcome) -> list[str]:
+    """What is not as in the paper, and what the paper leaves open, a line each."""
+    experiment, scale = outcome.experiment, outcome.scale
+    lines = []
+    objects = ", ".join(f"{count} {name}s" for name, count in outcome.objects.items())
+    if scale.resolution is not None:
+        lines.append(
+            f"Data: procedural objects of {scale.resolution}x{scale.resolution} pixels, {scale.views // 2} support and "
+            f"{scale.views // 2} query views; trained on {objects}. Paper: ShapeNet at {experiment.size}x"
+            f"{experiment.size}, 25 and 25 views."
+        )
+    else:
+        lines.append(f"Data: trained on {objects}.")
+    if scale.steps is not None:
+        epochs = experiment.epochs
+        paper = epochs if isinstance(epochs, int) else ", ".join(f"{n}s {count}" for n, count in epochs.items())
+        lines.append(f"Training: {scale.steps:,} steps of each model. Paper: epochs, {paper}.")
+    if scale.tuning is not None and any(scale.method(cell.method) != cell.method for cell in experiment.cells):
+        lines.append(f"At most {scale.tuning} gradient steps on the support views of an object.")
+    if experiment.figure == "steps" and scale.longest is not None:
+        lines.append(f"At most {scale.longest:,} gradient steps on the support views of an object.")
+    lines.append(
+        f"Seeds: {outcome.seeds}, each that of a training and of the fine-tuning of its evaluations"
+        f"{'; ± is the standard deviation over them' if outcome.seeds > 1 else ''}. Paper: {experiment.runs}."
+    )
+    if found := deviations(experiment, scale):
+        lines.append(f"Configuration ({scale.presets[experiment.size]}): {'; '.join(found)}.")
+    return [*lines, *experiment.notes]
+
+
+def as_markdown(outcome: Outcome, command: str) -> str:
+    """The table with all that one must know to read it.
+
+    Args:
+        outcome: what was found.
+        command: what makes it again.
+    """
+    experiment, where = outcome.experiment, environment()
+    machine = f"{where['gpu'] or where['processor']}, {where['cores']} cores, torch {where['torch']}"
+    notes = "\n".join(f"- {line}" for line in what_differs(outcome))
+    return (
+        f"# {experiment.title}\n\nHyperPlanes (arXiv 2402.01524), {experiment.where}.\n\n"
+        f"{markdown_table(headings(outcome), rows(outcome))}\n"
+        f"![figure](figure.png)\n\n## What differs\n\n{notes}\n\n## How it was made\n\n"
+        f"    {command}\n\nCommit {where['commit']}; {machine}.\n"
+    )
+
+
+def as_csv(outcome: Outcome) -> str:
+    """A line a number, ours and the paper's, every digit."""
+    lines: list[Sequence[object]] = []
+    for cell in outcome.experiment.cells:
+        number, deviation = value(outcome.scores[cell.row, cell.column], cell.quantity)
+        published = outcome.experiment.published
+        theirs = published and published.value(cell.row, cell.column)
+        lines.append((cell.row, cell.column, cell.quantity, number, deviation, outcome.seeds, theirs))
+    return csv_table(("row", "column", "quantity", "value", "deviation", "seeds", "paper"), lines)
+
+
+def as_json(outcome: Outcome, command: str) -> dict[str, Any]:
+    """All numbers, objects and seeds included."""
+    found: dict[str, Any] = {}
+    for cell in outcome.experiment.cells:
+        score, published = outcome.scores[cell.row, cell.column], outcome.experiment.published
+        number, deviation = value(score, cell.quantity)
+        found.setdefault(cell.row, {})[cell.column] = {
+            "quantity": cell.quantity,
+            "value": number if math.isfinite(number) else None,
+            "deviation": deviation,
+            "paper": published and published.value(cell.row, cell.column),
+            "score": score.as_json(),
+        }
+    return {
+        "experiment": outcome.experiment.name,
+        "where": outcome.experiment.where,
+        "scale": outcome.scale.name,
+        "seeds": outcome.seeds,
+        "command": command,
+        "differs": what_differs(outcome),
+        **environment(),
+        "table": found,
+        "curves": outcome.curves,
+    }
