@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -33,6 +34,14 @@ from hyperplanes.rendering.renderer import Hierarchical
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
+
+
+def tiny_preset():
+    """The preset "quick" with small networks and few gradient steps."""
+    quick = PRESETS["quick"]
+    network = replace(quick.model.network, depth=2, width=16)
+    initialisation = replace(quick.initialisation, inner_steps=1, steps=2, test_rays=32)
+    return replace(quick, model=replace(quick.model, network=network), initialisation=initialisation)
 
 
 def complaint(capsys):
@@ -202,6 +211,28 @@ def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
     for name in methods:
         assert written[name]["psnr"] == pytest.approx(before[name]["psnr"], abs=1e-3)
         assert f"{written[name]['psnr']:.2f} dB" in shown
+
+
+def test_fields_are_optimised_on_one_posed_scene_without_a_checkpoint(tmp_path):
+    scene, table = first_object(demo_folder()), tmp_path / "table.json"
+    methods = ["hull_blend", "nerf_scratch_3", "point_multiplane_scratch_3"]
+    assert main(["evaluate", "--data", str(scene), "--json", str(table), "--support", "5", "--method", *methods]) == 0
+    rows = json.loads(table.read_text())
+    assert set(rows) == set(methods)
+    assert rows["point_multiplane_scratch_3"]["psnr"] > 5
+
+
+def test_a_learned_initialisation_is_trained_matched_and_evaluated(tmp_path, monkeypatch):
+    monkeypatch.setitem(PRESETS, "quick", tiny_preset())
+    data = str(demo_folder() / "data")
+    for method, more in (("mv_meta", []), ("mv_matched", ["--checkpoint", str(tmp_path / "mv_meta")])):
+        out = str(tmp_path / method)
+        assert main(["train", "--data", data, "--method", method, "--steps", "2", "--out", out, *more]) == 0
+    methods = ["standard", "mv_shuffled_1", "mv_matched", "mv_meta_2"]
+    table = tmp_path / "table.json"
+    arguments = ["--checkpoint", str(tmp_path), "--json", str(table), "--objects", "1", "--method", *methods]
+    assert main(["evaluate", "--data", data, *arguments]) == 0
+    assert set(json.loads(table.read_text())) == set(methods)
 
 
 def test_render_writes_the_query_views_under_their_names(tmp_path):

@@ -1,11 +1,16 @@
+from dataclasses import replace
+from functools import partial
+
 import pytest
 import torch
 
+from hyperplanes import methods
 from hyperplanes.adaptation import (
     Adapter,
     FineTuned,
     FineTuning,
     FromScratch,
+    HullBlend,
     InitialisationConfig,
     NearestView,
     Swapped,
@@ -15,6 +20,7 @@ from hyperplanes.adaptation.pretrained import find_checkpoints
 from hyperplanes.evaluation import evaluate
 from hyperplanes.hypernetwork import AutoencoderConfig
 from hyperplanes.methods import METHODS, at_steps, describe_method, make_method
+from hyperplanes.presets import PRESETS
 from tests.reference_rendering import Balls, awaken, small_model
 
 
@@ -109,15 +115,17 @@ def test_swapping_takes_two_objects_and_a_hypernetwork():
         Swapped(small_model(hypernetwork=None), [support])
 
 
-def test_no_method_reads_a_pixel_of_the_query_views(folders):
+def test_no_method_reads_a_pixel_of_the_query_views(folders, monkeypatch):
     # Source of truth: NaN in the query images would reach the picture of whatever reads them.
-    clean, data = Balls(test=2), Balls(test=2)
+    quick = PRESETS["quick"]
+    monkeypatch.setitem(PRESETS, "quick", replace(quick, model=small_model(hypernetwork=None).config))
+    monkeypatch.setattr(methods, "HullBlend", partial(HullBlend, side=8, steps=16))
+    clean, data = Balls(test=2, size=(12, 12)), Balls(test=2, size=(12, 12))
     original, read = data.task, []
 
     def poisoned(name):
         task = original(name)
-        task.query.images.fill_(float("nan"))
-        return task
+        return replace(task, query=replace(task.query[:1], images=torch.full((1, 3, 12, 12), torch.nan)))
 
     data.task = poisoned
     objects = [data.task(name).support for name in data.names("test")]
@@ -125,5 +133,5 @@ def test_no_method_reads_a_pixel_of_the_query_views(folders):
         adapter = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))
         evaluate(name, adapter, data, ["test0"], lambda score, task, pictures: read.append(pictures.images))
         again = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))
-        shown = again.adapt(clean.task("test0").support).render(clean.task("test0").query.cameras).images
+        shown = again.adapt(clean.task("test0").support).render(clean.task("test0").query[:1].cameras).images
         assert torch.equal(read[-1], shown), name

@@ -34,11 +34,11 @@ def test_more_views_than_there_are_and_none_are_refused():
 
 
 def test_fifty_planes_are_trained_and_evaluated_with_support_and_query_unified():
-    data = WithSupport(Balls(train=2, views=25), 50)
+    data = WithSupport(Balls(train=1, views=25), 50)
     network = TargetConfig(depth=2, width=16, planes=50, point_octaves=2, direction_octaves=1)
-    hypernetwork = HyperNetworkConfig(views=50, normalisation="group", code=4, depth=1, width=8)
+    hypernetwork = HyperNetworkConfig(views=50, normalisation="group", code=2, depth=1, width=8)
     model = small_model(network=network, hypernetwork=hypernetwork)
-    trainer = train(model, data, TrainingConfig(steps=2, tasks=2, rays=16, evaluate_every=2))
+    trainer = train(model, data, TrainingConfig(steps=1, tasks=1, rays=16, held_out=0))
     assert trainer.model.rig.shape == (50, 3)
     task = data.task("test0")
     assert torch.equal(model.prepare(task.support).views.images, task.support.images)

@@ -27,9 +27,10 @@ class HullBlend:
     """The visual hull of the support masks is the surface, and its colour that of the support views that see it.
 
     A point lies in the hull where no view that shows it has background there. Its colour is a mean of the `nearest` of
-    the support views in front of which no part of the hull lies, by the angle between the direction of view and theirs:
-    a view at angle a of theirs weighs 1 / a - 1 / a_max, a_max being the angle of the next one (Buehler et al. 2001,
-    "Unstructured Lumigraph Rendering"). Where no view sees the point, the nearest ones serve.
+    the support views that see it, by the angle between the direction of view and theirs: one at angle a weighs
+    1 / a - 1 / a_max, a_max being the angle of the next one (Buehler et al. 2001, "Unstructured Lumigraph Rendering").
+    A view sees a point in front of which no part of the hull lies and where its mask is whole, so that no background is
+    mixed into the colour. Where fewer views see the point, the nearest of the others serve.
 
     Attributes:
         nearest: number of views that a colour is made of.

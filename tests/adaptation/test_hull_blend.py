@@ -10,7 +10,7 @@ from hyperplanes.metrics import psnr
 from hyperplanes.views import Views
 from tests.reference_rendering import ball_views, camera_at, ring
 
-SMALL = HullBlend(side=32, steps=96)
+SMALL = HullBlend(side=20, steps=64)
 
 
 def painted(cameras, colours):
@@ -22,8 +22,8 @@ def painted(cameras, colours):
 
 def test_a_ball_of_one_colour_has_it_in_every_view():
     blue = (0.2, 0.6, 0.9)
-    cameras = ring(2, (32, 32), shift=5)
-    pictures = SMALL.adapt(painted(ring(16, (32, 32)), [blue] * 16)).render(cameras)
+    cameras = ring(1, (24, 24), shift=5)
+    pictures = SMALL.adapt(painted(ring(10, (24, 24)), [blue] * 10)).render(cameras)
     truth = ball_views(cameras).masks
     inside = max_pool2d(1 - truth, 7, 1, 3) == 0  # three pixels from the edge
     found = pictures.images.movedim(1, -1)[inside[:, 0]]
@@ -33,16 +33,16 @@ def test_a_ball_of_one_colour_has_it_in_every_view():
 
 
 def test_seen_from_a_support_camera_it_is_nearly_that_image():
-    views = ball_views(ring(16, (32, 32)), colour=(0.9, 0.5, 0.2))
-    found = SMALL.adapt(views).render(views.cameras).images
-    assert psnr(found, views.images).mean() > 25
+    views = ball_views(ring(8, (24, 24)), colour=(0.9, 0.5, 0.2))
+    found = SMALL.adapt(views).render(views[:2].cameras).images
+    assert psnr(found, views.images[:2]).mean() > 25
 
 
 def test_a_view_from_behind_gives_no_colour():
     red, blue, green = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
     eyes = [(3.0, 0.0, 0.0), (-3.0, 0.0, 0.0), (0.0, 0.2, 3.0), (0.0, 0.2, -3.0), (0.3, 3.0, 0.3)]
     support = painted(concatenate([camera_at(eye, (32, 32)) for eye in eyes]), [red, blue, green, green, green])
-    blend = HullBlend(nearest=5, side=32, steps=96).adapt(support)
+    blend = HullBlend(nearest=5, side=20, steps=64).adapt(support)
     east, west = (
         blend.render(camera_at((side, 0.2, 0.1), (32, 32))).images[0, :, 14:18, 14:18] for side in (3.0, -3.0)
     )
@@ -53,7 +53,7 @@ def test_a_view_from_behind_gives_no_colour():
 
 
 def test_the_order_of_the_views_does_not_matter():
-    views, cameras = ball_views(ring(6)), ring(2, shift=1)
+    views, cameras = ball_views(ring(6)), ring(1, shift=1)
     one = SMALL.adapt(views).render(cameras).images
     other = SMALL.adapt(views[[3, 1, 5, 0, 2, 4]]).render(cameras).images
     torch.testing.assert_close(one, other)
