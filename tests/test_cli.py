@@ -27,6 +27,7 @@ from hyperplanes.cli import main
 from hyperplanes.commands import find_verbs
 from hyperplanes.data import read_task
 from hyperplanes.demo.pipeline import DemoSettings, configurations
+from hyperplanes.export import to_pixels
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.metrics import psnr
 from hyperplanes.presets import PRESETS
@@ -351,6 +352,20 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
         assert animation.n_frames == 2
     pictures = BakedScene(BakedField.load(out)).render(read_task(first_object(demo_folder())).query.cameras)
     assert 0 < float(pictures.opacity.mean()) < 1
+    scene = ["--views", str(first_object(demo_folder())), "--out", str(tmp_path / "again")]
+    assert main(["render", "--checkpoint", str(out), *scene]) == 0
+    names = sorted(Path(name).name for name in read_task(first_object(demo_folder())).query.names)
+    for name, image in zip(names, to_pixels(pictures.images).astype(int), strict=True):
+        assert abs(pixels(tmp_path / "again" / name) - image).max() <= 1
+    assert main(["export", "--checkpoint", str(out), *scene, "--what", "mesh", "--voxels", "32"]) == 0
+    assert re.search(r"overlap the rendered ones of 6 query views by [\d.]+%", capsys.readouterr().out)
+    assert main(["inspect", str(out)]) == 0
+    assert "of 32^3 voxels" in capsys.readouterr().out
+    capsys.readouterr()
+    assert main(["render", "--checkpoint", str(out), *scene, "--steps", "3"]) == 2
+    assert "steps: expected 0 with a baked file" in complaint(capsys)
+    assert main(["adapt", "--checkpoint", str(out), *scene]) == 2
+    assert "expected a checkpoint's folder to adapt with, got a file" in complaint(capsys)
     assert main([*command, "--voxels", "7"]) == 2
     assert "7" in complaint(capsys)
 
@@ -399,6 +414,22 @@ def test_views_of_a_world_with_z_up_are_adapted_to_as_if_y_were(tmp_path):
     assert main(["render", *common, "--views", str(turned), "--out", str(tmp_path / "z"), "--up", "z"]) == 0
     for path in (tmp_path / "y").iterdir():
         assert abs(pixels(path) - pixels(tmp_path / "z" / path.name)).max() <= 1
+
+
+def test_photographs_with_a_background_are_warned_about_and_ways_up_are_said(tmp_path, capsys):
+    scene = tmp_path / "photographs"
+    shutil.copytree(first_object(demo_folder()), scene)
+    for path in scene.rglob("*.png"):
+        with Image.open(path) as image:
+            image.convert("RGB").save(path)
+    capsys.readouterr()
+    command = ["render", "--checkpoint", str(demo_folder()), "--views", str(scene), "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    shown = capsys.readouterr()
+    assert "up: y, as the cameras are held; --up says otherwise" in shown.out
+    assert "rendering 6/6" in shown.out
+    assert "the views have no alpha and no masks" in shown.err
+    assert re.search("worse than copying the nearest view: .*; --steps 100 adapts", shown.err)
 
 
 def test_the_demonstration_does_nothing_twice(capsys):

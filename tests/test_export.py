@@ -10,12 +10,15 @@ from PIL import Image
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export import (
+    choose_level,
+    density_grid,
     encode_animation,
     extract_mesh,
     orbit_cameras,
     save_images,
     save_mesh,
     save_turntable,
+    silhouette_overlap,
     to_pixels,
     upward,
 )
@@ -74,6 +77,31 @@ def test_a_surface_that_leaves_the_cube_is_closed_there():
     mesh = trimesh.Trimesh(surface.vertices, surface.faces)
     assert mesh.is_watertight
     assert mesh.volume > 4**3
+
+
+def test_the_level_is_the_one_with_the_rendered_silhouettes():
+    """Closed form: a ball of density 8 within 0.5 and of 0.3 around it, up to 0.8: half opaque through its middle only.
+
+    A chord of length s through the haze is half opaque where 0.3 s = log 2, s = 2.3, which no chord has: the silhouette
+    is that of the core, where 8 s = log 2 at s = 0.09, which is a radius of 0.498. The default level, 11.1, misses it.
+    """
+
+    def field(points, directions):
+        distance = (points - points.new_tensor(CENTRE)).norm(dim=-1)
+        return torch.ones_like(points), 8.0 * (distance < 0.5) + 0.3 * ((distance >= 0.5) & (distance < RADIUS))
+
+    adapted = AdaptedField(field, full(BOUNDS, 16), Marched(steps=96))
+    density, cameras = density_grid(adapted, 64), views(3, 32).cameras
+    level = choose_level(adapted, density, cameras)
+    assert 0.3 < level < 8.0
+    surface = extract_mesh(adapted, level=level, density=density)
+    distance = np.linalg.norm(surface.vertices - np.array(CENTRE), axis=1)
+    assert np.abs(distance - 0.498).max() < 0.07
+    assert silhouette_overlap(surface, adapted, cameras) > 0.9
+    hazy = extract_mesh(adapted, level=0.1, density=density)
+    assert silhouette_overlap(hazy, adapted, cameras) == pytest.approx((0.5 / RADIUS) ** 2, abs=0.07)
+    with pytest.raises(ValueError, match="level: expected less than the highest density, 8, got 11.1"):
+        extract_mesh(adapted, density=density)
 
 
 def test_a_level_that_is_never_reached():

@@ -35,10 +35,10 @@ class Inspection:
 
     @property
     def has_problems(self) -> bool:
-        """Whether an object cannot be read, its poses contradict its masks, or a file has changed."""
+        """Whether an object cannot be read, its poses contradict its pictures, or a file has changed."""
         objects = self.description.objects
         damaged = self.verification is not None and not self.verification.intact
-        return damaged or bool(self.description.broken) or not all(one.conventions.consistent for one in objects)
+        return damaged or bool(self.description.broken) or not all(one.consistent for one in objects)
 
     def lines(self) -> list[str]:
         """All of it as text, a line a fact."""

@@ -1,63 +1,100 @@
-"""Do the poses mean what the file says? Masks decide: only with the right poses do the silhouettes agree."""
+"""Do the poses mean what the file says? Only with the right ones do silhouettes agree, and corners match.
+
+Masks decide where there are some, else corners of the pictures; what could not be checked is said.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
-from torch.nn.functional import interpolate, max_pool2d
 
 from hyperplanes.axes import flip_camera_axes
-from hyperplanes.data.bounds import estimate_bounds
+from hyperplanes.data.matches import Matches, match_pictures
+from hyperplanes.data.silhouettes import coarse_hull, masks_tell, small_masks
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.occupancy import Occupancy, carve
-from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Views
 
-__all__ = ["AS_DECLARED", "Conventions", "check_conventions"]
+__all__ = [
+    "AS_DECLARED",
+    "FEWEST_MATCHES",
+    "LEAST_COVERAGE",
+    "RANDOM",
+    "Conventions",
+    "check_conventions",
+    "near_lines",
+]
 
 AS_DECLARED = "as declared"
-SIDE = 32
-MASK = 64
-MOST_VIEWS = 16
 CLEARLY = 0.15
+LEAST_COVERAGE = 0.83  # of the masks by their hull: 0.86 to 0.95 with right poses, 0.24 to 0.80 with wrong ones
+FEWEST_MATCHES = 30
+NEAR = 2.0  # pixels of 256 from the epipolar line
+MATCHING, RANDOM = 0.6, 0.3  # of the matches are near with right poses, and at most that many with wrong ones
 
 
 @dataclass(frozen=True)
 class Conventions:
-    """How well the silhouettes agree under each reading of the poses.
+    """How well the pictures agree under each reading of the poses.
 
     Attributes:
-        scores: mean overlap (intersection over union, 0 to 1) of the masks with the silhouettes of their own visual
-            hull, by reading; empty where there are no masks to compare.
+        scores: by reading, from 0 to 1; empty where nothing can be compared. Of masks, their mean overlap
+            (intersection over union) with the silhouettes of their own visual hull; of pictures, the fraction of
+            matched corners within two pixels of their epipolar lines.
         best: the reading under which they agree best; "as declared" unless another one is clearly better.
+        by: "masks" or "pictures".
+        matches: how many corners were matched.
+        coverage: how much of the masks their hull covers with the poses as declared.
     """
 
     scores: dict[str, float]
     best: str
+    by: str = "masks"
+    matches: int = 0
+    coverage: float = 1.0
 
     @property
     def consistent(self) -> bool:
-        """Whether no other reading explains the masks clearly better."""
-        return self.best == AS_DECLARED
+        """Whether no other reading is clearly better, and the declared one is not impossible."""
+        if not self.scores:
+            return True
+        possible = self.coverage >= LEAST_COVERAGE if self.by == "masks" else self.scores[AS_DECLARED] >= RANDOM
+        return self.best == AS_DECLARED and possible
 
     def line(self) -> str:
         """One line for people."""
         if not self.scores:
-            return "conventions: not checked, the images have no masks"
+            return f"conventions: not checked, there are no masks, and only {self.matches} corners could be matched"
         declared = self.scores[AS_DECLARED]
-        if self.consistent:
-            others = max(score for name, score in self.scores.items() if name != AS_DECLARED)
+        others = max(score for name, score in self.scores.items() if name != AS_DECLARED)
+        what, measure = (
+            ("masks", "coarse hull's overlap")
+            if self.by == "masks"
+            else (f"{self.matches} matched corners of the pictures", "on their epipolar lines")
+        )
+        if self.best != AS_DECLARED:
             return (
-                f"conventions: masks agree with the poses (coarse hull's overlap {declared:.0%}; under other readings "
-                f"of the poses {others:.0%} at best)"
+                f"conventions: WRONG, the {what} agree with the poses as declared by {declared:.0%} only, but by "
+                f"{self.scores[self.best]:.0%} if the poses are {self.best}; convert them, or correct the declaration"
             )
+        if not self.consistent and self.by == "masks":
+            return (
+                f"conventions: WRONG, the hull of the masks covers {self.coverage:.0%} of them (with right poses "
+                f"{LEAST_COVERAGE:.0%} or more), and no more under any reading that is tried; check that poses and "
+                "pictures belong together"
+            )
+        if not self.consistent:
+            return (
+                f"conventions: WRONG, the {what} agree with the poses by {declared:.0%} only ({measure}), and under no "
+                "reading that is tried; check that poses and pictures belong together"
+            )
+        if self.by == "pictures" and declared < MATCHING:
+            return f"conventions: unclear, {declared:.0%} of the {what} are {measure}; inspect cameras.png"
         return (
-            f"conventions: WRONG, the masks agree with the poses as declared by {declared:.0%} only, but by "
-            f"{self.scores[self.best]:.0%} if the poses are {self.best}; convert them, or correct the declaration"
+            f"conventions: {what} agree with the poses ({measure} {declared:.0%}; under other readings of the poses "
+            f"{others:.0%} at best)"
         )
 
 
@@ -66,18 +103,37 @@ def check_conventions(views: Views) -> Conventions:
     """Try the ways in which poses are commonly mistaken for others.
 
     Args:
-        views: of one scene; without masks nothing can be said.
+        views: of one scene.
 
     Returns:
-        The overlap under each reading of the poses.
+        The agreement under each reading of the poses: of the masks, or without masks of the pictures.
     """
-    if views.masks is None or len(views) < 3 or not 0 < float((views.masks > 0).float().mean()) < 0.95:
-        return Conventions({}, AS_DECLARED)
-    chosen = torch.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().long()
-    masks, cameras = _small(views.masks[chosen], camera.select(views.cameras, chosen))
-    scores = {name: _overlap(masks, cameras, pose) for name, pose in _readings(cameras).items()}
+    if not masks_tell(views) or len(views) < 3:
+        return _by_pictures(views)
+    masks, cameras = small_masks(views)
+    readings = {name: camera.with_poses(cameras, pose) for name, pose in _readings(cameras).items()}
+    scores = {name: coarse_hull(masks, turned).overlap(masks, turned) for name, turned in readings.items()}
+    declared = readings[AS_DECLARED]
+    coverage = coarse_hull(masks, declared).coverage(masks, declared)
+    return Conventions(scores, _clearly_best(scores), coverage=coverage)
+
+
+def _by_pictures(views: Views) -> Conventions:
+    matches = match_pictures(views)
+    if len(matches) < FEWEST_MATCHES:
+        return Conventions({}, AS_DECLARED, "pictures", len(matches))
+    scores = {name: near_lines(matches, pose) for name, pose in _readings(views.cameras).items()}
+    return Conventions(scores, _clearly_best(scores), "pictures", len(matches))
+
+
+def near_lines(matches: Matches, pose: Tensor) -> float:
+    """The fraction of matches that are on their epipolar lines."""
+    return float((matches.errors(pose) < NEAR).double().mean())
+
+
+def _clearly_best(scores: dict[str, float]) -> str:
     best = max(scores, key=lambda name: scores[name])
-    return Conventions(scores, best if scores[best] > scores[AS_DECLARED] + CLEARLY else AS_DECLARED)
+    return best if scores[best] > scores[AS_DECLARED] + CLEARLY else AS_DECLARED
 
 
 def _readings(cameras: PinholeCamera) -> dict[str, Tensor]:
@@ -94,55 +150,3 @@ def _readings(cameras: PinholeCamera) -> dict[str, Tensor]:
 
 def _flip_rows(camera_from_world: Tensor) -> Tensor:
     return flip_camera_axes(camera_from_world.mT).mT
-
-
-def _overlap(masks: Tensor, cameras: PinholeCamera, pose: Tensor) -> float:
-    candidate = camera.with_poses(cameras, pose)
-    sphere = estimate_bounds(candidate)
-    ahead = camera.camera_from_world(candidate)[:, 2] @ pose.new_tensor([*sphere.centre, 1.0])
-    if (ahead > 0).float().mean() < 0.5:
-        return 0.0  # most cameras look away from where all would meet
-    for _ in range(2):  # the second time around what the first has found
-        hull = carve(masks, candidate, sphere, SIDE)
-        points = hull.centres()
-        points = points[sphere.normalise(points).norm(dim=-1) <= 1]
-        if not len(points):
-            return 0.0
-        middle = (points.amin(0) + points.amax(0)) / 2
-        radius = float((points - middle).norm(dim=-1).max()) + hull.voxel
-        sphere = Sphere(tuple(middle.tolist()), min(radius, sphere.radius))
-    seen = _silhouettes(points, hull, candidate)
-    wanted = masks[:, 0] > 0
-    union = (seen | wanted).flatten(1).sum(1)
-    return float(((seen & wanted).flatten(1).sum(1) / union.clamp_min(1)).mean())
-
-
-def _silhouettes(
-    points: Float[Tensor, "voxel 3"], hull: Occupancy, cameras: PinholeCamera
-) -> Bool[Tensor, "view height width"]:
-    """Which pixels see a voxel: its centre's pixel, and those around it as far as half the voxel reaches."""
-    height, width = camera.image_size(cameras)
-    matrices = camera.projection_matrices(cameras)
-    seen = torch.zeros(len(matrices), height, width, dtype=torch.bool)
-    for view, matrix in enumerate(matrices):
-        homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
-        front = homogeneous[homogeneous[:, 2] > hull.voxel]
-        column, row = (front[:, :2] / front[:, 2:]).round().long().unbind(-1)
-        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        if not inside.any():
-            continue
-        picture = torch.zeros(1, height, width)
-        picture[0, row[inside], column[inside]] = 1.0
-        focal = float(camera.intrinsics(cameras)[view, 0, 0])
-        reach = int(focal * hull.voxel / 2 / float(front[:, 2].median()))
-        seen[view] = max_pool2d(picture, 2 * reach + 1, 1, reach)[0] > 0
-    return seen
-
-
-def _small(masks: Tensor, cameras: PinholeCamera) -> tuple[Tensor, PinholeCamera]:
-    height, width = masks.shape[2:]
-    factor = MASK / max(height, width)
-    if factor >= 1:
-        return masks, cameras
-    size = max(1, round(height * factor)), max(1, round(width * factor))
-    return (interpolate(masks, size, mode="area") > 0.2).float(), camera.resized(cameras, *size)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
+from hyperplanes.data.checks import check_duplicates, check_gaze, check_splits
 from hyperplanes.data.conventions import Conventions, check_conventions
 from hyperplanes.data.dataset import Dataset
 from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
+from hyperplanes.views import Task
 
 __all__ = ["Description", "ObjectDescription", "describe"]
 
@@ -32,7 +35,10 @@ class ObjectDescription:
         bounds: centre and radius of the sphere that holds the scene.
         extent: side lengths of the box around the visual hull, or None without masks.
         coverage: mean opacity of the pixels, or None without masks.
-        conventions: whether masks and poses agree.
+        conventions: whether pictures and poses agree.
+        problems: what else is wrong with it, a sentence each.
+        checks: what else was looked at, or could not be, a sentence each.
+        notes: what the reading left out, turned or scaled.
     """
 
     name: str
@@ -45,6 +51,14 @@ class ObjectDescription:
     extent: tuple[float, float, float] | None
     coverage: float | None
     conventions: Conventions
+    problems: tuple[str, ...] = ()
+    checks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def consistent(self) -> bool:
+        """Whether nothing is known to be wrong with it."""
+        return self.conventions.consistent and not self.problems
 
 
 @dataclass(frozen=True)
@@ -82,10 +96,13 @@ class Description:
             if first.extent is not None and first.coverage is not None:
                 box = " x ".join(f"{side:.3g}" for side in first.extent)
                 lines.append(f"visual hull: {box}, {first.coverage:.0%} of the pixels covered")
-            wrong = [one for one in self.objects if not one.conventions.consistent]
-            lines.append((wrong or self.objects)[0].conventions.line())
+            wrong = [one for one in self.objects if not one.consistent]
+            shown = (wrong or self.objects)[0]
+            lines += [shown.conventions.line(), *shown.problems, *shown.checks]
             if wrong:
-                lines.append(f"conventions: wrong in {len(wrong)} of {len(self.objects)} objects looked at")
+                names = ", ".join(one.name for one in wrong)
+                lines.append(f"wrong: {len(wrong)} of {len(self.objects)} objects looked at: {names}")
+            lines += [f"{one.name}: {note}" for one in self.objects for note in one.notes]
         if self.unlisted:
             lines.append(f"not in the split file, so trained on: {self.unlisted}, named in the manifest")
         lines += [f"skipped by the generator: {name}: {reason}" for name, reason in self.skipped]
@@ -108,7 +125,9 @@ def describe(path: str | Path | Dataset, objects: int = 8) -> Description:
     found, broken = [], []
     for name in names[::step][:objects]:
         try:
-            found.append(_object(data, name))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # the notes are listed
+                found.append(_object(data, name))
         except DataError as error:
             broken.append((name, str(error)))
     splits = {split: len(data.names(split)) for split in ("train", "val", "test")}
@@ -118,7 +137,8 @@ def describe(path: str | Path | Dataset, objects: int = 8) -> Description:
 
 
 def _object(data: Dataset, name: str) -> ObjectDescription:
-    task = data.task(name)
+    posed = data.posed(name)
+    task = posed.task()
     views = task.support
     eyes = camera.centres(views.cameras)
     distance = (eyes - eyes.new_tensor(views.bounds.centre)).norm(dim=-1)
@@ -142,4 +162,15 @@ def _object(data: Dataset, name: str) -> ObjectDescription:
         extent,
         coverage,
         check_conventions(views),
+        *_checked(task),
+        posed.notes,
     )
+
+
+def _checked(task: Task) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What is wrong, and what was looked at besides."""
+    same = check_duplicates(task.support) or check_duplicates(task.query)
+    outcomes = [check_gaze(task.support), check_splits(task.support, task.query)]
+    problems = [same] if same else []
+    problems += [line for fine, line in outcomes if not fine]
+    return tuple(problems), tuple(line for fine, line in outcomes if fine)

@@ -1,0 +1,138 @@
+"""Source of truth: scenes whose poses are right by construction, and the same ones made wrong in a known way."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from hyperplanes.data.checks import check_duplicates, check_gaze, check_splits
+from hyperplanes.data.conventions import check_conventions
+from hyperplanes.data.matches import match_pictures, sampson
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.views import Views
+
+SIZE, RADIUS = 96, 0.8
+
+
+def photographs(count, start=0.0):
+    """A textured ball before a textured room, without masks; cameras a few degrees apart. Each pixel in closed form."""
+    angle = start + torch.arange(count) * 0.12
+    eyes = 3 * torch.stack([angle.sin(), 0.25 * (angle * 5).sin(), angle.cos()], -1)
+    cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), camera.look_at(eyes), SIZE, SIZE)
+    pixels = pixel_grid(SIZE, SIZE)
+    images = []
+    for view in range(count):
+        rays = cast(cameras, torch.full((len(pixels),), view), pixels)
+        along = -(rays.origins * rays.directions).sum(-1)
+        for radius, sign in ((RADIUS, -1.0), (6.0, 1.0)):
+            square = radius**2 - rays.origins.square().sum(-1) + along.square()
+            points = rays.origins + (along + sign * square.clamp_min(0).sqrt())[:, None] * rays.directions
+            if radius == RADIUS:
+                near, hit = points, square > 0
+        points = torch.where(hit[:, None], near * 7, points * 2)
+        cells = (points * 1.7).floor()
+        values = torch.frac((cells @ torch.tensor([12.9898, 78.233, 37.719])).sin().abs() * 43758.5453)
+        images.append(values.reshape(1, SIZE, SIZE).expand(3, -1, -1))
+    return Views(torch.stack(images), cameras)
+
+
+def moved(views, matrix):
+    """The pictures posed in another world."""
+    return replace(views, cameras=camera.with_poses(views.cameras, views.cameras.extrinsics @ matrix))
+
+
+def other_world():
+    turn = torch.eye(4)
+    turn[:3] = torch.tensor([[0.0, 0, 1, 0], [1, 0, 0, 0.8], [0, 1, 0, 0]])
+    return turn
+
+
+def balls(scene_class, views=12):
+    """Views of the ball of conftest with masks."""
+    scene = scene_class(views=views)
+    pixels = torch.from_numpy(np.stack(scene.pictures)).permute(0, 3, 1, 2).float() / 255
+    pose = torch.from_numpy(scene.camera_from_world).float()
+    cameras = camera.pinhole(torch.from_numpy(scene.matrix).float(), pose, *scene.size)
+    return Views(scene.over_white(), cameras, (pixels[:, 3:] > 0).float())
+
+
+def test_sampsons_error_is_opencvs():
+    generator = np.random.default_rng(0)
+    pixels = generator.uniform(0, 100, (1, 2, 2))
+    matrix = np.array([[80.0, 0, 50], [0, 90, 40], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(np.array([0.1, -0.2, 0.3]))[0], [0.5, 0.1, -0.2]
+    x, y, z = pose[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    fundamental = np.linalg.inv(matrix).T @ cross @ pose[:3, :3] @ np.linalg.inv(matrix)
+    homogeneous = [np.append(pixels[0, side], 1.0)[:, None] for side in (0, 1)]
+    expected = cv2.sampsonDistance(homogeneous[0], homogeneous[1], fundamental)  # the square of ours
+    ours = sampson(*(torch.from_numpy(each) for each in (pixels, matrix[None], matrix[None], pose[None])))
+    assert float(ours) ** 2 == pytest.approx(expected, rel=1e-6)
+
+
+def test_photographs_without_masks_are_checked_by_their_corners():
+    views = photographs(8)
+    matches = match_pictures(views)
+    assert float(matches.errors(views.cameras.extrinsics).median()) < 0.5
+    found = check_conventions(views)
+    assert found.consistent
+    assert found.by == "pictures"
+    assert "matched corners of the pictures agree with the poses" in found.line()
+    rolled = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ views.cameras.extrinsics
+    wrong = check_conventions(replace(views, cameras=camera.with_poses(views.cameras, rolled)))
+    assert not wrong.consistent
+    assert "WRONG" in wrong.line()
+    plain = replace(views, images=torch.full_like(views.images, 0.5))
+    assert "not checked, there are no masks, and only 0 corners" in check_conventions(plain).line()
+
+
+def test_photographs_in_the_axes_of_another_program_are_recognised():
+    views = photographs(8)
+    flipped = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])) @ views.cameras.extrinsics
+    found = check_conventions(replace(views, cameras=camera.with_poses(views.cameras, flipped)))
+    assert not found.consistent
+    fine, line = check_gaze(replace(views, cameras=camera.with_poses(views.cameras, flipped)))
+    assert (fine, "only 0 of 8 look at one place (0 have it ahead)" in line) == (False, True)
+    assert check_gaze(views) == (True, "cameras: 8 of 8 look at one place")
+
+
+def test_masks_that_agree_under_no_reading_are_wrong(scene):
+    """Poses dealt out at random explain no mask; the relative comparison alone called them right."""
+    views = balls(type(scene))
+    assert check_conventions(views).consistent
+    order = [5, 9, 0, 7, 11, 2, 10, 1, 4, 3, 6, 8]
+    cut = views.masks.clone()
+    cut[::2, :, :, 16:] = 0.0
+    cut[1::2, :, :, :16] = 0.0
+    wrong = check_conventions(replace(views, masks=cut, images=views.images)[order])
+    assert not wrong.consistent
+    assert "WRONG, the hull of the masks covers" in wrong.line()
+
+
+def test_one_picture_for_many_poses_is_found(scene):
+    views = balls(type(scene))
+    assert check_duplicates(views) is None
+    names = tuple(f"{index}.png" for index in range(12))
+    repeated = replace(views, images=views.images[[0, 1, 2, 0, 0, 5, 6, 7, 8, 9, 10, 0]], names=names)
+    assert "4 of 12 poses have the picture of another pose (0.png and 3.png" in check_duplicates(repeated)
+    assert check_duplicates(views[[0, 0, 1]]) is None  # the same view twice is no contradiction
+
+
+def test_splits_in_different_worlds_are_found(scene):
+    whole = balls(type(scene), 16)
+    support, query = whole[::2], whole[1::2]
+    assert check_splits(support, query)[0]
+    fine, line = check_splits(support, moved(query, other_world()))
+    assert not fine
+    assert "posed in different worlds" in line
+    opaque = photographs(9)
+    assert check_splits(opaque[::2], opaque[1::2])[0]
+    turn = torch.eye(4)
+    turn[:3, :3] = torch.from_numpy(cv2.Rodrigues(np.array([0.0, 0.2, 0.2]))[0])
+    fine, line = check_splits(opaque[::2], moved(opaque[1::2], turn))
+    assert not fine
+    assert "corners matched between support and query" in line
