@@ -113,7 +113,7 @@ def _checksum(tensors: Mapping[str, Tensor]) -> str:
     for name in sorted(tensors):
         value = tensors[name].contiguous()
         result.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
-        result.update(value.reshape(-1).view(torch.uint8).numpy())
+        result.update(value.reshape(-1).view(torch.uint8).numpy().data)
     return result.hexdigest()
 
 

@@ -159,7 +159,7 @@ def start_pull(s, height, width):
 
 @inner
 @no_type_check
-def back_project(s, points, at, pitch, matrices, view, height, width, gradients, sums):
+def back_project(s, points, at, pitch, matrices, view, gradients, sums):
     """GRAD_U, GRAD_V -> added to the `gradients` of points, laid out like these, and to the view's row of `sums`.
 
     What was clamped has no gradient. With h = M (x, 1) and (u, v) = (h0, h1) / h2:
@@ -169,18 +169,15 @@ def back_project(s, points, at, pitch, matrices, view, height, width, gradients,
     m10, m11, m12 = matrices[view, 1, 0], matrices[view, 1, 1], matrices[view, 1, 2]
     m20, m21, m22 = matrices[view, 2, 0], matrices[view, 2, 1], matrices[view, 2, 2]
     zero = s.dtype.type(0)
-    right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
     s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = s20 = s21 = s22 = s23 = zero
     for i in range(BLOCK):
         x, y, z = load(points, at + i), load(points, at + pitch + i), load(points, at + 2 * pitch + i)
         reciprocal = load(s, RECIPROCAL + i)
-        # Without a gradient RAW_U may be anything, but h2 is zero there only if it is finite.
-        raw_u, raw_v, front = load(s, RAW_U + i), load(s, RAW_V + i), reciprocal > zero
-        free_u, free_v = front & (raw_u >= zero) & (raw_u <= right), front & (raw_v >= zero) & (raw_v <= bottom)
-        raw_u, raw_v = raw_u if free_u else zero, raw_v if free_v else zero
-        h0 = load(s, GRAD_U + i) * reciprocal if free_u else zero
-        h1 = load(s, GRAD_V + i) * reciprocal if free_v else zero
-        h2 = -(h0 * raw_u + h1 * raw_v)
+        # Clamped pixels differ from those before clamping, also where these are NaN, and are always finite.
+        u, v, front = load(s, U + i), load(s, V + i), reciprocal > zero
+        h0 = load(s, GRAD_U + i) * reciprocal if front & (load(s, RAW_U + i) == u) else zero
+        h1 = load(s, GRAD_V + i) * reciprocal if front & (load(s, RAW_V + i) == v) else zero
+        h2 = -(h0 * u + h1 * v)
         store(gradients, at + i, load(gradients, at + i) + m00 * h0 + m10 * h1 + m20 * h2)
         store(gradients, at + pitch + i, load(gradients, at + pitch + i) + m01 * h0 + m11 * h1 + m21 * h2)
         store(gradients, at + 2 * pitch + i, load(gradients, at + 2 * pitch + i) + m02 * h0 + m12 * h1 + m22 * h2)

@@ -74,7 +74,7 @@ def backward(points, pitch, matrices, given, by, images, packed, bits, height, w
                     pull_plane(s, images, (view * channels + c) * size, height, width, c)
             # From pixels to points and matrices, or to the coordinates.
             if points is not None:
-                back_project(s, points, p, pitch, matrices, view, height, width, grad_points, sums)
+                back_project(s, points, p, pitch, matrices, view, grad_points, sums)
             if given is not None:
                 at = 2 * view * pitch + p
                 for i in range(BLOCK):
