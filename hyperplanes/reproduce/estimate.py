@@ -90,6 +90,7 @@ class _Measured:
 
 def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measured:
     trainer = _trainer(runner, experiment, trained)
+    trainer.names = trainer.names[: trainer.config.tasks]  # their planes and hulls are made by the first step
     trainer.take_step()
     _wait()
     started = time.perf_counter()
@@ -100,6 +101,7 @@ def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measu
     task = trainer.data.task(trainer.names[0])
     field = trainer.model.adapt(task.support)
     view = camera.resized(camera.select(task.query.cameras, [0]), SIDE, SIDE)
+    field.render(view)  # what is empty is found once an object
     started = time.perf_counter()
     field.render(view)
     _wait()
