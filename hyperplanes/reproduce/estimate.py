@@ -9,8 +9,11 @@ from dataclasses import dataclass
 
 import torch
 
+from hyperplanes.adaptation.fine_tuning import FineTuning
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.formatting import format_duration, format_rate
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.meta_training import initialisation_trainer
 from hyperplanes.reproduce.engine import Runner
 from hyperplanes.reproduce.experiments import Experiment, Trained
 from hyperplanes.training import Trainer
@@ -50,22 +53,24 @@ def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
     rows, whole = [], 0.0
     for trained in experiment.trainings:
         chosen = runner.configuration(experiment, trained, 0)
-        step, pixel = _measure(runner, experiment, trained)
-        training = step * chosen.training.steps
+        measured = _measure(runner, experiment, trained)
+        training = measured.step * chosen.training.steps
+        learned = chosen.model.initialisation
+        tuned = FineTuning().rays if learned is None else learned.test_rays
         evaluation = 0.0
         for cell in experiment.cells:
             if cell.trained == trained:
                 names = runner.names(cell.on, cell.split, experiment.objects)
                 task = runner.tasks(cell.on).task(names[0])
                 tuning = re.search(r"_(\d+)$", runner.scale.method(cell.method))
-                steps = step * int(tuning[1]) if tuning else 0.0
-                evaluation += len(names) * (steps + pixel * len(task.query) * task.query.size[0] * task.query.size[1])
-        rate = chosen.training.tasks * chosen.training.rays / step
+                rays = tuned * int(tuning[1]) if tuning else 0
+                pixels = len(task.query) * task.query.size[0] * task.query.size[1]
+                evaluation += len(names) * (rays / measured.rays_per_second + measured.pixel * pixels)
         rows.append(
             (
                 f"{trained.method} on {trained.on}" + "".join(f", {n} {v}" for n, v in trained.changes.items()),
                 f"{seeds} x {chosen.training.steps:,}",
-                format_rate(rate),
+                format_rate(measured.rays_per_second),
                 format_duration(seeds * training),
                 format_duration(seeds * evaluation),
             )
@@ -74,13 +79,18 @@ def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
     return Estimate(rows, whole)
 
 
-def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> tuple[float, float]:
-    """Seconds of a training step and of a rendered pixel."""
-    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+@dataclass(frozen=True)
+class _Measured:
+    """Seconds of a training step and of a rendered pixel, and the rays a second of the former."""
 
-    chosen = runner.configuration(experiment, trained, 0)
-    data = runner.arranged(trained, chosen)
-    trainer = Trainer(HyperPlanes(chosen.model).to(runner.device), data, chosen.training)
+    step: float
+    pixel: float
+    rays_per_second: float
+
+
+def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measured:
+    trainer = _trainer(runner, experiment, trained)
+    trainer.names = trainer.names[: trainer.config.tasks]  # their planes and hulls are made by the first step
     trainer.take_step()
     _wait()
     started = time.perf_counter()
@@ -88,13 +98,24 @@ def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> tuple[
         trainer.take_step()
     _wait()
     step = (time.perf_counter() - started) / STEPS
-    task = data.task(trainer.names[0])
+    task = trainer.data.task(trainer.names[0])
     field = trainer.model.adapt(task.support)
     view = camera.resized(camera.select(task.query.cameras, [0]), SIDE, SIDE)
+    field.render(view)  # what is empty is found once an object
     started = time.perf_counter()
     field.render(view)
     _wait()
-    return step, (time.perf_counter() - started) / SIDE**2
+    return _Measured(step, (time.perf_counter() - started) / SIDE**2, trainer.rays_per_step / step)
+
+
+def _trainer(runner: Runner, experiment: Experiment, trained: Trained) -> Trainer:
+    """A training that is never saved."""
+    chosen = runner.configuration(experiment, trained, 0)
+    model, data = HyperPlanes(chosen.model).to(runner.device), runner.arranged(trained, chosen)
+    if chosen.model.initialisation is None:
+        return Trainer(model, data, chosen.training)
+    reference = trained.reference and _trainer(runner, experiment, trained.reference).model
+    return initialisation_trainer(model, data, chosen.training, None, reference)
 
 
 def _wait() -> None:

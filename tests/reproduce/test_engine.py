@@ -98,10 +98,10 @@ def test_seeds_are_of_trainings(out, given):
 
 
 def test_an_estimate_counts_every_seed(out, given, capsys):
-    command = ["reproduce", "hyperplanes", "--scale", "smoke", "--estimate", "--out", str(out), *given]
+    command = ["reproduce", "shapenet", "--scale", "smoke", "--estimate", "--out", str(out), *given]
     assert main([*command, "--seeds", "3"]) == 0
     shown = capsys.readouterr().out
-    assert shown.count("hyperplanes on plane, model.hypernetwork.views") == 4
+    assert all(shown.count(f"{method} on ") == 3 for method in ("hyperplanes", "mv_meta", "mv_matched", "sv_meta"))
     assert "3 x 2" in shown
     assert "hours" in shown
 
