@@ -12,6 +12,7 @@ import os
 import shutil
 import stat
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Generator, Mapping
@@ -52,8 +53,8 @@ LARGEST_FILE = 2 * 2**30
 
 MALFORMED = (
     ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError,
-    NotImplementedError, RecursionError, RuntimeError, TypeError, ValueError, struct.error, zipfile.BadZipFile,
-    zlib.error,
+    NotImplementedError, RecursionError, RuntimeError, SyntaxError, TypeError, ValueError, struct.error,
+    zipfile.BadZipFile, tokenize.TokenError, zlib.error,
 )  # fmt: skip
 """What parsers raise where content is not what they took for granted."""
 
