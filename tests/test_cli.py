@@ -40,7 +40,7 @@ SHARED = ROOT.parent / "shared"
 def tiny_preset():
     """The preset "quick" with small networks and few gradient steps."""
     quick = PRESETS["quick"]
-    network = replace(quick.model.network, depth=2, width=16)
+    network = replace(quick.model.network, depth=2, width=16, planes=6)
     initialisation = replace(quick.initialisation, inner_steps=1, steps=2, test_rays=32)
     return replace(quick, model=replace(quick.model, network=network), initialisation=initialisation)
 

@@ -62,7 +62,7 @@ def test_one_inner_step_of_reptile_is_a_gradient_step_on_support_rays():
     int(torch.randint(1, (), generator=generator))  # the object
     rays_generator = torch.Generator().manual_seed(int(torch.randint(2**31, (), generator=generator)))
     trainer = Trainer(model_of("mv_meta"), Balls(train=1), FAST)
-    episode = trainer._episode("train0")
+    episode = trainer._prefetcher.get("train0")
     views = episode.prepared.views
     rays, truth = views.sample_rays(FAST.rays, generator=rays_generator, among=episode.support_live)
     field = trainer.model.field(episode.prepared, trainer.model.theta)

@@ -70,7 +70,7 @@ def test_poses_that_are_mistaken_are_recognised_and_named(tmp_path, change, name
 def test_without_masks_it_says_that_nothing_was_checked(tmp_path):
     found = inspect(write(tmp_path / "ball", alpha=False), tmp_path / "out")
     assert not found.has_problems
-    assert "conventions: not checked, the images have no masks" in found.lines()
+    assert "conventions: not checked, there are no masks, and only 0 corners could be matched" in found.lines()
 
 
 def test_an_object_that_cannot_be_read_is_listed_and_the_rest_is_looked_at(tmp_path):
