@@ -22,10 +22,10 @@ from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.diagnostics import diagnose
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.data.dataset import open_datasets
-from hyperplanes.episodes import prepare_episode
 from hyperplanes.metrics import psnr
 from hyperplanes.presets import Preset, preset
 from hyperplanes.training import Trainer
+from hyperplanes.training.episodes import prepare_episode
 from hyperplanes.views import Tasks
 
 __all__ = ["VARIANTS", "main", "measure", "variant"]

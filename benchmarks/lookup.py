@@ -25,7 +25,7 @@ from benchmarks._timing import copy_bandwidth, interleaved, peak_bytes, ratio, t
 from benchmarks.lookup_plot import plot
 from benchmarks.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
 from benchmarks.reporting import Row
-from hyperplanes.environment import environment
+from hyperplanes.utilities.environment import environment
 
 __all__ = ["main"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from hyperplanes.environment import environment
+from hyperplanes.utilities.environment import environment
 
 __all__ = ["Row", "finish"]
 

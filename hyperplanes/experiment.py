@@ -19,8 +19,8 @@ import yaml
 from hyperplanes.adaptation.configuration import ModelConfig
 from hyperplanes.files import DataError, write_whole
 from hyperplanes.presets import Preset
-from hyperplanes.settings import SettingsError, nearest, structure
 from hyperplanes.training import TrainingConfig
+from hyperplanes.utilities.settings import SettingsError, nearest, structure
 
 __all__ = ["changed", "document", "parse_options", "read_experiment", "write_experiment"]
 

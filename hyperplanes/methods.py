@@ -17,10 +17,10 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.initialisation import LEARNED, shuffled
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
-from hyperplanes.entry_points import load_entries
 from hyperplanes.fields import find_targets
 from hyperplanes.presets import configure
 from hyperplanes.rendering.samplers import Sampler
+from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.views import Views
 
 __all__ = ["METHODS", "Method", "at_steps", "WithSampler", "describe_method", "find_methods", "make_method"]

@@ -14,8 +14,8 @@ from data_gen.datasets.generate import Procedural, generate
 from hyperplanes.checkpoints import CheckpointError, load_tensors
 from hyperplanes.cli import _terminable, main
 from hyperplanes.data import open_dataset
-from hyperplanes.data.images import read_image
-from hyperplanes.data.npz import read_npz
+from hyperplanes.data.formats.npz import read_npz
+from hyperplanes.data.pictures.images import read_image
 from hyperplanes.files import DataError, malformed, one_writer, read_bytes, read_json
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -15,7 +15,7 @@ from small_demo import demo_folder
 from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
 from hyperplanes.demo.charts import line_chart
 from hyperplanes.demo.pictures import ERROR_SCALE, colour_scale, error_map
-from hyperplanes.environment import find_commit
+from hyperplanes.utilities.environment import find_commit
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 

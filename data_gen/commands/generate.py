@@ -21,7 +21,7 @@ import tyro
 from data_gen import SUPERSAMPLE
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, optional
-from hyperplanes.formatting import format_duration
+from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     from data_gen.datasets.generate import GenerationReport, MeshFolder, Procedural

@@ -22,7 +22,7 @@ class Inspection:
     """What was found and written.
 
     Attributes:
-        description: `hyperplanes.data.describe.Description` of the data set.
+        description: `hyperplanes.data.inspection.describe.Description` of the data set.
         files: the pictures that were written.
         notes: what could not be done and why, one line each.
         verification: of the checksums, where it was requested.
@@ -60,7 +60,7 @@ def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS, *, check
         no cameras.png, and a note.
     """
     from hyperplanes.data import open_dataset
-    from hyperplanes.data.describe import describe
+    from hyperplanes.data.inspection.describe import describe
 
     data, out = open_dataset(path), Path(out)
     description = describe(data, objects)

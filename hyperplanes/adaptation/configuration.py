@@ -12,7 +12,7 @@ from hyperplanes.checkpoints import CheckpointError, read_json
 from hyperplanes.fields import TargetConfig
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
-from hyperplanes.settings import SettingsError, choose_by_tag, structure
+from hyperplanes.utilities.settings import SettingsError, choose_by_tag, structure
 
 __all__ = ["ORDERS", "ModelConfig", "checkpoint_folder"]
 

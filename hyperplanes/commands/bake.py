@@ -20,7 +20,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, refuse_baked
 from hyperplanes.commands.options import OptionalInt, ViewsUp, optional
 from hyperplanes.commands.scene import read_scene
-from hyperplanes.formatting import format_duration
+from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from hyperplanes.commands.console import Console
-from hyperplanes.formatting import format_duration
+from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     from hyperplanes.demo.pipeline import DemoSettings

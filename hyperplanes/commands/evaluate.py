@@ -27,13 +27,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, Up, optional
-from hyperplanes.formatting import format_duration
+from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from hyperplanes.comparison import Comparison
     from hyperplanes.evaluation import Score
+    from hyperplanes.evaluation.comparison import Comparison
 
 __all__ = ["Arguments", "as_json", "compared_rows", "headings", "rows", "run", "with_seed"]
 
@@ -62,7 +62,7 @@ class Arguments:
         curve: Draw PSNR over --steps into this file.
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         seeds: How many seeds.
-        lpips: Measure LPIPS with these weights, a safetensors file; see `hyperplanes.perceptual` for how to make it.
+        lpips: Measure LPIPS with these weights, a safetensors file that `hyperplanes.evaluation.perceptual` describes.
         split: Which objects.
         objects: Only the first so many.
         support: Support views an object; more than there are go on with the query views.
@@ -153,14 +153,14 @@ def run(arguments: Arguments) -> int:
     """Evaluate all methods, print the table and write what was asked for."""
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.pretrained import find_checkpoints
-    from hyperplanes.comparison import compare_all
     from hyperplanes.data import open_dataset
+    from hyperplanes.data.support import WithSupport
     from hyperplanes.devices import TasksOnDevice, choose_device
     from hyperplanes.evaluation import evaluate_all
+    from hyperplanes.evaluation.comparison import compare_all
+    from hyperplanes.evaluation.perceptual import LPIPS
     from hyperplanes.methods import WithSampler, at_steps, make_method
-    from hyperplanes.perceptual import LPIPS
     from hyperplanes.presets import PROTOCOLS
-    from hyperplanes.support import WithSupport
 
     if arguments.curve is not None and len(arguments.steps) < 2:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
@@ -233,7 +233,7 @@ def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Compar
     """Every file but the grid of pictures."""
     from hyperplanes.evaluation import QUANTITIES
     from hyperplanes.files import write_json, write_whole
-    from hyperplanes.tables import csv_table, markdown_table
+    from hyperplanes.utilities.tables import csv_table, markdown_table
 
     if arguments.json is not None:
         write_json(arguments.json, as_json(scores, pairs))
@@ -267,7 +267,7 @@ def as_json(scores: Sequence[Score], pairs: Sequence[Comparison]) -> Mapping[str
 
 def _draw_boxes(scores: Sequence[Score], path: Path) -> None:
     """The objects' PSNR, a box a method."""
-    from hyperplanes.plots import draw_boxes, new_figure, save_figure
+    from hyperplanes.utilities.plots import draw_boxes, new_figure, save_figure
 
     figure = new_figure(max(5.0, 1.4 * len(scores)), 4.0)
     axes = figure.subplots()
@@ -280,7 +280,7 @@ def _draw_boxes(scores: Sequence[Score], path: Path) -> None:
 def _draw_curve(scores: Sequence[Score], methods: Sequence[str], steps: Sequence[int], path: Path) -> None:
     """PSNR over fine-tuning steps of every method; of one that takes none, a level."""
     from hyperplanes.methods import at_steps
-    from hyperplanes.plots import draw_lines, new_figure, save_figure, set_counts
+    from hyperplanes.utilities.plots import draw_lines, new_figure, save_figure, set_counts
 
     quality = {score.method: score.mean("psnr") for score in scores}
     curves = {}
@@ -313,7 +313,7 @@ class _Pictures:
         found[method] = to_pixels(pictures.images[view : view + 1])[0]
 
     def draw(self, path: Path) -> None:
-        from hyperplanes.plots import draw_grid, save_figure
+        from hyperplanes.utilities.plots import draw_grid, save_figure
 
         columns = list(next(iter(self.seen.values())))
         save_figure(draw_grid([list(row.values()) for row in self.seen.values()], columns, list(self.seen)), path)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from hyperplanes.formatting import format_duration
+from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     import torch

@@ -20,7 +20,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, ViewsUp, optional
 from hyperplanes.commands.scene import read_scene
-from hyperplanes.formatting import format_duration
+from hyperplanes.utilities.formatting import format_duration
 
 __all__ = ["Arguments", "run"]
 

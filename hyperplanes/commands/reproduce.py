@@ -93,13 +93,13 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.commands.train import follow
     from hyperplanes.devices import choose_device
     from hyperplanes.files import write_json, write_whole
-    from hyperplanes.formatting import format_duration
-    from hyperplanes.plots import save_figure
     from hyperplanes.reproduce import EXPERIMENTS, SCALES, report
     from hyperplanes.reproduce.engine import Runner
     from hyperplanes.reproduce.estimate import estimate
     from hyperplanes.reproduce.figures import figure_of
     from hyperplanes.training import start_training
+    from hyperplanes.utilities.formatting import format_duration
+    from hyperplanes.utilities.plots import save_figure
 
     console, device = Console(), choose_device(arguments.device)
     scale = SCALES[arguments.scale]

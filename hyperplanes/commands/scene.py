@@ -29,7 +29,7 @@ def read_scene(
     Returns:
         Views of a world with y up, and the direction that was up before.
     """
-    from hyperplanes.data.recognise import read_posed, read_posed_task
+    from hyperplanes.data.formats.recognise import read_posed, read_posed_task
     from hyperplanes.data.upright import guess_up, upright_task
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.views import Task

@@ -36,12 +36,12 @@ from hyperplanes.commands.options import (
     Protocol,
     optional,
 )
-from hyperplanes.formatting import format_duration, format_rate
+from hyperplanes.utilities.formatting import format_duration, format_rate
 
 if TYPE_CHECKING:
     from hyperplanes.presets import Preset
     from hyperplanes.training import Progress, Trainer
-    from hyperplanes.watching import TensorBoard
+    from hyperplanes.training.watching import TensorBoard
 
 __all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 
@@ -168,7 +168,7 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
     """
     from hyperplanes.experiment import changed, parse_options, read_experiment
     from hyperplanes.presets import preset
-    from hyperplanes.settings import SettingsError
+    from hyperplanes.utilities.settings import SettingsError
 
     given = read_experiment(arguments.config) if arguments.config else {}
     chosen = preset(arguments.preset or given.get("preset", "quick"))
@@ -213,11 +213,11 @@ def run(arguments: Arguments) -> int:
 def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.pretrained import find_checkpoints
     from hyperplanes.data.dataset import open_datasets
+    from hyperplanes.data.support import WithSupport
     from hyperplanes.devices import choose_device
     from hyperplanes.experiment import write_experiment
-    from hyperplanes.support import WithSupport
     from hyperplanes.training import start_training
-    from hyperplanes.watching import TensorBoard
+    from hyperplanes.training.watching import TensorBoard
 
     console = Console()
     method, chosen = resolve(arguments)

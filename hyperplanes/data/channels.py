@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyperplanes.data.npz import read_arrays
+from hyperplanes.data.formats.npz import read_arrays
 from hyperplanes.files import DataError
 
 __all__ = ["CHANNELS", "mesh_path", "read_channel"]

@@ -9,11 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hyperplanes.data.catalogue import SPLITS
-from hyperplanes.data.posed import PosedTask
-from hyperplanes.data.recognise import find_catalogue, read_posed, read_posed_task
+from hyperplanes.data.formats.catalogue import SPLITS
+from hyperplanes.data.formats.recognise import find_catalogue, read_posed, read_posed_task
+from hyperplanes.data.pictures.posed import PosedTask
 from hyperplanes.files import DataError, malformed
-from hyperplanes.lru_cache import LRUCache
+from hyperplanes.utilities.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
 
 __all__ = ["Dataset", "Datasets", "open_dataset", "open_datasets", "read_task", "read_views"]

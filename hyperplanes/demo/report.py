@@ -17,10 +17,10 @@ from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
 from hyperplanes.demo.content import Pixels
 from hyperplanes.demo.pipeline import METHODS, MODELS, DemoSettings, describe_row
 from hyperplanes.demo.stages import Stages
-from hyperplanes.environment import environment
 from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.files import encode_png, write_whole
-from hyperplanes.formatting import format_duration
+from hyperplanes.utilities.environment import environment
+from hyperplanes.utilities.formatting import format_duration
 from hyperplanes.views import Tasks
 
 __all__ = ["describe", "how_it_was_made", "overview", "write_report"]

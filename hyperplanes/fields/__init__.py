@@ -3,10 +3,10 @@
 Another package adds one by an entry point of the group `hyperplanes.fields` that names a subclass of `Target`.
 """
 
-from hyperplanes.entry_points import load_entries
 from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.multiplane import MultiPlaneNeRF, PointMultiPlaneNeRF
 from hyperplanes.fields.nerf import NeRF
+from hyperplanes.utilities.entry_points import load_entries
 
 __all__ = [
     "TARGETS",

@@ -15,6 +15,7 @@ from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.pretrained import find_checkpoints
 from hyperplanes.checkpoints import read_json
 from hyperplanes.data import open_dataset
+from hyperplanes.data.support import WithSupport
 from hyperplanes.devices import TasksOnDevice
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.files import encode_json, write_json
@@ -23,7 +24,6 @@ from hyperplanes.presets import PROTOCOLS, Preset
 from hyperplanes.reproduce.configurations import configuration
 from hyperplanes.reproduce.experiments import Cell, Experiment, Trained
 from hyperplanes.reproduce.scales import Scale
-from hyperplanes.support import WithSupport
 from hyperplanes.views import Tasks
 
 __all__ = ["Outcome", "Runner"]

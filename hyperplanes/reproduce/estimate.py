@@ -11,12 +11,12 @@ import torch
 
 from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.formatting import format_duration, format_rate
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.meta_training import initialisation_trainer
 from hyperplanes.reproduce.engine import Runner
 from hyperplanes.reproduce.experiments import Experiment, Trained
 from hyperplanes.training import Trainer
+from hyperplanes.training.meta_training import initialisation_trainer
+from hyperplanes.utilities.formatting import format_duration, format_rate
 
 __all__ = ["Estimate", "estimate"]
 

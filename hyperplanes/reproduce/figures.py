@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyperplanes.plots import draw_bars, draw_boxes, draw_lines, new_figure
 from hyperplanes.reproduce.engine import Curve, Outcome
 from hyperplanes.reproduce.report import value
+from hyperplanes.utilities.plots import draw_bars, draw_boxes, draw_lines, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from statistics import fmean, pstdev
 from typing import Any
 
-from hyperplanes.environment import environment
 from hyperplanes.evaluation import Score
 from hyperplanes.reproduce.configurations import deviations
 from hyperplanes.reproduce.engine import Outcome
 from hyperplanes.reproduce.experiments import Cell
-from hyperplanes.tables import csv_table, markdown_table
+from hyperplanes.utilities.environment import environment
+from hyperplanes.utilities.tables import csv_table, markdown_table
 
 __all__ = ["as_csv", "as_json", "as_markdown", "headings", "rows", "value", "what_differs"]
 

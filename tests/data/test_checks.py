@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from hyperplanes.data.checks import check_duplicates, check_gaze, check_splits
-from hyperplanes.data.conventions import check_conventions
-from hyperplanes.data.matches import match_pictures, sampson
+from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_splits
+from hyperplanes.data.inspection.conventions import check_conventions
+from hyperplanes.data.inspection.matches import match_pictures, sampson
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
 from hyperplanes.views import Views

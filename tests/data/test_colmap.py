@@ -10,8 +10,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from hyperplanes.data import DataError, open_dataset, read_task, read_views
-from hyperplanes.data.colmap import read_colmap
-from hyperplanes.data.undistort import distort, undistort
+from hyperplanes.data.formats.colmap import read_colmap
+from hyperplanes.data.pictures.undistort import distort, undistort
 from hyperplanes.geometry import cameras as camera
 
 COEFFICIENTS = (-0.12, 0.05, 0.01, -0.008, 0.02, 0.01, -0.02, 0.005)

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from hyperplanes.data import DataError, read_task, read_views
-from hyperplanes.data.posed import Posed
+from hyperplanes.data.pictures.posed import Posed
 from hyperplanes.geometry import cameras as camera
 
 
@@ -162,7 +162,7 @@ def test_bounds_are_those_of_the_support(scene, tmp_path):
         other.pictures[index] = np.full_like(other.pictures[index], 255)
     task = read_task(other.write(tmp_path / "b"))
     assert task.support.bounds == whole.support.bounds == task.query.bounds
-    from hyperplanes.data.recognise import read_posed
+    from hyperplanes.data.formats.recognise import read_posed
 
     scene_of_all = read_posed(tmp_path / "a")
     assert isinstance(scene_of_all, Posed)

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from hyperplanes.data import read_task, read_views
-from hyperplanes.data.transforms_document import transforms_document
-from hyperplanes.data.transforms_json import read_transforms
+from hyperplanes.data.formats.transforms_document import transforms_document
+from hyperplanes.data.formats.transforms_json import read_transforms
 from hyperplanes.geometry import cameras as camera
 
 CHAIR = Path(__file__).parents[3] / "shared/posed/chair"

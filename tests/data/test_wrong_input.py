@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from hyperplanes.data import DataError, Dataset, open_dataset, read_channel, read_task, read_views
-from hyperplanes.data.catalogue import FORMAT
-from hyperplanes.data.npz import read_npz
+from hyperplanes.data.formats.catalogue import FORMAT
+from hyperplanes.data.formats.npz import read_npz
 
 
 def refused(action, *argument, match):

@@ -17,7 +17,7 @@ from hyperplanes.fields.baked import BakedField
 from hyperplanes.files import encode_json, sha256
 from hyperplanes.geometry import Sphere, cameras
 from hyperplanes.presets import configure
-from hyperplanes.training_state import load_state, save_state
+from hyperplanes.training.state import load_state, save_state
 
 VIEWS, HEIGHT, WIDTH = 4, 10, 12
 CONFIG = {"steps": 3, "seed": 0}

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from hyperplanes.data.bounds import estimate_bounds
-from hyperplanes.data.conventions import check_conventions
-from hyperplanes.data.undistort import distort
+from hyperplanes.data.inspection.conventions import check_conventions
+from hyperplanes.data.pictures.bounds import estimate_bounds
+from hyperplanes.data.pictures.undistort import distort
 from hyperplanes.data.upright import upright, y_up_from
 from hyperplanes.export import orbit_cameras
 from hyperplanes.geometry import ImagePlanes, Sphere, cameras, carve, cast

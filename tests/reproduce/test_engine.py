@@ -7,10 +7,10 @@ import pytest
 
 from hyperplanes.cli import main
 from hyperplanes.data import open_dataset
+from hyperplanes.data.support import WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.methods import make_method
 from hyperplanes.reproduce import EXPERIMENTS, SCALES
-from hyperplanes.support import WithSupport
 
 CLASSES = ("car", "chair", "lamp", "plane")
 

@@ -23,7 +23,7 @@ from data_gen.datasets.manifest import verify
 from data_gen.datasets.sources import list_items
 from data_gen.rigs import RIG_PRESETS, fixed, make_rig
 from hyperplanes.data import DataError, Dataset
-from hyperplanes.data.describe import describe
+from hyperplanes.data.inspection.describe import describe
 from hyperplanes.geometry import cameras as camera
 
 SMALL = {"views": 4, "resolution": 16, "workers": 1}

@@ -1,0 +1,85 @@
+"""What a data set holds, whatever its layout: names, splits, and how to read one object."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from hyperplanes.data.formats.transforms_json import read_transforms_task
+from hyperplanes.data.pictures.posed import PosedTask
+from hyperplanes.files import DataError
+
+__all__ = ["FORMAT", "SPLITS", "Catalogue", "is_plain", "native"]
+
+FORMAT = "hyperplanes-dataset"
+"""The value of "format" in a native manifest.json."""
+
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """The objects of a data set.
+
+    Attributes:
+        layout: "native", "posed", "srn", "learnit-128" or "hyperplanes-200".
+        splits: the names of each of SPLITS, in their order.
+        read: from a name to its pictures.
+        manifest: what manifest.json says, empty without one.
+        skipped: a line about each list of objects of which some are missing.
+    """
+
+    layout: str
+    splits: dict[str, tuple[str, ...]]
+    read: Callable[[str], PosedTask]
+    manifest: dict[str, Any] = field(default_factory=dict)
+    skipped: tuple[str, ...] = ()
+
+
+def native(folder: Path, manifest: dict[str, Any]) -> Catalogue:
+    """The catalogue of a native data set.
+
+    Args:
+        folder: what holds manifest.json.
+        manifest: its content.
+
+    Returns:
+        The catalogue.
+
+    Raises:
+        DataError: a manifest of another version, or splits that are not lists of plain names.
+    """
+    source = folder / "manifest.json"
+    if manifest.get("version") != 1:
+        raise DataError(source, "version 1", repr(manifest.get("version")), "read it with the release that wrote it")
+    splits = manifest_splits(source, manifest)
+    return Catalogue("native", splits, lambda name: read_transforms_task(folder / name, name, complete=True), manifest)
+
+
+def manifest_splits(source: Path, manifest: dict[str, Any]) -> dict[str, tuple[str, ...]]:
+    """The names in each split of a manifest, checked to be plain file names.
+
+    Raises:
+        DataError: no splits, or names that are not plain file names.
+    """
+    splits = manifest.get("splits")
+    if not isinstance(splits, dict):
+        raise DataError(source, "splits, a list of names each", repr(splits)[:40], "generate the data set again")
+    result = {}
+    for split in SPLITS:
+        names = splits.get(split, [])
+        if not isinstance(names, list) or not all(isinstance(name, str) and is_plain(name) for name in names):
+            raise DataError(source, f"plain names in splits.{split}", repr(names)[:60], "correct the manifest")
+        result[split] = tuple(names)
+    return result
+
+
+def is_plain(name: str) -> bool:
+    """Whether a name is a single path component.
+
+    >>> is_plain("car_0001"), is_plain("../car"), is_plain("")
+    (True, False, False)
+    """
+    return PurePosixPath(name).name == name and name not in {"", ".", ".."} and "\\" not in name and "\0" not in name

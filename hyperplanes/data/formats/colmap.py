@@ -1,0 +1,237 @@
+"""COLMAP's sparse models, text or binary, to posed pictures; distorted pictures are undistorted."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.masks import find_masks
+from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.files import DataError, inside, read_bytes, read_text
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["find_model", "read_colmap"]
+
+# COLMAP's number, name and parameters of the camera models that are read
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
+    1: ("PINHOLE", ("fx", "fy", "cx", "cy")),
+    2: ("SIMPLE_RADIAL", ("f", "cx", "cy", "k1")),
+    3: ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
+    4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    6: ("FULL_OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+}
+_PARAMETERS = dict(_MODELS.values())
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_PLACES = ("sparse", "dense/sparse", "dense", "distorted/sparse", "colmap/sparse", "colmap")
+_REMEDY = "export the model again with COLMAP"
+
+
+@dataclass(frozen=True)
+class _Camera:
+    size: tuple[int, int]
+    matrix: npt.NDArray[np.float64]
+    coefficients: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Image:
+    name: str
+    camera: int
+    camera_from_world: npt.NDArray[np.float64]
+
+
+def find_model(folder: str | Path) -> Path | None:
+    """The folder with cameras and images files, where COLMAP and the tools around it put it; None where there is none.
+
+    That is the folder itself, or sparse/0 of it (sparse/1, ...), sparse, dense/sparse, dense, distorted/sparse/0 and
+    colmap/sparse/0. Of the parts of a reconstruction that fell into several, the one with most pictures.
+
+    >>> find_model("no such folder") is None
+    True
+    """
+    folder = Path(folder)
+    if _is_model(folder):
+        return folder
+    for place in _PLACES:
+        parts = [path for path in sorted((folder / place).glob("[0-9]*")) if _is_model(path)]
+        if parts:
+            return max(parts, key=_count)
+        if _is_model(folder / place):
+            return folder / place
+    return None
+
+
+def read_colmap(folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None) -> Posed:
+    """The posed pictures of a COLMAP reconstruction.
+
+    COLMAP's world and its OpenCV axes are kept; its principal point counts from the pictures' borders. Pictures lie in
+    images/ or input/ beside sparse/, above it, or beside the model. Cameras with distortion (SIMPLE_RADIAL, RADIAL,
+    OPENCV, FULL_OPENCV) keep their calibration, their pictures are resampled. Masks may lie in masks/ beside the
+    pictures' folder.
+
+    Args:
+        folder: the project, or the model itself.
+        bounds: of the scene; estimated when None.
+        downscale: as in `assemble`.
+
+    Returns:
+        The pictures, sorted by name.
+
+    Raises:
+        DataError: no model, a camera model that is not read (fisheye), a truncated file, or pictures that are missing.
+    """
+    folder = Path(folder)
+    model = find_model(folder)
+    if model is None:
+        raise DataError(folder, "cameras and images, .bin or .txt", "neither", "check the path")
+    binary = (model / "images.bin").is_file() and (model / "cameras.bin").is_file()
+    suffix = ".bin" if binary else ".txt"
+    paths = model / f"cameras{suffix}", model / f"images{suffix}"
+    try:
+        if binary:
+            cameras, images = _cameras_binary(paths[0]), _images_binary(paths[1])
+        else:
+            cameras, images = _cameras_text(paths[0]), _images_text(paths[1])
+    except DataError:
+        raise
+    except (struct.error, IndexError, UnicodeDecodeError, ValueError) as error:
+        raise DataError(model, "a whole COLMAP model", f"a broken one ({error})", _REMEDY) from error
+    if not images:
+        raise DataError(paths[1], "registered images", "none", "reconstruct again")
+    images = sorted(images, key=lambda image: image.name)
+    absent = [image.name for image in images if image.camera not in cameras]
+    if absent:
+        raise DataError(paths[0], f"the camera of {absent[0]}", "none", _REMEDY)
+    home = _pictures_folder(folder, model, images, paths[1])
+    frames = []
+    for image in images:
+        seen = cameras[image.camera]
+        frames.append(
+            Frame(
+                inside(home, image.name, paths[1]),
+                image.name,
+                check_pose(image.camera_from_world, paths[1], image.name),
+                partial(_scaled, seen),
+                seen.size,
+                seen.coefficients,
+            )
+        )
+    masks = find_masks(home.parent / "masks", [frame.path for frame in frames])
+    if masks:
+        frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
+    return assemble(frames, paths[1], bounds=bounds, downscale=downscale)[0]
+
+
+def _is_model(folder: Path) -> bool:
+    return any(
+        all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")) for suffix in (".bin", ".txt")
+    )
+
+
+def _count(model: Path) -> int:
+    """How large a part of a reconstruction is: the bytes of its file of images."""
+    return max((model / name).stat().st_size for name in ("images.bin", "images.txt") if (model / name).is_file())
+
+
+def _pictures_folder(folder: Path, model: Path, images: list[_Image], source: Path) -> Path:
+    """The folder that holds most of the pictures: images or input, beside the model or up to four folders above."""
+    roots = [folder, model, *list(model.absolute().parents)[:4]]
+    homes = [root / name for root in roots for name in ("images", "input")] + [folder, model]
+    homes = list(dict.fromkeys(home for home in homes if home.is_dir()))
+    chosen = [image.name for image in images[:: max(1, len(images) // 20)]]
+
+    def present(home: Path) -> int:
+        return sum((home / inside(home, name, source).relative_to(home)).is_file() for name in chosen)
+
+    return max(homes, key=present)
+
+
+def _scaled(seen: _Camera, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """The calibration of a camera for pictures of another size: the borders stay in place."""
+    scale = np.array([size[1] / seen.size[1], size[0] / seen.size[0]])
+    matrix = seen.matrix.copy()
+    matrix[[0, 1], [0, 1]] *= scale
+    matrix[:2, 2] = scale * (matrix[:2, 2] + 0.5) - 0.5
+    return matrix
+
+
+def _camera(model: str, width: int, height: int, values: list[float], path: Path) -> _Camera:
+    if model not in _PARAMETERS:
+        known = ", ".join(_PARAMETERS)
+        raise DataError(path, f"one of the camera models {known}", model, "run COLMAP's image_undistorter")
+    named = dict(zip(_PARAMETERS[model], values, strict=True))
+    focal = named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
+    matrix = np.array([[focal[0], 0.0, named["cx"] - 0.5], [0.0, focal[1], named["cy"] - 0.5], [0.0, 0.0, 1.0]])
+    return _Camera((height, width), matrix, tuple(named.get(name, 0.0) for name in _COEFFICIENTS))
+
+
+def _pose(quaternion: npt.NDArray[np.float64], translation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = translation
+    return pose
+
+
+def _lines(path: Path) -> Iterator[list[str]]:
+    for line in read_text(path).splitlines():
+        if not line.startswith("#"):
+            yield line.split()
+
+
+def _cameras_text(path: Path) -> dict[int, _Camera]:
+    return {
+        int(words[0]): _camera(words[1], int(words[2]), int(words[3]), [float(word) for word in words[4:]], path)
+        for words in _lines(path)
+        if words
+    }
+
+
+def _images_text(path: Path) -> list[_Image]:
+    images = []
+    lines = _lines(path)
+    for words in lines:
+        if not words:
+            continue
+        numbers = np.array(words[1:8], dtype=np.float64)
+        images.append(_Image(" ".join(words[9:]), int(words[8]), _pose(numbers[:4], numbers[4:])))
+        next(lines, None)  # the points of this image, possibly none
+    return images
+
+
+def _cameras_binary(path: Path) -> dict[int, _Camera]:
+    data, at = read_bytes(path), 8
+    cameras = {}
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        number, model, width, height = struct.unpack_from("<iiQQ", data, at)
+        name, parameters = _MODELS.get(model, (f"number {model}", ()))
+        values = struct.unpack_from(f"<{len(parameters)}d", data, at + 24)
+        cameras[number] = _camera(name, width, height, list(values), path)
+        at += 24 + 8 * len(parameters)
+    return cameras
+
+
+def _images_binary(path: Path) -> list[_Image]:
+    data, at = read_bytes(path), 8
+    images = []
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        values = struct.unpack_from("<i7di", data, at)
+        end = data.index(b"\0", at + 64)
+        pose = _pose(np.array(values[1:5]), np.array(values[5:8]))
+        images.append(_Image(data[at + 64 : end].decode(), values[8], pose))
+        at = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
+    if at > len(data):
+        raise ValueError(f"{path.name} ends early")
+    return images

@@ -1,0 +1,118 @@
+"""LLFF's layout: poses_bounds.npy beside images (Mildenhall et al., 2019; NeRF's forward-facing scenes)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
+from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.files import DataError
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["FILE", "is_llff", "read_llff"]
+
+FILE = "poses_bounds.npy"
+LARGEST_FILE = 64 * 2**20
+
+
+def is_llff(folder: Path) -> bool:
+    """Whether a folder is in LLFF's layout."""
+    return (folder / FILE).is_file()
+
+
+def read_llff(folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None) -> Posed:
+    """The posed pictures of a scene in LLFF's layout.
+
+    A row of poses_bounds.npy is a 3 x 5 matrix, row by row, and two depths: the axes of the camera in the world (down,
+    right, backwards), its centre, and (height, width, focal length); the nearest and the farthest depth that it shows.
+    The principal point is the middle of the picture. Rows are in the order of the sorted names of the pictures, which
+    lie in images/, or scaled down by N in images_N/, of which the largest are read.
+
+    Args:
+        folder: with poses_bounds.npy.
+        bounds: of the scene; estimated when None.
+        downscale: as in `assemble`.
+
+    Returns:
+        The pictures in the order of their names.
+
+    Raises:
+        DataError: another array, or not one picture a row.
+    """
+    folder = Path(folder)
+    source = folder / FILE
+    rows = _rows(source)
+    pictures = _pictures(folder, len(rows))
+    frames = []
+    for path, row in zip(pictures, rows, strict=True):
+        matrix = row[:15].reshape(3, 5)
+        height, width, focal = matrix[:, 4]
+        if not (np.isfinite(matrix).all() and min(height, width, focal) > 0):
+            found = f"{height:g}, {width:g}, {focal:g} for {path.name}"
+            raise DataError(source, "a positive height, width and focal length in each row", found, "write it again")
+        down, right, backwards, centre = matrix[:, :4].T
+        world_from_camera = check_pose(np.stack([right, down, -backwards, centre], 1), source, path.name)
+        pose = np.eye(4)
+        pose[:3, :3] = world_from_camera[:3, :3].T
+        pose[:3, 3] = -pose[:3, :3] @ world_from_camera[:3, 3]
+        near, far = row[15:]
+        frames.append(
+            Frame(
+                path,
+                path.relative_to(folder).as_posix(),
+                pose,
+                _Calibration(width, focal),
+                (round(height), round(width)),
+                depths=(float(near), float(far)) if 0 < near < far < np.inf else None,
+            )
+        )
+    return assemble(frames, source, bounds=bounds, downscale=downscale)[0]
+
+
+class _Calibration:
+    """The calibration of a picture whose principal point is its middle."""
+
+    def __init__(self, width: float, focal: float) -> None:
+        self.relative = focal / width
+
+    def __call__(self, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+        height, width = size
+        focal = self.relative * width
+        return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+
+
+def _rows(source: Path) -> npt.NDArray[np.float64]:
+    if source.stat().st_size > LARGEST_FILE:
+        raise DataError(source, f"at most {LARGEST_FILE} bytes", f"{source.stat().st_size}", "is it LLFF's file?")
+    try:
+        rows = np.load(source, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise DataError(source, "an array of numbers", str(error), "write or download it again") from error
+    if (
+        not isinstance(rows, np.ndarray)
+        or rows.ndim != 2
+        or rows.shape[1] != 17
+        or not np.issubdtype(rows.dtype, np.number)
+    ):
+        found = f"{getattr(rows, 'dtype', '')} {getattr(rows, 'shape', 'an archive')}"
+        raise DataError(source, "an array (view, 17)", found, "write it again with LLFF's imgs2poses.py")
+    return rows.astype(np.float64)
+
+
+def _pictures(folder: Path, count: int) -> list[Path]:
+    """The largest pictures of which there is one a row, by name."""
+    scaled = [path for path in folder.iterdir() if path.is_dir() and re.fullmatch(r"images(_\d+)?", path.name)]
+    homes = sorted(scaled, key=lambda path: int(path.name.partition("_")[2] or 1))
+    found = {}
+    for home in homes:
+        files = sorted(path for path in home.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+        if len(files) == count:
+            return files
+        found[home.name] = len(files)
+    text = ", ".join(f"{number} in {name}" for name, number in found.items()) or "no folder images"
+    raise DataError(folder / FILE, f"{count} pictures, one a row", text, "copy all pictures to images/")

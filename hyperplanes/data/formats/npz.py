@@ -1,0 +1,213 @@
+"""The two layouts of the paper's data: learnit's folders (128 pixels) and the authors' .npz files (200 pixels)."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.data.formats.catalogue import SPLITS, Catalogue, is_plain
+from hyperplanes.data.formats.transforms_document import opencv_from_opengl
+from hyperplanes.data.formats.transforms_json import read_transforms, read_transforms_task
+from hyperplanes.data.pictures.bounds import stated_bounds
+from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
+from hyperplanes.files import MALFORMED, DataError, check_regular, read_json
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["AUTHORS_FOCAL", "catalogue", "read_arrays", "read_npz"]
+
+AUTHORS_FOCAL = 277.77
+"""Focal length in pixels of the authors' 200x200 pictures: Blender's 50 mm on 36 mm."""
+
+LARGEST_ARRAY = 2 * 2**30
+
+
+def read_npz(path: str | Path, *, legacy: bool = False, bounds: Sphere | None = None) -> Posed:
+    """The posed pictures of one object of the 200x200 data (HyperPlanes, MultiPlaneNeRF, points2nerf).
+
+    `images` (view, height, width, 3 or 4), 8 bits or floats in [0, 1]; `cam_poses` or `poses` (view, 4, 4), OpenGL
+    camera-to-world. Three channels lie over white and have no masks. `focal` in pixels, where present, replaces
+    277.77 per 200 pixels of width; `rgba` 8-bit with straight alpha, where present, replaces `images`.
+
+    Args:
+        path: the .npz file; pickles in it are refused.
+        legacy: put the principal point at W / 2 at integer pixel centres, as the authors' code does, instead of at
+            the middle of the picture, (W - 1) / 2.
+        bounds: of the scene; estimated when None.
+
+    Returns:
+        The pictures in the order of the file.
+
+    Raises:
+        DataError: not such a file, too large, or with other content.
+    """
+    path = Path(path)
+    arrays = read_arrays(path, {"images", "rgba", "cam_poses", "poses", "focal"})
+    poses = arrays.get("cam_poses", arrays.get("poses"))
+    images = arrays.get("rgba", arrays.get("images"))
+    if images is None or poses is None:
+        raise DataError(path, "arrays images and cam_poses", ", ".join(arrays) or "none", "check the file")
+    if images.ndim != 4 or images.shape[-1] not in (3, 4) or len(images) != len(poses) or 0 in images.shape:
+        found = f"images {images.shape}, poses {poses.shape}"
+        raise DataError(path, "images (view, height, width, 3 or 4), a pose each", found, "check the file")
+    rgba, alpha = _rgba(images, path)
+    checked = np.stack([check_pose(pose, path, str(index)) for index, pose in enumerate(poses)])
+    height, width = images.shape[1:3]
+    stated = arrays.get("focal", np.array([AUTHORS_FOCAL * width / 200]))
+    if stated.size != 1 or not np.issubdtype(stated.dtype, np.number):
+        raise DataError(path, "focal, one number of pixels", f"{stated.dtype} {stated.shape}", "check the file")
+    focal = float(stated.reshape(-1)[0])
+    shift = 0.0 if legacy else 0.5
+    matrix = np.array([[focal, 0.0, width / 2 - shift], [0.0, focal, height / 2 - shift], [0.0, 0.0, 1.0]])
+    return posed(
+        list(rgba),
+        opencv_from_opengl(checked),
+        np.tile(matrix, (len(rgba), 1, 1)),
+        has_alpha=alpha,
+        bounds=bounds,
+        names=tuple(f"{index:03d}" for index in range(len(rgba))),
+        source=path,
+    )
+
+
+def read_arrays(path: str | Path, names: set[str]) -> dict[str, npt.NDArray[Any]]:
+    """Some arrays of an .npz file; sizes are looked at before anything is unpacked, pickles are refused.
+
+    Args:
+        path: the file.
+        names: which arrays to read, those that there are.
+
+    Returns:
+        The arrays by name.
+
+    Raises:
+        DataError: no such file, not an .npz file, a pickle in it, or too large.
+    """
+    path = Path(path)
+    try:
+        check_regular(path)
+        with zipfile.ZipFile(path) as archive:
+            wanted = [entry for entry in archive.infolist() if entry.filename[:-4] in names]
+            total = sum(max(entry.file_size, _claimed_size(archive, entry)) for entry in wanted)
+        if total > LARGEST_ARRAY:
+            raise DataError(path, f"at most {LARGEST_ARRAY} bytes of arrays", f"{total}", "split it")
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files if name in names}
+    except FileNotFoundError as error:
+        raise DataError(path, "an .npz file", "nothing", "check the path") from error
+    except DataError:
+        raise
+    except MALFORMED + (OSError,) as error:
+        raise DataError(path, "an .npz file of plain arrays", str(error), "write or download it again") from error
+
+
+def _claimed_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
+    """The bytes that an array's own header says it has, whatever the archive says."""
+    with archive.open(entry) as member:
+        version = np.lib.format.read_magic(member)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(member)
+    if min(shape, default=0) < 0:
+        raise ValueError(f"an array of shape {shape}")
+    return math.prod(shape) * dtype.itemsize
+
+
+def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -> Catalogue | None:
+    """The catalogue of a folder in one of the two layouts.
+
+    learnit: CLASS_splits.json beside the folder of the class; CLASSs/NAME/transforms.json with its pictures beside it.
+    Names whose folder is missing are skipped and counted. The authors': CLASS/sampled/VIEWS_NAME.npz, sorted by name,
+    the first 80 % to train on and the last 20 % to test, unless a manifest says otherwise. In both, the first half of
+    the views is support and the rest query, as learnit's notebook and the authors' code take 25 and 25 of 50; in data
+    sets with a manifest, which `generate` wrote, views alternate.
+
+    Args:
+        folder: what may be in one of the layouts.
+        manifest: of the folder, empty without one.
+        legacy: as in `read_npz`.
+
+    Returns:
+        The catalogue; None when it is something else.
+    """
+    bounds = stated_bounds(manifest, folder / "manifest.json")
+    archives = sorted(folder.glob("*/sampled/*.npz")) or sorted(folder.glob("sampled/*.npz"))
+    if archives:
+        return _authors(archives, manifest, bounds, legacy)
+    splits = sorted(folder.glob("*_splits.json"))
+    return _learnit(folder, splits, manifest, bounds, legacy) if splits else None
+
+
+def _authors(archives: list[Path], manifest: dict[str, Any], bounds: Sphere | None, legacy: bool) -> Catalogue:
+    paths = {path.stem.rpartition("_")[2]: path for path in archives}
+    splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
+    if isinstance(manifest.get("splits"), dict):
+        for split in SPLITS:
+            names = (str(name).replace("_", "-") for name in manifest["splits"].get(split, []))
+            splits[split] = tuple(name for name in names if name in paths)
+    else:
+        for home in sorted({path.parent for path in archives}):
+            names = sorted(name for name, path in paths.items() if path.parent == home)
+            first, last = max(1, int(len(names) * 0.8)), max(1, int(len(names) * 0.2))
+            splits["train"] += tuple(names[:first])
+            splits["test"] += tuple(names[first:][-last:])
+    split = PosedTask.alternating if manifest else PosedTask.halves
+
+    def read(name: str) -> PosedTask:
+        return split(read_npz(paths[name], legacy=legacy, bounds=bounds), name)
+
+    return Catalogue("hyperplanes-200", splits, read, manifest)
+
+
+def _learnit(
+    folder: Path, files: list[Path], manifest: dict[str, Any], bounds: Sphere | None, legacy: bool
+) -> Catalogue:
+    homes: dict[str, Path] = {}
+    skipped: list[str] = []
+    splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
+    for file in files:
+        document = read_json(file)
+        for split in SPLITS:
+            names = document.get(split, [])
+            if not isinstance(names, list) or not all(isinstance(name, str) and is_plain(name) for name in names):
+                raise DataError(file, f"plain names in {split}", repr(names)[:60], "correct the file")
+            found = {name: home for name in names if (home := _home(folder, name, file)) is not None}
+            splits[split] += tuple(found)
+            homes |= found
+            if missing := [name for name in names if name not in found]:
+                skipped.append(f"{file}: skipped {len(missing)} of {len(names)} objects of {split} without a folder, "
+                               f"as {missing[0]}")  # fmt: skip
+    if not homes:
+        raise DataError(folder, "the objects that its splits name", "none of their folders", "download them again")
+
+    def read(name: str) -> PosedTask:
+        if manifest:
+            return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, flat=True, complete=True)
+        file = homes[name] / "transforms.json"
+        return PosedTask.halves(read_transforms(file, legacy=legacy, bounds=bounds, flat=True, complete=True), name)
+
+    return Catalogue("learnit-128", splits, read, manifest, tuple(skipped))
+
+
+def _home(folder: Path, name: str, file: Path) -> Path | None:
+    """The folder of an object, None where there is none."""
+    singular = file.name.removesuffix("_splits.json")
+    candidates = [folder / f"{singular}s" / name, folder / singular / name, folder / name]
+    candidates += [child / name for child in sorted(folder.iterdir()) if child.is_dir()]
+    return next((path for path in candidates if (path / "transforms.json").is_file()), None)
+
+
+def _rgba(images: npt.NDArray[Any], path: Path) -> tuple[npt.NDArray[np.uint8], bool]:
+    if images.dtype != np.uint8:
+        if not np.issubdtype(images.dtype, np.floating) or not np.isfinite(images).all():
+            raise DataError(path, "images of 8 bits or finite floats", f"{images.dtype}", "check the file")
+        if images.min() < 0 or images.max() > 1:
+            found = f"{images.min():g} to {images.max():g}"
+            raise DataError(path, "floating-point images in [0, 1]", found, "check the file")
+        images = np.rint(images * 255).astype(np.uint8)
+    if images.shape[-1] == 4:
+        return images, True
+    return np.concatenate([images, np.full_like(images[..., :1], 255)], -1), False

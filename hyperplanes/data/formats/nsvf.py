@@ -1,0 +1,144 @@
+"""NSVF's layout: intrinsics.txt, bbox.txt, pose/ and rgb/ with the split in the names (Liu et al., 2020)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
+from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
+from hyperplanes.files import DataError
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["is_nsvf", "read_nsvf", "read_nsvf_task"]
+
+_REMEDY = "download the scene again"
+
+
+def is_nsvf(folder: Path) -> bool:
+    """Whether a folder holds one scene in NSVF's layout: SRN's folders, and names that begin with the split."""
+    if not all((folder / name).exists() for name in ("intrinsics.txt", "rgb", "pose")):
+        return False
+    names = [path.name for path in (folder / "rgb").iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
+    return bool(names) and all(re.match(r"[012]_", name) for name in names)
+
+
+def read_nsvf(folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None) -> Posed:
+    """The posed pictures of a scene in NSVF's layout.
+
+    pose/*.txt are OpenCV camera-to-world; intrinsics.txt is a 3 x 3 or 4 x 4 calibration, or begins with
+    "f cx cy"; its principal point counts from the pictures' borders. bbox.txt, where it is, holds the corners of a box
+    around the scene.
+
+    Args:
+        folder: of the scene.
+        bounds: of the scene; the sphere around the box when None.
+        downscale: as in `assemble`.
+
+    Returns:
+        The pictures, sorted by name: those to train on, to validate with, and to test on.
+
+    Raises:
+        DataError: anything wrong with a file.
+    """
+    folder = Path(folder)
+    pictures = sorted(path for path in (folder / "rgb").iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+    if not pictures:
+        raise DataError(folder / "rgb", "pictures", "none", _REMEDY)
+    matrix, size = _intrinsics(folder / "intrinsics.txt")
+    frames = []
+    for path in pictures:
+        pose_file = folder / "pose" / f"{path.stem}.txt"
+        world_from_camera = check_pose(_numbers(pose_file, (16,)).reshape(4, 4), pose_file, path.stem)
+        pose = np.eye(4)
+        pose[:3, :3] = world_from_camera[:3, :3].T
+        pose[:3, 3] = -pose[:3, :3] @ world_from_camera[:3, 3]
+        frames.append(Frame(path, f"rgb/{path.name}", pose, _Calibration(matrix, size), size))
+    return assemble(frames, folder, bounds=bounds or _box(folder / "bbox.txt"), downscale=downscale)[0]
+
+
+def read_nsvf_task(folder: str | Path, name: str, *, downscale: int | None = None) -> PosedTask:
+    """Support and query of a scene: the pictures 0_* to train on and 2_* to test on, or 1_* where there are none.
+
+    Args:
+        folder: of the scene.
+        name: of the object.
+        downscale: as in `assemble`.
+
+    Returns:
+        The two halves; views alternate where the names leave one of them empty.
+    """
+    scene = read_nsvf(folder, downscale=downscale)
+    splits = [[at for at, each in enumerate(scene.names) if Path(each).name[0] == digit] for digit in "012"]
+    query = splits[2] or splits[1]
+    if not splits[0] or not query:
+        return PosedTask.alternating(scene, name)
+    return PosedTask.split(scene, splits[0], query, name)
+
+
+class _Calibration:
+    """The calibration for pictures of a size, from one for another size, or for the same where that is not stated."""
+
+    def __init__(self, matrix: npt.NDArray[np.float64], size: tuple[int, int] | None) -> None:
+        self.matrix, self.size = matrix, size
+
+    def __call__(self, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+        stated = self.size or size
+        result = self.matrix.copy()
+        result[:2] *= np.array([size[1] / stated[1], size[0] / stated[0]])[:, None]
+        result[:2, 2] -= 0.5
+        return result
+
+
+def _intrinsics(path: Path) -> tuple[npt.NDArray[np.float64], tuple[int, int] | None]:
+    """The calibration, the principal point from the borders, and (height, width) where the file states it."""
+    try:
+        lines = [[float(word) for word in line.split()] for line in path.read_text().splitlines() if line.strip()]
+    except (OSError, ValueError, UnicodeDecodeError) as error:
+        raise DataError(path, "a calibration in numbers", str(error), _REMEDY) from error
+    size = None
+    values = np.array([value for line in lines for value in line])
+    if len(lines) in (3, 4) and all(len(line) == len(lines) for line in lines):
+        matrix = values.reshape(len(lines), -1)[:3, :3].copy()
+    elif len(values) == 16:
+        matrix = values.reshape(4, 4)[:3, :3].copy()
+    elif lines and len(lines[0]) >= 3:
+        focal, x, y = lines[0][:3]
+        matrix = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
+        if len(lines[-1]) == 2 and min(lines[-1]) >= 1:
+            size = round(lines[-1][0]), round(lines[-1][1])
+    else:
+        raise DataError(path, "a 4 x 4 matrix, or f cx cy", f"{len(values)} numbers", _REMEDY)
+    if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise DataError(path, "finite numbers and positive focal lengths", f"{matrix.tolist()}", _REMEDY)
+    matrix[2] = [0.0, 0.0, 1.0]
+    return matrix, size
+
+
+def _box(path: Path) -> Sphere | None:
+    """The sphere around the box, None where there is no file."""
+    if not path.is_file():
+        return None
+    values = _numbers(path, (6, 7))  # the seventh is the side of a voxel
+    low, high = values[:3], values[3:6]
+    if not (high > low).all():
+        raise DataError(path, "a box: lowest corner, then the highest", f"{values.tolist()}", _REMEDY)
+    x, y, z = ((low + high) / 2).tolist()
+    return Sphere((x, y, z), float(np.linalg.norm(high - low) / 2))
+
+
+def _numbers(path: Path, counts: tuple[int, ...]) -> npt.NDArray[np.float64]:
+    expected = f"{' or '.join(map(str, counts))} finite numbers"
+    try:
+        values = np.array(path.read_text().split(), dtype=np.float64)
+    except FileNotFoundError as error:
+        raise DataError(path, expected, "nothing", _REMEDY) from error
+    except (ValueError, UnicodeDecodeError) as error:
+        raise DataError(path, expected, str(error), _REMEDY) from error
+    if len(values) not in counts or not np.isfinite(values).all():
+        raise DataError(path, expected, f"{len(values)}", _REMEDY)
+    return values

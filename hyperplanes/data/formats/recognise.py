@@ -1,0 +1,169 @@
+"""Which layout lies at a path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from hyperplanes.data.formats import colmap, idr, llff, npz, nsvf, srn
+from hyperplanes.data.formats.catalogue import FORMAT, Catalogue, native
+from hyperplanes.data.formats.transforms_json import find_transforms, read_transforms, read_transforms_task
+from hyperplanes.data.formats.unposed import refuse_unposed
+from hyperplanes.data.pictures.posed import Posed, PosedTask
+from hyperplanes.files import DataError, read_json
+
+__all__ = ["find_catalogue", "read_posed", "read_posed_task"]
+
+
+@dataclass(frozen=True)
+class _Format:
+    """A layout of one posed scene.
+
+    Attributes:
+        found: whether a folder is in it.
+        read: all of its pictures; a folder and a factor to scale down by.
+        read_task: support and query, where the layout has splits of its own; views alternate else.
+    """
+
+    found: Callable[[Path], bool]
+    read: Callable[[Path, int | None], Posed]
+    read_task: Callable[[Path, str, int | None], PosedTask] | None = None
+
+    def task(self, folder: Path, name: str, downscale: int | None) -> PosedTask:
+        if self.read_task is not None:
+            return self.read_task(folder, name, downscale)
+        return PosedTask.alternating(self.read(folder, downscale), name)
+
+
+_FORMATS = (
+    _Format(
+        lambda folder: bool(find_transforms(folder)),
+        lambda folder, downscale: read_transforms(find_transforms(folder), downscale=downscale),
+        lambda folder, name, downscale: read_transforms_task(folder, name, downscale=downscale),
+    ),
+    _Format(
+        nsvf.is_nsvf,
+        lambda folder, downscale: nsvf.read_nsvf(folder, downscale=downscale),
+        lambda folder, name, downscale: nsvf.read_nsvf_task(folder, name, downscale=downscale),
+    ),
+    _Format(srn.is_srn, lambda folder, downscale: srn.read_srn(folder).downscaled(downscale)),
+    _Format(
+        lambda folder: colmap.find_model(folder) is not None,
+        lambda folder, downscale: colmap.read_colmap(folder, downscale=downscale),
+    ),
+    _Format(llff.is_llff, lambda folder, downscale: llff.read_llff(folder, downscale=downscale)),
+    _Format(
+        lambda folder: idr.camera_file(folder) is not None,
+        lambda folder, downscale: idr.read_idr(folder, downscale=downscale),
+    ),
+)
+
+
+def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
+    """The catalogue of whatever lies at a path.
+
+    A manifest.json that names its layout decides; else the folder's content does: a posed scene (one object, in the
+    test split), SRN's, learnit's or the HyperPlanes authors' layout, or a folder of posed scenes (all in the test
+    split).
+
+    Args:
+        path: a folder, or a transforms file.
+        legacy: of learnit's and the authors' layouts, as in `npz.read_npz`.
+
+    Returns:
+        The catalogue; no picture has been read yet.
+
+    Raises:
+        DataError: nothing that is known lies there.
+    """
+    path = Path(path)
+    if path.is_file() and path.suffix in (".json", ".npz"):
+        return _one_scene(path, path.stem if path.suffix == ".npz" else path.resolve().parent.name)
+    if not path.is_dir():
+        refuse_unposed(path)
+        raise DataError(path, "the folder of a data set", "nothing", "check the path, or run hyperplanes generate")
+    manifest = read_json(path / "manifest.json") if (path / "manifest.json").is_file() else {}
+    if manifest.get("format") == FORMAT and manifest.get("layout", "native") == "native":
+        return native(path, manifest)
+    if nsvf.is_nsvf(path):
+        return _one_scene(path, path.resolve().name)
+    found = srn.catalogue(path, manifest) or npz.catalogue(path, manifest, legacy=legacy)
+    if found is not None:
+        return found
+    if _find_format(path) is not None:
+        return _one_scene(path, path.resolve().name)
+    children = {child.name: child for child in sorted(path.iterdir()) if child.is_dir() and _find_format(child)}
+    if children:
+        splits = {"train": (), "val": (), "test": tuple(children)}
+        return Catalogue("posed", splits, lambda name: _read_child(path, name))
+    refuse_unposed(path)
+    found_names = ", ".join(sorted(child.name for child in path.iterdir())[:5]) or "an empty folder"
+    raise DataError(path, "a data set or posed images", found_names, "generate one with hyperplanes generate")
+
+
+def read_posed(path: str | Path, downscale: int | None = None) -> Posed:
+    """All posed pictures of one scene.
+
+    Args:
+        path: a transforms*.json, the .npz of one object, or the folder of a scene in any layout.
+        downscale: as in `frames.assemble`.
+
+    Returns:
+        The pictures in the order of the files. Anything wrong with a file is a DataError.
+    """
+    path = Path(path)
+    if path.is_file() and path.suffix == ".npz":
+        return npz.read_npz(path).downscaled(downscale)
+    if path.is_file() and path.suffix == ".json":
+        return read_transforms(path, downscale=downscale)
+    return _format(path).read(path, downscale)
+
+
+def read_posed_task(path: str | Path, downscale: int | None = None) -> PosedTask:
+    """Support and query of one scene: as its files split it, or views in turn.
+
+    Args:
+        path: as in `read_posed`; of a transforms file, those beside it belong to the scene.
+        downscale: as in `frames.assemble`.
+
+    Returns:
+        The task, named after the folder or the .npz file. Anything wrong with a file is a DataError.
+    """
+    path = Path(path)
+    if path.is_file() and path.suffix == ".npz":
+        return PosedTask.alternating(npz.read_npz(path), path.stem).downscaled(downscale)
+    folder = path.parent if path.is_file() and path.suffix == ".json" else path
+    return _format(folder).task(folder, folder.resolve().name, downscale)
+
+
+def _one_scene(path: Path, name: str) -> Catalogue:
+    """One posed scene as a data set of one test object."""
+    return Catalogue("posed", {"train": (), "val": (), "test": (name,)}, lambda _: read_posed_task(path))
+
+
+def _read_child(root: Path, name: str) -> PosedTask:
+    """A scene of a folder of scenes; its links may lead to other places in that folder."""
+    if find_transforms(root / name):
+        return read_transforms_task(root / name, name, root=root)
+    return read_posed_task(root / name)
+
+
+def _find_format(folder: Path) -> _Format | None:
+    return next((each for each in _FORMATS if each.found(folder)), None)
+
+
+def _format(folder: Path) -> _Format:
+    """The layout of a folder.
+
+    Raises:
+        DataError: none that is known.
+    """
+    found = _find_format(folder) if folder.is_dir() else None
+    if found is not None:
+        return found
+    refuse_unposed(folder)
+    if not folder.is_dir():
+        raise DataError(folder, "a transforms*.json or a folder that holds one", "nothing", "check the path")
+    names = ", ".join(sorted(child.name for child in folder.iterdir())[:5]) or "an empty folder"
+    raise DataError(folder, "transforms.json or another layout of one scene", names, "give one object's folder")

@@ -1,0 +1,147 @@
+"""SRN's layout: OBJECT/intrinsics.txt, rgb/*.png, pose/*.txt (Sitzmann et al., 2019; pixelNeRF's cars and chairs)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.data.formats.catalogue import Catalogue
+from hyperplanes.data.pictures.bounds import stated_bounds
+from hyperplanes.data.pictures.images import image_size, read_image
+from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
+from hyperplanes.files import DataError, read_text
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["catalogue", "is_srn", "read_srn"]
+
+_SUFFIXES = {".png", ".jpg", ".jpeg"}
+
+
+def is_srn(folder: Path) -> bool:
+    """Whether a folder holds one object in SRN's layout."""
+    return all((folder / name).exists() for name in ("intrinsics.txt", "rgb", "pose"))
+
+
+def read_srn(folder: str | Path, *, bounds: Sphere | None = None) -> Posed:
+    """The posed pictures of one object.
+
+    Poses are OpenCV camera-to-world. The pictures have no alpha: where every pixel of their border is white, masks are
+    made from what is not purely white, as pixelNeRF does; else there are none. The principal point counts from the
+    pictures' borders (half-pixel centres) and is scaled with the focal length when the pictures have another size than
+    the file says.
+
+    Args:
+        folder: with intrinsics.txt, rgb and pose.
+        bounds: of the scene; estimated when None.
+
+    Returns:
+        The pictures in the order of their names.
+
+    Raises:
+        DataError: anything wrong with a file.
+    """
+    folder = Path(folder)
+    pictures = sorted(path for path in (folder / "rgb").iterdir() if path.suffix.lower() in _SUFFIXES)
+    if not pictures:
+        raise DataError(folder / "rgb", "pictures", "none", "download the object again")
+    poses = [folder / "pose" / f"{path.stem}.txt" for path in pictures]
+    size = image_size(pictures[0])
+    pixels = [read_image(path, size) for path in pictures]
+    rgba = [picture for picture, _ in pixels]
+    alpha = any(has_alpha and (picture[..., 3] < 255).any() for picture, has_alpha in pixels)
+    if not alpha and all(_white_border(picture) for picture in rgba):
+        alpha = True
+        for picture in rgba:
+            picture[..., 3] = np.where((picture[..., :3] == 255).all(-1), 0, 255)
+    world_from_camera = np.stack([check_pose(_numbers(path, 16).reshape(4, 4), path, path.stem) for path in poses])
+    rotation = world_from_camera[:, :3, :3].transpose(0, 2, 1)
+    camera_from_world = np.tile(np.eye(4), (len(poses), 1, 1))
+    camera_from_world[:, :3, :3] = rotation
+    camera_from_world[:, :3, 3:] = -rotation @ world_from_camera[:, :3, 3:]
+    matrix = _intrinsics(folder / "intrinsics.txt", size)
+    return posed(
+        rgba,
+        camera_from_world,
+        np.tile(matrix, (len(poses), 1, 1)),
+        has_alpha=alpha,
+        bounds=bounds,
+        names=tuple(f"rgb/{path.name}" for path in pictures),
+        source=folder,
+    )
+
+
+def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
+    """The catalogue of a folder with CLASS_train, CLASS_val and CLASS_test, or of one of these, or of one object.
+
+    Args:
+        folder: what may be in SRN's layout.
+        manifest: of the folder, empty without one.
+
+    Returns:
+        The catalogue, views alternating between support and query; None when it is something else.
+    """
+    if is_srn(folder):
+        homes = {"test": [folder]}
+    else:
+        homes = {split: [] for split in ("train", "val", "test")}
+        for child in sorted(path for path in folder.iterdir() if path.is_dir()):
+            split = child.name.rpartition("_")[2]
+            if split in homes:
+                homes[split] += _objects(child)
+        if not any(homes.values()) and (alone := _objects(folder)):
+            split = folder.resolve().name.rpartition("_")[2]
+            homes[split if split in homes else "test"] = alone
+    if not any(homes.values()):
+        return None
+    paths = {path.name: path for found in homes.values() for path in found}
+    splits = {split: tuple(path.name for path in homes.get(split, [])) for split in ("train", "val", "test")}
+    bounds = stated_bounds(manifest, folder / "manifest.json")
+    return Catalogue(
+        "srn", splits, lambda name: PosedTask.alternating(read_srn(paths[name], bounds=bounds), name), manifest
+    )
+
+
+def _objects(folder: Path) -> list[Path]:
+    found = sorted(child for child in folder.iterdir() if child.is_dir() and is_srn(child))
+    if not found:  # SRN's published chairs lie a level deeper
+        found = [deeper for child in sorted(folder.glob("*_2.0_*")) for deeper in _objects(child)]
+    return found
+
+
+def _white_border(picture: npt.NDArray[np.uint8]) -> bool:
+    rows, columns = picture[[0, -1], :, :3], picture[:, [0, -1], :3]
+    return bool((rows == 255).all() and (columns == 255).all())
+
+
+def _numbers(path: Path, count: int) -> npt.NDArray[np.float64]:
+    try:
+        values = np.array(read_text(path).split(), dtype=np.float64)
+    except FileNotFoundError as error:
+        raise DataError(path, f"{count} numbers", "nothing", "download the object again") from error
+    except ValueError as error:
+        raise DataError(path, f"{count} numbers", str(error), "download the object again") from error
+    if len(values) != count:
+        raise DataError(path, f"{count} numbers", f"{len(values)}", "download the object again")
+    return values
+
+
+def _intrinsics(path: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    try:
+        lines = [[float(word) for word in line.split()] for line in read_text(path).splitlines() if line.strip()]
+        focal, centre_x, centre_y = lines[0][:3]
+        height, width = (lines[4] if len(lines) > 4 else lines[-1])[:2]
+    except (ValueError, IndexError, UnicodeDecodeError) as error:
+        raise DataError(path, "f cx cy first and height width last", str(error), "download it again") from error
+    if not np.isfinite([focal, centre_x, centre_y, height, width]).all() or min(focal, height, width) <= 0:
+        raise DataError(path, "finite and positive numbers", f"{lines}", "download it again")
+    scale = np.array([size[1] / width, size[0] / height])
+    return np.array(
+        [
+            [focal * scale[0], 0.0, centre_x * scale[0] - 0.5],
+            [0.0, focal * scale[1], centre_y * scale[1] - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )

@@ -1,0 +1,201 @@
+"""transforms.json: nerfstudio's, Blender's (NeRF synthetic) and the native one, to posed pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from hyperplanes.data.formats.transforms_document import calibration, opencv_from_opengl, stated_size
+from hyperplanes.data.pictures.bounds import stated_bounds
+from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.masks import find_masks
+from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
+from hyperplanes.data.pictures.undistort import distortion
+from hyperplanes.files import DataError, inside, read_json
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["find_transforms", "read_transforms", "read_transforms_task"]
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".webp")
+
+
+def find_transforms(folder: str | Path) -> list[Path]:
+    """The transforms files of a folder: transforms.json alone, or transforms_train.json, _val and _test.
+
+    >>> find_transforms("no such folder")
+    []
+    """
+    folder = Path(folder)
+    if (folder / "transforms.json").is_file():
+        return [folder / "transforms.json"]
+    names = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+    return [folder / name for name in names if (folder / name).is_file()]
+
+
+def read_transforms(
+    path: str | Path | Sequence[Path],
+    *,
+    legacy: bool = False,
+    bounds: Sphere | None = None,
+    flat: bool = False,
+    downscale: int | None = None,
+    complete: bool = False,
+    root: Path | None = None,
+) -> Posed:
+    """The posed pictures of one scene.
+
+    Distorted pictures (k1, k2, k3, p1, p2 not zero) are undistorted with the same calibration. An alpha channel, or the
+    pictures that `mask_path` names, or those of a folder masks/ beside the file, become the masks.
+
+    Args:
+        path: a transforms file, or several of one folder that are read as one scene.
+        legacy: as in `calibration`.
+        bounds: of the scene; "scene_sphere" of the file, else an estimate, when None.
+        flat: take only the last part of each `file_path`, beside the file, as learnit's data have it.
+        downscale: as in `assemble`.
+        complete: as in `assemble`.
+        root: no picture may lie outside of it, symbolic links followed; the file's folder when None.
+
+    Returns:
+        The pictures of all frames in the order of the files. Anything wrong with a file is a DataError that names it.
+    """
+    paths = [Path(path)] if isinstance(path, (str, Path)) else list(path)
+    document, frames, _ = _listed_frames(paths, legacy, flat, root)
+    source = paths[0] if len(paths) == 1 else paths[0].parent
+    bounds = bounds or stated_bounds(document, paths[0])
+    return assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)[0]
+
+
+def read_transforms_task(
+    folder: str | Path,
+    name: str,
+    *,
+    legacy: bool = False,
+    bounds: Sphere | None = None,
+    flat: bool = False,
+    downscale: int | None = None,
+    complete: bool = False,
+    root: Path | None = None,
+) -> PosedTask:
+    """Support and query of one scene.
+
+    transforms_train.json is the support and transforms_test.json (or _val) the query where they are; in one
+    transforms.json, `train_filenames` and `test_filenames` decide; else views alternate, the first one support.
+
+    Args:
+        folder: what holds the files.
+        name: of the object.
+        legacy: as in `calibration`.
+        bounds: as in `read_transforms`; an estimate uses the views of the support alone.
+        flat: as in `read_transforms`.
+        downscale: as in `assemble`.
+        complete: as in `assemble`.
+        root: as in `read_transforms`.
+
+    Returns:
+        The two halves with the same bounds.
+
+    Raises:
+        DataError: no transforms file, no view in one half, or anything wrong with a file.
+    """
+    files = find_transforms(folder)
+    if not files:
+        raise DataError(folder, "transforms.json or transforms_train.json", "neither", "check the path")
+    paths = files if len(files) == 1 else [files[0], files[-1]]
+    document, frames, counts = _listed_frames(paths, legacy, flat, root)
+    query = range(counts[0], len(frames))
+    if len(paths) == 1:
+        frames, query = _split_by_names(document, frames, files[0])
+    bounds = bounds or stated_bounds(document, files[0])
+    source = files[0] if len(paths) == 1 else folder
+    scene, kept = assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)
+    if query is None:
+        if len(scene) < 2:
+            raise DataError(files[0], "two frames or more", f"{len(scene)}", "add views to support or to query")
+        return PosedTask.alternating(scene, name)
+    halves = [[at for at, index in enumerate(kept) if (index in query) == asked] for asked in (False, True)]
+    if not all(halves):
+        found = f"{len(halves[0])} to train and {len(halves[1])} to test on"
+        raise DataError(source, "pictures of both splits", found, "copy the pictures to where the files name them")
+    return PosedTask.split(scene, halves[0], halves[1], name)
+
+
+def _split_by_names(document: dict[str, Any], frames: list[Frame], path: Path) -> tuple[list[Frame], range | None]:
+    """The frames that train_filenames and test_filenames name, and which of them are the query; None: no such lists."""
+    halves = [document.get(f"{half}_filenames") for half in ("train", "test")]
+    if not document.get("test_filenames") and isinstance(document.get("val_filenames"), list):
+        halves[1] = document["val_filenames"]
+    support, query = halves
+    if not (isinstance(support, list) and support and isinstance(query, list) and query):
+        return frames, None
+    names = [*support, *query]
+    if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+        raise DataError(
+            path, "train_filenames and test_filenames without common or repeated files", "some", "correct the file"
+        )
+    return _chosen(frames, names, path), range(len(support), len(names))
+
+
+def _listed_frames(
+    paths: list[Path], legacy: bool, flat: bool, root: Path | None
+) -> tuple[dict[str, Any], list[Frame], list[int]]:
+    """The first document, the frames of all, and how many each has."""
+    documents = [read_json(one) for one in paths]
+    parts = [_frames(path, document, legacy, flat, root) for path, document in zip(paths, documents, strict=True)]
+    return documents[0], [frame for part in parts for frame in part], [len(part) for part in parts]
+
+
+def _frames(path: Path, document: dict[str, Any], legacy: bool, flat: bool, root: Path | None) -> list[Frame]:
+    listed = document.get("frames")
+    if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
+        found = f"{len(listed)} of them" if isinstance(listed, list) else repr(listed)[:40]
+        raise DataError(path, "frames, a list of one or more objects", found, "export the file again")
+    common = {key: value for key, value in document.items() if key != "frames"}
+    frames = [_frame(path, common | frame, legacy, flat, root or path.parent) for frame in listed]
+    if any(frame.mask is not None for frame in frames):
+        return frames
+    masks = find_masks(path.parent / "masks", [frame.path for frame in frames])
+    return [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)] if masks else frames
+
+
+def _frame(path: Path, fields: dict[str, Any], legacy: bool, flat: bool, root: Path) -> Frame:
+    written = fields.get("file_path")
+    if not isinstance(written, str) or not written:
+        raise DataError(path, "a file_path in every frame", repr(written), "export the file again")
+    name = PurePosixPath(written.replace("\\", "/")).name if flat else written
+    located = _located(path, name, root)
+    if not located.is_file():
+        with_suffix = [located.with_name(located.name + suffix) for suffix in _SUFFIXES]
+        located = next((candidate for candidate in with_suffix if candidate.is_file()), located)
+    pose = check_pose(fields.get("transform_matrix"), path, written)
+    mask = fields.get("mask_path")
+    return Frame(
+        located,
+        written,
+        opencv_from_opengl(pose[None])[0],
+        lambda size: calibration(fields, size, path, legacy=legacy),
+        stated_size(fields, path),
+        distortion(fields, path),
+        None if mask is None else _located(path, mask, root),
+    )
+
+
+def _located(path: Path, name: object, root: Path) -> Path:
+    """Where a name that a file writes leads to; names stay below its folder, links below the root."""
+    text = name.replace("\\", "/") if isinstance(name, str) else ""
+    if ".." in PurePosixPath(text).parts or root == path.parent:
+        return inside(path.parent, name, path)  # type: ignore[arg-type]
+    return inside(root, str(path.parent.relative_to(root) / text) if text else "", path)
+
+
+def _chosen(frames: list[Frame], only: Sequence[str], path: Path) -> list[Frame]:
+    by_name = {str(PurePosixPath(frame.name)): frame for frame in frames}
+    chosen = []
+    for name in only:
+        frame = by_name.get(str(PurePosixPath(name)))
+        if frame is None:
+            raise DataError(path, f"a frame for {name!r} of train_filenames, test_filenames", "none", "correct it")
+        chosen.append(frame)
+    return chosen

@@ -1,0 +1,69 @@
+"""What is not posed images yet, and how it becomes so: photographs alone, and the exports of capture apps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
+from hyperplanes.files import DataError
+
+__all__ = ["refuse_unposed"]
+
+_HOMES = (".", "images", "input", "rgb", "photos", "image")
+_COUNTED = 10_000  # entries of a folder that are looked at
+_VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv"})
+
+
+def refuse_unposed(path: Path) -> None:
+    """Say what is missing where a path holds something that posed images can be made from.
+
+    Args:
+        path: a file or a folder in no layout that is read.
+
+    Raises:
+        DataError: photographs without poses, a video, or an export of Polycam or Record3D.
+    """
+    tool = _capture_app(path)
+    if tool is not None:
+        name, kind = tool
+        remedy = f"convert it with nerfstudio: ns-process-data {kind} --data {path} --output-dir posed"
+        raise DataError(path, "posed images, such as a transforms.json", f"an export of {name}", remedy)
+    if path.is_file() and path.suffix.lower() in _VIDEOS:
+        remedy = f"take pictures out of it and find their poses: ns-process-data video --data {path} --output-dir posed"
+        raise DataError(path, "posed images", "a video", remedy)
+    home, count = _photographs(path)
+    if count:
+        raise DataError(
+            path,
+            "camera poses beside the photographs (transforms.json, or a COLMAP model in sparse/0)",
+            f"{count} photograph{'s' if count > 1 else ''} and no poses",
+            f"find them with COLMAP (colmap automatic_reconstructor --workspace_path posed --image_path {home}) "
+            f"or nerfstudio (ns-process-data images --data {home} --output-dir posed)",
+        )
+
+
+def _capture_app(path: Path) -> tuple[str, str] | None:
+    """The app that wrote what lies there, and nerfstudio's word for it."""
+    if path.suffix.lower() == ".r3d" and path.is_file():
+        return "Record3D", "record3d"
+    if not path.is_dir():
+        return None
+    names = {child.name for _, child in zip(range(_COUNTED), path.iterdir(), strict=False)}
+    if "metadata" in names and "rgbd" in names or any(name.lower().endswith(".r3d") for name in names):
+        return "Record3D", "record3d"
+    if (path / "keyframes").is_dir() or {"cameras", "images", "depth"} <= names or "corrected_cameras" in names:
+        return "Polycam", "polycam"
+    return None
+
+
+def _photographs(path: Path) -> tuple[Path, int]:
+    """The folder of photographs, and how many there are."""
+    if path.is_file():
+        return path.parent, int(path.suffix.lower() in PICTURE_SUFFIXES)
+    for home in (path / name for name in _HOMES):
+        if home.is_dir():
+            children = zip(range(_COUNTED), home.iterdir(), strict=False)
+            count = sum(child.suffix.lower() in PICTURE_SUFFIXES for _, child in children)
+            if count:
+                return home, count
+    return path, 0

@@ -1,0 +1,123 @@
+"""Coarse visual hulls and their silhouettes: what masks say about poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+from torch.nn.functional import interpolate, max_pool2d
+
+from hyperplanes.data.pictures.bounds import estimate_bounds
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import Occupancy, carve
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.views import Views
+
+__all__ = ["CoarseHull", "coarse_hull", "masks_tell", "small_masks"]
+
+SIDE = 32
+MASK = 64
+MOST_VIEWS = 16
+
+
+@dataclass(frozen=True)
+class CoarseHull:
+    """The visual hull of some masks.
+
+    Attributes:
+        points: centres of its voxels; none where the masks leave nothing.
+        grid: the voxels.
+    """
+
+    points: Float[Tensor, "voxel 3"]
+    grid: Occupancy | None
+
+    def overlap(self, masks: Float[Tensor, "view 1 height width"], cameras: PinholeCamera) -> float:
+        """Mean intersection over union of masks with the silhouettes of the hull."""
+        if self.grid is None:
+            return 0.0
+        seen, wanted = _silhouettes(self.points, self.grid, cameras), masks[:, 0] > 0
+        union = (seen | wanted).flatten(1).sum(1)
+        return float(((seen & wanted).flatten(1).sum(1) / union.clamp_min(1)).mean())
+
+    def coverage(self, masks: Float[Tensor, "view 1 height width"], cameras: PinholeCamera) -> float:
+        """How much of each mask the hull's silhouette covers, on average: nearly all with right poses."""
+        if self.grid is None:
+            return 0.0
+        seen, wanted = _silhouettes(self.points, self.grid, cameras), masks[:, 0] > 0
+        filled = wanted.flatten(1).any(1)
+        covered = (seen & wanted).flatten(1).sum(1) / wanted.flatten(1).sum(1).clamp_min(1)
+        return float(covered[filled].mean()) if filled.any() else 0.0
+
+
+def coarse_hull(masks: Float[Tensor, "view 1 height width"], cameras: PinholeCamera) -> CoarseHull:
+    """The hull of masks in the sphere that the cameras look at, and once more in the sphere around that.
+
+    Args:
+        masks: opacity, as `small_masks` gives them.
+        cameras: one a mask.
+
+    Returns:
+        The hull, empty where most cameras look away from where all would meet.
+    """
+    sphere = estimate_bounds(cameras)
+    nothing = CoarseHull(masks.new_zeros(0, 3), None)
+    pose = camera.camera_from_world(cameras)
+    ahead = pose[:, 2] @ pose.new_tensor([*sphere.centre, 1.0])
+    if (ahead > 0).float().mean() < 0.5:
+        return nothing
+    hull = nothing
+    for _ in range(2):
+        grid = carve(masks, cameras, sphere, SIDE)
+        points = grid.centres()
+        points = points[sphere.normalise(points).norm(dim=-1) <= 1]
+        if not len(points):
+            return nothing
+        hull = CoarseHull(points, grid)
+        middle = (points.amin(0) + points.amax(0)) / 2
+        radius = float((points - middle).norm(dim=-1).max()) + grid.voxel
+        sphere = Sphere(tuple(middle.tolist()), min(radius, sphere.radius))
+    return hull
+
+
+def masks_tell(views: Views) -> bool:
+    """Whether there are masks, and they say where the object is."""
+    return views.masks is not None and 0 < float((views.masks > 0).float().mean()) < 0.95
+
+
+def small_masks(views: Views) -> tuple[Float[Tensor, "view 1 height width"], PinholeCamera]:
+    """Masks of up to MOST_VIEWS views, spread over all, at up to MASK pixels, with their cameras."""
+    assert views.masks is not None
+    chosen = torch.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().long()
+    masks, cameras = views.masks[chosen], camera.select(views.cameras, chosen)
+    height, width = masks.shape[2:]
+    factor = MASK / max(height, width)
+    if factor >= 1:
+        return masks, cameras
+    size = max(1, round(height * factor)), max(1, round(width * factor))
+    return (interpolate(masks, size, mode="area") > 0.2).float(), camera.resized(cameras, *size)
+
+
+def _silhouettes(
+    points: Float[Tensor, "voxel 3"], hull: Occupancy, cameras: PinholeCamera
+) -> Bool[Tensor, "view height width"]:
+    """Which pixels see a voxel: its centre's pixel, and those around it as far as half the voxel reaches."""
+    height, width = camera.image_size(cameras)
+    matrices = camera.projection_matrices(cameras)
+    seen = torch.zeros(len(matrices), height, width, dtype=torch.bool)
+    for view, matrix in enumerate(matrices):
+        homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
+        front = homogeneous[homogeneous[:, 2] > hull.voxel]
+        column, row = (front[:, :2] / front[:, 2:]).round().long().unbind(-1)
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        if not inside.any():
+            continue
+        picture = torch.zeros(1, height, width)
+        picture[0, row[inside], column[inside]] = 1.0
+        focal = float(camera.intrinsics(cameras)[view, 0, 0])
+        reach = int(focal * hull.voxel / 2 / float(front[:, 2].median()))
+        seen[view] = max_pool2d(picture, 2 * reach + 1, 1, reach)[0] > 0
+    return seen

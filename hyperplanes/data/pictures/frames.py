@@ -1,0 +1,278 @@
+"""From the frames that a file lists to posed pictures of one size: what every reader of photographs shares."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from hyperplanes.data.pictures.images import (
+    Header,
+    Pixels,
+    image_header,
+    image_size,
+    read_image,
+    reduced,
+    resized,
+    turned,
+)
+from hyperplanes.data.pictures.posed import Posed, posed
+from hyperplanes.data.pictures.undistort import check_lens, undistort
+from hyperplanes.files import DataError
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["MEGAPIXEL", "Frame", "assemble", "listed"]
+
+MEGAPIXEL = 2**20
+"""Pixels above which photographs are scaled down unless the caller says by how much."""
+
+ENOUGH = 2 / 3  # of the frames of a file must be there
+ROUNDING = 1.01  # pixels by which a picture scaled to whole pixels may differ from the exact size
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture that a file lists, with its camera; nothing of it has been read.
+
+    Attributes:
+        path: of the picture.
+        name: as the file writes it.
+        camera_from_world: (4, 4), OpenCV axes, already checked.
+        calibrate: the (3, 3) calibration, integer pixel centres, for a picture of (height, width).
+        size: (height, width) of the pictures that the calibration was made for, or None where the file does not say.
+        lens: OpenCV's coefficients in the order of `undistort.COEFFICIENTS`; empty where there is none.
+        mask: a picture of its opacity, or None.
+        depths: nearest and farthest distance of what it shows, or None.
+    """
+
+    path: Path
+    name: str
+    camera_from_world: npt.NDArray[np.float64]
+    calibrate: Callable[[tuple[int, int]], npt.NDArray[np.float64]]
+    size: tuple[int, int] | None = None
+    lens: tuple[float, ...] = ()
+    mask: Path | None = None
+    depths: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A frame whose picture is there.
+
+    Attributes:
+        frame: as the file lists it.
+        stored: (height, width) of the pixels in the file.
+        turn: EXIF's orientation where it has to be applied, else 1.
+    """
+
+    frame: Frame
+    stored: tuple[int, int]
+    turn: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        height, width = self.stored
+        return (width, height) if self.turn >= 5 else self.stored
+
+
+def assemble(
+    frames: Sequence[Frame],
+    source: str | Path,
+    *,
+    bounds: Sphere | None = None,
+    downscale: int | None = None,
+    complete: bool = False,
+) -> tuple[Posed, list[int]]:
+    """Read the pictures of frames and bring them to one size.
+
+    Where at least two thirds of the pictures are there, the others are left out and named. Pictures of several sizes
+    but one aspect ratio are scaled to the commonest; those of another aspect ratio are left out by the same rule of two
+    thirds. EXIF's orientation is applied where the size that the file states asks for it. Distorted pictures are
+    undistorted with the same calibration.
+
+    Args:
+        frames: what a file lists.
+        source: that file, for messages.
+        bounds: of the scene; estimated when None.
+        downscale: take the mean of so many by so many pixels; None stands for as many as leave a megapixel at most.
+        complete: a missing picture is an error, and nothing is scaled down unless asked for: data of ours.
+
+    Returns:
+        The pictures, and which of the frames they are. Pictures that are missing or misfit, or a lens that folds the
+        picture, are a DataError.
+    """
+    kept, notes = _present(frames, source, complete)
+    found = [_examine(frames[index], source) for index in kept]
+    size, fitting = _common_size(found, source)
+    if left := [one.frame.name for at, one in enumerate(found) if at not in fitting]:
+        notes.append(f"{len(left)} of {len(found)} pictures have another shape and are left out: {listed(left)}")
+    kept, found = [kept[at] for at in fitting], [found[at] for at in fitting]
+    if scaled := [one.frame.name for one in found if one.size != size]:
+        notes.append(f"{len(scaled)} pictures of other sizes scaled to {size[1]} x {size[0]} pixels: {listed(scaled)}")
+    if turns := [one.frame.name for one in found if one.turn != 1]:
+        notes.append(f"{len(turns)} pictures turned as their EXIF orientation says: {listed(turns)}")
+    factor = _factor(size, downscale, complete, source)
+    if factor > 1:
+        why = "" if downscale else "; --downscale 1 keeps every pixel"
+        notes.append(f"scaled down by {factor}, to {size[1] // factor} x {size[0] // factor} pixels{why}")
+    pictures, alphas, matrices = [], [], []
+    for one in found:
+        matrix = _reduced_matrix(one.frame.calibrate(one.size), one.size, size, factor)
+        picture, alpha = _pixels(one, size, factor)
+        if any(one.frame.lens):
+            check_lens(matrix, one.frame.lens, picture.shape[:2], f"{source}, frame {one.frame.name}")
+            picture = undistort(picture, matrix, one.frame.lens, opaque=not alpha)
+        pictures.append(picture)
+        alphas.append(alpha)
+        matrices.append(matrix)
+    if any(alphas) and not all(alphas):
+        bare = [one.frame.name for one, alpha in zip(found, alphas, strict=True) if not alpha]
+        notes.append(f"{len(bare)} of {len(found)} pictures have no mask and count as covered: {listed(bare)}")
+    depths = [one.frame.depths for one in found]
+    scene = posed(
+        pictures,
+        np.stack([one.frame.camera_from_world for one in found]),
+        np.stack(matrices),
+        has_alpha=any(alphas),
+        bounds=bounds,
+        names=tuple(one.frame.name for one in found),
+        source=source,
+        depths=None if None in depths else torch.tensor(depths, dtype=torch.float32),
+        notes=tuple(notes),
+    )
+    return scene, kept
+
+
+def listed(names: Sequence[str], most: int = 20) -> str:
+    """Names for a message: all of them, or the first ones and how many more there are.
+
+    >>> listed(["a", "b", "c"], 2)
+    'a, b and 1 more'
+    """
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+
+
+def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tuple[list[int], list[str]]:
+    """Which frames have a picture, and what to say of the others."""
+    kept = [index for index, frame in enumerate(frames) if frame.path.is_file()]
+    missing = [frame for frame in frames if not frame.path.is_file()]
+    if not missing:
+        return kept, []
+    if complete:
+        raise DataError(missing[0].path, "an image", "nothing", "generate or copy the data set again")
+    if len(kept) < ENOUGH * len(frames):
+        raise DataError(
+            source,
+            f"the pictures of its {len(frames)} frames, or of two thirds of them",
+            f"{len(kept)} ({missing[0].path} and {len(missing) - 1} others are missing)",
+            "copy the pictures to where the file names them",
+        )
+    names = listed([frame.name for frame in missing])
+    return kept, [f"{len(kept)} of {len(frames)} frames have a picture, {len(missing)} are missing: {names}"]
+
+
+def _examine(frame: Frame, source: str | Path) -> _Found:
+    """Whether the picture has to be turned; DataError where it cannot be the one that the calibration is for."""
+    header = image_header(frame.path)
+    if frame.size is None:
+        if header.orientation != 1:
+            raise DataError(
+                frame.path,
+                "pixels stored upright, as the cameras' file does not say for which size it was made",
+                f"EXIF orientation {header.orientation}",
+                "turn the pixels (mogrify -auto-orient), or drop the tag where the poses are of the stored pixels",
+            )
+        return _Found(frame, header.size, 1)
+    if _same_shape(header.size, frame.size):
+        return _Found(frame, header.size, 1)  # COLMAP and nerfstudio take the pixels as they are stored
+    if header.orientation >= 5 and _same_shape(header.upright_size, frame.size):
+        return _Found(frame, header.size, header.orientation)
+    raise DataError(
+        frame.path,
+        f"the shape of the {frame.size[1]} x {frame.size[0]} pixels that {Path(source).name} states",
+        f"{_text(header)}",
+        "give the pictures that the cameras were made for, or correct w and h",
+    )
+
+
+def _text(header: Header) -> str:
+    turned = f" with EXIF orientation {header.orientation}" if header.orientation != 1 else ""
+    return f"{header.size[1]} x {header.size[0]}{turned}"
+
+
+def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether one is the other scaled, but for rounding to whole pixels."""
+    (height, width), (tall, wide) = size, other
+    return abs(width / wide * tall - height) < ROUNDING or abs(height / tall * wide - width) < ROUNDING
+
+
+def _common_size(found: Sequence[_Found], source: str | Path) -> tuple[tuple[int, int], list[int]]:
+    """The commonest size, and which pictures have its shape."""
+    counts = Counter(one.size for one in found)
+    if len(counts) == 1:
+        return found[0].size, list(range(len(found)))
+    size = max(counts, key=lambda each: (sum(n for s, n in counts.items() if _same_shape(s, each)), counts[each]))
+    fitting = [at for at, one in enumerate(found) if _same_shape(one.size, size)]
+    if len(fitting) < ENOUGH * len(found):
+        text = ", ".join(f"{number} of {each[1]} x {each[0]}" for each, number in counts.most_common(4))
+        other = next(one for one in found if one.size != size)
+        raise DataError(
+            source,
+            "pictures of one shape, or two thirds of them",
+            f"{text} ({other.frame.name})",
+            "give all images of a scene one aspect ratio",
+        )
+    return size, fitting
+
+
+def _factor(size: tuple[int, int], downscale: int | None, complete: bool, source: str | Path) -> int:
+    if downscale is None:
+        factor = 1
+        while not complete and (size[0] // factor) * (size[1] // factor) > MEGAPIXEL:
+            factor += 1
+        return factor
+    if downscale < 1 or downscale > min(size):
+        found = f"{downscale} for pictures of {size[1]} x {size[0]} pixels"
+        raise DataError(source, f"a downscale from 1 to {min(size)}", found, "give another --downscale")
+    return downscale
+
+
+def _reduced_matrix(
+    matrix: npt.NDArray[np.float64], own: tuple[int, int], size: tuple[int, int], factor: int
+) -> npt.NDArray[np.float64]:
+    """The calibration of a picture scaled from its own size to the common one and reduced: borders stay in place."""
+    scale = np.array([size[1] / own[1] / factor, size[0] / own[0] / factor])
+    result = matrix.copy()
+    result[:2, :2] *= scale[:, None]
+    result[:2, 2] = scale * (matrix[:2, 2] + 0.5) - 0.5
+    return result
+
+
+def _pixels(one: _Found, size: tuple[int, int], factor: int) -> tuple[Pixels, bool]:
+    picture, alpha = read_image(one.frame.path, one.stored)
+    picture = turned(picture, one.turn)
+    if one.frame.mask is not None and not alpha:
+        stored = image_size(one.frame.mask)
+        if stored not in (one.size, one.stored):
+            raise DataError(
+                one.frame.mask,
+                f"{one.size[1]} x {one.size[0]} pixels, as {one.frame.path.name}",
+                f"{stored[1]} x {stored[0]}",
+                "scale the mask to the size of its picture",
+            )
+        values, has_alpha = read_image(one.frame.mask, stored)
+        opacity = values if stored == one.size else turned(values, one.turn)
+        picture[..., 3] = opacity[..., 3] if _only_alpha(opacity, has_alpha) else opacity[..., :3].max(-1)
+        alpha = True
+    return reduced(resized(picture, size), factor), alpha
+
+
+def _only_alpha(values: Pixels, has_alpha: bool) -> bool:
+    """Whether a mask says what it says by its alpha channel alone."""
+    return has_alpha and bool((values[..., 3] < 255).any()) and not np.ptp(values[..., :3])

@@ -1,0 +1,226 @@
+"""Posed 8-bit pictures as every reader returns them, before they become float `Views`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from jaxtyping import Float, UInt8
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from hyperplanes.data.pictures.bounds import estimate_bounds
+from hyperplanes.data.pictures.images import composite_over_white, reduced
+from hyperplanes.files import DataError
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.views import Task, Views
+
+__all__ = ["Posed", "PosedTask", "check_pose", "posed"]
+
+ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Posed:
+    """Pictures and cameras of one scene, compact enough to keep many in memory.
+
+    Attributes:
+        rgba: straight alpha, 255 where the file had none.
+        cameras: one a picture, OpenCV axes, integer pixel centres.
+        has_alpha: whether alpha means anything.
+        stated_bounds: the sphere that the files state, or None.
+        names: of the files, relative to their folder.
+        depths: (view, 2), the nearest and farthest distance that the files state, or None.
+        notes: what a person should know of the reading, a sentence each: what was left out, turned or scaled.
+    """
+
+    rgba: UInt8[Tensor, "view 4 height width"]
+    cameras: PinholeCamera
+    has_alpha: bool
+    stated_bounds: Sphere | None
+    names: tuple[str, ...]
+    depths: Float[Tensor, "view 2"] | None = None
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def bounds(self) -> Sphere:
+        """The sphere that holds the scene: the stated one, or an estimate from these views."""
+        if self.stated_bounds is not None:
+            return self.stated_bounds
+        return estimate_bounds(self.cameras, self.rgba[:, 3:] if self.has_alpha else None, self.depths)
+
+    def __len__(self) -> int:
+        return len(self.rgba)
+
+    def views(self) -> Views:
+        """The float images over white, with masks where the files had alpha."""
+        images, masks = composite_over_white(self.rgba)
+        return Views(images, self.cameras, masks if self.has_alpha else None, self.bounds, self.names)
+
+    def select(self, index: list[int]) -> Posed:
+        """The pictures at `index`, in that order; stated bounds stay, others are estimated from these alone."""
+        return replace(
+            self,
+            rgba=self.rgba[index],
+            cameras=camera.select(self.cameras, index),
+            names=tuple(self.names[i] for i in index),
+            depths=None if self.depths is None else self.depths[index],
+        )
+
+    def downscaled(self, factor: int | None) -> Posed:
+        """The pictures with the mean of every factor x factor pixels as one pixel; None leaves them as they are."""
+        if factor is None or factor == 1:
+            return self
+        height, width = self.rgba.shape[2] // factor, self.rgba.shape[3] // factor
+        if not height or not width:
+            raise DataError(
+                self.names[0],
+                f"pictures of {factor} pixels or more to scale down by {factor}",
+                f"{self.rgba.shape[3]} x {self.rgba.shape[2]}",
+                "give a smaller --downscale",
+            )
+        pictures = [reduced(picture, factor) for picture in self.rgba.permute(0, 2, 3, 1).numpy()]
+        whole = camera.cropped(self.cameras, height * factor, width * factor)
+        return replace(
+            self,
+            rgba=torch.from_numpy(np.ascontiguousarray(np.stack(pictures).transpose(0, 3, 1, 2))),
+            cameras=camera.resized(whole, height, width),
+            notes=(*self.notes, f"scaled down by {factor}, to {width} x {height} pixels"),
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the pictures in bytes."""
+        return self.rgba.nbytes
+
+
+@dataclass(frozen=True)
+class PosedTask:
+    """The support and the query pictures of one object.
+
+    Attributes:
+        support: what the method may use.
+        query: what it is judged by, disjoint from the support.
+        name: of the object.
+    """
+
+    support: Posed
+    query: Posed
+    name: str
+
+    def task(self) -> Task:
+        """The same as float views."""
+        return Task(self.support.views(), self.query.views(), self.name)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the pictures in bytes."""
+        return self.support.nbytes + self.query.nbytes
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know of the reading."""
+        return self.support.notes
+
+    @classmethod
+    def split(cls, scene: Posed, support: list[int], query: list[int], name: str) -> PosedTask:
+        """Some views of a scene as support and others as query; bounds are estimated from the support alone."""
+        shown = scene.select(support)
+        return cls(shown, replace(scene.select(query), stated_bounds=shown.bounds), name)
+
+    @classmethod
+    def halves(cls, scene: Posed, name: str) -> PosedTask:
+        """The first half of the views as support, the rest as query."""
+        index = list(range(len(scene)))
+        return cls.split(scene, index[: len(index) // 2], index[len(index) // 2 :], name)
+
+    @classmethod
+    def alternating(cls, scene: Posed, name: str) -> PosedTask:
+        """Every other view from the first on as support, the rest as query."""
+        index = list(range(len(scene)))
+        return cls.split(scene, index[::2], index[1::2], name)
+
+    def downscaled(self, factor: int | None) -> PosedTask:
+        """Both halves as `Posed.downscaled`."""
+        return PosedTask(self.support.downscaled(factor), self.query.downscaled(factor), self.name)
+
+
+def posed(
+    pictures: list[npt.NDArray[np.uint8]],
+    camera_from_world: npt.NDArray[np.float64],
+    intrinsics: npt.NDArray[np.float64],
+    *,
+    has_alpha: bool,
+    bounds: Sphere | None,
+    names: tuple[str, ...],
+    source: str | Path,
+    depths: Float[Tensor, "view 2"] | None = None,
+    notes: tuple[str, ...] = (),
+) -> Posed:
+    """Put together what a reader found.
+
+    Args:
+        pictures: (height, width, 4) each, all of one size.
+        camera_from_world: (view, 4, 4), OpenCV axes, already checked.
+        intrinsics: (view, 3, 3) in pixels, integer pixel centres.
+        has_alpha: whether alpha means anything.
+        bounds: of the scene, or None to estimate them.
+        names: one a picture.
+        source: the file, for messages.
+        depths: nearest and farthest distance of what each picture shows, where the files say.
+        notes: as in `Posed`.
+
+    Returns:
+        The scene.
+
+    Raises:
+        DataError: a calibration that is none.
+    """
+    rgba = torch.from_numpy(np.ascontiguousarray(np.stack(pictures).transpose(0, 3, 1, 2)))
+    height, width = rgba.shape[2:]
+    try:
+        cameras = camera.pinhole(
+            torch.from_numpy(intrinsics).float(), torch.from_numpy(camera_from_world).float(), height, width
+        )
+    except ValueError as error:
+        raise DataError(source, "usable cameras", str(error), "export the cameras again") from error
+    return Posed(rgba, cameras, has_alpha, bounds, names, depths, notes)
+
+
+def check_pose(matrix: object, source: str | Path, frame: str) -> npt.NDArray[np.float64]:
+    """A rigid (4, 4) transform from what a file holds.
+
+    Args:
+        matrix: nested lists or an array, (3, 4) or (4, 4).
+        source: the file, for the message.
+        frame: which of its frames, for the message.
+
+    Returns:
+        The transform in float64.
+
+    Raises:
+        DataError: another shape, a value that is not finite, or a block that is no rotation.
+    """
+    where = f"{source}, frame {frame}"
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(where, "a 4 x 4 pose of numbers", str(error), "export the poses again") from error
+    if pose.shape == (3, 4):
+        pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
+    if pose.shape != (4, 4):
+        raise DataError(where, "a 4 x 4 pose", f"shape {pose.shape}", "export the poses again")
+    if not np.isfinite(pose).all():
+        raise DataError(where, "a pose of finite numbers", "NaN or infinity", "export the poses again")
+    rotation = pose[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    determinant = float(np.linalg.det(rotation))
+    if error > ROTATION_TOLERANCE or determinant < 0 or np.abs(pose[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
+        found = f"|R R^T - I| = {error:.2g}, determinant {determinant:.3g}, last row {pose[3].tolist()}"
+        raise DataError(where, "a rotation and a translation", found, "take scale and mirroring out of the poses")
+    return pose

@@ -1,0 +1,236 @@
+"""The tables: every method through the same code, on objects and views it never saw."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean, pstdev, stdev
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from hyperplanes.adaptation.base import Adapter, Pictures
+from hyperplanes.metrics import foreground_psnr, pooled_psnr, psnr, ssim
+from hyperplanes.utilities.errors import prefix_errors
+from hyperplanes.views import Task, Tasks
+
+__all__ = ["QUANTITIES", "ObjectScore", "Perceptual", "Score", "evaluate", "evaluate_all", "merge_seeds"]
+
+QUANTITIES = ("psnr", "psnr_pooled", "psnr_foreground", "ssim", "lpips", "adapt_seconds", "render_seconds")
+"""The numbers of an `ObjectScore`, in the order of the tables."""
+
+Perceptual = Callable[[Float[Tensor, "view 3 h w"], Float[Tensor, "view 3 h w"]], Float[Tensor, " view"]]
+"""LPIPS, such as `perceptual.LPIPS`: (predicted, truth) -> a distance an image."""
+
+
+@dataclass(frozen=True)
+class ObjectScore:
+    """One object by one method.
+
+    Attributes:
+        name: of the object.
+        psnr: dB, mean over its query views.
+        ssim: mean over its query views.
+        adapt_seconds: from support views to a field.
+        render_seconds: of one query view.
+        psnr_pooled: dB, of the squared error of all its query views together.
+        psnr_foreground: dB, inside the true masks, mean over its query views; None without masks.
+        lpips: mean over its query views; None where its weights were not given.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    adapt_seconds: float
+    render_seconds: float
+    psnr_pooled: float | None = None
+    psnr_foreground: float | None = None
+    lpips: float | None = None
+
+    def as_json(self) -> dict[str, float]:
+        """The numbers that there are."""
+        return {name: value for name in QUANTITIES if (value := getattr(self, name)) is not None}
+
+    @property
+    def image_seconds(self) -> float:
+        """From support views to the picture of one query view."""
+        return self.adapt_seconds + self.render_seconds
+
+
+@dataclass(frozen=True)
+class Score:
+    """A row of the table: means over objects, and the objects themselves.
+
+    Attributes:
+        method: the name of the row.
+        objects: each a mean over the seeds, where there were several.
+        seeds: the rows of the single seeds, where there were several.
+    """
+
+    method: str
+    objects: tuple[ObjectScore, ...]
+    seeds: tuple[Score, ...] = ()
+
+    def mean(self, quantity: str) -> float:
+        """Mean over objects of one of `ObjectScore`'s numbers; NaN where an object has none."""
+        found = [getattr(each, quantity) for each in self.objects]
+        return math.nan if None in found else fmean(found)
+
+    def spread(self, quantity: str) -> float:
+        """Standard deviation over objects."""
+        found = [getattr(each, quantity) for each in self.objects]
+        return pstdev(found) if None not in found and all(map(math.isfinite, found)) else math.nan
+
+    def deviation(self, quantity: str) -> float | None:
+        """Standard deviation over seeds of the mean over objects; None of fewer than two seeds."""
+        return stdev(seed.mean(quantity) for seed in self.seeds) if len(self.seeds) > 1 else None
+
+    @property
+    def quantities(self) -> list[str]:
+        """The numbers that every object has."""
+        return [name for name in QUANTITIES if all(getattr(each, name) is not None for each in self.objects)]
+
+    def as_json(self) -> dict[str, Any]:
+        """The row as it stands in metrics.json."""
+        row: dict[str, Any] = {name: self.mean(name) for name in self.quantities}
+        row["objects"] = {each.name: each.as_json() for each in self.objects}
+        if self.seeds:
+            row["deviation"] = {name: self.deviation(name) for name in self.quantities}
+            row["seeds"] = [seed.as_json() for seed in self.seeds]
+        return row
+
+    @classmethod
+    def of_json(cls, method: str, value: Mapping[str, Any]) -> Score:
+        """The row that `as_json` wrote; infinity comes back of null."""
+
+        def score(name: str, numbers: Mapping[str, float | None]) -> ObjectScore:
+            return ObjectScore(name, **{key: math.inf if each is None else each for key, each in numbers.items()})
+
+        objects = tuple(score(name, numbers) for name, numbers in value["objects"].items())
+        return cls(method, objects, tuple(cls.of_json(method, seed) for seed in value.get("seeds", ())))
+
+
+def merge_seeds(scores: Sequence[Score]) -> Score:
+    """One row of the rows of several seeds: every object's numbers are means over them.
+
+    Args:
+        scores: of one method on the same objects in the same order.
+
+    Raises:
+        ValueError: none, or other objects.
+    """
+    if not scores:
+        raise ValueError("scores: expected those of at least one seed, got none")
+    if len(scores) == 1:
+        return scores[0]
+    names = [[each.name for each in score.objects] for score in scores]
+    if any(each != names[0] for each in names):
+        raise ValueError(f"scores: expected the same objects for every seed, got {names}")
+    objects = []
+    for same in zip(*(score.objects for score in scores), strict=True):
+        numbers = {name: [getattr(each, name) for each in same] for name in QUANTITIES}
+        objects.append(
+            ObjectScore(same[0].name, **{n: fmean(values) for n, values in numbers.items() if None not in values})
+        )
+    return Score(scores[0].method, tuple(objects), tuple(scores))
+
+
+def evaluate(
+    method: str,
+    adapter: Adapter,
+    data: Tasks,
+    names: Sequence[str],
+    on_object: Callable[[ObjectScore, Task, Pictures], None] | None = None,
+    lpips: Perceptual | None = None,
+) -> Score:
+    """Adapt to the support views of each object and compare all its query views.
+
+    The method computes where its weights are; pictures are compared where the data is.
+
+    Args:
+        method: the name of the row.
+        adapter: the method.
+        data: where the tasks are.
+        names: the objects, never trained on.
+        on_object: called after each, with its score, task and pictures.
+        lpips: where the perceptual distance is asked for, too.
+
+    Returns:
+        The row.
+
+    Raises:
+        ValueError: no object, or one without query views or with views that cannot be used; it is named.
+    """
+    if not names:
+        raise ValueError("names: expected at least one object to evaluate on, got none")
+    scores = []
+    for name in names:
+        task = data.task(name)
+        if not len(task.query):
+            raise ValueError(f"{name}: expected at least one query view to compare with, got none")
+        start = time.perf_counter()
+        with prefix_errors(name):
+            adapted = adapter.adapt(task.support)
+        adapted_at = time.perf_counter()
+        pictures = adapted.render(task.query.cameras)
+        rendered_at = time.perf_counter()
+        images, truth, masks = pictures.images.to(task.query.images).clamp(0, 1), task.query.images, task.query.masks
+        score = ObjectScore(
+            name,
+            float(psnr(images, truth).mean()),
+            float(ssim(images, truth).mean()),
+            adapted_at - start,
+            (rendered_at - adapted_at) / len(task.query),
+            float(pooled_psnr(images, truth)),
+            None if masks is None else float(foreground_psnr(images, truth, masks).nanmean()),
+            None if lpips is None else float(lpips(images, truth).mean()),
+        )
+        scores.append(score)
+        if on_object is not None:
+            on_object(score, task, pictures)
+    return Score(method, tuple(scores))
+
+
+def evaluate_all(
+    methods: Mapping[str, Callable[[int], Adapter]],
+    data: Tasks,
+    names: Sequence[str],
+    report: Callable[[int, int, str], None],
+    *,
+    seeds: int = 1,
+    on_object: Callable[[str, int, Task, Pictures], None] | None = None,
+    lpips: Perceptual | None = None,
+) -> list[Score]:
+    """Every method on every object, by every seed.
+
+    Args:
+        methods: by the names of their rows, each a function of the seed.
+        data: where the objects are.
+        names: the objects.
+        report: called with (evaluations done, evaluations in all, what has just been found) after each.
+        seeds: how many, from 0.
+        on_object: called with a method, a seed, a task and its pictures.
+        lpips: as in `evaluate`.
+
+    Returns:
+        The rows in the order of the methods.
+    """
+    done, scores = 0, []
+
+    def seen(method: str, seed: int, score: ObjectScore, task: Task, pictures: Pictures) -> None:
+        nonlocal done
+        done += 1
+        report(done, len(methods) * len(names) * seeds, f"{method} on {score.name}: {score.psnr:.2f} dB")
+        if on_object is not None:
+            on_object(method, seed, task, pictures)
+
+    for method, make in methods.items():
+        runs = []
+        for seed in range(seeds):
+            look = lambda *found, method=method, seed=seed: seen(method, seed, *found)  # noqa: E731
+            runs.append(evaluate(method, make(seed), data, names, look, lpips))
+        scores.append(merge_seeds(runs))
+    return scores

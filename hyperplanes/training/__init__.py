@@ -1,0 +1,5 @@
+"""Meta-training: the hypernetwork and theta, or an initialisation alone, from tasks (HyperPlanes, Algorithm 1)."""
+
+from hyperplanes.training.trainer import Progress, Trainer, TrainingConfig, start_training, train
+
+__all__ = ["Progress", "Trainer", "TrainingConfig", "start_training", "train"]

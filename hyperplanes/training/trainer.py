@@ -1,0 +1,450 @@
+"""Meta-training: theta and the hypernetwork by separate Adam steps on query rays (HyperPlanes, Algorithm 1)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+from torch.profiler import record_function
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
+from hyperplanes.adaptation.fine_tuning import ray_loss
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
+from hyperplanes.devices import TasksOnDevice
+from hyperplanes.files import encode_png, write_json, write_whole
+from hyperplanes.metrics import psnr
+from hyperplanes.optimisers import make_optimisers
+from hyperplanes.parameters import Parameters
+from hyperplanes.training.episodes import Episode, prepare_episode
+from hyperplanes.training.prefetching import Prefetcher
+from hyperplanes.training.state import Curve, check_model, load_state, save_state
+from hyperplanes.training.watching import Samples, write_curve
+from hyperplanes.utilities.errors import prefix_errors
+from hyperplanes.utilities.lru_cache import LRUCache
+from hyperplanes.views import Tasks
+
+__all__ = ["Progress", "Trainer", "TrainingConfig", "start_training", "train"]
+
+
+EMPTINESS = 0.01  # weight of the opacity of empty space beside the squared error of pixels
+FREE = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every", "memory", "prefetch")
+"""What may differ in a training that is resumed."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a model is trained (HyperPlanes, Appendix B: one task a step, 512 rays, learning rates 1e-4, no schedule).
+
+    Four objects of 128 rays a step cost what one of 512 does and end 0.5 dB higher; the paper's presets say one.
+
+    Attributes:
+        steps: Adam steps.
+        epochs: how often each training object is drawn, on average, instead of `steps`; 0 takes `steps`.
+        tasks: objects a step.
+        reference_objects: further objects a step, of which only the HyperPlanes are read. The hypernetwork standardises
+            codes by the objects of the step, and cannot tell what one object alone has in common with the others.
+        rays: query rays an object and step.
+        empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
+            training sees nothing there, but a field that is rendered without masks must know.
+        optimiser: of theta: "adam" as in the paper, or "muon" for the matrices of its hidden layers.
+        learning_rate: of theta, by Adam.
+        muon_learning_rate: of the matrices of theta that Muon optimises.
+        hypernetwork_learning_rate: of the hypernetwork.
+        warmup: steps in which the learning rates rise from zero.
+        final: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
+        alternating: theta and the hypernetwork move in turns, theta first, instead of both in every step. The paper
+            speaks of separate gradient steps; its code moves both.
+        evaluate_every: steps between looks at held-out objects.
+        held_out: how many of them are looked at: objects of the "val" split, or where there is none of "test".
+        checkpoint_every: steps between checkpoints.
+        memory: bytes of images, planes and hulls that are kept for later steps; the last object always is.
+        prefetch: steps whose objects a thread makes ready ahead, beyond `memory`; 0 makes them when they are due.
+        seed: of the objects, rays and samples of every step.
+    """
+
+    steps: Annotated[int, range(1, 10**10)] = 2000
+    epochs: Annotated[int, range(10**7)] = 0
+    tasks: Annotated[int, range(1, 4097)] = 4
+    reference_objects: Annotated[int, range(4097)] = 0
+    rays: Annotated[int, range(1, 2**24)] = 128
+    empty_points: Annotated[int, range(2**24)] = 0
+    optimiser: str = "adam"
+    learning_rate: float = 1e-4
+    muon_learning_rate: float = 0.02
+    hypernetwork_learning_rate: float = 1e-4
+    warmup: Annotated[int, range(10**10)] = 0
+    final: float = 1.0
+    alternating: bool = False
+    evaluate_every: Annotated[int, range(1, 10**10)] = 250
+    held_out: Annotated[int, range(10**6)] = 4
+    checkpoint_every: Annotated[int, range(1, 10**10)] = 500
+    memory: Annotated[int, range(2**50)] = 2 * 2**30
+    prefetch: Annotated[int, range(1025)] = 1
+    seed: Annotated[int, range(2**40)] = 0
+
+    def steps_for(self, objects: int) -> int:
+        """How many steps are taken with so many training objects.
+
+        >>> TrainingConfig(epochs=10, tasks=4).steps_for(150)
+        375
+
+        Args:
+            objects: to train on.
+        """
+        return -(-self.epochs * objects // self.tasks) if self.epochs else self.steps
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training stands.
+
+    Attributes:
+        step: steps done.
+        steps: steps to do.
+        loss: mean squared error of the last step's rays.
+        rays_per_second: since the last report.
+        psnr: in dB, of some views of held-out objects, where this step looked at them.
+        seconds_left: by the speed so far.
+        diagnostics: of the hypernetwork on those objects.
+        ssim: of the same views, where they are large enough for it.
+    """
+
+    step: int
+    steps: int
+    loss: float
+    rays_per_second: float
+    psnr: float | None
+    seconds_left: float
+    diagnostics: Diagnostics | None = None
+    ssim: float | None = None
+
+
+class Trainer:
+    """The state of one training: model, two optimisers, step count, the curve so far.
+
+    Every step draws from a generator seeded by (seed, step), so a training that is stopped and resumed ends exactly
+    where an uninterrupted one does. It computes where the model is.
+
+    Args:
+        model: trained in place.
+        data: tasks with a "train" split and perhaps a "val" or "test" split.
+        config: how.
+        folder: for checkpoints; a training that lies there already goes on.
+
+    Raises:
+        ValueError: no object to train on.
+    """
+
+    def __init__(self, model: HyperPlanes, data: Tasks, config: TrainingConfig, folder: Path | None = None) -> None:
+        self.model = model
+        self.data = data
+        self.folder = folder
+        self.step = 0
+        self.curve: Curve = []
+        self.diagnostics: Diagnostics | None = None
+        self.samples: Samples | None = None
+        self.stopping = False  # set by whoever wants `run` to end after the step at hand
+        self.names = sorted(data.names("train"))
+        if not self.names:
+            raise ValueError("data: expected at least one training object, got none")
+        self.config = config = replace(config, steps=config.steps_for(len(self.names)))
+        self._episodes: LRUCache[Episode] = LRUCache(config.memory, keep_last=True)
+        self._prefetcher = Prefetcher(self._load, self._episodes)
+        self._held_out: dict[str, Episode] = {}
+        self._updates: list[Parameters] = []
+        theta = list(model.networks.parameters())
+        self.optimisers = make_optimisers(theta, config.optimiser, config.learning_rate, config.muon_learning_rate)
+        self._of_theta = len(self.optimisers)
+        if model.hypernetwork is not None:
+            rate = config.hypernetwork_learning_rate
+            self.optimisers += make_optimisers(list(model.hypernetwork.parameters()), "adam", rate, 0.0)
+        self.rates = [optimiser.param_groups[0]["lr"] for optimiser in self.optimisers]
+        if folder is not None:
+            check_model(folder, model.config)
+        if folder is not None and (folder / "training.json").exists():
+            self.step, self.curve = load_state(folder, model, self.optimisers, asdict(config), FREE)
+        else:
+            with prefix_errors(self.names[0]):
+                model.set_rig(data.task(self.names[0]).support)
+
+    def run(self) -> Iterator[Progress]:
+        """Train until the last step, reporting every 25 steps; checkpoints are written on the way and at the end.
+
+        With them come curve.csv and samples/STEP.png, held-out views beside the truth.
+        Once `stopping` is set, the step at hand is the last one, and a checkpoint of it is written.
+
+        Yields:
+            Where the training stands.
+        """
+        try:
+            yield from self._run()
+        finally:
+            self._prefetcher.close()
+
+    def _run(self) -> Iterator[Progress]:
+        started, first, reported = time.perf_counter(), self.step, (time.perf_counter(), self.step)
+        while self.step < self.config.steps:
+            ahead = range(self.step, min(self.step + 1 + self.config.prefetch, self.config.steps))
+            self._prefetcher.expect(name for step in ahead[1:] for name in self._drawn(self._generator(step)))
+            loss = self.take_step()
+            step, last = self.step, self.step == self.config.steps
+            look = step % self.config.evaluate_every == 0 or last
+            report = look or step % 25 == 0
+            now = time.perf_counter()
+            quality, diagnostics = self.look() if look else (None, None)
+            self.diagnostics = diagnostics or self.diagnostics
+            seen = self.samples if look else None
+            if report:
+                row = {"step": step, "loss": loss, **self.norms()}
+                row |= {} if quality is None else {"psnr": quality}
+                row |= {} if seen is None or seen.ssim is None else {"ssim": seen.ssim}
+                row |= diagnostics.as_json() if diagnostics else {}
+                self.curve.append(row)
+            saving = step % self.config.checkpoint_every == 0 or last or self.stopping
+            if self.folder is not None and (look or saving):
+                write_curve(self.folder / "curve.csv", self.curve)
+                if seen is not None:
+                    write_whole(self.folder / "samples" / f"{step:08d}.png", encode_png(seen.sheet()))
+            if saving:
+                self.save()
+            if self.stopping:
+                return
+            if not report:
+                continue
+            rays = (step - reported[1]) * self.rays_per_step / max(now - reported[0], 1e-9)
+            left = (time.perf_counter() - started) / (step - first) * (self.config.steps - step)
+            reported = (time.perf_counter(), step)
+            ssim = seen.ssim if seen else None
+            yield Progress(step, self.config.steps, loss, rays, quality, left, diagnostics, ssim)
+
+    def take_step(self) -> float:
+        """One step of the optimisers on freshly drawn objects and rays; returns the loss."""
+        generator = self._generator(self.step)
+        self.model.train()
+        for optimiser in self.optimisers:
+            optimiser.zero_grad(set_to_none=True)
+        drawn = self._drawn(generator)
+        with record_function("step:data"):
+            episodes = [self._prefetcher.get(name) for name in drawn]
+        loss = self.gradients(drawn, episodes, generator)
+        if not math.isfinite(loss):
+            raise ValueError(
+                f"step {self.step + 1}, on {', '.join(drawn)}: expected a finite loss, got {loss}; the last checkpoint "
+                "is kept; check the images of these objects, or train with lower rates"
+            )
+        for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
+            optimiser.param_groups[0]["lr"] = rate * self._schedule()
+        with record_function("step:optimisers"):
+            for optimiser in self._due():
+                optimiser.step()
+        self.step += 1
+        return loss
+
+    @property
+    def rays_per_step(self) -> int:
+        """Rays of all objects of a step."""
+        return self.config.rays * self.config.tasks
+
+    def gradients(self, drawn: Sequence[str], episodes: Sequence[Episode], generator: torch.Generator) -> float:
+        """Set the gradients of a step.
+
+        Args:
+            drawn: names of the objects, those that are rendered first.
+            episodes: the objects.
+            generator: of rays and samples.
+
+        Returns:
+            The loss.
+        """
+        config = self.config
+        total = torch.zeros(())
+        with record_function("step:update"):
+            updates = self.model.updates([episode.prepared for episode in episodes])
+        for name, episode, update in list(zip(drawn, episodes, updates, strict=True))[: config.tasks]:
+            field = self.model.field(episode.prepared, self.model.theta + update)
+            span = field.sampling.span
+            with record_function("step:rays"), prefix_errors(name):
+                rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
+            with record_function("step:rendering"):
+                seen = field.trace(rays, generator)
+            if config.empty_points:
+                with record_function("step:emptiness"):
+                    total = total + self._emptiness(field, generator)
+            total = total + ray_loss(seen, truth)
+        with record_function("step:gradients"):
+            (total / config.tasks).backward()
+        self._updates = [update.detach() for update in updates]
+        return float(total.detach()) / config.tasks
+
+    def _due(self) -> list[torch.optim.Optimizer]:
+        """The optimisers of this step: all, or in turns those of theta and that of the hypernetwork."""
+        theta, hypernetwork = self.optimisers[: self._of_theta], self.optimisers[self._of_theta :]
+        if not self.config.alternating or not hypernetwork:
+            return self.optimisers
+        return hypernetwork if self.step % 2 else theta
+
+    @torch.no_grad()
+    def norms(self) -> dict[str, float]:
+        """Norms of the last step: of the gradient of each part, and of its objects' updates (root mean square)."""
+        parts = {"theta": self.model.networks, "hypernetwork": self.model.hypernetwork}
+        found = {}
+        for name, part in parts.items():
+            gradients = [] if part is None else [each.grad for each in part.parameters() if each.grad is not None]
+            if gradients:
+                found[f"gradient_{name}"] = float(torch.stack([each.norm() for each in gradients]).norm())
+        if self.model.hypernetwork is not None and self._updates:
+            squares = [value.square().sum() for update in self._updates for value in update.values()]
+            found["update"] = float((torch.stack(squares).sum() / len(self._updates)).sqrt())
+        return found
+
+    def _generator(self, step: int) -> torch.Generator:
+        """What everything random of a step is drawn from, its objects first."""
+        return torch.Generator().manual_seed(self.config.seed * 1_000_003 + step)
+
+    def _drawn(self, generator: torch.Generator) -> list[str]:
+        """The objects of a step, different ones while there are enough: those to render, then the reference objects."""
+        count, total = self.config.tasks, len(self.names)
+        if self.model.hypernetwork is not None:
+            count += self.config.reference_objects
+        if count == 1:
+            return [self.names[int(torch.randint(total, (), generator=generator))]]
+        repeats = -(-count // total)
+        drawn = torch.cat([torch.randperm(total, generator=generator) for _ in range(repeats)])[:count]
+        return [self.names[index] for index in drawn.tolist()]
+
+    def warm(self, name: str) -> None:
+        """Have the planes and the hull of an object ready, as its first step otherwise makes them."""
+        self._prefetcher.get(name)
+
+    @torch.no_grad()
+    def look(self) -> tuple[float | None, Diagnostics | None]:
+        """Mean PSNR in dB of two query views of some held-out objects, and the diagnostics of the hypernetwork there.
+
+        The objects are those of the "val" split, or of "test" where a data set has no other; nothing is chosen by these
+        numbers. None where there are no such objects, and no hypernetwork or a single object to compare updates of.
+        `samples` holds the views themselves.
+        """
+        names = sorted(self.data.names("val")) or sorted(self.data.names("test"))
+        for name in names[: self.config.held_out]:
+            if name not in self._held_out:
+                task = self.data.task(name)
+                few = replace(task, query=task.query[:: max(1, len(task.query) // 2)][:2])
+                self._held_out[name] = prepare_episode(self.model, few, carved=self._reads_hull)
+        episodes = list(self._held_out.values())
+        if not episodes:
+            return None, None
+        prepared, queries = [each.prepared for each in episodes], [each.query for each in episodes]
+        training = self.model.training
+        self.model.eval()
+        try:
+            fields = [self._adapted(each) for each in episodes]
+            pictures = [field.render(query.cameras).images for field, query in zip(fields, queries, strict=True)]
+            self.samples = Samples(pictures, [query.images for query in queries])
+            quality = float(torch.cat([psnr(*pair) for pair in self.samples.pairs]).mean())
+            if self.model.hypernetwork is None or len(episodes) < 2:
+                return quality, None
+            _, gap = swap_gap(self.model, prepared, queries, quality)
+            return quality, replace(diagnose(self.model, prepared), swap_gap=gap)
+        finally:
+            self.model.train(training)
+
+    def _adapted(self, episode: Episode) -> AdaptedField:
+        """The field of a held-out object."""
+        return self.model.adapt(episode.prepared)
+
+    def save(self) -> None:
+        """Write model and training state to the folder, where there is one; whole or not at all."""
+        if self.folder is not None:
+            if self.diagnostics is not None:
+                write_json(self.folder / "diagnostics.json", self.diagnostics.as_json())
+            save_state(self.folder, self.model, self.optimisers, self.step, self.curve, asdict(self.config))
+
+    def _emptiness(self, field: AdaptedField, generator: torch.Generator) -> Tensor:
+        """Mean opacity, a tenth of a radius thick, of random points of the sphere that the hull rules out."""
+        bounds, device = field.occupancy.bounds, field.occupancy.occupied.device
+        unit = torch.randn(self.config.empty_points, 3, generator=generator)
+        unit = unit / unit.norm(dim=1, keepdim=True) * torch.rand(len(unit), 1, generator=generator) ** (1 / 3)
+        points = (unit * bounds.radius + torch.tensor(bounds.centre)).to(device)
+        points = points[~field.occupancy.contains(points)]
+        opacity = [1 - torch.exp(-density(points) * bounds.radius / 10) for density in field.densities]
+        return EMPTINESS * sum((each.sum() for each in opacity), torch.zeros((), device=device)) / len(unit)
+
+    def _schedule(self) -> float:
+        config = self.config
+        if self.step < config.warmup:
+            return (self.step + 1) / config.warmup
+        done = (self.step - config.warmup) / max(1, config.steps - config.warmup)
+        return config.final + (1 - config.final) * (1 + math.cos(math.pi * done)) / 2
+
+    @property
+    def _reads_hull(self) -> bool:
+        """Whether any sample depends on the hull; the paper's protocol samples without one."""
+        return self.model.config.sampling.needs_occupancy or self.config.empty_points > 0
+
+    def _load(self, name: str) -> Episode:
+        return prepare_episode(self.model, self.data.task(name), carved=self._reads_hull)
+
+
+def train(
+    model: HyperPlanes,
+    data: Tasks,
+    config: TrainingConfig,
+    folder: Path | None = None,
+    report: Callable[[Progress], None] | None = None,
+) -> Trainer:
+    """Run a training, resumed from `folder` where it holds one.
+
+    Args:
+        model: trained in place.
+        data: tasks, as in `Trainer`.
+        config: how.
+        folder: for checkpoints.
+        report: called with every progress.
+
+    Returns:
+        The finished training.
+    """
+    trainer = Trainer(model, data, config, folder)
+    for progress in trainer.run():
+        if report is not None:
+            report(progress)
+    return trainer
+
+
+def start_training(
+    config: ModelConfig,
+    training: TrainingConfig,
+    data: Tasks,
+    folder: Path,
+    device: torch.device | str = "cpu",
+    reference: Path | None = None,
+) -> Trainer:
+    """A new training, or the one that was interrupted in `folder`.
+
+    Args:
+        config: of the model.
+        training: how it is trained; its seed is that of the first weights, too.
+        data: tasks with a "train" split.
+        folder: for checkpoints.
+        device: where to compute.
+        reference: the checkpoint of mv_meta that mv_matched is to match.
+
+    Returns:
+        A trainer; its `step` says how far it is. CheckpointError where the folder holds another model or training.
+    """
+    matching = config.initialisation is not None and config.initialisation.method == "mv_matched"
+    model = HyperPlanes(config, training.seed + matching).to(device)  # not the weights that mv_meta began with
+    tasks = TasksOnDevice(data, torch.device(device))
+    if config.initialisation is None:
+        return Trainer(model, tasks, training, folder)
+    from hyperplanes.training.meta_training import initialisation_trainer
+
+    matched = None if reference is None else HyperPlanes.from_pretrained(reference)
+    return initialisation_trainer(model, tasks, training, folder, matched)

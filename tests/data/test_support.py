@@ -1,0 +1,56 @@
+"""Source of truth: the views of a task themselves."""
+
+import pytest
+import torch
+
+from hyperplanes.data.support import SingleView, WithSupport
+from hyperplanes.evaluation import evaluate
+from hyperplanes.fields import TargetConfig
+from hyperplanes.geometry.cameras import centres
+from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.training import TrainingConfig, train
+from tests.reference_rendering import Balls, small_model
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 6, 8])
+def test_the_support_is_its_first_views_and_then_those_of_the_query(count):
+    data = Balls()
+    before, after = data.task("train1"), WithSupport(data, count).task("train1")
+    images = torch.cat([before.support.images, before.query.images])
+    standing = torch.cat([centres(before.support.cameras), centres(before.query.cameras)])
+    masks = torch.cat([before.support.masks, before.query.masks])
+    assert torch.equal(after.support.images, images[:count])
+    assert torch.equal(centres(after.support.cameras), standing[:count])
+    assert torch.equal(after.support.masks, masks[:count])
+    assert torch.equal(after.query.images, before.query.images)
+    assert WithSupport(data, count).names("train") == data.names("train")
+
+
+def test_more_views_than_there_are_and_none_are_refused():
+    with pytest.raises(ValueError, match="train0: expected 9 views for the support, got 8"):
+        WithSupport(Balls(), 9).task("train0")
+    with pytest.raises(ValueError, match="support: expected at least 1 view, got 0"):
+        WithSupport(Balls(), 0)
+
+
+def test_fifty_planes_are_trained_and_evaluated_with_support_and_query_unified():
+    data = WithSupport(Balls(train=1, views=25), 50)
+    network = TargetConfig(depth=2, width=16, planes=50, point_octaves=2, direction_octaves=1)
+    hypernetwork = HyperNetworkConfig(views=50, normalisation="group", code=2, depth=1, width=8)
+    model = small_model(network=network, hypernetwork=hypernetwork)
+    trainer = train(model, data, TrainingConfig(steps=1, tasks=1, rays=16, held_out=0))
+    assert trainer.model.rig.shape == (50, 3)
+    task = data.task("test0")
+    assert torch.equal(model.prepare(task.support).views.images, task.support.images)
+    assert evaluate("hyperplanes", model.eval(), data, ["test0"]).mean("psnr") > 0
+    with pytest.raises(ValueError, match="support: expected at least 50 views, got 25; .* unified"):
+        model.set_rig(Balls(views=25).task("test0").support)
+
+
+def test_the_single_view_of_an_object_is_always_the_same():
+    data = SingleView(Balls(train=3))
+    for name in data.names("train"):
+        first, again = data.task(name).support, data.task(name).support
+        assert len(first) == 1
+        assert torch.equal(first.images, again.images)
+        assert torch.equal(data.task(name).query.images, Balls().task(name).query.images)

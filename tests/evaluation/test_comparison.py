@@ -1,0 +1,65 @@
+"""Source of truth: scipy's paired t-test, and arithmetic by hand."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import t, ttest_rel
+
+from hyperplanes.evaluation import ObjectScore, Score, merge_seeds
+from hyperplanes.evaluation.comparison import compare, compare_all
+
+
+def score(method, values, **numbers):
+    objects = [ObjectScore(f"o{i}", value, 0.5, 1.0, 2.0, **numbers) for i, value in enumerate(values)]
+    return Score(method, tuple(objects))
+
+
+def test_the_paired_test_is_that_of_scipy():
+    first, second = [20.0, 25.5, 31.0, 28.0], [19.0, 25.0, 28.5, 27.9]
+    found = compare(score("a", first), score("b", second))
+    assert found.p == pytest.approx(ttest_rel(first, second).pvalue)
+    differences = np.subtract(first, second)
+    half = t.ppf(0.975, 3) * differences.std(ddof=1) / 2  # the root of four objects
+    assert (found.low, found.high) == pytest.approx((differences.mean() - half, differences.mean() + half))
+    assert found.differences == pytest.approx({"o0": 1.0, "o1": 0.5, "o2": 2.5, "o3": 0.1})
+
+
+@pytest.mark.parametrize(("shift", "p"), [(0.0, 1.0), (0.5, 0.0)])
+def test_differences_that_are_all_alike(shift, p):
+    found = compare(score("a", [20.0 + shift, 30.0 + shift]), score("b", [20.0, 30.0]))
+    assert (found.low, found.high, found.p) == (shift, shift, p)
+
+
+def test_one_object_says_nothing_about_others():
+    found = compare(score("a", [20.0]), score("b", [19.0]))
+    assert (found.mean, found.low, found.p) == (1.0, None, None)
+
+
+def test_only_the_same_objects_can_be_compared():
+    with pytest.raises(ValueError, match="expected the objects of a, o0, o1, got those of b, o0"):
+        compare(score("a", [1.0, 2.0]), score("b", [1.0]))
+    with pytest.raises(ValueError, match="expected a finite psnr of every object, got none of o1"):
+        compare(score("a", [1.0, math.inf]), score("b", [1.0, 2.0]))
+
+
+def test_every_pair_the_better_method_first():
+    pairs = compare_all([score("low", [10.0, 12.0]), score("high", [20.0, 21.0]), score("perfect", [math.inf, 9.0])])
+    assert [(pair.first, pair.second, pair.mean) for pair in pairs] == [("high", "low", 9.5)]
+
+
+def test_seeds_are_averaged_object_by_object():
+    merged = merge_seeds([score("a", [20.0, 30.0]), score("a", [22.0, 34.0], psnr_foreground=1.0)])
+    assert [each.psnr for each in merged.objects] == [21.0, 32.0]
+    assert merged.objects[0].psnr_foreground is None  # one of the seeds has none
+    assert merged.mean("psnr") == 26.5
+    assert merged.deviation("psnr") == pytest.approx(3 / 2**0.5)  # of 25 and 28
+    assert merged.spread("psnr") == pytest.approx(5.5)
+    assert merge_seeds([score("a", [20.0])]).deviation("psnr") is None
+    with pytest.raises(ValueError, match="expected the same objects for every seed"):
+        merge_seeds([score("a", [20.0]), score("a", [20.0, 21.0])])
+
+
+def test_scores_come_back_from_json():
+    merged = merge_seeds([score("a", [20.0, 30.0], psnr_pooled=19.0), score("a", [22.0, 34.0], psnr_pooled=21.0)])
+    assert Score.of_json("a", merged.as_json()) == merged

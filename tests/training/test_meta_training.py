@@ -1,0 +1,146 @@
+"""Source of truth: autograd and a loop beside the trainers, bitwise equality of resumed trainings, poisoned pixels."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import FineTuned, HyperPlanes, InitialisationConfig
+from hyperplanes.adaptation.fine_tuning import ray_loss
+from hyperplanes.data.support import SingleView
+from hyperplanes.evaluation import evaluate
+from hyperplanes.parameters import Parameters
+from hyperplanes.rendering import Hierarchical
+from hyperplanes.training import Trainer, TrainingConfig, start_training
+from hyperplanes.training.meta_training import initialisation_trainer
+from hyperplanes.views import Task
+from tests.reference_rendering import Balls, small_model
+
+FAST = TrainingConfig(steps=4, tasks=2, rays=24, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
+
+
+def model_of(method, **changes):
+    parts = {"inner_steps": 2, "steps": 3, "test_rays": 16, **changes}
+    return small_model(hypernetwork=None, target="nerf", initialisation=InitialisationConfig(method, **parts))
+
+
+def gradients_of(trainer):
+    """The gradient of the first step, before an optimiser sees it."""
+    for optimiser in trainer.optimisers:
+        optimiser.step = lambda: None
+    trainer.take_step()
+    return Parameters((name, value.grad) for name, value in trainer.model.networks.named_parameters())
+
+
+@pytest.mark.parametrize("method", ["mv_meta", "sv_meta", "maml", "mv_matched"])
+def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, method):
+    data, config = Balls(), model_of(method).config
+    model_of("mv_meta").save(tmp_path / "reference")
+
+    def run(folder, steps):
+        training = replace(FAST, steps=steps)
+        trainer = start_training(config, training, data, folder, reference=tmp_path / "reference")
+        started = trainer.step
+        for _ in trainer.run():
+            pass
+        return trainer, started
+
+    whole, _ = run(tmp_path / "whole", 4)
+    _, none = run(tmp_path / "parts", 2)
+    parts, started = run(tmp_path / "parts", 4)
+    assert (none, started) == (0, 2)
+    assert parts.curve[-1] == whole.curve[-1]
+    for name, value in whole.model.state_dict().items():
+        assert torch.equal(value, parts.model.state_dict()[name]), name
+    assert HyperPlanes.from_pretrained(tmp_path / "parts").config == config
+
+
+def test_one_inner_step_of_reptile_is_a_gradient_step_on_support_rays():
+    model = model_of("mv_meta", inner_steps=1, inner_rate=0.3)
+    found = gradients_of(initialisation_trainer(model, Balls(train=1), replace(FAST, tasks=1), None))
+    generator = torch.Generator().manual_seed(0)
+    int(torch.randint(1, (), generator=generator))  # the object
+    rays_generator = torch.Generator().manual_seed(int(torch.randint(2**31, (), generator=generator)))
+    trainer = Trainer(model_of("mv_meta"), Balls(train=1), FAST)
+    episode = trainer._prefetcher.get("train0")
+    views = episode.prepared.views
+    rays, truth = views.sample_rays(FAST.rays, generator=rays_generator, among=episode.support_live)
+    field = trainer.model.field(episode.prepared, trainer.model.theta)
+    ray_loss(field.trace(rays, rays_generator), truth).backward()
+    for name, value in trainer.model.networks.named_parameters():
+        torch.testing.assert_close(found[name], 0.3 * value.grad, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("coarse", [False, True])
+def test_inner_steps_of_rate_zero_lead_nowhere(coarse):
+    changes = {"coarse_network": True, "sampling": Hierarchical(6, 6)} if coarse else {}
+
+    def found(method):
+        model = small_model(
+            hypernetwork=None,
+            target="nerf",
+            initialisation=InitialisationConfig(method, inner_steps=2, inner_rate=0.0),
+            **changes,
+        )
+        return gradients_of(initialisation_trainer(model, Balls(), FAST, None))
+
+    assert all((value == 0).all() for value in found("mv_meta").values())
+    second, first = found("maml"), found("maml_first_order")
+    for name in second:
+        torch.testing.assert_close(second[name], first[name])
+    assert any((value != 0).any() for value in second.values())
+
+
+def test_a_single_view_an_object_is_all_that_sv_meta_sees():
+    data, poisoned = Balls(), Balls()
+    clean = data.task
+
+    def poison(name):
+        task = clean(name)
+        kept = SingleView(data).task(name).support
+        images = torch.full_like(task.support.images, torch.nan)
+        same = (task.support.images == kept.images).flatten(1).all(1)
+        assert same.sum() == 1
+        images[same] = kept.images
+        masks = torch.full_like(task.support.masks, torch.nan)
+        masks[same] = kept.masks
+        return Task(replace(task.support, images=images, masks=masks), task.query, name)
+
+    poisoned.task = poison
+    config = replace(FAST, steps=2)
+    one, other = (initialisation_trainer(model_of("sv_meta"), each, config, None) for each in (data, poisoned))
+    assert [one.take_step(), one.take_step()] == [other.take_step(), other.take_step()]
+
+
+def test_matching_makes_the_outputs_of_the_reference(tmp_path):
+    model_of("mv_meta").save(tmp_path)
+    config = replace(FAST, steps=80, tasks=1, rays=128, learning_rate=1e-2)
+    trainer = start_training(model_of("mv_matched").config, config, Balls(), tmp_path / "out", reference=tmp_path)
+    assert not torch.equal(trainer.model.networks.fine.colour.weight, model_of("mv_meta").networks.fine.colour.weight)
+    losses = [trainer.take_step() for _ in range(80)]
+    assert sum(losses[-5:]) < 0.1 * sum(losses[:5])
+
+
+def test_a_reference_that_does_not_fit_is_refused(tmp_path):
+    model = model_of("mv_matched")
+    with pytest.raises(ValueError, match="mv_matched: expected a checkpoint of mv_meta to match, got none"):
+        initialisation_trainer(model, Balls(), FAST, None)
+    with pytest.raises(ValueError, match="reference: expected mv_meta .*, got a checkpoint of maml"):
+        initialisation_trainer(model, Balls(), FAST, None, model_of("maml"))
+    other = small_model(hypernetwork=None, initialisation=InitialisationConfig())
+    with pytest.raises(ValueError, match="reference: expected mv_meta .*, got other target"):
+        initialisation_trainer(model, Balls(), FAST, None, other)
+
+
+def test_objects_in_another_order_have_the_same_results_and_the_initialisation_stays_as_it_is():
+    model, data = model_of("mv_meta"), Balls(test=2)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    settings = model.config.initialisation.descent()
+    rows = [
+        evaluate("mv_meta", FineTuned(model, 3, settings), data, order).objects
+        for order in (["test0", "test1"], ["test1", "test0"])
+    ]
+    one, other = ({each.name: (each.psnr, each.ssim) for each in row} for row in rows)
+    assert one == other
+    assert len(set(one.values())) == 2
+    assert all(torch.equal(value, model.state_dict()[name]) for name, value in before.items())

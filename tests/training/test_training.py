@@ -1,0 +1,569 @@
+import csv
+import json
+import signal
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from hyperplanes import checkpoints, files
+from hyperplanes.adaptation import Diagnostics, HyperPlanes, base, diagnose
+from hyperplanes.checkpoints import CheckpointError, read_json
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.train import follow
+from hyperplanes.geometry import occupancy
+from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.metrics import psnr
+from hyperplanes.rendering import Hierarchical, Marched
+from hyperplanes.training import Trainer, TrainingConfig, train
+from hyperplanes.training.watching import TensorBoard
+from tests.reference_rendering import Balls, awaken, small_model
+
+FAST = TrainingConfig(steps=6, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
+
+
+def with_(config=FAST, **changes):
+    return TrainingConfig(**{**config.__dict__, **changes})
+
+
+def losses(model, config, steps=None):
+    trainer = Trainer(model, Balls(), config)
+    return [trainer.take_step() for _ in range(steps or config.steps)]
+
+
+def state_of(model):
+    return {name: value.clone() for name, value in model.state_dict().items()}
+
+
+def same(one, other):
+    return set(one) == set(other) and all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize(
+    "parts", [{}, {"hypernetwork": None}, {"coarse_network": True, "sampling": Hierarchical(8, 8)}], ids=str
+)
+def test_the_loss_falls(parts):
+    found = losses(small_model(**parts), with_(steps=40, learning_rate=5e-3, hypernetwork_learning_rate=2e-3))
+    assert sum(found[-5:]) < 0.5 * sum(found[:5])
+
+
+def test_the_same_seed_makes_the_same_curve_and_the_same_weights():
+    first, second, third = small_model(), small_model(), small_model()
+    curve = losses(first, FAST, 4)
+    before = torch.random.get_rng_state()
+    assert losses(second, FAST, 4) == curve
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert same(first.state_dict(), second.state_dict())
+    assert losses(third, with_(seed=1), 4) != curve
+
+
+def test_every_step_draws_anew():
+    still = with_(learning_rate=0.0, hypernetwork_learning_rate=0.0)
+    assert len(set(losses(small_model(), still, 6))) == 6
+
+
+ALL_LAYERS = {"layers": ("all",), "update": "low_rank", "weights_seen": "all"}
+
+
+@pytest.mark.parametrize(
+    ("optimiser", "parts"),
+    [("adam", {"normalisation": "batch"}), ("muon", {"normalisation": "group"}), ("muon", ALL_LAYERS)],
+    ids=str,
+)
+def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, optimiser, parts):
+    shape = HyperNetworkConfig(**{"views": 2, "code": 8, "depth": 2, "width": 16, **parts})
+    config = with_(steps=5, warmup=2, final=0.1, optimiser=optimiser)
+    whole = train(small_model(hypernetwork=shape), Balls(), config, tmp_path / "whole")
+
+    first = Trainer(small_model(hypernetwork=shape), Balls(), config, tmp_path / "parts")
+    for _ in range(3):
+        first.take_step()
+    first.save()
+    first.take_step()  # lost: the training was stopped before the next checkpoint
+    resumed = Trainer(small_model(hypernetwork=shape), Balls(), config, tmp_path / "parts")
+    assert resumed.step == 3
+    list(resumed.run())
+    assert resumed.step == 5
+    assert resumed.curve == whole.curve
+    assert same(resumed.model.state_dict(), whole.model.state_dict())
+    for one, other in zip(resumed.optimisers, whole.optimisers, strict=True):
+        states = one.state_dict()["state"], other.state_dict()["state"]
+        for place in states[0]:
+            assert same(states[0][place], states[1][place])
+
+
+@pytest.mark.parametrize("reference_objects", [0, 3])
+def test_reference_objects_take_what_objects_share_out_of_the_gradient_of_their_codes(reference_objects):
+    # Property: batch normalisation over the objects of a step has a gradient that sums to zero over them.
+    shape = HyperNetworkConfig(views=2, code=8, depth=2, width=16, normalisation="group", **ALL_LAYERS)
+    model = awaken(small_model(hypernetwork=shape))
+    trainer = Trainer(model, Balls(), with_(tasks=1, reference_objects=reference_objects))
+    trainer.take_step()  # the running statistics are those of a step before
+    gradients = []
+    model.hypernetwork.code_normalisation.register_full_backward_hook(lambda _, given, __: gradients.append(given[0]))
+    trainer.take_step()
+    (gradient,) = gradients
+    assert len(gradient) == 1 + reference_objects
+    shared = gradient.sum(0).abs().max() / gradient.abs().max()
+    assert shared < 1e-4 if reference_objects else shared == 1
+
+
+def test_only_the_objects_of_a_step_are_rendered():
+    trainer = Trainer(small_model(), Balls(), with_(tasks=1, reference_objects=2))
+    drawn = trainer._drawn(trainer._generator(0))
+    assert len(set(drawn)) == len(drawn) == 3
+    for name in drawn[1:]:
+        trainer._prefetcher.get(name).query.images.fill_(float("nan"))
+    assert np.isfinite(trainer.take_step())
+
+
+def test_a_finished_training_is_not_repeated(tmp_path):
+    done = train(small_model(), Balls(), with_(steps=2), tmp_path)
+    weights = state_of(done.model)
+    again = train(small_model(), Balls(), with_(steps=2), tmp_path)
+    assert again.step == 2
+    assert same(again.model.state_dict(), weights)
+
+
+def test_a_training_with_other_options_is_not_resumed(tmp_path):
+    train(small_model(), Balls(), with_(steps=1), tmp_path)
+    with pytest.raises(CheckpointError) as caught:
+        Trainer(small_model(), Balls(), with_(steps=1, rays=64, seed=3), tmp_path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(word in message for word in ("training.json", "expected the same training", "rays", "seed", "--out"))
+    Trainer(small_model(), Balls(), with_(steps=9), tmp_path)  # more steps of the same training are fine
+
+
+def test_a_checkpoint_of_another_model_is_not_resumed(tmp_path):
+    train(small_model(), Balls(), with_(steps=1), tmp_path)
+    with pytest.raises(
+        CheckpointError, match="model.json: expected the model that is to be trained, found other hyper"
+    ):
+        Trainer(small_model(hypernetwork=None), Balls(), with_(steps=1), tmp_path)
+
+
+def test_theta_and_the_hypernetwork_have_optimisers_of_their_own():
+    model = small_model()
+    trainer = Trainer(model, Balls(), with_(learning_rate=3e-3, hypernetwork_learning_rate=1e-4))
+    groups = [{id(value) for group in o.param_groups for value in group["params"]} for o in trainer.optimisers]
+    assert groups == [{id(value) for value in part.parameters()} for part in (model.networks, model.hypernetwork)]
+    trainer.take_step()
+    assert [optimiser.param_groups[0]["lr"] for optimiser in trainer.optimisers] == [3e-3, 1e-4]
+
+
+@pytest.mark.parametrize("frozen", ["theta", "hypernetwork"])
+def test_a_rate_of_zero_freezes_its_part_alone(frozen):
+    rates = {"learning_rate": 1e-2, "hypernetwork_learning_rate": 1e-2}
+    rates["learning_rate" if frozen == "theta" else "hypernetwork_learning_rate"] = 0.0
+    model = small_model()
+    before = state_of(model)
+    losses(model, with_(**rates), 2)
+    moved = {name.split(".")[0] for name, value in model.named_parameters() if not torch.equal(value, before[name])}
+    assert moved == ({"hypernetwork"} if frozen == "theta" else {"networks"})
+
+
+def test_theta_and_the_hypernetwork_move_in_turns_when_asked_to():
+    model = small_model()
+    trainer = Trainer(model, Balls(), with_(alternating=True))
+    for moving in ("networks", "hypernetwork", "networks"):
+        before = {name: value.clone() for name, value in model.named_parameters()}
+        trainer.take_step()
+        moved = {name.split(".")[0] for name, value in model.named_parameters() if not torch.equal(value, before[name])}
+        assert moved == {moving}
+
+
+def test_muon_moves_the_hidden_matrices_by_its_own_rate():
+    model = small_model()
+    before = state_of(model)
+    config = with_(optimiser="muon", learning_rate=0.0, hypernetwork_learning_rate=0.0, muon_learning_rate=0.01)
+    losses(model, config, 2)
+    moved = {name for name, value in model.named_parameters() if not torch.equal(value, before[name])}
+    assert moved == {f"networks.fine.{name}.weight" for name in ("layers.0", "layers.1", "feature")}
+
+
+def test_without_a_hypernetwork_theta_alone_is_trained():
+    trainer = Trainer(small_model(hypernetwork=None), Balls(), FAST)
+    assert len(trainer.optimisers) == 1
+
+
+def test_rates_rise_in_the_warm_up_and_fall_along_half_a_cosine():
+    # 2 steps of warm-up: 1/2, 1; then half a cosine over 4 steps from 1 towards 0.2: at 0, 1/4, 1/2, 3/4 of it
+    trainer = Trainer(small_model(), Balls(), with_(steps=6, warmup=2, final=0.2, learning_rate=1.0))
+    rates = []
+    for _ in range(6):
+        trainer.take_step()
+        rates.append(trainer.optimisers[0].param_groups[0]["lr"])
+    half = 2**-0.5
+    expected = [0.5, 1.0, 1.0, 0.2 + 0.4 * (1 + half), 0.6, 0.2 + 0.4 * (1 - half)]
+    assert rates == pytest.approx(expected)
+
+
+def test_the_paper_keeps_its_rate():
+    trainer = Trainer(small_model(), Balls(), with_(steps=3))
+    for _ in range(3):
+        trainer.take_step()
+        assert trainer.optimisers[0].param_groups[0]["lr"] == 1e-3
+
+
+def test_several_objects_a_step_are_averaged():
+    assert all(0 < loss < 1 for loss in losses(small_model(), with_(tasks=3), 2))
+
+
+def test_objects_that_fall_out_of_memory_change_nothing():
+    assert losses(small_model(), with_(memory=1), 5) == losses(small_model(), FAST, 5)
+
+
+def test_only_training_objects_are_trained_on():
+    data = Balls()
+    asked = []
+    task = data.task
+    data.task = lambda name: asked.append(name) or task(name)
+    trainer = Trainer(small_model(), data, FAST)
+    for _ in range(6):
+        trainer.take_step()
+    assert set(asked) <= set(data.names("train"))
+    trainer.look()
+    assert asked[-1] in data.names("test")
+
+
+def test_progress_is_reported_with_the_held_out_quality(tmp_path):
+    reports = []
+    config = with_(steps=27, rays=8, evaluate_every=26, checkpoint_every=26)
+    trainer = train(small_model(), Balls(), config, tmp_path, reports.append)
+    assert [report.step for report in reports] == [25, 26, 27]
+    assert reports[0].psnr is None
+    assert all(0 < report.psnr < 60 for report in reports[1:])
+    assert all(report.loss > 0 and report.rays_per_second > 0 and report.seconds_left >= 0 for report in reports)
+    assert reports[-1].seconds_left == 0
+    assert [entry["step"] for entry in trainer.curve] == [25, 26, 27]
+    assert json.loads((tmp_path / "training.json").read_text())["curve"] == trainer.curve
+
+
+def test_no_held_out_objects_have_no_quality():
+    assert Trainer(small_model(), Balls(test=0), FAST).look() == (None, None)
+
+
+def test_no_training_object_is_refused():
+    with pytest.raises(ValueError, match="data: expected at least one training object, got none"):
+        Trainer(small_model(), Balls(train=0), FAST)
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+@pytest.mark.parametrize("memory", [1, 2**30], ids=["nothing kept", "all kept"])
+def test_objects_made_ready_by_a_thread_change_nothing(memory):
+    """The same curve to the bit, and every object that is not kept is made in the thread."""
+    threads, runs = set(), []
+    for prefetch in (0, 2):
+        data = Balls(train=5)
+        task = data.task
+        data.task = lambda name, task=task: threads.add(threading.current_thread().name) or task(name)
+        config = with_(steps=4, tasks=2, rays=16, memory=memory, prefetch=prefetch)
+        trainer = train(small_model(), data, config)
+        runs.append((trainer.curve, state_of(trainer.model)))
+        assert any("prefetch" in name for name in threads) == (prefetch > 0)
+    for curve, weights in runs[1:]:
+        assert curve == runs[0][0]
+        assert same(weights, runs[0][1])
+
+
+def test_an_object_that_the_thread_cannot_read_ends_the_step_that_needs_it():
+    data = Balls(train=1)
+    task = data.task
+    trainer = Trainer(small_model(), data, with_(steps=3, memory=1))
+    data.task = lambda name: task("no such object")
+    with pytest.raises(ValueError, match="invalid literal"):
+        list(trainer.run())
+    assert trainer.step == 0
+
+
+def test_epochs_are_steps_in_which_every_object_is_drawn_so_often():
+    # 5 objects, 2 a step, 4 epochs: 20 draws, 10 steps
+    assert Trainer(small_model(), Balls(train=5), with_(epochs=4, tasks=2)).config.steps == 10
+    assert Trainer(small_model(), Balls(train=5), with_(epochs=1, tasks=2)).config.steps == 3
+    assert train(small_model(), Balls(train=2), with_(epochs=2, tasks=2, rays=4)).step == 2
+
+
+def test_theta_and_the_hypernetwork_take_turns_where_asked():
+    model = awaken(small_model())
+    trainer = Trainer(model, Balls(), with_(alternating=True, hypernetwork_learning_rate=1e-3))
+    for part in ("networks", "hypernetwork", "networks"):
+        before = {name: value.clone() for name, value in model.named_parameters()}
+        trainer.take_step()
+        moved = {name.split(".")[0] for name, v in model.named_parameters() if not torch.equal(v, before[name])}
+        assert moved == {part}
+
+
+def test_norms_are_those_of_gradients_and_updates():
+    model, made = awaken(small_model()), []
+    updates = model.updates
+    model.updates = lambda *given: made.extend(updates(*given)) or list(made)
+    trainer = Trainer(model, Balls(), with_(tasks=2))
+    trainer.take_step()
+    found = trainer.norms()
+    for name, part in (("theta", model.networks), ("hypernetwork", model.hypernetwork)):
+        squares = [each.grad.square().sum() for each in part.parameters() if each.grad is not None]
+        assert found[f"gradient_{name}"] == pytest.approx(float(sum(squares)) ** 0.5, rel=1e-5)
+    squares = [float(value.detach().square().sum()) for update in made for value in update.values()]
+    assert found["update"] == pytest.approx((sum(squares) / 2) ** 0.5, rel=1e-5)
+    assert found["update"] > 0.1
+
+
+def test_a_curve_and_pictures_lie_beside_the_weights(tmp_path):
+    trainer = train(small_model(), Balls(test=2), with_(steps=1), tmp_path)
+    with (tmp_path / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [{name: float(value) for name, value in row.items()} for row in rows] == trainer.curve
+    assert {"step", "loss", "psnr", "ssim", "spread", "swap_gap", "gradient_theta", "update"} <= set(rows[0])
+    assert sorted(path.name for path in (tmp_path / "samples").iterdir()) == ["00000001.png"]
+    with Image.open(tmp_path / "samples" / "00000001.png") as sheet:  # two views of two objects, beside the truth
+        pixels = np.asarray(sheet)
+    assert pixels.shape == (4 * 16, 2 * 16, 3)
+    for index, (name, view) in enumerate((name, view) for name in ("test0", "test1") for view in (0, 2)):
+        truth = Balls(test=2).task(name).query.images[view].permute(1, 2, 0).numpy()
+        assert abs(pixels[16 * index : 16 * index + 16, 16:] / 255 - truth).max() <= 0.5 / 255 + 1e-6
+        task = Balls(test=2).task(name)
+        seen = trainer.model.eval().adapt(task.support).render(task.query[[view]].cameras).images[0].permute(1, 2, 0)
+        assert abs(pixels[16 * index : 16 * index + 16, :16] / 255 - seen.clamp(0, 1).numpy()).max() <= 1 / 255
+
+
+def test_tensorboard_shows_the_curve_and_the_pictures(tmp_path):
+    """Source of truth: TensorBoard's own reader of event files."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    trainer = Trainer(small_model(), Balls(test=2), with_(steps=2, evaluate_every=1))
+    board = TensorBoard(tmp_path)
+    with Console().bar("training") as bar:
+        follow(trainer, bar, board)
+    board.close()
+    found = EventAccumulator(str(tmp_path)).Reload()
+    for name in set(trainer.curve[-1]) - {"step"}:
+        expected = [(row["step"], pytest.approx(row[name], rel=1e-6)) for row in trainer.curve]
+        assert [(event.step, event.value) for event in found.Scalars(name)] == expected
+    assert [event.step for event in found.Images(found.Tags()["images"][0])] == [1, 2]
+
+
+def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, monkeypatch):
+    """Killed before each write of the second checkpoint in turn: the first or the second is there, never a mixture."""
+    trainer = Trainer(small_model(), Balls(), FAST, tmp_path)
+    states = {}
+    for step in (1, 2):
+        trainer.take_step()
+        states[step] = state_of(trainer.model)
+        if step == 1:
+            trainer.save()
+    write, found = files.write_whole, []
+    for survived in range(5):
+        left = iter(range(survived))
+
+        def write_some(path, content, left=left):
+            if next(left, None) is None:
+                raise Killed
+            write(path, content)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(files, "write_whole", write_some)
+            if survived < 4:
+                with pytest.raises(Killed):
+                    trainer.save()
+            else:
+                trainer.save()
+        loaded = HyperPlanes.from_pretrained(tmp_path)
+        assert any(same(loaded.state_dict(), state) for state in states.values())
+        resumed = Trainer(small_model(), Balls(), FAST, tmp_path)
+        found.append(resumed.step)
+        assert same(resumed.model.state_dict(), states[resumed.step])
+        assert {int(o.state_dict()["state"][0]["step"]) for o in resumed.optimisers} == {resumed.step}
+    assert found == [1, 1, 1, 1, 2]
+    names = {"model.json", "model.safetensors", "training-00000002.safetensors", "training.json"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_checkpoints_are_written_when_they_are_due_and_not_only_with_a_report(tmp_path, monkeypatch):
+    saved = []
+    trainer = Trainer(small_model(), Balls(), with_(steps=30, rays=4, checkpoint_every=7), tmp_path)
+    monkeypatch.setattr(trainer, "save", lambda: saved.append(trainer.step))
+    reported = [progress.step for progress in trainer.run()]
+    assert saved == [7, 14, 21, 28, 30]
+    assert reported == [25, 30]
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"sampling": Marched(25)}, "sampling.steps"),
+        ({"sampling": Hierarchical(4, 4)}, "protocol"),
+        ({"hull_side": 17}, "hull_side"),
+        ({"network": replace(small_model().config.network, density_scale=3.0)}, "network.density_scale"),
+        ({"hypernetwork": replace(small_model().config.hypernetwork, gain=0.5)}, "hypernetwork.gain"),
+    ],
+)
+def test_a_model_that_differs_in_no_weight_is_another_all_the_same(tmp_path, change, name):
+    train(small_model(), Balls(), with_(steps=1), tmp_path)
+    with pytest.raises(CheckpointError, match=f"model.json: .*found other .*{name}.*; give another --out"):
+        Trainer(small_model(**change), Balls(), with_(steps=1), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["step", "curve", "config", "state"])
+@pytest.mark.parametrize("value", [None, "missing", "../../elsewhere"])
+def test_a_training_file_with_a_hole_is_a_checkpoint_error(tmp_path, name, value):
+    train(small_model(), Balls(), with_(steps=1), tmp_path)
+    saved = json.loads((tmp_path / "training.json").read_text())
+    saved = (
+        {key: entry for key, entry in saved.items() if key != name} if value == "missing" else {**saved, name: value}
+    )
+    (tmp_path / "training.json").write_text(json.dumps(saved))
+    with pytest.raises(CheckpointError, match="training.json: expected ") as caught:
+        Trainer(small_model(), Balls(), with_(steps=1), tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_state_of_another_shape_is_a_checkpoint_error(tmp_path):
+    train(small_model(), Balls(), with_(steps=1), tmp_path)
+    (path,) = tmp_path.glob("training-*.safetensors")
+    tensors = checkpoints.load_tensors(path)
+    for change in ({"0.0.exp_avg": torch.zeros(3)}, {"0.99.step": torch.zeros(())}, {"model.rig": torch.zeros(1, 3)}):
+        checkpoints.save_tensors(path, {**tensors, **change})
+        with pytest.raises(CheckpointError, match="training-00000001.safetensors: expected"):
+            Trainer(small_model(), Balls(), with_(steps=1), tmp_path)
+
+
+def test_memory_is_bounded_in_bytes():
+    whole = Trainer(small_model(), Balls(), FAST)
+    whole.warm("train0")
+    one = whole._episodes.nbytes
+    # 4 support and 4 query views of 16 x 16 pixels, 4 floats each, a third of the colours again for lookups, a hull
+    # of 16^3 bytes, and 8 bytes a pixel that sees it
+    least = 8 * 16 * 16 * 4 * 4 + 4 * 16 * 16 * 4 + 16**3
+    assert least < one <= least + 4 * 16 * 16 * 8
+    tight = Trainer(small_model(), Balls(), with_(memory=int(2.5 * one)))
+    for name in ("train0", "train1", "train2", "train1"):
+        tight.warm(name)
+        assert tight._episodes.nbytes <= 2.5 * one
+    assert len(tight._episodes) == 2
+    assert tight._episodes.get("train0") is None
+    assert tight._episodes.get("train1") is not None
+
+
+def test_the_papers_protocol_carves_no_hull_unless_empty_space_is_asked_for(monkeypatch):
+    carved = []
+    monkeypatch.setattr(base, "carve", lambda *given: carved.append(given) or occupancy.carve(*given))
+    dense = {"coarse_network": True, "sampling": Hierarchical(4, 4)}
+    trainer = Trainer(small_model(**dense), Balls(), FAST)
+    trainer.take_step()
+    trainer.look()
+    assert not carved
+    Trainer(small_model(**dense), Balls(), with_(empty_points=8)).take_step()
+    assert carved
+
+
+def test_held_out_objects_are_of_the_validation_split_where_there_is_one():
+    data, asked = Balls(test=2), []
+    task = data.task
+    data.task = lambda name: asked.append(name) or task(name)
+    data.splits["val"] = ["test1"]
+    trainer = Trainer(small_model(), data, FAST)
+    asked.clear()
+    first = trainer.look()
+    assert trainer.look() == first
+    assert asked == ["test1"]  # and its planes and hull are kept between looks
+
+
+def test_a_look_at_held_out_objects_is_adapting_and_rendering():
+    data = Balls()
+    trainer = Trainer(small_model(), data, FAST)
+    trainer.take_step()
+    task = data.task("test0")
+    views = task.query[[0, 2]]
+    expected = psnr(trainer.model.adapt(task.support).render(views.cameras).images, views.images).mean()
+    assert trainer.look()[0] == pytest.approx(expected.item())
+    assert trainer.model.training
+
+
+def test_an_object_that_cannot_be_trained_on_is_named():
+    class Blank(Balls):
+        def task(self, name):
+            task = super().task(name)
+            return replace(task, support=replace(task.support, masks=torch.zeros_like(task.support.masks)))
+
+    with pytest.raises(ValueError, match="train[0-2]: masks of the support views: expected an object"):
+        Trainer(small_model(), Blank(), FAST).take_step()
+
+
+def test_a_look_tells_what_the_updates_have_in_common(tmp_path):
+    """Diagnostics of the objects that are looked at, recorded in the curve and beside the weights."""
+    model = awaken(small_model())
+    trainer = Trainer(model, Balls(test=3), with_(steps=2, evaluate_every=2), tmp_path)
+    (progress,) = list(trainer.run())
+    found = progress.diagnostics
+    prepared = [model.prepare(Balls(test=3).task(name).support) for name in ("test0", "test1", "test2")]
+    assert found.spread == pytest.approx(diagnose(model, prepared).spread, rel=1e-4)
+    assert trainer.curve[-1]["spread"] == found.spread
+    assert trainer.curve[-1]["swap_gap"] == found.swap_gap
+    assert Diagnostics.of_json(read_json(tmp_path / "diagnostics.json")) == found
+
+
+def test_training_warns_once_when_every_object_gets_the_same_update(capsys):
+    model = awaken(small_model())
+    model.hypernetwork.encoder.register_forward_hook(lambda module, given, codes: torch.zeros_like(codes))
+    trainer = Trainer(model, Balls(test=2), with_(steps=4, evaluate_every=2))
+    with Console().bar("training") as bar:
+        follow(trainer, bar)
+    assert capsys.readouterr().err.count("the hypernetwork writes the same update for every object") == 1
+
+
+def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stays(tmp_path):
+    class Poisoned(Balls):
+        broken = False
+
+        def task(self, name):
+            task = super().task(name)
+            images = torch.full_like(task.query.images, float("nan")) if self.broken else task.query.images
+            return replace(task, query=replace(task.query, images=images))
+
+    data = Poisoned(test=0)
+    trainer = Trainer(small_model(), data, with_(steps=4, checkpoint_every=2, memory=0), tmp_path)
+    trainer.take_step()
+    trainer.take_step()
+    trainer.save()
+    before = (tmp_path / "model.safetensors").read_bytes()
+    data.broken = True
+    with pytest.raises(ValueError, match=r"step 3, on train[0-2].*: expected a finite loss, got nan; the last"):
+        trainer.take_step()
+    assert (tmp_path / "model.safetensors").read_bytes() == before
+    assert all(value.isfinite().all() for value in trainer.model.parameters())
+
+
+def test_sigterm_ends_a_training_after_its_step_with_a_checkpoint(tmp_path):
+    class Terminated(Trainer):
+        def take_step(self):
+            loss = super().take_step()
+            if self.step == 2:
+                signal.raise_signal(signal.SIGTERM)
+            return loss
+
+    before = signal.getsignal(signal.SIGTERM)
+    trainer = Terminated(small_model(), Balls(test=0), with_(steps=9, checkpoint_every=9), tmp_path)
+    with Console().bar("training") as bar, pytest.raises(KeyboardInterrupt, match="step 2 is saved, the same command"):
+        follow(trainer, bar)
+    assert json.loads((tmp_path / "training.json").read_text())["step"] == 2
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_weights_that_are_not_finite_are_not_saved(tmp_path):
+    trainer = Trainer(small_model(), Balls(test=0), with_(steps=4), tmp_path)
+    trainer.take_step()
+    trainer.save()
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with torch.no_grad():
+        next(iter(trainer.model.networks.parameters()))[0] = float("nan")
+    trainer.step = 2
+    with pytest.raises(ValueError, match=r"training-00000002.*expected finite numbers to save, found NaN .* model\."):
+        trainer.save()
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

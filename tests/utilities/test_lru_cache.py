@@ -1,0 +1,33 @@
+from dataclasses import dataclass
+
+from hyperplanes.utilities.lru_cache import LRUCache
+
+
+@dataclass
+class Sized:
+    nbytes: int
+
+
+def test_the_least_recently_used_goes_first():
+    cache = LRUCache(30)
+    for name in "abc":
+        cache.add(name, Sized(10))
+    assert cache.get("a") is not None
+    cache.add("d", Sized(10))
+    assert [name for name in "abcd" if name in cache] == ["a", "c", "d"]
+    assert (len(cache), cache.nbytes) == (3, 30)
+
+
+def test_a_value_in_the_place_of_another_counts_once():
+    cache = LRUCache(30)
+    cache.add("a", Sized(10))
+    cache.add("a", Sized(20))
+    assert (len(cache), cache.nbytes) == (1, 20)
+
+
+def test_a_value_above_the_budget_stays_only_where_the_last_one_is_to():
+    for keep_last in (False, True):
+        cache = LRUCache(30, keep_last=keep_last)
+        cache.add("a", Sized(10))
+        cache.add("large", Sized(40))
+        assert ("large" in cache, len(cache)) == (keep_last, int(keep_last))

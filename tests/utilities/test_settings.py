@@ -1,0 +1,269 @@
+"""Settings from files and options. Source of truth: the dataclasses themselves, and what people write by hand."""
+
+import json
+import re
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import EntryPoint, EntryPoints
+from pathlib import Path
+
+import pytest
+import yaml
+from small_demo import demo_folder
+
+from hyperplanes.adaptation import HyperPlanes, ModelConfig, NearestView
+from hyperplanes.adaptation.fine_tuned import FineTuned
+from hyperplanes.adaptation.pretrained import find_checkpoints
+from hyperplanes.cli import main
+from hyperplanes.commands.train import Arguments, resolve
+from hyperplanes.experiment import changed, document, parse_options, read_experiment, write_experiment
+from hyperplanes.fields import NeRF, find_targets
+from hyperplanes.files import DataError
+from hyperplanes.methods import Method, describe_method, make_method
+from hyperplanes.presets import PRESETS, configure, preset
+from hyperplanes.rendering import Hierarchical, Marched
+from hyperplanes.utilities import entry_points
+from hyperplanes.utilities.settings import SettingsError, structure
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def leaves(value, prefix=""):
+    """The paths of all entries that are no mappings, with their values."""
+    for name, entry in value.items():
+        if isinstance(entry, dict):
+            yield from leaves(entry, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", entry
+
+
+def other(value):
+    """Another value of the same kind, as it is written on the command line."""
+    known = {
+        "adam": "muon",
+        "muon": "adam",
+        "point_multiplane": "nerf",
+        "convnet": "resnet101",
+        "group": "batch",
+        "silu": "relu",
+    }
+    known |= {"none": "relu", "running": "layer", "concatenate": "mean", "low_rank": "full", "marched": "hierarchical"}
+    known |= {
+        "all": "updated",
+        "intervals": "samples",
+        "farthest": "first",
+        "matched": "file",
+        "mv_meta": "maml",
+        "nerf": "multiplane",
+    }
+    if isinstance(value, bool):
+        return json.dumps(not value)
+    if isinstance(value, str):
+        return known[value]
+    if isinstance(value, list | tuple):
+        return "[colour]"
+    return str(value + 1) if isinstance(value, int) else repr(value * 0.5)
+
+
+@pytest.mark.parametrize(
+    "base",
+    [
+        preset("quick"),
+        preset("quick").by_protocol("paper"),
+        preset("quick").by_method("autoencoder"),
+        preset("quick").by_method("mv_meta"),
+    ],
+    ids=["marched", "hierarchical", "autoencoder", "initialisation"],
+)
+def test_every_field_of_every_configuration_can_be_set_by_an_option(base):
+    entries = dict(leaves({"model": base.model.as_json(), "training": asdict(base.training)}))
+    assert len(entries) > 30
+    for path, value in entries.items():
+        if path == "model.protocol" or value is None:
+            continue
+        made = changed(base, parse_options([f"--{path.replace('_', '-')}", other(value)]))
+        now = dict(leaves({"model": made.model.as_json(), "training": asdict(made.training)}))
+        assert {name for name in entries if now[name] != entries[name]} == {path}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_configuration_written_is_the_one_read(name, tmp_path):
+    chosen = configure(name, "multiplane", seed=4)
+    write_experiment(tmp_path / "config.yaml", "multiplane", chosen)
+    found = read_experiment(tmp_path / "config.yaml")
+    assert found["method"] == "multiplane"
+    again = changed(preset("quick"), found)
+    assert (again.model, again.training) == (chosen.model, chosen.training)
+    assert yaml.safe_load(document("x", chosen))["model"] == json.loads(json.dumps(chosen.model.as_json()))
+
+
+def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "preset: small\nmethod: nerf\nmodel: {network: {depth: 3}, protocol: hierarchical, sampling: {coarse: 8}}\n"
+        "training: {learning_rate: 1e-3, steps: 7, rays: 9}\n"
+    )
+    given = Arguments(
+        data=(), out=tmp_path, config=path, steps=11, settings=("--training.rays", "13", "--model.sampling.fine=5")
+    )
+    method, chosen = resolve(given)
+    small = preset("small")
+    assert method == "nerf"
+    assert (chosen.model.target, chosen.model.hypernetwork) == ("nerf", None)
+    assert chosen.model.network == replace(small.model.network, depth=3)
+    assert chosen.model.sampling == Hierarchical(8, 5)
+    assert chosen.training == replace(small.training, learning_rate=1e-3, steps=11, rays=13)
+    assert resolve(replace(given, method="multiplane", protocol="fast", settings=()))[1].model.sampling == Marched()
+    none = resolve(Arguments(data=(), out=tmp_path, settings=("--model.hypernetwork", "null")))
+    assert none == ("point_multiplane", changed(preset("quick"), {"model": {"hypernetwork": None}}))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["--training.learning-rte", "1"], "--training.learning-rte: an unknown entry; did you mean learning_rate?"),
+        (["--modle.views", "1"], "--modle.views: an unknown option; did you mean model?"),
+        (["--training.learning-rate", "fast"], "--training.learning-rate: 'fast' instead of a number"),
+        (["--training.rays", "1.5"], "--training.rays: 1.5 instead of a whole number from 1 to"),
+        (["--model.hypernetwork.views", "0"], "--model.hypernetwork.views: 0 instead of a whole number from 1 to 1024"),
+        (["--model.protocol", "guessed"], "guessed"),
+        (["--model.hypernetwork.encoder", "vgg"], "encoder: expected one of 'convnet', 'resnet101', got 'vgg'"),
+        (["--model.network", "3"], "--model.network: 3 instead of its entries"),
+        (["--training.rays", "["], "--training.rays: expected a plain value"),
+        (["--method", "magic"], "method: expected one of hyperplanes, "),
+        (["--config", "OUT/none.yaml"], "none.yaml: expected a YAML file of settings"),
+        (["--steps", "0"], "--steps: 0 instead of a whole number from 1 to"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(settings, words, tmp_path, capsys):
+    given = [each.replace("OUT", str(tmp_path)) for each in settings]
+    assert main(["train", "--data", str(tmp_path), "--out", str(tmp_path / "run"), *given]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert words in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[1]", "expected a mapping of settings, found a list"),
+        ("model: [", "expected YAML"),
+        ("a: &x [1]\nb: *x\n", "an alias"),
+        ("trainig: {}\n", "trainig: an unknown entry; did you mean training?"),
+        ("model: 3\n", "expected model of type dict, found int"),
+        ("a: !!python/object/apply:os.system [ls]\n", "expected YAML"),
+        ("", "expected a mapping of settings, found a NoneType"),
+    ],
+)
+def test_a_file_that_is_no_experiment_is_refused(text, words, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    with pytest.raises(DataError) as caught:
+        read_experiment(path)
+    assert words in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_structures_are_nested_and_named_by_their_path():
+    @dataclass(frozen=True)
+    class Refusing:
+        size: int = 1
+
+        def __post_init__(self):
+            if self.size == 3:
+                raise ValueError("size: 3 is refused")
+
+    with pytest.raises(SettingsError, match=r"^size: 3 is refused$"):
+        structure(Refusing, {"size": 3})
+    with pytest.raises(SettingsError) as caught:
+        ModelConfig.structured({**ModelConfig().as_json(), "network": {"depth": 10**30}})
+    assert caught.value.path == "network.depth"
+
+
+def test_training_writes_a_configuration_that_trains_the_same_again(tmp_path, capsys):
+    data = str(demo_folder() / "data")
+    first = ["--preset", "quick", "--steps", "2", "--training.rays", "8", "--model.network.planes", "6"]
+    small = [
+        "--model.network.width",
+        "16",
+        "--model.network.depth",
+        "2",
+        "--model.hypernetwork.views=2",
+        "--model.hypernetwork.width",
+        "16",
+    ]
+    assert main(["train", "--data", data, "--out", str(tmp_path / "one"), *first, *small]) == 0
+    assert {"config.yaml", "curve.csv", "samples", "model.json"} <= {p.name for p in (tmp_path / "one").iterdir()}
+    config = ["--config", str(tmp_path / "one" / "config.yaml")]
+    assert main(["train", "--data", data, "--out", str(tmp_path / "two"), *config, "--tensorboard"]) == 0
+    for name in ("model.safetensors", "config.yaml", "curve.csv", "samples/00000002.png"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    assert list((tmp_path / "two" / "tensorboard").iterdir())
+    capsys.readouterr()
+    assert main(["presets", "quick"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["training"] == asdict(preset("quick").training)
+
+
+class Constant(NeRF):
+    """A field of another package."""
+
+
+class FakeDistribution:
+    name = "other-package"
+
+
+BROUGHT = {
+    "hyperplanes.fields": {"constant": f"{__name__}:Constant"},
+    "hyperplanes.methods": {"copycat": f"{__name__}:COPYCAT"},
+}
+COPYCAT = Method("the nearest support view, from another package", lambda **given: NearestView())
+
+
+@pytest.fixture
+def other_package(monkeypatch):
+    """An installed distribution with entry points of both groups."""
+    monkeypatch.setattr(
+        entry_points,
+        "entry_points",
+        lambda group: EntryPoints(
+            EntryPoint(name, value, group)._for(FakeDistribution()) for name, value in BROUGHT.get(group, {}).items()
+        ),
+    )
+
+
+def test_a_field_of_another_package_is_trained_saved_and_loaded(other_package, tmp_path):
+    assert find_targets()["constant"] is Constant
+    chosen = preset("quick").by_method("constant")
+    assert (chosen.model.target, chosen.model.hypernetwork) == ("constant", None)
+    model = HyperPlanes(replace(chosen.model, network=replace(chosen.model.network, width=8)))
+    assert isinstance(model.networks["fine"], Constant)
+    model.save(tmp_path)
+    assert isinstance(HyperPlanes.from_pretrained(tmp_path).networks["fine"], Constant)
+    made = make_method("constant_10", find_checkpoints([tmp_path]))
+    assert isinstance(made, FineTuned)
+    assert isinstance(made.model.networks["fine"], Constant)
+    assert describe_method("constant_10") == "constant after 10 fine-tuning steps"
+
+
+def test_a_method_of_another_package_is_made_and_described(other_package):
+    assert describe_method("copycat") == "the nearest support view, from another package"
+    assert isinstance(make_method("copycat", {}), NearestView)
+    with pytest.raises(ValueError, match="copycat"):
+        make_method("unheard_of", {})
+
+
+def test_an_entry_point_that_cannot_be_loaded_names_its_package(other_package, monkeypatch):
+    monkeypatch.setitem(BROUGHT, "hyperplanes.fields", {"lost": "no.such.module:Field"})
+    with pytest.raises(ValueError, match="other-package: expected no.such.module:Field for hyperplanes.fields 'lost'"):
+        find_targets()
+
+
+def test_every_option_that_the_documents_name_is_one():
+    bases = [preset("quick"), preset("quick").by_protocol("paper")]
+    known = {"model.hypernetwork"}
+    for base in bases:
+        known |= {path for path, _ in leaves({"model": base.model.as_json(), "training": asdict(base.training)})}
+    pages = [*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]
+    named = {name for page in pages for name in re.findall(r"--((?:model|training)\.[\w.-]+)", page.read_text())}
+    assert len(named) > 15
+    assert {name.replace("-", "_") for name in named} <= known
