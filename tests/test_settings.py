@@ -47,7 +47,14 @@ def other(value):
         "silu": "relu",
     }
     known |= {"none": "relu", "running": "layer", "concatenate": "mean", "low_rank": "full", "marched": "hierarchical"}
-    known |= {"all": "updated", "intervals": "samples", "farthest": "first", "matched": "file", "mv_meta": "maml", "nerf": "multiplane"}
+    known |= {
+        "all": "updated",
+        "intervals": "samples",
+        "farthest": "first",
+        "matched": "file",
+        "mv_meta": "maml",
+        "nerf": "multiplane",
+    }
     if isinstance(value, bool):
         return json.dumps(not value)
     if isinstance(value, str):
