@@ -14,6 +14,7 @@ from hyperplanes.adaptation import Diagnostics, HyperPlanes, base, diagnose
 from hyperplanes.checkpoints import CheckpointError, read_json
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.train import follow
+from hyperplanes.errors import Terminated
 from hyperplanes.geometry import occupancy
 from hyperplanes.hypernetwork import HyperNetworkConfig
 from hyperplanes.metrics import psnr
@@ -550,7 +551,7 @@ def test_sigterm_ends_a_training_after_its_step_with_a_checkpoint(tmp_path):
 
     before = signal.getsignal(signal.SIGTERM)
     trainer = Terminated(small_model(), Balls(test=0), with_(steps=9, checkpoint_every=9), tmp_path)
-    with Console().bar("training") as bar, pytest.raises(KeyboardInterrupt, match="step 2 is saved, the same command"):
+    with Console().bar("training") as bar, pytest.raises(Terminated, match="step 2 is saved, the same command"):
         follow(trainer, bar)
     assert json.loads((tmp_path / "training.json").read_text())["step"] == 2
     assert signal.getsignal(signal.SIGTERM) is before

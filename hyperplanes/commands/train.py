@@ -36,6 +36,7 @@ from hyperplanes.commands.options import (
     Protocol,
     optional,
 )
+from hyperplanes.errors import Terminated
 from hyperplanes.formatting import format_duration, format_rate
 
 if TYPE_CHECKING:
@@ -108,18 +109,20 @@ def progress_line(progress: Progress, best: float | None = None) -> str:
 
 
 @contextmanager
-def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[None]:
-    """The first Ctrl-C or SIGTERM ends the training after its step, the second one is a KeyboardInterrupt."""
+def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[list[type[KeyboardInterrupt]]]:
+    """The first Ctrl-C or SIGTERM ends the training after its step, the second one at once; yields what was heard."""
+    heard: list[type[KeyboardInterrupt]] = []
 
     def note(number: int, _: object) -> None:
+        heard.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
         if trainer.stopping:
-            raise KeyboardInterrupt
+            raise heard[-1]
         trainer.stopping = True
         bar.warn(f"{signal.Signals(number).name}: stopping after this step; once more to stop at once")
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield heard
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -134,12 +137,12 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
         board: where every report goes as well.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C, with a checkpoint written and advice as its text.
+        KeyboardInterrupt: after Ctrl-C, with a checkpoint written and advice as its text; `Terminated` after SIGTERM.
     """
     from hyperplanes.adaptation.diagnostics import SMALLEST_SPREAD
 
     quality = None
-    with _polite_interrupt(trainer, bar):
+    with _polite_interrupt(trainer, bar) as heard:
         warned = False
         for progress in trainer.run():
             quality = progress.psnr if progress.psnr is not None else quality
@@ -157,7 +160,7 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
                     )
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
     if trainer.stopping and trainer.step < trainer.config.steps:
-        raise KeyboardInterrupt(f"step {trainer.step} is saved, the same command goes on from there")
+        raise (heard or [KeyboardInterrupt])[0](f"step {trainer.step} is saved, the same command goes on from there")
 
 
 def resolve(arguments: Arguments) -> tuple[str, Preset]:
