@@ -542,7 +542,7 @@ def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stay
 
 
 def test_sigterm_ends_a_training_after_its_step_with_a_checkpoint(tmp_path):
-    class Terminated(Trainer):
+    class Signalled(Trainer):
         def take_step(self):
             loss = super().take_step()
             if self.step == 2:
@@ -550,7 +550,7 @@ def test_sigterm_ends_a_training_after_its_step_with_a_checkpoint(tmp_path):
             return loss
 
     before = signal.getsignal(signal.SIGTERM)
-    trainer = Terminated(small_model(), Balls(test=0), with_(steps=9, checkpoint_every=9), tmp_path)
+    trainer = Signalled(small_model(), Balls(test=0), with_(steps=9, checkpoint_every=9), tmp_path)
     with Console().bar("training") as bar, pytest.raises(Terminated, match="step 2 is saved, the same command"):
         follow(trainer, bar)
     assert json.loads((tmp_path / "training.json").read_text())["step"] == 2

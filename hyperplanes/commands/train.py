@@ -137,7 +137,8 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
         board: where every report goes as well.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C, with a checkpoint written and advice as its text; `Terminated` after SIGTERM.
+        KeyboardInterrupt: after Ctrl-C, with a checkpoint written and advice as its text.
+        Terminated: after SIGTERM, likewise.
     """
     from hyperplanes.adaptation.diagnostics import SMALLEST_SPREAD
 
@@ -160,7 +161,10 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
                     )
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
     if trainer.stopping and trainer.step < trainer.config.steps:
-        raise (heard or [KeyboardInterrupt])[0](f"step {trainer.step} is saved, the same command goes on from there")
+        advice = f"step {trainer.step} is saved, the same command goes on from there"
+        if Terminated in heard:
+            raise Terminated(advice)
+        raise KeyboardInterrupt(advice)
 
 
 def resolve(arguments: Arguments) -> tuple[str, Preset]:
