@@ -17,6 +17,7 @@ from dataclasses import replace
 from importlib import import_module
 
 from hyperplanes.commands import EXAMPLES, find_verb, find_verbs, split_settings
+from hyperplanes.utilities.errors import Terminated
 
 __all__ = ["main"]
 
@@ -52,14 +53,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         module = find_verb(verb).module
     except ValueError as error:
         return _complain(f"hyperplanes: {error}")
-    ended: list[int] = []
     try:
-        with _terminable(ended):
+        with _terminable():
             return _run(verb, module, rest)
     except KeyboardInterrupt as interrupt:
         advice = str(interrupt) or "the same command goes on where it can"
-        _complain(f"hyperplanes {verb}: {'terminated' if ended else 'interrupted'}; {advice}")
-        return 143 if ended else 130
+        terminated = isinstance(interrupt, Terminated)
+        _complain(f"hyperplanes {verb}: {'terminated' if terminated else 'interrupted'}; {advice}")
+        return 143 if terminated else 130
     except BrokenPipeError:
         sys.stdout = None  # whoever read our output has gone; nothing is left to be flushed to
         return 0
@@ -70,15 +71,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def _terminable(ended: list[int]) -> Generator[None]:
-    """SIGTERM, as `kill` and clusters send it, ends a verb as Ctrl-C does; it is noted in `ended`."""
+def _terminable() -> Generator[None]:
+    """SIGTERM raises `Terminated` within."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
-    def end(number: int, _: object) -> None:
-        ended.append(number)
-        raise KeyboardInterrupt
+    def end(*_: object) -> None:
+        raise Terminated
 
     before = signal.signal(signal.SIGTERM, end)
     try:

@@ -17,6 +17,7 @@ from hyperplanes.data import open_dataset
 from hyperplanes.data.formats.npz import read_npz
 from hyperplanes.data.pictures.images import read_image
 from hyperplanes.files import DataError, malformed, one_writer, read_bytes, read_json
+from hyperplanes.utilities.errors import Terminated
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -119,12 +120,14 @@ def test_a_lock_ends_with_its_process(tmp_path):
         pass
 
 
-def test_sigterm_ends_as_ctrl_c_does():
-    before, ended = signal.getsignal(signal.SIGTERM), []
-    with pytest.raises(KeyboardInterrupt), _terminable(ended):
+def test_sigterm_ends_as_ctrl_c_does_with_another_code(monkeypatch, capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(Terminated), _terminable():
         signal.raise_signal(signal.SIGTERM)
-    assert ended == [signal.SIGTERM]
     assert signal.getsignal(signal.SIGTERM) is before
+    monkeypatch.setattr("hyperplanes.cli._run", lambda *_: signal.raise_signal(signal.SIGTERM))
+    assert main(["doctor"]) == 143
+    assert "hyperplanes doctor: terminated; the same command goes on where it can" in capsys.readouterr().err
 
 
 def test_an_absurd_count_is_refused_at_once(tmp_path):

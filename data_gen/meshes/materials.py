@@ -21,9 +21,11 @@ from hyperplanes.colour import convert_8bit, linear_from_srgb, srgb_from_linear
 __all__ = [
     "DEFAULT_COLOUR",
     "ColourSpace",
+    "LinearMaterial",
     "Visual",
     "canonical_visual",
     "convert_image",
+    "linear_factor",
     "pbr_of_mtl",
     "roughness_of_exponent",
     "texture_of",
@@ -40,6 +42,36 @@ _MAP_SLOTS = ("metallicRoughnessTexture", "normalTexture", "occlusionTexture", "
 
 
 Visual = ColorVisuals | TextureVisuals
+
+
+class LinearMaterial(PBRMaterial):
+    """A PBRMaterial that also keeps its linear base colour in float.
+
+    trimesh rounds it to 8 bits, whose steps are up to 13 of 255 apart in sRGB, where it is dark.
+
+    Args:
+        baseColorFactor: linear RGBA in [0, 1].
+        **values: the others of a PBRMaterial.
+    """
+
+    def __init__(self, *, baseColorFactor: npt.ArrayLike, **values: Any) -> None:
+        self.exact = np.array(baseColorFactor, dtype=np.float64)
+        super().__init__(baseColorFactor=self.exact.copy(), **values)
+
+    def copy(self) -> LinearMaterial:
+        """Another one with the same values; pictures are shared."""
+        return LinearMaterial(**{**self._data, "baseColorFactor": linear_factor(self)})
+
+
+def linear_factor(material: PBRMaterial) -> npt.NDArray[np.float64] | None:
+    """Linear RGBA in [0, 1] of a material, as exactly as it is known; None where it states none."""
+    factor = material.baseColorFactor
+    if factor is None:
+        return None
+    rounded = np.asarray(factor, dtype=np.float64) / 255.0
+    if isinstance(material, LinearMaterial) and np.abs(material.exact - rounded).max() < 0.51 / 255.0:
+        return material.exact.copy()
+    return rounded  # of another class, or set anew since
 
 
 def visual_of(mesh: trimesh.Trimesh) -> Visual:
@@ -104,20 +136,19 @@ def _textured(
         material = material.materials[0] if material.materials else SimpleMaterial()
     is_gltf = isinstance(material, PBRMaterial)
     data = _pbr_values(material if is_gltf else pbr_of_mtl(material, images), images)
-    if colours == "srgb" and is_gltf and data.get("baseColorFactor") is not None:
-        factor = np.round(np.asarray(data["baseColorFactor"]) * 255.0).astype(np.uint8)
-        data["baseColorFactor"] = convert_8bit(factor, linear_from_srgb) / 255.0
+    if colours == "srgb" and is_gltf:
+        data["baseColorFactor"][:3] = linear_from_srgb(data["baseColorFactor"][:3])
     coordinates = _coordinates(visual, len(mesh.vertices), label, warnings)
     if coordinates is None:
         _drop_textures(data, label, warnings)
     vertex_colours = _material_vertex_colours(visual, len(mesh.vertices))
     if vertex_colours is not None and data.get("baseColorTexture") is None:
-        tint = convert_8bit(np.round(data["baseColorFactor"] * 255.0).astype(np.uint8), srgb_from_linear)
+        tint = np.append(srgb_from_linear(data["baseColorFactor"][:3]), data["baseColorFactor"][3])
         if colours == "gltf":
             vertex_colours = convert_8bit(vertex_colours, srgb_from_linear)
         if data["alphaMode"] == "OPAQUE":
-            vertex_colours[:, 3] = tint[3] = 255
-        return _coloured((vertex_colours * (tint / 255.0)).round(), "vertex", label, "scene")
+            vertex_colours[:, 3], tint[3] = 255, 1.0
+        return _coloured((vertex_colours * tint).round(), "vertex", label, "scene")
     if vertex_colours is not None and (vertex_colours[:, :3] < 255).any():
         warnings.append(f"{label}: vertex colours left out, its texture counts")
     data = {key: value for key, value in data.items() if value is not None}
@@ -125,7 +156,7 @@ def _textured(
         data["baseColorFactor"][3] = 1.0
         if "baseColorTexture" in data:
             data["baseColorTexture"] = _converted(data["baseColorTexture"], "RGB", images)
-    return TextureVisuals(uv=coordinates, material=PBRMaterial(**data)), warnings, _visible(data)
+    return TextureVisuals(uv=coordinates, material=LinearMaterial(**data)), warnings, _visible(data)
 
 
 def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> None:
@@ -133,7 +164,7 @@ def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> Non
     image = data.get("baseColorTexture")
     if image is not None:
         mean = np.asarray(image.convert("RGB"), dtype=np.float64).reshape(-1, 3).mean(axis=0)
-        data["baseColorFactor"][:3] *= convert_8bit(mean.astype(np.uint8), linear_from_srgb) / 255.0
+        data["baseColorFactor"][:3] *= linear_from_srgb(mean / 255.0)
         warnings.append(f"{label}: texture without texture coordinates; its mean colour taken")
     for slot in ("baseColorTexture", *_MAP_SLOTS):
         data.pop(slot, None)
@@ -167,14 +198,14 @@ def _coordinates(visual: TextureVisuals, count: int, label: str, warnings: list[
 
 
 def _pbr_values(material: PBRMaterial, images: dict[Any, Any]) -> dict[str, Any]:
-    factor = material.baseColorFactor
+    factor = linear_factor(material)
     emissive = material.emissiveFactor
     cutoff = 0.5 if material.alphaCutoff is None else float(material.alphaCutoff)
     return {
         "name": material.name,
         "alphaMode": material.alphaMode if material.alphaMode in ("MASK", "BLEND") else "OPAQUE",
         "alphaCutoff": min(max(cutoff, 0.0), 1.0),
-        "baseColorFactor": np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64) / 255.0,
+        "baseColorFactor": np.ones(4) if factor is None else factor,
         "baseColorTexture": _converted(material.baseColorTexture, "RGBA", images),
         "metallicFactor": material.metallicFactor,
         "roughnessFactor": material.roughnessFactor,
@@ -184,7 +215,7 @@ def _pbr_values(material: PBRMaterial, images: dict[Any, Any]) -> dict[str, Any]
     }
 
 
-def pbr_of_mtl(material: SimpleMaterial, images: dict[Any, Any] | None = None) -> PBRMaterial:
+def pbr_of_mtl(material: SimpleMaterial, images: dict[Any, Any] | None = None) -> LinearMaterial:
     """The material of an MTL file or a texture without one, as glTF would state it.
 
     Args:
@@ -195,10 +226,9 @@ def pbr_of_mtl(material: SimpleMaterial, images: dict[Any, Any] | None = None) -
         The material, its factor linear; a mirror exponent (Ns) gives the roughness.
     """
     image = _converted(material.image, "RGBA", {} if images is None else images)
-    factor = convert_8bit(np.asarray(material.diffuse, dtype=np.uint8), linear_from_srgb) / 255.0
-    if image is not None:
-        factor[:3] = 1.0
-    return PBRMaterial(
+    colour = np.asarray(material.diffuse, dtype=np.float64) / 255.0
+    factor = np.append(linear_from_srgb(colour[:3]) if image is None else np.ones(3), colour[3])
+    return LinearMaterial(
         name=material.name,
         alphaMode="BLEND",
         baseColorFactor=factor,

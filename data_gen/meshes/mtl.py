@@ -18,12 +18,11 @@ from typing import Any
 
 import numpy as np
 import PIL.Image
-from trimesh.visual.material import PBRMaterial
 
 from data_gen.meshes.files import MAX_TEXT_BYTES
-from data_gen.meshes.materials import convert_image, roughness_of_exponent
+from data_gen.meshes.materials import LinearMaterial, convert_image, roughness_of_exponent
 from data_gen.meshes.model_folder import ModelFolder
-from hyperplanes.colour import convert_8bit, linear_from_srgb
+from hyperplanes.colour import linear_from_srgb
 
 __all__ = ["decode_text", "read_materials"]
 
@@ -36,7 +35,7 @@ def decode_text(data: bytes) -> str:
         return data.decode("latin-1")
 
 
-def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str]) -> dict[str, PBRMaterial]:
+def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str]) -> dict[str, LinearMaterial]:
     """Read all material libraries of an OBJ file; the folder refuses what lies outside it.
 
     Args:
@@ -47,7 +46,7 @@ def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str
     Returns:
         Materials by name, colours linear.
     """
-    materials: dict[str, PBRMaterial] = {}
+    materials: dict[str, LinearMaterial] = {}
     for line in libraries:
         whole = folder.locate(line) is not None or not line.lower().endswith(".mtl")
         names = [line] if whole or len(line.split()) < 2 else line.split()
@@ -81,10 +80,10 @@ def _statements(text: str, library: str, warnings: list[str]) -> list[dict[str, 
     return found
 
 
-def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) -> PBRMaterial:
+def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) -> LinearMaterial:
     label = f"material {values['name']!r}"
     colour = np.array([*_floats(values.get("kd"), 3, (0.8, 0.8, 0.8), f"{label}: Kd", warnings), 1.0])
-    colour[:3] = convert_8bit(np.clip(np.round(colour[:3] * 255.0), 0, 255).astype(np.uint8), linear_from_srgb) / 255.0
+    colour[:3] = linear_from_srgb(np.clip(colour[:3], 0.0, 1.0))
     colour[3] = _opacity(values, label, warnings)
     image = _texture(values, label, folder, warnings)
     if image is not None and (values.get("map_kd") or values.get("map_ka")):
@@ -93,7 +92,7 @@ def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) 
     glow = np.clip(_floats(values.get("ke"), 3, (0.0, 0.0, 0.0), f"{label}: Ke", warnings), 0.0, 1.0)
     if values.get("map_ke"):
         warnings.append(f"{label}: its glow map {values['map_ke']} left out")
-    return PBRMaterial(
+    return LinearMaterial(
         name=values["name"],
         baseColorFactor=colour,
         baseColorTexture=image,

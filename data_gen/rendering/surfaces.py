@@ -22,7 +22,7 @@ from PIL import Image
 from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from data_gen.meshes.materials import pbr_of_mtl, texture_of, visual_of
+from data_gen.meshes.materials import linear_factor, pbr_of_mtl, texture_of, visual_of
 from hyperplanes.colour import linear_from_srgb
 
 __all__ = [
@@ -245,8 +245,8 @@ def _material(material: Any, images: dict[Any, Any], where: str) -> dict[str, An
         material = PBRMaterial(baseColorFactor=_PLAIN)
     if not isinstance(material, PBRMaterial):
         raise RenderError(f"{where}: expected a PBRMaterial or a SimpleMaterial, received {type(material).__name__}")
-    factor = material.baseColorFactor
-    base = np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64) / 255.0
+    factor = linear_factor(material)
+    base = np.ones(4) if factor is None else factor
     texture = _texels(material.baseColorTexture, images, keep_alpha=material.alphaMode in {"BLEND", "MASK"})
     if material.alphaMode not in {"BLEND", "MASK"}:
         base[3] = 1.0

@@ -36,6 +36,7 @@ from hyperplanes.commands.options import (
     Protocol,
     optional,
 )
+from hyperplanes.utilities.errors import Terminated
 from hyperplanes.utilities.formatting import format_duration, format_rate
 
 if TYPE_CHECKING:
@@ -108,18 +109,20 @@ def progress_line(progress: Progress, best: float | None = None) -> str:
 
 
 @contextmanager
-def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[None]:
-    """The first Ctrl-C or SIGTERM ends the training after its step, the second one is a KeyboardInterrupt."""
+def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[list[type[KeyboardInterrupt]]]:
+    """The first Ctrl-C or SIGTERM ends the training after its step, the second one at once; yields what was heard."""
+    heard: list[type[KeyboardInterrupt]] = []
 
     def note(number: int, _: object) -> None:
+        heard.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
         if trainer.stopping:
-            raise KeyboardInterrupt
+            raise heard[-1]
         trainer.stopping = True
         bar.warn(f"{signal.Signals(number).name}: stopping after this step; once more to stop at once")
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield heard
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -135,11 +138,12 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
 
     Raises:
         KeyboardInterrupt: after Ctrl-C, with a checkpoint written and advice as its text.
+        Terminated: after SIGTERM, likewise.
     """
     from hyperplanes.adaptation.diagnostics import SMALLEST_SPREAD
 
     quality = None
-    with _polite_interrupt(trainer, bar):
+    with _polite_interrupt(trainer, bar) as heard:
         warned = False
         for progress in trainer.run():
             quality = progress.psnr if progress.psnr is not None else quality
@@ -157,7 +161,10 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
                     )
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
     if trainer.stopping and trainer.step < trainer.config.steps:
-        raise KeyboardInterrupt(f"step {trainer.step} is saved, the same command goes on from there")
+        advice = f"step {trainer.step} is saved, the same command goes on from there"
+        if Terminated in heard:
+            raise Terminated(advice)
+        raise KeyboardInterrupt(advice)
 
 
 def resolve(arguments: Arguments) -> tuple[str, Preset]:

@@ -81,8 +81,14 @@ def carve(masks: Numbers, cameras: PinholeCamera, bounds: Sphere, side: int = 64
     """The visual hull: voxels that no mask rules out.
 
     A voxel is cleared where some image contains the whole projection of the voxel's bounding ball and no pixel of the
-    mask is set in the bounding box of that projection. So the hull of the true object is never cut, whatever the
-    resolution and wherever the images end, and does not depend on the order of the views.
+    mask is set in the bounding box of that projection. So nothing is cut of what the masks show, however thin,
+    whatever the resolution and wherever the images end, and the result does not depend on the order of the views.
+
+    What a mask does not show is cut: a part thinner than the distance of its samples may set no pixel. With 25 views of
+    64 pixels and nine samples a pixel, 0.04 % of the visible surface of procedural planes (12 of them; 0.16 % of the
+    worst) lies outside the hull. Masks dilated by one pixel leave 0.001 %, but their hulls have 1.7 times the voxels,
+    and 100 steps of fine-tuning in them cost 1.3 times the processor time and end 0.2 dB lower (3 planes): masks are
+    taken as they are.
 
     Args:
         masks: (view, 1, height, width), opacity in [0, 1], boolean, or 8 bits.

@@ -1,11 +1,15 @@
-"""Errors that say which object or file they are about."""
+"""Errors that say which object or file they are about, and the end that SIGTERM asks for."""
 
 from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
 
-__all__ = ["prefix_errors"]
+__all__ = ["Terminated", "prefix_errors"]
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, as `kill` and clusters send it: ends a verb as Ctrl-C does, with another exit code."""
 
 
 @contextmanager

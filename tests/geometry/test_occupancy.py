@@ -62,6 +62,25 @@ def test_an_object_that_the_pictures_cut_off_is_kept():
     assert hull.occupied.float().mean() < 0.9
 
 
+def test_a_thin_wire_is_kept_wherever_the_masks_show_it():
+    """Property: of a wire without thickness, all is kept whose pixels are set; a pixel that one mask misses is cut."""
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(40, 40, 0.9), cameras.fibonacci_sphere(12, 2.7), 40, 40)
+    wire = torch.linspace(-0.6, 0.6, 4000)[:, None] * torch.tensor([[0.7, 0.5, -0.5]])
+    pixels = ours.project(wire.expand(12, -1, 3)).round().long()
+    masks = torch.zeros(12, 1, 40, 40)
+    for mask, pixel in zip(masks, pixels, strict=True):
+        mask[0, pixel[:, 1], pixel[:, 0]] = 1
+    hull = carve(masks, ours, Sphere(), 48)
+    assert hull.contains(wire).all()
+    assert hull.occupied.float().mean() < 0.02
+    column, row = pixels[0, 2000].tolist()
+    masks[0, 0, row - 3 : row + 4, column - 3 : column + 4] = 0
+    cut = ~carve(masks, ours, Sphere(), 48).contains(wire)
+    assert cut[2000]
+    hidden = (pixels[0] - pixels[0, 2000]).abs().amax(1) <= 3
+    assert not cut[~hidden].any()
+
+
 def test_the_compiled_hull_is_the_plain_one(monkeypatch):
     ours = cameras.pinhole(cameras.symmetric_intrinsics(33, 33, 0.8), cameras.fibonacci_sphere(7, 2.2), 33, 33)
     masks = pictures(box(0.4), ours, 33, (0.1, 0.0, -0.1))

@@ -20,6 +20,7 @@ from hyperplanes.metrics import psnr
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer, TrainingConfig, train
 from hyperplanes.training.watching import TensorBoard
+from hyperplanes.utilities.errors import Terminated
 from tests.reference_rendering import Balls, awaken, small_model
 
 FAST = TrainingConfig(steps=6, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
@@ -541,7 +542,7 @@ def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stay
 
 
 def test_sigterm_ends_a_training_after_its_step_with_a_checkpoint(tmp_path):
-    class Terminated(Trainer):
+    class Signalled(Trainer):
         def take_step(self):
             loss = super().take_step()
             if self.step == 2:
@@ -549,8 +550,8 @@ def test_sigterm_ends_a_training_after_its_step_with_a_checkpoint(tmp_path):
             return loss
 
     before = signal.getsignal(signal.SIGTERM)
-    trainer = Terminated(small_model(), Balls(test=0), with_(steps=9, checkpoint_every=9), tmp_path)
-    with Console().bar("training") as bar, pytest.raises(KeyboardInterrupt, match="step 2 is saved, the same command"):
+    trainer = Signalled(small_model(), Balls(test=0), with_(steps=9, checkpoint_every=9), tmp_path)
+    with Console().bar("training") as bar, pytest.raises(Terminated, match="step 2 is saved, the same command"):
         follow(trainer, bar)
     assert json.loads((tmp_path / "training.json").read_text())["step"] == 2
     assert signal.getsignal(signal.SIGTERM) is before

@@ -136,8 +136,10 @@ def test_normals_follow_a_stretching_transform(tmp_path):
 
 def test_obj_colours_are_made_linear_and_a_texture_takes_their_place(tmp_path):
     # sRGB 188 / 255 is linear 128 / 255.
-    plain = load_mesh(write_obj(tmp_path, mtl="newmtl paint\nKd 0.737255 0 1\n"))
-    assert colour(mesh_parts(plain)[0][0]) == [128, 0, 255, 255]
+    # sRGB 0.1 is linear ((0.1 + 0.055) / 1.055)^2.4, which 8 bits would round to 3 / 255.
+    plain = mesh_parts(load_mesh(write_obj(tmp_path, mtl="newmtl paint\nKd 0.737255 0 0.1\n")))[0][0]
+    assert colour(plain) == [128, 0, 3, 255]
+    assert plain.copy().visual.material.exact[2] == pytest.approx(((0.1 + 0.055) / 1.055) ** 2.4, abs=1e-9)
     path = write_obj(tmp_path, mtl="newmtl paint\nKd 0 0 0\nmap_Kd wood.png\n", texture=picture(colour=(9, 8, 7)))
     part = mesh_parts(load_mesh(path))[0][0]
     assert colour(part) == [255] * 4
