@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -12,7 +13,7 @@ from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.views import Views
 
-__all__ = ["SCRATCH_RATES", "FieldFromScratch", "FineTuned", "FromScratch", "random_model"]
+__all__ = ["SCRATCH_RATES", "FieldFromScratch", "FineTuned", "FromScratch", "random_model", "shuffled"]
 
 SCRATCH_RATES = {"learning_rate": 4e-3, "muon_learning_rate": 0.05}
 """Of Adam and of Muon from random weights: higher than those of fine-tuning, docs/adaptation.md."""
@@ -96,3 +97,21 @@ def _rated(settings: FineTuning) -> FineTuning:
     stated = {name: getattr(settings, name) for name in SCRATCH_RATES}
     rates = {name: SCRATCH_RATES[name] if rate is None else rate for name, rate in stated.items()}
     return replace(settings, free="weights", **rates)
+
+
+@torch.no_grad()
+def shuffled(model: HyperPlanes, seed: int = 0) -> HyperPlanes:
+    """The model with the entries of every weight matrix and of every bias in random order ("Shuffled" there).
+
+    Each keeps its mean and its variance and loses everything else that was learned.
+
+    Args:
+        model: left as it is.
+        seed: of the order.
+    """
+    result = copy.deepcopy(model)
+    generator = torch.Generator().manual_seed(seed)
+    for value in result.networks.parameters():
+        order = torch.randperm(value.numel(), generator=generator).to(value.device)
+        value.copy_(value.flatten()[order].reshape(value.shape))
+    return result

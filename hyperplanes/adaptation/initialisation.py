@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated
-
-import torch
+from typing import Annotated
 
 from hyperplanes.adaptation.fine_tuning import FineTuning
 
-if TYPE_CHECKING:
-    from hyperplanes.adaptation.hyperplanes import HyperPlanes
-
-__all__ = ["LEARNED", "InitialisationConfig", "shuffled"]
+__all__ = ["LEARNED", "InitialisationConfig"]
 
 LEARNED: dict[str, str] = {
     "mv_meta": "an initialisation learned by Reptile from all support views of every object",
@@ -69,21 +63,3 @@ class InitialisationConfig:
             learning_rate=given.learning_rate if stated else self.inner_rate,
             final=given.final if stated else 1.0,
         )
-
-
-@torch.no_grad()
-def shuffled(model: HyperPlanes, seed: int = 0) -> HyperPlanes:
-    """The model with the entries of every weight matrix and of every bias in random order ("Shuffled" there).
-
-    Each keeps its mean and its variance and loses everything else that was learned.
-
-    Args:
-        model: left as it is.
-        seed: of the order.
-    """
-    result = copy.deepcopy(model)
-    generator = torch.Generator().manual_seed(seed)
-    for value in result.networks.parameters():
-        order = torch.randperm(value.numel(), generator=generator).to(value.device)
-        value.copy_(value.flatten()[order].reshape(value.shape))
-    return result

@@ -16,8 +16,7 @@ from torch.profiler import record_function
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
 from hyperplanes.adaptation.fine_tuning import ray_loss
-from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
-from hyperplanes.devices import TasksOnDevice
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.files import encode_png, write_json, write_whole
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
@@ -30,7 +29,7 @@ from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.utilities.lru_cache import LRUCache
 from hyperplanes.views import Tasks
 
-__all__ = ["Progress", "Trainer", "TrainingConfig", "start_training", "train"]
+__all__ = ["Progress", "Trainer", "TrainingConfig", "train"]
 
 
 EMPTINESS = 0.01  # weight of the opacity of empty space beside the squared error of pixels
@@ -416,35 +415,3 @@ def train(
         if report is not None:
             report(progress)
     return trainer
-
-
-def start_training(
-    config: ModelConfig,
-    training: TrainingConfig,
-    data: Tasks,
-    folder: Path,
-    device: torch.device | str = "cpu",
-    reference: Path | None = None,
-) -> Trainer:
-    """A new training, or the one that was interrupted in `folder`.
-
-    Args:
-        config: of the model.
-        training: how it is trained; its seed is that of the first weights, too.
-        data: tasks with a "train" split.
-        folder: for checkpoints.
-        device: where to compute.
-        reference: the checkpoint of mv_meta that mv_matched is to match.
-
-    Returns:
-        A trainer; its `step` says how far it is. CheckpointError where the folder holds another model or training.
-    """
-    matching = config.initialisation is not None and config.initialisation.method == "mv_matched"
-    model = HyperPlanes(config, training.seed + matching).to(device)  # not the weights that mv_meta began with
-    tasks = TasksOnDevice(data, torch.device(device))
-    if config.initialisation is None:
-        return Trainer(model, tasks, training, folder)
-    from hyperplanes.training.meta_training import initialisation_trainer
-
-    matched = None if reference is None else HyperPlanes.from_pretrained(reference)
-    return initialisation_trainer(model, tasks, training, folder, matched)

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import InitialisationConfig
+from hyperplanes.adaptation.fine_tuned import shuffled
 from hyperplanes.adaptation.fine_tuning import ray_loss
-from hyperplanes.adaptation.initialisation import shuffled
 from hyperplanes.adaptation.meta_learning import maml_gradient, reptile_gradient
 from hyperplanes.parameters import Parameters
 from tests.reference_rendering import ball_views, ring, small_model
