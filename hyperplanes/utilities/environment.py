@@ -9,7 +9,7 @@ from pathlib import Path
 
 __all__ = ["environment", "find_commit", "find_processor"]
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def find_commit() -> str:
