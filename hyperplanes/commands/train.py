@@ -36,6 +36,7 @@ from hyperplanes.commands.options import (
     Protocol,
     optional,
 )
+from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration, format_rate
 
 if TYPE_CHECKING:
@@ -202,15 +203,9 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
     return chosen.model.method, chosen
 
 
+@writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Train, from the start or from where it was interrupted."""
-    from hyperplanes.files import one_writer
-
-    with one_writer(arguments.out):
-        return _run(arguments)
-
-
-def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.pretrained import find_checkpoints
     from hyperplanes.data.dataset import open_datasets
     from hyperplanes.data.support import WithSupport
