@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -20,6 +21,7 @@ from small_demo import demo_folder, first_object
 
 from data_gen.rendering.renderers import RendererError
 from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
@@ -262,7 +264,8 @@ def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
     assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, *frozen]) == 2
 
 
-def test_steps_chosen_on_left_out_views_are_reported(tmp_path, capsys):
+def test_steps_chosen_on_left_out_views_are_reported(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("hyperplanes.adaptation.fine_tuning.FineTuning", partial(FineTuning, longest=20))
     demo, scene = demo_folder(), str(first_object(demo_folder()))
     command = ["adapt", "--checkpoint", str(demo), "--views", scene, "--out", str(tmp_path / "weights")]
     assert main([*command, "--steps", "auto"]) == 0

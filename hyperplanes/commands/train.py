@@ -1,6 +1,6 @@
 """Train a model on a data set; what `generate` writes, or any other layout that `inspect` can read.
 
-The model is looked at on held-out objects now and then. Checkpoints are written to --out on the way; interrupted, the
+The model is evaluated on held-out objects at intervals. Checkpoints are written to --out on the way; interrupted, the
 same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once; SIGTERM, as a
 cluster sends it, stops after a checkpoint too. Beside the weights lie config.yaml, which --config takes, curve.csv, and
 samples/ with held-out views beside the truth.
