@@ -76,7 +76,7 @@ def _parse(name: str) -> tuple[str, Steps | None]:
     Raises:
         ValueError: no method has that name.
     """
-    if name in (brought := find_methods()):
+    if name in (registered := find_methods()):
         return name, None
     match = _NAME.fullmatch(name)
     base, steps = (match["base"], match["steps"]) if match else (name, None)
@@ -85,7 +85,7 @@ def _parse(name: str) -> tuple[str, Steps | None]:
         or (steps and base in _WITHOUT_STEPS)
         or (base in _NEED_STEPS and not steps)
     ):
-        every = {**METHODS, **find_targets(), **brought}
+        every = {**METHODS, **find_targets(), **registered}
         known = ", ".join(f"{each}_N" if each in _NEED_STEPS else each for each in every)
         raise ValueError(
             f"method: expected one of {known}, with _N or _auto after it for so many gradient steps, got {name!r}"
@@ -120,8 +120,9 @@ def describe_method(name: str) -> str:
         name: such as "hyperplanes_100".
     """
     base, steps = _parse(name)
-    brought = find_methods()
-    whole = brought[base].about if base in brought else METHODS.get(base, f"{base}, one set of weights for all objects")
+    registered = find_methods()
+    plain = METHODS.get(base, f"{base}, one set of weights for all objects")
+    whole = registered[base].about if base in registered else plain
     if steps is None:
         return whole
     about = whole.removesuffix(" in one step").replace(", one set of weights for all objects", "")
@@ -157,8 +158,8 @@ def make_method(
     """
     base, steps = _parse(name)
     settings = settings or FineTuning()
-    if base in (brought := find_methods()):
-        return brought[base].make(checkpoints=checkpoints, device=device, settings=settings, objects=objects)
+    if base in (registered := find_methods()):
+        return registered[base].make(checkpoints=checkpoints, device=device, settings=settings, objects=objects)
     if base == "nearest_view":
         return NearestView()
     if base == "hull_blend":

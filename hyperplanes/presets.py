@@ -244,7 +244,7 @@ def configure(
 
     Args:
         name: of the preset.
-        method: one of TRAINABLE, or a field that another installed package brings.
+        method: one of TRAINABLE, or a field of another installed package.
         steps: other than the preset's.
         seed: of the training.
         protocol: a name in PROTOCOLS: how rays are sampled.

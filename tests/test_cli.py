@@ -8,8 +8,8 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -21,6 +21,7 @@ from small_demo import demo_folder, first_object
 
 from data_gen.rendering.renderers import RendererError
 from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
@@ -32,6 +33,7 @@ from hyperplanes.fields.baked import BakedField
 from hyperplanes.metrics import psnr
 from hyperplanes.presets import PRESETS
 from hyperplanes.rendering.renderer import Hierarchical
+from hyperplanes.training import Trainer
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
@@ -262,7 +264,8 @@ def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
     assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, *frozen]) == 2
 
 
-def test_steps_chosen_on_left_out_views_are_reported(tmp_path, capsys):
+def test_steps_chosen_on_left_out_views_are_reported(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("hyperplanes.adaptation.fine_tuning.FineTuning", partial(FineTuning, longest=20))
     demo, scene = demo_folder(), str(first_object(demo_folder()))
     command = ["adapt", "--checkpoint", str(demo), "--views", scene, "--out", str(tmp_path / "weights")]
     assert main([*command, "--steps", "auto"]) == 0
@@ -442,31 +445,25 @@ def test_the_demonstration_does_nothing_twice(capsys):
 
 
 def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_path, monkeypatch, capsys):
-    tiny = configurations(DemoSettings.quick_check())["hyperplanes"]
-    monkeypatch.setitem(PRESETS, "tiny", tiny)
+    monkeypatch.setitem(PRESETS, "tiny", configurations(DemoSettings.quick_check())["hyperplanes"])
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    command = ["train", "--data", str(demo_folder() / "data"), "--preset", "tiny", "--steps", "400", "--out"]
-    script = (
-        "import sys; from hyperplanes.cli import main; from hyperplanes.presets import PRESETS; "
-        "from hyperplanes.demo.pipeline import DemoSettings, configurations; "
-        "PRESETS['tiny'] = configurations(DemoSettings.quick_check())['hyperplanes']; sys.exit(main(sys.argv[1:]))"
-    )
-    start = [sys.executable, "-c", script, *command, str(parts)]
-    one_thread = os.environ | {"OMP_NUM_THREADS": "1"}  # as the tests: sums depend on how many threads share them
-    first = subprocess.Popen(
-        start, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=one_thread
-    )
-    deadline = time.monotonic() + 120
-    while not (parts / "training.json").exists() and first.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.02)
-    first.send_signal(signal.SIGINT)
-    _, errors = first.communicate(timeout=120)
-    assert first.returncode == 130, errors
-    at_once, at_the_end = errors.strip().splitlines()
+    command = ["train", "--data", str(demo_folder() / "data"), "--preset", "tiny", "--steps", "24", "--out"]
+    step = Trainer.take_step
+
+    def interrupted(trainer):
+        if trainer.step == 6:
+            signal.raise_signal(signal.SIGINT)
+        return step(trainer)
+
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "take_step", interrupted)
+        assert main([*command, str(parts)]) == 130
+    at_once, at_the_end = capsys.readouterr().err.strip().splitlines()
     assert at_once == "SIGINT: stopping after this step; once more to stop at once"
     assert "the same command goes on" in at_the_end
     assert main([*command, str(parts)]) == 0
-    assert "going on from step" in capsys.readouterr().out
+    assert "going on from step 7" in capsys.readouterr().out
     assert main([*command, str(whole)]) == 0
     same = (parts / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
     assert same

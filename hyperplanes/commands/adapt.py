@@ -17,6 +17,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, refuse_baked
 from hyperplanes.commands.options import Free, OptionalInt, Steps, ViewsUp
 from hyperplanes.commands.scene import read_scene
+from hyperplanes.commands.writing import writes_to
 
 __all__ = ["Arguments", "run"]
 
@@ -51,15 +52,9 @@ class Arguments:
     device: str = "auto"
 
 
+@writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Adapt and write the weights."""
-    from hyperplanes.files import one_writer
-
-    with one_writer(arguments.out):
-        return _run(arguments)
-
-
-def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.pretrained import adapted_model, load_model

@@ -20,6 +20,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, refuse_baked
 from hyperplanes.commands.options import OptionalInt, ViewsUp, optional
 from hyperplanes.commands.scene import read_scene
+from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
@@ -69,17 +70,9 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
     return time.perf_counter() - started, result
 
 
+@writes_to(lambda arguments: arguments.out.parent)
 def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
-    from hyperplanes.files import one_writer
-
-    if arguments.out.is_dir():
-        raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")
-    with one_writer(arguments.out.parent):
-        return _run(arguments)
-
-
-def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.adaptation.pretrained import load_model
     from hyperplanes.baking import BakedScene, bake
@@ -89,6 +82,8 @@ def _run(arguments: Arguments) -> int:
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.metrics import psnr
 
+    if arguments.out.is_dir():
+        raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "bake")
     model = load_model(arguments.checkpoint).to(device)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from hyperplanes.commands.console import Console
+from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
@@ -84,15 +85,9 @@ def settings_of(arguments: Arguments) -> DemoSettings:
     )
 
 
+@writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """All stages, each skipped when it is done."""
-    from hyperplanes.files import one_writer
-
-    with one_writer(arguments.out):
-        return _run(arguments)
-
-
-def _run(arguments: Arguments) -> int:
     from hyperplanes.demo.pipeline import stages
     from hyperplanes.demo.stages import Stages
 

@@ -20,6 +20,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, ViewsUp, optional
 from hyperplanes.commands.scene import read_scene
+from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
 
 __all__ = ["Arguments", "run"]
@@ -63,15 +64,9 @@ class Arguments:
     device: str = "auto"
 
 
+@writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
-    from hyperplanes.files import one_writer
-
-    with one_writer(arguments.out):
-        return _run(arguments)
-
-
-def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.nearest_view import NearestView
     from hyperplanes.baking import BakedScene

@@ -1,6 +1,6 @@
 """Train a model on a data set; what `generate` writes, or any other layout that `inspect` can read.
 
-The model is looked at on held-out objects now and then. Checkpoints are written to --out on the way; interrupted, the
+The model is evaluated on held-out objects at intervals. Checkpoints are written to --out on the way; interrupted, the
 same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once; SIGTERM, as a
 cluster sends it, stops after a checkpoint too. Beside the weights lie config.yaml, which --config takes, curve.csv, and
 samples/ with held-out views beside the truth.
@@ -36,6 +36,7 @@ from hyperplanes.commands.options import (
     Protocol,
     optional,
 )
+from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.errors import Terminated
 from hyperplanes.utilities.formatting import format_duration, format_rate
 
@@ -209,15 +210,9 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
     return chosen.model.method, chosen
 
 
+@writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Train, from the start or from where it was interrupted."""
-    from hyperplanes.files import one_writer
-
-    with one_writer(arguments.out):
-        return _run(arguments)
-
-
-def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.pretrained import find_checkpoints
     from hyperplanes.data.dataset import open_datasets
     from hyperplanes.data.support import WithSupport

@@ -23,10 +23,8 @@ from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Task, Tasks
 
 __all__ = [
-    "METHODS",
     "MODELS",
     "TUNED",
-    "UNSEEN_METHODS",
     "DemoSettings",
     "describe_row",
     "file_name",
@@ -36,20 +34,6 @@ __all__ = [
     "stages",
     "write_metrics",
 ]
-
-METHODS = (
-    "nearest_view",
-    "point_multiplane",
-    "hyperplanes_swapped",
-    "hyperplanes",
-    "hyperplanes_10",
-    "hyperplanes_100",
-    "scratch_100",
-)
-"""The rows of the demonstration's table."""
-
-UNSEEN_METHODS = ("nearest_view", "hyperplanes", "hyperplanes_100", "scratch_100")
-"""The rows on objects of a class that was never trained on, called METHOD:CLASS."""
 
 TUNED = ("hyperplanes", "scratch")
 """Methods whose PSNR over fine-tuning steps is drawn."""
@@ -74,6 +58,7 @@ class DemoSettings:
         exhibits: objects shown in the report.
         frames: of each turntable.
         unseen_objects: of another class, which no model is trained on.
+        fine_tuned: numbers of fine-tuning steps of the rows of the table, a few and many.
         tuning: numbers of fine-tuning steps in the chart of fine-tuning.
         tuned_objects: held-out objects that it is drawn of.
         tiny: networks so small that nothing is learnt: to see that everything runs.
@@ -90,6 +75,7 @@ class DemoSettings:
     exhibits: int = 5
     frames: int = 36
     unseen_objects: int = 2
+    fine_tuned: tuple[int, int] = (10, 100)
     tuning: tuple[int, ...] = (0, 1, 3, 10, 30, 100, 300)
     tuned_objects: int = 1
     tiny: bool = False
@@ -100,9 +86,18 @@ class DemoSettings:
         return "car" if self.class_name == "chair" else "chair"
 
     @property
+    def methods(self) -> tuple[str, ...]:
+        """The rows of the table on the class that was trained on."""
+        few, many = self.fine_tuned
+        tuned = (f"hyperplanes_{few}", f"hyperplanes_{many}", f"scratch_{many}")
+        return ("nearest_view", "point_multiplane", "hyperplanes_swapped", "hyperplanes", *tuned)
+
+    @property
     def rows(self) -> tuple[str, ...]:
-        """The rows of the table: methods, and METHOD:CLASS for those on the other class."""
-        return (*METHODS, *(f"{method}:{self.unseen_class}" for method in UNSEEN_METHODS))
+        """All rows of the table: `methods`, and METHOD:CLASS for those on the class that was never trained on."""
+        many = self.fine_tuned[1]
+        unseen = ("nearest_view", "hyperplanes", f"hyperplanes_{many}", f"scratch_{many}")
+        return (*self.methods, *(f"{method}:{self.unseen_class}" for method in unseen))
 
     @classmethod
     def quick_check(cls, seed: int = 0) -> DemoSettings:
@@ -117,6 +112,7 @@ class DemoSettings:
             exhibits=1,
             frames=6,
             unseen_objects=1,
+            fine_tuned=(1, 2),
             tuning=(0, 2, 5),
             tuned_objects=1,
             tiny=True,

@@ -15,7 +15,7 @@ from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.checkpoints import read_json
 from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
 from hyperplanes.demo.content import Pixels
-from hyperplanes.demo.pipeline import METHODS, MODELS, DemoSettings, describe_row
+from hyperplanes.demo.pipeline import MODELS, DemoSettings, describe_row
 from hyperplanes.demo.stages import Stages
 from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.files import encode_png, write_whole
@@ -56,8 +56,8 @@ def write_report(
         rounds.append(frames)
         truth = to_pixels(task.query.images)
         chosen = sorted({len(truth) // 4, 3 * len(truth) // 4})
-        looks = [Look(truth[i], _predictions(folder, name, task.query.names[i])) for i in chosen]
-        quality = {method: metrics[method]["objects"][name]["psnr"] for method in METHODS}
+        looks = [Look(truth[i], _predictions(folder, settings, name, task.query.names[i])) for i in chosen]
+        quality = {method: metrics[method]["objects"][name]["psnr"] for method in settings.methods}
         read = model.hyperplanes().tolist()
         exhibits.append(
             Exhibit(name, to_pixels(support.images), read, looks, quality, encode_animation(frames, "webp"))
@@ -70,9 +70,9 @@ def write_report(
     return folder / "report.html"
 
 
-def _predictions(folder: Path, name: str, view: str) -> dict[str, Pixels]:
+def _predictions(folder: Path, settings: DemoSettings, name: str, view: str) -> dict[str, Pixels]:
     file = f"{Path(view).stem}.png"
-    return {method: _read(folder / "pictures" / method / name / file) for method in METHODS}
+    return {method: _read(folder / "pictures" / method / name / file) for method in settings.methods}
 
 
 def _read(path: Path) -> Pixels:

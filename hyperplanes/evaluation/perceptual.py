@@ -1,4 +1,4 @@
-"""LPIPS, the perceptual distance of Zhang et al. 2018, by AlexNet and with weights that the user brings.
+"""LPIPS, the perceptual distance of Zhang et al. 2018, by AlexNet and with weights that the user provides.
 
 The weights are the state of the `lpips` package's network, written once, where that package is installed, by
 
@@ -6,7 +6,7 @@ The weights are the state of the `lpips` package's network, written once, where 
     state = lpips.LPIPS(net="alex").state_dict()
     safetensors.torch.save_file({name: value.clone() for name, value in state.items()}, "lpips-alex.safetensors")
 
-The package itself is no dependency: it brings torchvision, and with it another build of torch.
+The package itself is no dependency: it depends on torchvision, which installs another build of torch.
 """
 
 from __future__ import annotations

@@ -1,0 +1,33 @@
+"""Verbs that write into a folder, of which one runs at a time there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+__all__ = ["writes_to"]
+
+
+def writes_to(folder: Callable[[Any], Path]) -> Callable[[Callable[[Any], int]], Callable[[Any], int]]:
+    """A decorator of a verb's `run`: it fails at once where another process writes into the same folder.
+
+    Args:
+        folder: from a verb's arguments the folder that it writes into, as in `files.one_writer`.
+
+    Returns:
+        The decorator.
+    """
+
+    def decorate(run: Callable[[Any], int]) -> Callable[[Any], int]:
+        @wraps(run)
+        def locked(arguments: Any) -> int:
+            from hyperplanes.files import one_writer
+
+            with one_writer(folder(arguments)):
+                return run(arguments)
+
+        return locked
+
+    return decorate
