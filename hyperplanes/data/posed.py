@@ -24,6 +24,7 @@ from hyperplanes.views import Task, Views
 __all__ = ["Posed", "PosedTask", "check_pose", "posed"]
 
 ROTATION_TOLERANCE = 1e-3
+ONE_PLACE = 1e-9  # share of their distance from the origin by which cameras in one place may lie apart
 FARTHEST = 1e3  # extents of a scene from the origin, within which float32 keeps it to a tenth of a pixel
 
 
@@ -213,10 +214,10 @@ def _far_offset(camera_from_world: npt.NDArray[np.float64], bounds: Sphere | Non
     middle = np.median(centres, axis=0)
     extent = max(float(np.abs(centres - middle).max()), 0.0 if bounds is None else bounds.radius)
     far = float(np.abs(middle).max())
-    if extent == 0 or far <= FARTHEST * extent:
+    if far <= FARTHEST * extent or extent <= ONE_PLACE * far:
         return np.zeros(3)
     step = 2.0 ** (math.floor(math.log2(far)) - 14)
-    return np.round(middle / step) * step
+    return np.round(middle / step) * step + 0.0
 
 
 def check_pose(matrix: object, source: str | Path, frame: str) -> npt.NDArray[np.float64]:
