@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 __all__ = [
     "MESH_FORMATS",
     "TURNTABLE_FORMATS",
+    "Agreement",
     "Surface",
+    "agreement",
     "choose_level",
     "density_grid",
     "encode_animation",
@@ -39,7 +41,6 @@ __all__ = [
     "save_images",
     "save_mesh",
     "save_turntable",
-    "silhouette_overlap",
     "to_pixels",
     "upward",
 ]
@@ -50,6 +51,7 @@ TURNTABLE_FORMATS = ("webp", "gif")
 SILHOUETTE = 64  # pixels along the longer side of the silhouettes that surfaces are compared by
 LEVEL_VIEWS = 8
 LEVELS = 60
+DEPTH_TOLERANCE = 0.05  # radii of the scene
 
 
 def to_pixels(images: Float[Tensor, "view 3 height width"]) -> npt.NDArray[np.uint8]:
@@ -241,10 +243,11 @@ def density_grid(field: AdaptedField, voxels: int = 128) -> Float[Tensor, "x y z
 
 @torch.no_grad()
 def choose_level(field: AdaptedField, density: Float[Tensor, "x y z"], cameras: PinholeCamera) -> float:
-    """The density at which the surface has most nearly the silhouettes that the field is rendered with.
+    """The density at which the surface has most nearly the silhouettes and the depth that the field is rendered with.
 
-    A ray meets the surface of a level where the greatest density along it is above the level, so one pass over the
-    rays judges every level. A fixed level leaves holes where walls are opaque by being thick, not dense.
+    A ray meets the surface of a level where the density along it first exceeds the level, so one pass over the rays
+    judges every level. A fixed level leaves holes where walls are opaque by being thick, not dense; silhouettes alone
+    do not see a hole with a wall behind it.
 
     Args:
         field: rendered by its own sampler.
@@ -252,7 +255,8 @@ def choose_level(field: AdaptedField, density: Float[Tensor, "x y z"], cameras: 
         cameras: up to eight of them are used, at 64 pixels.
 
     Returns:
-        Density per world unit: the level with the largest mean overlap (intersection over union).
+        Density per world unit: the level with the largest product of overlap and share, as in `Agreement`, of all views
+        together.
 
     Raises:
         ValueError: a field that is empty everywhere.
@@ -261,19 +265,35 @@ def choose_level(field: AdaptedField, density: Float[Tensor, "x y z"], cameras: 
     if not top > 0:
         raise ValueError("field: expected some density, got one that is empty everywhere; train longer, or check masks")
     small = _small_cameras(cameras, LEVEL_VIEWS)
-    wanted = field.render(small).opacity.flatten(1) > 0.5
-    greatest = _greatest_density(density, field.occupancy.bounds, small)
-    best, chosen = -1.0, top / 2
-    for level in np.geomspace(top * 1e-4, top * 0.9, LEVELS).tolist():
-        overlap = _overlap(greatest > level, wanted)
-        if overlap > best:
-            best, chosen = overlap, level
-    return chosen
+    covered, depth = _rendered(field, small)
+    bounds, levels = field.occupancy.bounds, torch.from_numpy(np.geomspace(top * 1e-4, top * 0.9, LEVELS)).float()
+    right, union = torch.zeros(LEVELS), torch.zeros(LEVELS)
+    for view, first in enumerate(_first_crossings(density, levels, bounds, small)):
+        seen, wanted = first.isfinite(), covered[view, :, None]
+        near = (first - depth[view, :, None]).abs() <= DEPTH_TOLERANCE * bounds.radius
+        right += (seen & wanted & near).sum(0)
+        union += (seen | wanted).sum(0)
+    return float(levels[(right / union.clamp_min(1)).argmax()]) if right.any() else top / 2
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well a surface shows what the field's pictures show.
+
+    Attributes:
+        overlap: of the silhouettes: intersection over union, mean over views.
+        depth: share of the pixels that both cover at which the surface is as far away as the field is rendered, to
+            `DEPTH_TOLERANCE` of the scene's radius. A hole through which the far side is seen lowers it; 0 where no
+            pixel is covered by both.
+    """
+
+    overlap: float
+    depth: float
 
 
 @torch.no_grad()
-def silhouette_overlap(surface: Surface, field: AdaptedField, cameras: PinholeCamera) -> float:
-    """How well a surface covers the pixels that the field's pictures cover: mean intersection over union.
+def agreement(surface: Surface, field: AdaptedField, cameras: PinholeCamera) -> Agreement:
+    """Compare a surface with the pictures of the field that it was cut from.
 
     Args:
         surface: rays are cast at its triangles.
@@ -281,14 +301,21 @@ def silhouette_overlap(surface: Surface, field: AdaptedField, cameras: PinholeCa
         cameras: all of them, at 64 pixels.
 
     Returns:
-        From 0 to 1.
+        Both figures, from 0 to 1.
     """
     small = _small_cameras(cameras, cameras.batch_size)
-    wanted = field.render(small).opacity.flatten(1).cpu() > 0.5
-    origins, directions = _pixel_rays(small)
-    mesh = _mesh(surface.vertices, surface.faces)
-    hit = mesh.ray.intersects_any(origins.reshape(-1, 3).numpy(), directions.reshape(-1, 3).numpy())
-    return _overlap(torch.from_numpy(hit).reshape(wanted.shape), wanted)
+    wanted, depth = _rendered(field, small)
+    origins, directions = (part.reshape(-1, 3).numpy() for part in _pixel_rays(small))
+    rays = _mesh(surface.vertices, surface.faces).ray
+    places, ray, _ = rays.intersects_location(origins, directions, multiple_hits=False)
+    first = torch.full((wanted.numel(),), math.inf)
+    distances = np.linalg.norm(places - origins[ray], axis=1)
+    first[torch.from_numpy(ray)] = torch.from_numpy(distances).float()
+    first = first.reshape(wanted.shape)
+    both, union = first.isfinite() & wanted, (first.isfinite() | wanted).sum(1)
+    overlap = torch.where(union > 0, both.sum(1) / union.clamp_min(1), 1.0).mean()
+    near = (first - depth)[both].abs() <= DEPTH_TOLERANCE * field.occupancy.bounds.radius
+    return Agreement(float(overlap), float(near.float().mean()) if len(near) else 0.0)
 
 
 @torch.no_grad()
@@ -305,7 +332,7 @@ def extract_mesh(
         field: asked on a grid, only where its occupancy may hold something.
         voxels: along each side of the cube around the scene.
         level: density per world unit; where absent, what makes 1/64 of the scene's diameter half opaque. `choose_level`
-            finds the one whose silhouettes agree with the rendered ones.
+            finds the one whose silhouettes and depth agree with the rendered ones.
         density: of `density_grid`, where it was computed before; `voxels` does not count then.
 
     Returns:
@@ -350,24 +377,34 @@ def _pixel_rays(cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
     return torch.stack([each.origins for each in rays]), torch.stack([each.directions for each in rays])
 
 
-def _greatest_density(density: Tensor, bounds: Sphere, cameras: PinholeCamera) -> Float[Tensor, "view pixel"]:
-    """The greatest density along the ray of each pixel, trilinear between the grid's points, half a voxel apart."""
+def _rendered(field: AdaptedField, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
+    """What a field's pictures cover, and how far away it is along the rays; both (view, pixel), on the CPU."""
+    pictures = field.render(cameras)
+    return pictures.opacity.flatten(1).cpu() > 0.5, pictures.depth.flatten(1).cpu()
+
+
+def _first_crossings(
+    density: Tensor, levels: Tensor, bounds: Sphere, cameras: PinholeCamera
+) -> Iterator[Float[Tensor, "pixel level"]]:
+    """Where the density along the ray of each pixel first exceeds each level.
+
+    The density is trilinear between the grid's points and looked at every half voxel.
+
+    Yields:
+        For each view, distances along the rays, infinite where the level is never exceeded.
+    """
     origins, directions = (part.to(density.device) for part in _pixel_rays(cameras))
     start = bounds.normalise(origins)
     middle = -(start * directions).sum(-1, keepdim=True)
     along = torch.linspace(-(3**0.5), 3**0.5, 2 * len(density), device=density.device)
-    result = []
     for view in range(len(origins)):
-        points = start[view, :, None] + (middle[view] + along)[..., None] * directions[view, :, None]
-        values = grid_sample(density[None, None], points.flip(-1)[None, None], align_corners=True)
-        result.append(values[0, 0, 0].amax(-1))
-    return torch.stack(result).cpu()
-
-
-def _overlap(seen: Tensor, wanted: Tensor) -> float:
-    """Mean intersection over union of masks (view, pixel); views that show nothing in either count as 1."""
-    union = (seen | wanted).sum(1)
-    return float(torch.where(union > 0, (seen & wanted).sum(1) / union.clamp_min(1), 1.0).mean())
+        distance = middle[view] + along
+        points = start[view, :, None] + distance[..., None] * directions[view, :, None]
+        values = grid_sample(density[None, None], points.flip(-1)[None, None], align_corners=True)[0, 0, 0]
+        wanted = levels.to(values).expand(len(values), -1).contiguous()
+        index = torch.searchsorted(values.cummax(-1).values, wanted, right=True)
+        distance = torch.cat([distance * bounds.radius, distance.new_full((len(distance), 1), math.inf)], 1)
+        yield distance.gather(1, index).cpu()
 
 
 def _mesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) -> trimesh.Trimesh:

@@ -10,6 +10,9 @@ from PIL import Image
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export import (
+    Agreement,
+    Surface,
+    agreement,
     choose_level,
     density_grid,
     encode_animation,
@@ -18,7 +21,6 @@ from hyperplanes.export import (
     save_images,
     save_mesh,
     save_turntable,
-    silhouette_overlap,
     to_pixels,
     upward,
 )
@@ -97,11 +99,40 @@ def test_the_level_is_the_one_with_the_rendered_silhouettes():
     surface = extract_mesh(adapted, level=level, density=density)
     distance = np.linalg.norm(surface.vertices - np.array(CENTRE), axis=1)
     assert np.abs(distance - 0.498).max() < 0.07
-    assert silhouette_overlap(surface, adapted, cameras) > 0.9
+    assert agreement(surface, adapted, cameras).overlap > 0.9
     hazy = extract_mesh(adapted, level=0.1, density=density)
-    assert silhouette_overlap(hazy, adapted, cameras) == pytest.approx((0.5 / RADIUS) ** 2, abs=0.07)
+    assert agreement(hazy, adapted, cameras).overlap == pytest.approx((0.5 / RADIUS) ** 2, abs=0.07)
     with pytest.raises(ValueError, match="level: expected less than the highest density, 8, got 11.1"):
         extract_mesh(adapted, density=density)
+
+
+def test_a_hole_with_a_wall_behind_it_is_noticed_by_depth_and_closed_by_the_level():
+    """Closed form: a hollow ball, 0.3 thick, of density 30 within 0.4 of the +x axis, 300 elsewhere.
+
+    From far along x both are opaque (30 x 0.3 = 9), so the silhouettes of every level below 300 are the same, but a
+    level above 30 has a hole there: (0.4 / 0.8)^2 of the disc, through which the far wall is seen.
+    """
+
+    def field(points, directions):
+        local = points - points.new_tensor(CENTRE)
+        weak = (local[:, 0] > 0) & (local[:, 1:].norm(dim=-1) < 0.4)
+        distance = local.norm(dim=-1)
+        shell = (distance < RADIUS) & (distance > RADIUS - 0.3)
+        return torch.ones_like(points), shell * torch.where(weak, 30.0, 300.0)
+
+    adapted = AdaptedField(field, full(Sphere(CENTRE, 1.0), 16), Marched(steps=128))
+    pose = camera.look_at(torch.tensor(CENTRE) + torch.tensor([[20.0, 0.0, 0.0]]), CENTRE, (0.0, 1.0, 0.0))
+    cameras = camera.pinhole(camera.symmetric_intrinsics(64, 64, 0.1), pose, 64, 64)
+    density = density_grid(adapted, 64)
+    level = choose_level(adapted, density, cameras)
+    assert level < 30
+    whole = agreement(extract_mesh(adapted, level=level, density=density), adapted, cameras)
+    assert min(whole.overlap, whole.depth) > 0.95
+    holed = agreement(extract_mesh(adapted, level=150.0, density=density), adapted, cameras)
+    assert holed.overlap > 0.95
+    assert holed.depth == pytest.approx(1 - (0.4 / RADIUS) ** 2, abs=0.05)
+    empty = Surface(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]]), np.ones((3, 3), np.float32))
+    assert agreement(empty, adapted, cameras) == Agreement(0.0, 0.0)
 
 
 def test_a_level_that_is_never_reached():

@@ -37,7 +37,8 @@ class Arguments:
         turntable: The format of the turntable.
         mesh_format: The format of the mesh.
         voxels: Along each side of the grid that the mesh is cut from.
-        level: Density at the surface; the one whose silhouettes agree best with the rendered ones when not given.
+        level: Density at the surface; the one whose silhouettes and depth agree best with the rendered ones when not
+            given.
         all_views: Show the model every view, not only the support half.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held. What is written has y up.
@@ -64,6 +65,7 @@ class Arguments:
 
 
 GOOD_OVERLAP = 0.9
+GOOD_DEPTH = 0.9
 
 
 def run(arguments: Arguments) -> int:
@@ -78,13 +80,13 @@ def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.devices import choose_device
     from hyperplanes.export import (
+        agreement,
         choose_level,
         density_grid,
         extract_mesh,
         save_images,
         save_mesh,
         save_turntable,
-        silhouette_overlap,
     )
 
     console, device, out = Console(), choose_device(arguments.device), arguments.out
@@ -110,13 +112,16 @@ def _run(arguments: Arguments) -> int:
         density = density_grid(solid, arguments.voxels)
         level = arguments.level if arguments.level is not None else choose_level(solid, density, shown.cameras)
         surface = extract_mesh(solid, level=level, density=density)
-        overlap = silhouette_overlap(surface, solid, query.cameras)
+        found = agreement(surface, solid, query.cameras)
         path = save_mesh(surface, out / f"mesh.{arguments.mesh_format}")
         console.say(f"{path}: {len(surface.vertices):,} vertices, {len(surface.faces):,} faces")
         console.say(
-            f"{path}: its silhouettes overlap the rendered ones of {len(query)} query views by {overlap:.1%} "
-            f"(intersection over union), cut at density {level:.3g}"
+            f"{path}: its silhouettes overlap the rendered ones of {len(query)} query views by {found.overlap:.1%} "
+            f"(intersection over union), and {found.depth:.1%} of what both cover is as far away; cut at density "
+            f"{level:.3g}"
         )
-        if overlap < GOOD_OVERLAP:
+        if found.overlap < GOOD_OVERLAP:
             console.warn(f"{path}: parts are missing or too large; more --voxels, another --level, or --steps 100")
+        elif found.depth < GOOD_DEPTH:
+            console.warn(f"{path}: walls are missing or lie too far out; another --level, or --steps 100")
     return 0

@@ -11,7 +11,7 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry import lookup_torch
 from hyperplanes.geometry.distortion import DistortedCamera, distorted_pixels
-from hyperplanes.geometry.inputs import Numbers, as_images, as_indices, as_points
+from hyperplanes.geometry.inputs import Numbers, as_images, as_indices, as_points, check_indices
 from hyperplanes.geometry.lookup import Lookup, choose, lookup
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.packed_images import PackedImages, pack
@@ -87,7 +87,7 @@ class ImagePlanes:
             Colours, coordinates and validity, differentiable in points, images and cameras.
         """
         points = as_points(points)
-        views = None if views is None else as_indices(views, points, len(self.images))
+        views = None if views is None else as_indices(views, points)
         matrices = camera.projection_matrices(self.cameras)
         if isinstance(self.cameras, DistortedCamera):
             found = self._lookup_distorted(points, matrices, views)
@@ -113,6 +113,8 @@ class ImagePlanes:
     def _lookup_distorted(self, points: Tensor, matrices: Tensor, views: Tensor | None) -> Lookup:
         """The lookup in plain PyTorch; points that a lens cannot show count as behind the camera."""
         assert isinstance(self.cameras, DistortedCamera)
+        if views is not None:
+            check_indices(views, len(self.images))
         ideal, front = lookup_torch.project(points, matrices.to(points), views, self.nearest)
         pixels, shown = distorted_pixels(self.cameras, ideal, views)
         coordinates, valid = lookup_torch.place(pixels, front & shown, *self.images.shape[2:])

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hyperplanes.geometry import lookup_torch
-from hyperplanes.geometry.inputs import Numbers, as_images, as_indices, as_matrices, as_points, as_tensor
+from hyperplanes.geometry.inputs import Numbers, as_images, as_indices, as_matrices, as_points, as_tensor, check_indices
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.packed_images import PackedImages
 
@@ -127,13 +127,15 @@ def lookup(
     """
     points, images = as_points(points), as_images(images)
     matrices, images = as_matrices(matrices, len(images)).to(points), images.to(points)
-    views = None if views is None else as_indices(views, points, len(images))
+    views = None if views is None else as_indices(views, points)
     name = backend or choose(points, images)
     if name != "torch" and (unknown := lookup_torch.transform_of(points, matrices, images)):
         if backend is not None:
             raise ValueError(f"backend: {backend} has no {unknown}; use backend='torch'")
         name = "torch"
     if name == "torch":
+        if views is not None:
+            check_indices(views, len(images))
         return Lookup(*lookup_torch.lookup(points, matrices, images, views, background, nearest))
     if backend is not None:
         _check(backend, points.device)

@@ -1,6 +1,7 @@
 """Source of truth: a ball whose pictures are computed in closed form (conftest), and numbers worked out by hand."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from hyperplanes.data import read_task, read_views
+from hyperplanes.data.formats.recognise import read_posed_task
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.formats.transforms_json import read_transforms
 from hyperplanes.geometry import cameras as camera
@@ -76,6 +78,29 @@ def test_what_is_written_is_read_again(scene, tmp_path):
     rays = task.query.rays(0)
     other = read_views(scene.write(tmp_path / "blender")).rays(1)
     assert torch.allclose(rays.directions, other.directions, atol=1e-6)
+
+
+def test_a_scene_at_coordinates_of_a_map_loses_no_pixel(scene, tmp_path):
+    """Closed form: a scene moved as a whole shows its points at the same pixels. At 4e6, float32 has steps of 0.25."""
+    offset = np.array([512_345.678, 4_198_765.432, 210.5])
+    document = scene.document(scene_sphere={"centre": (scene.centre + offset).tolist(), "radius": 0.7})
+    for frame in document["frames"]:
+        frame["transform_matrix"] = np.array(frame["transform_matrix"])
+        frame["transform_matrix"][:3, 3] += offset
+        frame["transform_matrix"] = frame["transform_matrix"].tolist()
+    near = read_task(scene.write(tmp_path / "near"))
+    far = read_posed_task(scene.write(tmp_path / "far", document))
+    origin = np.array(re.findall(r"[-\d.]+", far.notes[0].split(": ")[1])[:3], float)
+    np.testing.assert_allclose(far.support.bounds.centre, scene.centre + offset - origin, atol=1e-9)
+    assert far.query.bounds == far.support.bounds
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    moved = (points.double() + torch.from_numpy(offset - origin)).float()
+    for half, reference in ((far.support, near.support), (far.query, near.query)):
+        shown = half.cameras.project(moved.expand(len(half), -1, -1))
+        torch.testing.assert_close(
+            shown, reference.cameras.project(points.expand(len(half), -1, -1)), atol=0.01, rtol=0
+        )
+    assert not any("shifted" in note for note in read_posed_task(tmp_path / "near").notes)
 
 
 def test_train_and_test_files_are_support_and_query(scene, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +24,8 @@ from hyperplanes.views import Task, Views
 __all__ = ["Posed", "PosedTask", "check_pose", "posed"]
 
 ROTATION_TOLERANCE = 1e-3
+ONE_PLACE = 1e-9  # share of their distance from the origin by which cameras in one place may lie apart
+FARTHEST = 1e3  # extents of a scene from the origin, within which float32 keeps it to a tenth of a pixel
 
 
 @dataclass(frozen=True)
@@ -162,7 +165,10 @@ def posed(
     depths: Float[Tensor, "view 2"] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Posed:
-    """Put together what a reader found.
+    """Put together what a reader found: support and query of a scene in one call, for they share their world.
+
+    Where a scene lies so far from its origin that float32 would lose pixels, as at coordinates of a map, a round vector
+    is subtracted from its cameras and bounds in float64, and stated in the notes.
 
     Args:
         pictures: (height, width, 4) each, all of one size.
@@ -183,6 +189,15 @@ def posed(
     """
     rgba = torch.from_numpy(np.ascontiguousarray(np.stack(pictures).transpose(0, 3, 1, 2)))
     height, width = rgba.shape[2:]
+    offset = _far_offset(camera_from_world, bounds)
+    if offset.any():
+        x, y, z = offset.tolist()
+        camera_from_world = camera_from_world.copy()
+        camera_from_world[:, :3, 3] += camera_from_world[:, :3, :3] @ offset
+        if bounds is not None:
+            centre = bounds.centre
+            bounds = Sphere((centre[0] - x, centre[1] - y, centre[2] - z), bounds.radius)
+        notes = (*notes, f"the world is shifted: ({x:.10g}, {y:.10g}, {z:.10g}) is its new origin, for float32's sake")
     try:
         cameras = camera.pinhole(
             torch.from_numpy(intrinsics).float(), torch.from_numpy(camera_from_world).float(), height, width
@@ -190,6 +205,19 @@ def posed(
     except ValueError as error:
         raise DataError(source, "usable cameras", str(error), "export the cameras again") from error
     return Posed(rgba, cameras, has_alpha, bounds, names, depths, notes)
+
+
+def _far_offset(camera_from_world: npt.NDArray[np.float64], bounds: Sphere | None) -> npt.NDArray[np.float64]:
+    """What to subtract from a world far from its origin: round numbers, so that folders of one world mostly agree."""
+    rotation, translation = camera_from_world[:, :3, :3], camera_from_world[:, :3, 3:]
+    centres = -(rotation.transpose(0, 2, 1) @ translation)[..., 0]
+    middle = np.median(centres, axis=0)
+    extent = max(float(np.abs(centres - middle).max()), 0.0 if bounds is None else bounds.radius)
+    far = float(np.abs(middle).max())
+    if far <= FARTHEST * extent or extent <= ONE_PLACE * far:
+        return np.zeros(3)
+    step = 2.0 ** (math.floor(math.log2(far)) - 14)
+    return np.round(middle / step) * step + 0.0
 
 
 def check_pose(matrix: object, source: str | Path, frame: str) -> npt.NDArray[np.float64]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hyperplanes.geometry.inputs import check_indices
+
 __all__ = ["check_gradient", "check_lookup", "check_sample"]
 
 _NUMBERS = (torch.float32, torch.float64)
@@ -34,10 +36,7 @@ def check_lookup(
             f"views: expected int64 of shape ({len(points)}, chosen), a row a point, "
             f"got {views.dtype} {tuple(views.shape)}"
         )
-    if views.numel():
-        least, most = (int(value) for value in torch.aminmax(views))
-        if least < 0 or most >= len(images):
-            raise ValueError(f"views: expected indices of {len(images)} planes, got {least} to {most}")
+    check_indices(views, len(images))
 
 
 def check_sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bits: int) -> None:
