@@ -178,6 +178,9 @@ def _whole_number(digits: str) -> int:
     return int(digits)
 
 
+LONGEST_NAME = 255  # bytes of a part of a path, on every common file system
+
+
 def inside(folder: str | Path, relative: str, source: str | Path) -> Path:
     """The path of a file named in another file, which may not leave the folder.
 
@@ -190,12 +193,15 @@ def inside(folder: str | Path, relative: str, source: str | Path) -> Path:
         The path; whether there is such a file is not looked at.
 
     Raises:
-        DataError: an absolute path, or one that leaves the folder.
+        DataError: an absolute path, one that leaves the folder, or a name that no file can have.
     """
     root = Path(folder).resolve()
     text = relative.replace("\\", "/") if isinstance(relative, str) else ""
     if not text or "\0" in text or not (root / text).resolve().is_relative_to(root) or Path(text).is_absolute():
         raise DataError(source, f"file names inside {folder}", repr(relative), "move the file into the folder")
+    if any(len(os.fsencode(part)) > LONGEST_NAME for part in text.split("/")):
+        found = f"{text[:40]}..., {len(text)} characters"
+        raise DataError(source, f"file names of at most {LONGEST_NAME} bytes", found, "export the file again")
     return Path(folder) / text
 
 

@@ -16,7 +16,7 @@ from hyperplanes.cli import _terminable, main
 from hyperplanes.data import open_dataset
 from hyperplanes.data.formats.npz import read_npz
 from hyperplanes.data.pictures.images import read_image
-from hyperplanes.files import DataError, malformed, one_writer, read_bytes, read_json
+from hyperplanes.files import DataError, inside, malformed, one_writer, read_bytes, read_json
 from hyperplanes.utilities.errors import Terminated
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -118,6 +118,12 @@ def test_a_lock_ends_with_its_process(tmp_path):
     assert (tmp_path / ".lock").exists()
     with one_writer(tmp_path):
         pass
+
+
+def test_a_name_that_no_file_can_have_is_refused(tmp_path):
+    assert inside(tmp_path, "a" * 255, "images.bin") == tmp_path / ("a" * 255)
+    with pytest.raises(DataError, match="images.bin: expected file names of at most 255 bytes"):
+        inside(tmp_path, "images/" + "1" * 252 + ".png", "images.bin")
 
 
 def test_sigterm_ends_as_ctrl_c_does_with_another_code(monkeypatch, capsys):
