@@ -216,7 +216,8 @@ def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
         assert f"{written[name]['psnr']:.2f} dB" in shown
 
 
-def test_fields_are_optimised_on_one_posed_scene_without_a_checkpoint(tmp_path):
+def test_fields_are_optimised_on_one_posed_scene_without_a_checkpoint(tmp_path, monkeypatch):
+    monkeypatch.setitem(PRESETS, "quick", tiny_preset())
     scene, table = first_object(demo_folder()), tmp_path / "table.json"
     methods = ["hull_blend", "nerf_scratch_3", "point_multiplane_scratch_3"]
     assert main(["evaluate", "--data", str(scene), "--json", str(table), "--support", "5", "--method", *methods]) == 0

@@ -154,7 +154,7 @@ def test_the_page_of_a_demonstration():
     page = (demo_folder() / "report.html").read_text(encoding="utf-8")
     parser = checked(page)
     assert any(source.startswith("data:image/webp") for source in parser.sources)
-    for name in ("nearest_view", "point_multiplane", "hyperplanes", "hyperplanes_10"):
+    for name in ("nearest_view", "point_multiplane", "hyperplanes", "hyperplanes_1"):
         assert f"<small>{name}</small>" in page
     assert "arXiv 2402.01524" in page
     assert find_commit() in page

@@ -127,10 +127,10 @@ def test_density_is_per_world_unit():
 
 
 def test_gradients_reach_parameters_points_and_directions():
-    config = TargetConfig(depth=2, width=6, planes=2, point_octaves=1, direction_octaves=1)
+    config = TargetConfig(depth=2, width=4, planes=2, point_octaves=1, direction_octaves=1)
     network = make(config=config).double()
     images = planes(2, dtype=torch.float64)
-    points, directions = queries(3, seed=4, dtype=torch.float64)
+    points, directions = queries(2, seed=4, dtype=torch.float64)
     names = list(Parameters.of(network))
 
     def outputs(points, directions, *values):

@@ -113,6 +113,9 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
     assert chosen.model.sampling == Hierarchical(8, 5)
     assert chosen.training == replace(small.training, learning_rate=1e-3, steps=11, rays=13)
     assert resolve(replace(given, method="multiplane", protocol="fast", settings=()))[1].model.sampling == Marched()
+    assert resolve(replace(given, cache_size=0.5))[1].training.memory == 2**29
+    with pytest.raises(ValueError, match="^--cache-size: "):
+        resolve(replace(given, cache_size=-1))
     none = resolve(Arguments(data=(), out=tmp_path, settings=("--model.hypernetwork", "null")))
     assert none == ("point_multiplane", changed(preset("quick"), {"model": {"hypernetwork": None}}))
 
