@@ -24,7 +24,7 @@ from hyperplanes.views import Task, Views
 __all__ = ["Posed", "PosedTask", "check_pose", "posed"]
 
 ROTATION_TOLERANCE = 1e-3
-ONE_PLACE = 1e-9  # share of their distance from the origin by which cameras in one place may lie apart
+ONE_PLACE = 2.0**-21  # of their distance from the origin: cameras in one place lie so far apart by float32 rounding
 FARTHEST = 1e3  # extents of a scene from the origin, within which float32 keeps it to a tenth of a pixel
 
 
