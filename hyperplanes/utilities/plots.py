@@ -103,7 +103,7 @@ def draw_bars(
         places = np.arange(len(groups)) + width * (index - (len(series) - 1) / 2)
         axes.bar(places, values, width * 0.95, yerr=spread, color=colour, label=name, error_kw={"linewidth": 1})
     axes.set_xticks(range(len(groups)), groups)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the bars, which fill the axes
     axes.grid(alpha=0.3, axis="y")
     axes.set_axisbelow(True)
 
