@@ -97,6 +97,7 @@ def test_every_verb_that_writes_locks_its_folder_and_names_a_file_in_its_place(t
         "render": ["--checkpoint", scene, "--views", scene],
         "export": ["--checkpoint", scene, "--views", scene],
         "demo": [],
+        "reproduce": ["target"],
     }
     with one_writer(out):
         for verb, options in verbs.items():

@@ -18,6 +18,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
 from hyperplanes.commands.options import OptionalInt, ViewsUp, optional
 from hyperplanes.commands.scene import read_scene
+from hyperplanes.commands.writing import writes_to
 
 __all__ = ["Arguments", "run"]
 
@@ -68,15 +69,9 @@ GOOD_OVERLAP = 0.9
 GOOD_DEPTH = 0.9
 
 
+@writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Adapt and write what was asked for."""
-    from hyperplanes.files import one_writer
-
-    with one_writer(arguments.out):
-        return _run(arguments)
-
-
-def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.devices import choose_device
     from hyperplanes.export import (

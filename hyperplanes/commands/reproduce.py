@@ -24,6 +24,7 @@ import tyro
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalInt
+from hyperplanes.commands.writing import writes_to
 
 if TYPE_CHECKING:
     from hyperplanes.presets import Preset
@@ -88,6 +89,7 @@ def data_sets(given: Sequence[str]) -> dict[str, Path]:
     return found
 
 
+@writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Run what is not done yet and print the table."""
     from hyperplanes.commands.train import follow
