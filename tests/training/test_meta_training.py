@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import FineTuned, HyperPlanes, InitialisationConfig
+from hyperplanes.adaptation.fine_tuned import shuffled
 from hyperplanes.adaptation.fine_tuning import ray_loss
 from hyperplanes.data.support import SingleView
 from hyperplanes.evaluation import evaluate
@@ -144,3 +145,20 @@ def test_objects_in_another_order_have_the_same_results_and_the_initialisation_s
     assert one == other
     assert len(set(one.values())) == 2
     assert all(torch.equal(value, model.state_dict()[name]) for name, value in before.items())
+
+
+@pytest.mark.parametrize(("method", "rate"), [("mv_meta", 0.02), ("maml", 0.01)])
+def test_what_is_learned_helps_on_an_object_that_was_not_trained_on(method, rate):
+    # Taking away: the same weights in random order, and those before the training, after as many steps on the object.
+    data, untrained, model = Balls(), model_of(method, inner_rate=0.1), model_of(method, inner_rate=0.1)
+    trainer = initialisation_trainer(model, data, replace(FAST, steps=30, learning_rate=rate), None)
+    for _ in range(30):
+        trainer.take_step()
+    settings, names = model.config.initialisation.descent(), data.names("test")
+
+    def quality(start):
+        return evaluate("any", FineTuned(start.eval(), 3, settings), data, names).mean("psnr")
+
+    reached = quality(model)
+    assert reached > quality(shuffled(model)) + 1
+    assert reached > quality(untrained) + 1
