@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.fields.baked import HARMONICS, LARGEST_SIDE, BakedField, spherical_harmonics
-from hyperplanes.fields.base import Field
+from hyperplanes.fields.base import MLPField
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
@@ -124,11 +124,11 @@ def _voxels(
 ) -> tuple[Bool[Tensor, " point"], Float[Tensor, "filled 28"]]:
     """Which points have density, and the density and coefficients of those."""
     field, length = adapted.field, adapted.occupancy.bounds.radius / 64
-    hidden = field.hidden(points) if isinstance(field, Field) else points
-    density = field.density_of(hidden) if isinstance(field, Field) else adapted.density(points)
+    hidden = field.hidden(points) if isinstance(field, MLPField) else points
+    density = field.density_of(hidden) if isinstance(field, MLPField) else adapted.density(points)
     some = 1 - torch.exp(-density * length) > MIN_OPACITY
     hidden, density, arriving = hidden[some], density[some], arriving[some]
-    if isinstance(field, Field):
+    if isinstance(field, MLPField):
         colours = field.colours_along(hidden, view)
     else:
         colours = torch.stack([field(hidden, each.expand(len(hidden), 3))[0] for each in view], 1)

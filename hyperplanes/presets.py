@@ -161,6 +161,29 @@ PRESETS: dict[str, Preset] = {
     ),
     "small": Preset(
         ModelConfig(
+            target="any_order",
+            network=TargetConfig(depth=3, width=96, planes=8, point_octaves=6, direction_octaves=2),
+            hypernetwork=replace(ALL_LAYERS, join="mean", views=8),
+            sampling=Marched(steps=64),
+            hull_side=64,
+        ),
+        TrainingConfig(
+            steps=30_000,
+            tasks=4,
+            rays=128,
+            views=(1, 2, 3, 4, 5, 7, 10, 15, 25, 40),
+            random_background=True,
+            optimiser="muon",
+            learning_rate=2e-3,
+            hypernetwork_learning_rate=1e-3,
+            warmup=300,
+            final=0.02,
+        ),
+        128,
+        "any number of views of any rig, 128x128, hours on a few cores",
+    ),
+    "small-paper": Preset(
+        ModelConfig(
             network=TargetConfig(depth=6, width=192, point_octaves=6),
             hypernetwork=ALL_LAYERS,
             sampling=Marched(steps=96),
@@ -177,7 +200,7 @@ PRESETS: dict[str, Preset] = {
             final=0.02,
         ),
         128,
-        "128x128, hours on a few cores",
+        "the paper's field of 25 planes with a low-rank update of all layers, 128x128, hours on a few cores",
     ),
     "paper-128": Preset(
         ModelConfig(coarse_network=True, sampling=PAPER_SAMPLING),

@@ -14,7 +14,7 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 
-__all__ = ["Task", "Tasks", "Views"]
+__all__ = ["Task", "Tasks", "Views", "join_views"]
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,17 @@ class Views:
         Raises:
             ValueError: no pixel to draw from.
         """
+        return self.sample_masked_rays(count, generator=generator, among=among, span=span)[:2]
+
+    def sample_masked_rays(
+        self,
+        count: int,
+        *,
+        generator: torch.Generator | None = None,
+        among: Int[Tensor, " pixel"] | None = None,
+        span: str = "sphere",
+    ) -> tuple[Rays, Float[Tensor, "ray 3"], Float[Tensor, "ray 1"]]:
+        """As `sample_rays`, with the opacity of the masks there; 1 without masks."""
         height, width = self.size
         total = len(self) * height * width if among is None else len(among)
         if not total:
@@ -121,7 +132,22 @@ class Views:
         view, pixel = flat // (height * width), flat % (height * width)
         row, column = pixel // width, pixel % width
         rays = cast(self.cameras, view, torch.stack([column, row], -1).to(self.images), self.bounds, span=span)
-        return rays, self.images[view, :, row, column]
+        colours = self.images[view, :, row, column]
+        return (
+            rays,
+            colours,
+            torch.ones_like(colours[:, :1]) if self.masks is None else self.masks[view, :, row, column],
+        )
+
+
+def join_views(first: Views, second: Views) -> Views:
+    """Two sets of views of one scene as one; the sphere of the first counts, and masks where both have them."""
+    masks = None
+    if first.masks is not None and second.masks is not None:
+        masks = torch.cat([first.masks, second.masks])
+    names = first.names + second.names if first.names and second.names else ()
+    cameras = camera.concatenate([first.cameras, second.cameras])
+    return Views(torch.cat([first.images, second.images]), cameras, masks, first.bounds, names)
 
 
 @dataclass(frozen=True)

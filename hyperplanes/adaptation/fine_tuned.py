@@ -11,6 +11,7 @@ import torch
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
+from hyperplanes.fields import find_targets
 from hyperplanes.views import Views
 
 __all__ = ["SCRATCH_RATES", "FieldFromScratch", "FineTuned", "FromScratch", "random_model", "shuffled"]
@@ -69,7 +70,7 @@ class FieldFromScratch:
     No checkpoint is needed: there is one ImagePlane a support view, in the order of the views.
 
     Attributes:
-        config: which field, of which shape; its number of planes does not count.
+        config: which field, of which shape; its number of planes counts for fields that take any number of views.
         steps: of optimising an object, or "auto".
         settings: as those of `FromScratch`.
         device: where to compute.
@@ -82,7 +83,8 @@ class FieldFromScratch:
 
     def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
         """The field after so many steps from random weights."""
-        network = replace(self.config.network, planes=len(support))
+        planes = self.config.network.planes if find_targets()[self.config.target].any_order else len(support)
+        network = replace(self.config.network, planes=planes)
         fresh = random_model(replace(self.config, network=network, order="file"), self.settings.seed).to(self.device)
         return fresh.fine_tune(support, self.steps, _rated(self.settings), on_step=on_step)
 

@@ -16,9 +16,12 @@ from hyperplanes.optimisers import make_optimisers
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
 
-__all__ = ["FineTuning", "Steps", "best_stop", "minimise", "ray_loss"]
+__all__ = ["FineTuning", "Hiding", "Steps", "best_stop", "minimise", "ray_loss"]
 
 Steps: TypeAlias = int | Literal["auto"]
+
+Hiding: TypeAlias = Callable[[Int[Tensor, " hidden"] | None], AdaptedField]
+"""The field that some variables make, to which the support views of these indices, if any, are not shown."""
 
 JUDGED = 4096  # rays of left-out views that "auto" compares
 CHECKS = 10  # times that it compares them
@@ -45,6 +48,8 @@ class FineTuning:
         final: what the rates fall to along half a cosine, as a fraction.
         longest: the most steps that "auto" may choose.
         left_out: every so many-th support view is left out of the planes and of the rays while "auto" chooses.
+        hide: a field that takes any number of views is not shown those that the rays of a step come from, a share
+            `1 / left_out` of them, as it could copy their colours; of fewer than three views none is hidden.
         seed: of rays and samples.
     """
 
@@ -56,6 +61,7 @@ class FineTuning:
     final: float = 0.1
     longest: int = 300
     left_out: int = 6
+    hide: bool = True
     seed: int = 0
 
     def optimisers(self, variables: Sequence[Tensor]) -> list[torch.optim.Optimizer]:
@@ -81,13 +87,14 @@ def ray_loss(seen: Rendered, truth: Tensor) -> Tensor:
 
 
 def minimise(
-    field: Callable[[], AdaptedField],
+    field: Hiding,
     variables: Sequence[Tensor],
     support: Views,
     steps: int,
     settings: FineTuning,
     *,
     pixels: Int[Tensor, " pixel"] | None = None,
+    hiding: bool = False,
 ) -> Iterator[int]:
     """Gradient steps on the squared error of rays of the support views.
 
@@ -97,7 +104,8 @@ def minimise(
         support: where rays and their colours come from.
         steps: length of the schedule.
         settings: rays, rates and seed.
-        pixels: flat indices (view, row, column) to draw from; all where absent.
+        pixels: flat indices (view, row, column) to draw from, ascending; all where absent.
+        hiding: hide the views that the rays of a step come from, as `settings.hide` says.
 
     Yields:
         The number of steps done: 0, and after each step of the schedule one more.
@@ -105,11 +113,14 @@ def minimise(
     optimisers = settings.optimisers(variables)
     rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
     generator = torch.Generator().manual_seed(settings.seed)
+    hiding = hiding and settings.hide and len(support) > 2
     yield 0
     for step in range(steps):
         with torch.enable_grad():
-            made = field()
-            rays, truth = support.sample_rays(settings.rays, generator=generator, among=pixels, span=made.sampling.span)
+            hidden = _hidden(support, settings, generator, pixels) if hiding else None
+            among = _pixels_of(hidden, support, pixels) if hidden is not None else pixels
+            made = field(hidden)
+            rays, truth = support.sample_rays(settings.rays, generator=generator, among=among, span=made.sampling.span)
             loss = ray_loss(made.trace(rays, generator), truth)
             for variable in variables:
                 variable.grad = None
@@ -120,8 +131,31 @@ def minimise(
         yield step + 1
 
 
+def _hidden(
+    support: Views, settings: FineTuning, generator: torch.Generator, pixels: Int[Tensor, " pixel"] | None
+) -> Int[Tensor, " hidden"]:
+    """The views that a step draws rays from, among those that have a pixel to draw."""
+    area = support.size[0] * support.size[1]
+    drawn = torch.randperm(len(support), generator=generator).to(support.images.device)
+    if pixels is not None:
+        edges = torch.searchsorted(pixels, torch.arange(len(support) + 1, device=pixels.device) * area)
+        drawn = drawn[(edges.diff() > 0)[drawn]]
+    return drawn[: max(1, len(support) // settings.left_out)]
+
+
+def _pixels_of(
+    views: Int[Tensor, " chosen"], support: Views, pixels: Int[Tensor, " pixel"] | None
+) -> Int[Tensor, " pixel"]:
+    """Flat indices of the pixels of some views: all of them, or those of `pixels`."""
+    area = support.size[0] * support.size[1]
+    if pixels is None:
+        return (views[:, None] * area + torch.arange(area, device=views.device)).flatten()
+    edges = torch.searchsorted(pixels, torch.stack([views, views + 1], 1) * area)
+    return torch.cat([pixels[start:stop] for start, stop in edges.tolist()])
+
+
 def best_stop(
-    field: Callable[[], AdaptedField],
+    field: Hiding,
     variables: Sequence[Tensor],
     support: Views,
     left_out: Views,
@@ -129,6 +163,7 @@ def best_stop(
     *,
     pixels: Int[Tensor, " pixel"] | None = None,
     judged: Int[Tensor, " judged"] | None = None,
+    hiding: bool = False,
 ) -> int:
     """After how many steps of a schedule of `settings.longest` the field shows left-out views best; 0 for none.
 
@@ -143,23 +178,24 @@ def best_stop(
         settings: as in `minimise`.
         pixels: as in `minimise`.
         judged: flat indices of the pixels of `left_out` that count.
+        hiding: as in `minimise`.
 
     Returns:
         A number of steps.
     """
     generator = torch.Generator().manual_seed(settings.seed + 1)
     with torch.no_grad():
-        made = field()
+        made = field(None)
         rays, truth = left_out.sample_rays(JUDGED, generator=generator, among=judged, span=made.sampling.span)
     errors: dict[int, float] = {}
     every = max(1, settings.longest // CHECKS)
 
     best = 0
-    for step in minimise(field, variables, support, settings.longest, settings, pixels=pixels):
+    for step in minimise(field, variables, support, settings.longest, settings, pixels=pixels, hiding=hiding):
         if step not in (0, every // 3, settings.longest) and step % every:
             continue
         with torch.no_grad():
-            error = float((field().trace(rays).colour - truth).square().mean())
+            error = float((field(None).trace(rays).colour - truth).square().mean())
         errors[step] = error if math.isfinite(error) else math.inf
         best = min(errors, key=lambda each: errors[each])
         if step - best > 2 * every:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -13,16 +13,18 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
-from hyperplanes.adaptation.fine_tuning import FineTuning, Steps, best_stop, minimise
+from hyperplanes.adaptation.fine_tuning import FineTuning, Hiding, Steps, best_stop, minimise
 from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.fields import Target, find_targets
 from hyperplanes.files import write_json
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.hypernetwork import Autoencoder, HyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.footprint import footprint
@@ -36,14 +38,23 @@ class Prepared:
     """The support side of one object, computed once.
 
     Attributes:
-        views: the support views in the order of the model's rig, one a plane.
-        planes: the same as ImagePlanes.
+        views: the support views in the order of the model's rig, one a plane; as given where any order will do.
+        planes: the same as the field reads them.
         occupancy: the visual hull of all support masks.
     """
 
     views: Views
-    planes: ImagePlanes
+    planes: ImagePlanes | VisibilityPlanes
     occupancy: Occupancy
+
+    def hiding(self, views: Int[Tensor, " hidden"]) -> Prepared:
+        """The same object, of which some views show the field nothing; for a model that takes any number of views.
+
+        Args:
+            views: their indices.
+        """
+        assert isinstance(self.planes, VisibilityPlanes)
+        return replace(self, planes=self.planes.hiding(views))
 
 
 class HyperPlanes(nn.Module):
@@ -52,7 +63,8 @@ class HyperPlanes(nn.Module):
     Without a hypernetwork the same weights serve every object: the plain target network that the paper compares with.
 
     An MLP that concatenates what n planes say knows each plane by its place, so views of any other rig are matched to
-    the one of the training (`arrange`). Views are taken to where the weights are.
+    the one of the training (`arrange`). Fields of the target "any_order" need no rig: they take any number of views as
+    they come. Views are taken to where the weights are.
 
     Args:
         config: what it is made of.
@@ -71,7 +83,14 @@ class HyperPlanes(nn.Module):
             raise ValueError(f"target: expected one of {sorted(targets)}, got {config.target!r}")
         planes = config.network.planes
         reader = config.hypernetwork or config.autoencoder
-        if reader and reader.views > planes:
+        self.any_order = targets[config.target].any_order
+        if self.any_order and reader and (config.hypernetwork is None or config.hypernetwork.join != "mean"):
+            found = "an autoencoder" if config.hypernetwork is None else repr(config.hypernetwork.join)
+            raise ValueError(
+                f"{config.target}: expected a hypernetwork with join 'mean', which takes HyperPlanes in any number and "
+                f"order, got {found}"
+            )
+        if reader and reader.views > planes and not self.any_order:
             raise ValueError(f"views: expected at most as many HyperPlanes as planes, {planes}, got {reader.views}")
         self.config = config
         make = targets[config.target]
@@ -87,7 +106,7 @@ class HyperPlanes(nn.Module):
             elif config.autoencoder:
                 read = cast(Target, self.networks["fine"]).reading_layers
                 self.hypernetwork = Autoencoder(config.autoencoder, shapes, read)
-        self.register_buffer("rig", torch.zeros(planes, 3))
+        self.register_buffer("rig", torch.zeros(0 if self.any_order else planes, 3))
 
     @property
     def theta(self) -> Parameters:
@@ -95,7 +114,7 @@ class HyperPlanes(nn.Module):
         return Parameters.of(self.networks)
 
     def set_rig(self, support: Views) -> None:
-        """Take the standpoints of these support views as the order of the planes.
+        """Take the standpoints of these support views as the order of the planes; a model of any order has none.
 
         Raises:
             ValueError: fewer views than planes.
@@ -108,7 +127,7 @@ class HyperPlanes(nn.Module):
         self.rig.copy_(_standpoints(support)[: len(self.rig)])
 
     def arrange(self, support: Views) -> Views:
-        """One support view a plane, each the nearest to where the training rig has one.
+        """One support view a plane, each the nearest to where the training rig has one; all as they are for any order.
 
         More views than planes: the best matching ones, none twice. Fewer: some stand for several planes. With order
         "file" the views stay in their order: the first ones, and again from the first where there are too few.
@@ -120,6 +139,8 @@ class HyperPlanes(nn.Module):
 
         if not len(support):
             raise ValueError("support: expected at least one view, got none")
+        if self.any_order:
+            return support
         if self.config.order == "file":
             return support[torch.arange(len(self.rig), device=support.images.device) % len(support)]
         cost = (1 - self._known_rig() @ _standpoints(support).cpu().T).double().numpy()
@@ -141,23 +162,27 @@ class HyperPlanes(nn.Module):
         views = self.arrange(support)
         side = self.config.hull_side
         region = hull(support, side) if carved else full(support.bounds, 1, support.images.device)
-        return Prepared(views, ImagePlanes(views.images, views.cameras), region)
+        return Prepared(views, cast(Target, self.networks["fine"]).planes_of(views, region), region)
 
-    def hyperplanes(self) -> Int[Tensor, " k"]:
+    def hyperplanes(self, views: Views | None = None) -> Int[Tensor, " k"]:
         """Which planes the hypernetwork reads: k of the rig, spread as far apart as they can be, or the first k.
 
-        A model that was never shown its rig raises ValueError.
+        Args:
+            views: arranged; they count for a model of any order, which reads at most k of them.
+
+        Returns:
+            Indices of planes. A model that was never shown its rig raises ValueError.
         """
         count = self.hypernetwork.config.views if self.hypernetwork else 0
+        standing = _standpoints(views).cpu() if self.any_order and views is not None else None
+        count = count if standing is None else min(count, len(standing))
         if self.hypernetwork and self.hypernetwork.config.choice == "first":
             return torch.arange(count, device=self.rig.device)
-        rig = self._known_rig()
-        chosen = [0]
-        nearest = rig @ rig[0]
-        while len(chosen) < count:
-            chosen.append(int(nearest.argmin()))
-            nearest = torch.maximum(nearest, rig @ rig[chosen[-1]])
-        return torch.tensor(chosen[:count], device=self.rig.device)
+        if standing is not None:
+            first = int((standing @ standing.mean(0)).argmin())
+        else:
+            standing, first = self._known_rig(), 0
+        return torch.tensor(_farthest(standing, first, count), device=self.rig.device)
 
     def _known_rig(self) -> Float[Tensor, "plane 3"]:
         """The rig on the CPU, where views are matched to it."""
@@ -192,10 +217,16 @@ class HyperPlanes(nn.Module):
         hypernetwork = hypernetwork or self.hypernetwork
         if hypernetwork is None:
             return [Parameters() for _ in prepared]
-        chosen = self.hyperplanes()
-        images = torch.stack([each.views.images[chosen] for each in prepared])
-        directions = torch.stack([camera.viewing_directions(each.views.cameras)[chosen] for each in prepared])
-        return cast("list[Parameters]", hypernetwork(images, directions, theta))
+        read = [each.views[self.hyperplanes(each.views)] for each in prepared]
+        directions = [camera.viewing_directions(each.cameras) for each in read]
+        if not self.any_order:
+            images = torch.stack([each.images for each in read])
+            return cast("list[Parameters]", hypernetwork(images, torch.stack(directions), theta))
+        assert isinstance(hypernetwork, HyperNetwork)
+        images = [_resized(each.images, read[0].size) for each in read]
+        present = [torch.ones(len(each), device=each.device) for each in directions]
+        batch = [pad_sequence(part, batch_first=True) for part in (images, directions, present)]
+        return cast("list[Parameters]", hypernetwork(batch[0], batch[1], theta, batch[2] > 0))
 
     def field(self, prepared: Prepared, parameters: Parameters) -> AdaptedField:
         """The field of given weights on prepared planes (HyperPlanes, Eq. 5)."""
@@ -252,13 +283,13 @@ class HyperPlanes(nn.Module):
         prepared = given if isinstance(given, Prepared) else self.prepare(support)
         field, variables = self._tunable(prepared, settings)
         pixels = self._live_pixels(prepared, support)
-        for done in minimise(field, variables, support, schedule, settings, pixels=pixels):
+        for done in minimise(field, variables, support, schedule, settings, pixels=pixels, hiding=self.any_order):
             if on_step is not None:
                 on_step(done)
             if done == stop:
                 break
         with torch.no_grad():
-            return field()
+            return field(None)
 
     def _best_stop(self, support: Views, settings: FineTuning) -> int:
         """How many steps of fine-tuning show left-out views best; they are neither planes nor give rays meanwhile."""
@@ -277,22 +308,28 @@ class HyperPlanes(nn.Module):
             settings,
             pixels=self._live_pixels(prepared, shown),
             judged=self._live_pixels(prepared, judged),
+            hiding=self.any_order,
         )
 
-    def _tunable(
-        self, prepared: Prepared, settings: FineTuning
-    ) -> tuple[Callable[[], AdaptedField], list[torch.Tensor]]:
+    def _tunable(self, prepared: Prepared, settings: FineTuning) -> tuple[Hiding, Sequence[Tensor]]:
         """The field as a function of what fine-tuning optimises, and the tensors that it optimises."""
         if settings.free == "hypernetwork":
             tuned = copy.deepcopy(self.hypernetwork)
             assert tuned is not None
             tuned = tuned.eval().requires_grad_(True)
-            theta = self.theta.detach()
-            return lambda: self.field(prepared, theta + self.update(prepared, tuned)), list(tuned.parameters())
-        with torch.no_grad(), _in_use(self):
-            start = self.theta + self.update(prepared)
-        free = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
-        return lambda: self.field(prepared, free if torch.is_grad_enabled() else free.detach()), list(free.values())
+            theta, variables = self.theta.detach(), [*tuned.parameters()]
+        else:
+            with torch.no_grad(), _in_use(self):
+                start = self.theta + self.update(prepared)
+            free = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
+            tuned, theta, variables = None, free, list(free.values())
+
+        def field(hidden: Tensor | None) -> AdaptedField:
+            weights = theta if torch.is_grad_enabled() else theta.detach()
+            weights = weights if tuned is None else weights + self.update(prepared, tuned)
+            return self.field(prepared if hidden is None else prepared.hiding(hidden), weights)
+
+        return field, variables
 
     def _live_pixels(self, prepared: Prepared, views: Views) -> Int[Tensor, " pixel"] | None:
         """Flat indices of the pixels of views that look into the hull; None where all are drawn from."""
@@ -343,6 +380,21 @@ def _in_use(module: nn.Module) -> Generator[None]:
     finally:
         for part, training in before.items():
             part.training = training
+
+
+def _resized(images: Float[Tensor, "view 3 height width"], size: tuple[int, int]) -> Tensor:
+    """Images of that size, by the mean of the pixels that one covers where there are more."""
+    return images if images.shape[2:] == size else torch.nn.functional.interpolate(images, size, mode="area")
+
+
+def _farthest(points: Float[Tensor, "point 3"], first: int, count: int) -> list[int]:
+    """Indices of unit vectors: the first, and after it always the one farthest from those before."""
+    chosen = [first]
+    nearest = points @ points[first]
+    while len(chosen) < count:
+        chosen.append(int(nearest.argmin()))
+        nearest = torch.maximum(nearest, points @ points[chosen[-1]])
+    return chosen[:count]
 
 
 def _standpoints(views: Views) -> Float[Tensor, "view 3"]:

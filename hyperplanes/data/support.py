@@ -6,10 +6,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
-
-from hyperplanes.geometry import cameras as camera
-from hyperplanes.views import Task, Tasks, Views
+from hyperplanes.views import Task, Tasks, join_views
 
 __all__ = ["SingleView", "WithSupport"]
 
@@ -49,7 +46,7 @@ class WithSupport:
         if self.count > total:
             raise ValueError(f"{name}: expected {self.count} views for the support, got {total}")
         more = self.count - len(task.support)
-        support = task.support[: self.count] if more <= 0 else _joined(task.support, task.query[:more])
+        support = task.support[: self.count] if more <= 0 else join_views(task.support, task.query[:more])
         return replace(task, support=support)
 
 
@@ -68,13 +65,3 @@ class SingleView:
         task = self.data.task(name)
         chosen = zlib.crc32(name.encode()) % len(task.support)
         return replace(task, support=task.support[[chosen]])
-
-
-def _joined(first: Views, second: Views) -> Views:
-    """Two sets of views of one scene as one; the sphere of the first counts."""
-    masks = None
-    if first.masks is not None and second.masks is not None:
-        masks = torch.cat([first.masks, second.masks])
-    names = first.names + second.names if first.names and second.names else ()
-    cameras = camera.concatenate([first.cameras, second.cameras])
-    return Views(torch.cat([first.images, second.images]), cameras, masks, first.bounds, names)

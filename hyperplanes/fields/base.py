@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -13,12 +12,12 @@ from torch.nn.functional import linear, relu, softplus
 
 from hyperplanes.fields.encoding import encode, encoded_size
 from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.parameters import Parameters
+from hyperplanes.views import Views
 
-__all__ = ["Field", "Target", "TargetConfig"]
-
-Inputs = Callable[[Tensor], Tensor]
+__all__ = ["Field", "MLPField", "Target", "TargetConfig"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,8 @@ class TargetConfig:
     Attributes:
         depth: fully connected layers before the heads.
         width: of each of them.
-        planes: number of ImagePlanes the network is made for.
+        planes: number of ImagePlanes the network is made for; of "any_order", the views that are read at a point.
+        blended: views whose colours "any_order" blends; the other fields have none.
         point_octaves: of the positional encoding of points.
         direction_octaves: of the positional encoding of viewing directions.
         density_scale: what the density head is multiplied with; an object of unit radius is a few voxels deep, so
@@ -38,6 +38,7 @@ class TargetConfig:
     depth: Annotated[int, range(1, 257)] = 8
     width: Annotated[int, range(1, 8193)] = 256
     planes: Annotated[int, range(1, 1025)] = 25
+    blended: Annotated[int, range(1, 65)] = 4
     point_octaves: Annotated[int, range(33)] = 10
     direction_octaves: Annotated[int, range(33)] = 4
     density_scale: float = 25.0
@@ -48,7 +49,12 @@ class Target(nn.Module):
 
     The module holds theta; `bind` evaluates the network with any parameters of the same names and shapes. Subclasses
     say what the first layer reads.
+
+    Attributes:
+        any_order: takes any number of views in any order; otherwise `config.planes` of them, each known by its place.
     """
+
+    any_order: ClassVar[bool] = False
 
     def __init__(self, config: TargetConfig) -> None:
         super().__init__()
@@ -83,12 +89,16 @@ class Target(nn.Module):
         """What the first layer reads of world points, (point, input_size)."""
         raise TypeError(f"{type(self).__name__} does not say what it reads")
 
-    def bind(self, parameters: Parameters, planes: ImagePlanes | None, bounds: Sphere | None = None) -> Field:
+    def planes_of(self, views: Views, occupancy: Occupancy) -> Any:
+        """What `bind` reads of support views and their visual hull; here the ImagePlanes alone."""
+        return ImagePlanes(views.images, views.cameras)
+
+    def bind(self, parameters: Parameters, planes: Any, bounds: Sphere | None = None) -> Field:
         """The field that these parameters and planes make.
 
         Args:
             parameters: theta or theta + delta.
-            planes: the support images; None for a network that reads none.
+            planes: the support images, as `planes_of` made them; None for a network that reads none.
             bounds: the sphere of the scene, which the network sees as the unit sphere.
 
         Returns:
@@ -99,7 +109,7 @@ class Target(nn.Module):
         """
         if planes is not None and len(planes) != self.config.planes:
             raise ValueError(f"planes: expected {self.config.planes}, got {len(planes)}")
-        return Field(self, parameters, planes, bounds or Sphere())
+        return MLPField(self, parameters, planes, bounds or Sphere())
 
 
 @dataclass(frozen=True)
@@ -109,14 +119,42 @@ class Field:
     Attributes:
         target: the network.
         parameters: its weights for this object.
-        planes: the support images of this object.
+        planes: the support images of this object, as `Target.planes_of` made them.
         bounds: the sphere of the scene.
     """
 
     target: Target
     parameters: Parameters
-    planes: ImagePlanes | None
+    planes: Any
     bounds: Sphere
+
+    def __call__(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
+        """Colour in [0, 1] and density per world unit at points seen along unit directions."""
+        raise TypeError(f"{type(self).__name__} does not say what it computes")
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per world unit alone."""
+        raise TypeError(f"{type(self).__name__} does not say what it computes")
+
+    def trunk(self, inputs: Float[Tensor, "point input"]) -> Float[Tensor, "point width"]:
+        """The layers before the heads, with the skip connection of NeRF in their middle."""
+        value = inputs
+        for index in range(self.target.config.depth):
+            if index == self.target.skip > 0:
+                value = torch.cat([inputs, value], -1)
+            value = relu(self.layer(f"layers.{index}", value))
+        return value
+
+    def layer(self, name: str, value: Tensor) -> Tensor:
+        """A fully connected layer of the network."""
+        return linear(value, self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"])
+
+
+@dataclass(frozen=True)
+class MLPField(Field):
+    """The field of a network whose first layer reads all planes at a point."""
 
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
@@ -131,17 +169,11 @@ class Field:
 
     def hidden(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:
         """What the heads read; all that is expensive about a point."""
-        inputs = self.target.inputs(points, self.planes, self.bounds)
-        value = inputs
-        for index in range(self.target.config.depth):
-            if index == self.target.skip > 0:
-                value = torch.cat([inputs, value], -1)
-            value = relu(self._linear(f"layers.{index}", value))
-        return value
+        return self.trunk(self.target.inputs(points, self.planes, self.bounds))
 
     def density_of(self, hidden: Float[Tensor, "point width"]) -> Float[Tensor, " point"]:
         """The opacity head. Softplus, not NeRF's ReLU: it cannot die, and a hypernetwork moves its bias."""
-        raw = self._linear("density", hidden)[:, 0]
+        raw = self.layer("density", hidden)[:, 0]
         return softplus(raw) * (self.target.config.density_scale / self.bounds.radius)
 
     def colour_of(
@@ -149,8 +181,8 @@ class Field:
     ) -> Float[Tensor, "point 3"]:
         """The colour head."""
         seen = encode(directions, self.target.config.direction_octaves)
-        value = relu(self._linear("view", torch.cat([self._linear("feature", hidden), seen], -1)))
-        return torch.sigmoid(self._linear("colour", value))
+        value = relu(self.layer("view", torch.cat([self.layer("feature", hidden), seen], -1)))
+        return torch.sigmoid(self.layer("colour", value))
 
     def colours_along(
         self, hidden: Float[Tensor, "point width"], directions: Float[Tensor, "direction 3"]
@@ -158,9 +190,6 @@ class Field:
         """The colour head for every point in every direction; what does not depend on both is computed once."""
         width = self.target.config.width
         weight, bias = self.parameters["view.weight"], self.parameters["view.bias"]
-        here = linear(self._linear("feature", hidden), weight[:, :width], bias)
+        here = linear(self.layer("feature", hidden), weight[:, :width], bias)
         along = linear(encode(directions, self.target.config.direction_octaves), weight[:, width:])
-        return torch.sigmoid(self._linear("colour", relu(here[:, None] + along)))
-
-    def _linear(self, name: str, value: Tensor) -> Tensor:
-        return linear(value, self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"])
+        return torch.sigmoid(self.layer("colour", relu(here[:, None] + along)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import relu, silu
 
@@ -30,7 +30,7 @@ class HyperNetworkConfig:
     """The shape of a hypernetwork. `docs/hypernetwork.md` has what each choice is worth in dB.
 
     Attributes:
-        views: k, the number of HyperPlanes it reads.
+        views: k, the number of HyperPlanes it reads; the most it reads with a field that takes any number of views.
         choice: which k of the n planes they are: the "farthest" apart, or the "first".
         encoder: "convnet" (ShapeNet 128) or "resnet101" (ShapeNet 200).
         normalisation: of the encoder: "batch" as in the paper, by running statistics in use; "batch_statistics", by the
@@ -137,6 +137,7 @@ class HyperNetwork(nn.Module):
         images: Float[Tensor, "*object view 3 height width"],
         directions: Float[Tensor, "*object view 3"],
         theta: Mapping[str, Tensor],
+        present: Bool[Tensor, "*object view"] | None = None,
     ) -> Parameters | list[Parameters]:
         """The update of theta for the object that these HyperPlanes show.
 
@@ -144,6 +145,8 @@ class HyperNetwork(nn.Module):
             images: the k HyperPlanes of one object, or of each of several, RGB in [0, 1].
             directions: their unit viewing directions in the world.
             theta: the target's parameters.
+            present: which of the images there are, for objects of different numbers of HyperPlanes; all where absent.
+                Only with join "mean", which takes any number of images.
 
         Returns:
             One tensor a named parameter of the chosen layers, of its shape; a list of those for several objects.
@@ -152,15 +155,18 @@ class HyperNetwork(nn.Module):
             ValueError: another number of images than the network was made for.
         """
         config = self.config
-        if images.shape[-4] != config.views or directions.shape[-2] != config.views:
+        counts = {images.shape[-4], directions.shape[-2]}
+        if counts != {config.views} if config.join == "concatenate" else len(counts) > 1 or 0 in counts:
+            expected = config.views if config.join == "concatenate" else "as many"
             raise ValueError(
-                f"HyperPlanes: expected {config.views} images and directions, "
+                f"HyperPlanes: expected {expected} images and directions, "
                 f"got {images.shape[-4]} and {directions.shape[-2]}"
             )
         several = images.ndim == 5
         if not several:
             images, directions = images[None], directions[None]
-        hidden = self._joined(self.encode(images, directions), directions, theta)
+        present = present if present is None or several else present[None]
+        hidden = self._joined(self.encode(images, directions, present), directions, theta)
         activation = ACTIVATIONS[config.activation]
         for layer in self.head:
             hidden = activation(layer(hidden))
@@ -177,14 +183,19 @@ class HyperNetwork(nn.Module):
         return results if several else results[0]
 
     def encode(
-        self, images: Float[Tensor, "object view 3 height width"], directions: Float[Tensor, "object view 3"]
+        self,
+        images: Float[Tensor, "object view 3 height width"],
+        directions: Float[Tensor, "object view 3"],
+        present: Bool[Tensor, "object view"] | None = None,
     ) -> Float[Tensor, "object ..."]:
         """The codes of the images before their activation: (object, view, code), or (object, code) of their mean."""
         codes = self.encoder(images.flatten(0, 1)).unflatten(0, images.shape[:2])
         if self.config.join == "mean":
             if not self.config.see_directions:
                 directions = torch.zeros_like(directions)
-            codes = silu(self.place(torch.cat([codes, directions], -1))).mean(1)
+            codes = silu(self.place(torch.cat([codes, directions], -1)))
+            weights = codes.new_ones(codes.shape[:2]) if present is None else present.to(codes)
+            codes = (weights[..., None] * codes).sum(1) / weights.sum(1, keepdim=True)
         return self.code_normalisation(codes)
 
     def _joined(self, codes: Tensor, directions: Tensor, theta: Mapping[str, Tensor]) -> Float[Tensor, "object input"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -30,6 +30,10 @@ class Rendered:
     depth: Float[Tensor, " ray"]
     samples: int
     coarse: Float[Tensor, "ray 3"] | None = None
+
+    def over(self, background: Float[Tensor, " 3"]) -> Rendered:
+        """The same pixels, rendered over white, over another colour; not those of the coarse pass."""
+        return replace(self, colour=self.colour + (1 - self.opacity)[:, None] * (background - 1))
 
 
 def composite(

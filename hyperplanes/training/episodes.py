@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import torch
 from jaxtyping import Int
 from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.errors import prefix_errors
-from hyperplanes.views import Task, Views
+from hyperplanes.views import Task, Views, join_views
 
-__all__ = ["Episode", "prepare_episode"]
+__all__ = ["Episode", "prepare_episode", "prepare_subset"]
+
+QUERIES = 6  # views that rays are drawn from, of those that an episode does not show
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,12 @@ class Episode:
     def nbytes(self) -> int:
         """Memory of images, masks, hull and indices, and of the copy that lookups make of the planes."""
         planes = self.prepared.views
-        own = planes.nbytes + planes.images.nbytes // 3 + self.query.nbytes + self.prepared.occupancy.occupied.nbytes
+        own = (
+            planes.nbytes * (2 if isinstance(self.prepared.planes, VisibilityPlanes) else 1)
+            + planes.images.nbytes // 3
+            + self.query.nbytes
+            + self.prepared.occupancy.occupied.nbytes
+        )
         return own + (0 if self.live is None else self.live.nbytes)
 
 
@@ -63,3 +73,22 @@ def prepare_episode(model: HyperPlanes, task: Task, *, carved: bool = True) -> E
         if model.config.sampling.needs_occupancy:
             live = footprint(prepared.occupancy, query.cameras).flatten().nonzero()[:, 0]
     return Episode(prepared, query, live)
+
+
+def prepare_subset(model: HyperPlanes, task: Task, counts: Sequence[int], generator: torch.Generator) -> Episode:
+    """An object shown by a random number of random views, some others of which are the query views.
+
+    Args:
+        model: takes any number of views in any order.
+        task: the object; which of its views are support and which query does not matter.
+        counts: of the views that are shown, each as likely as the others; one is left for the query.
+        generator: of the choice.
+
+    Returns:
+        The object, made ready for steps of training.
+    """
+    views = join_views(task.support, task.query)
+    count = counts[int(torch.randint(len(counts), (), generator=generator))]
+    count = min(count, len(views) - 1)
+    order = torch.randperm(len(views), generator=generator).to(views.images.device)
+    return prepare_episode(model, Task(views[order[:count]], views[order[count : count + QUERIES]], task.name))

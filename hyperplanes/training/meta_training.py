@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.fine_tuning import minimise, ray_loss
+from hyperplanes.adaptation.fine_tuning import Hiding, minimise, ray_loss
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.initialisation import InitialisationConfig
 from hyperplanes.adaptation.meta_learning import maml_gradient, reptile_gradient
@@ -68,7 +68,9 @@ class ReptileTrainer(_InitialisationTrainer):
             settings = replace(self.initialisation.descent(self.config.rays), seed=_seed(generator))
             views, steps = episode.prepared.views, self.initialisation.inner_steps
             live = episode.support_live
-            for _ in minimise(lambda field=field: field, list(free.values()), views, steps, settings, pixels=live):
+            for _ in minimise(
+                lambda hidden, field=field: field, list(free.values()), views, steps, settings, pixels=live
+            ):
                 pass
             adapted.append(free.detach())
             with torch.no_grad():
@@ -186,6 +188,11 @@ def initialisation_trainer(
             raise ValueError("mv_matched: expected a checkpoint of mv_meta to match, got none; see --checkpoint")
         return MatchedTrainer(model, data, config, folder, reference)
     return (ReptileTrainer if method in ("mv_meta", "sv_meta") else MAMLTrainer)(model, data, config, folder)
+
+
+def _constant(field: AdaptedField) -> Hiding:
+    """The field, whatever is hidden."""
+    return lambda hidden: field
 
 
 def _seed(generator: torch.Generator) -> int:

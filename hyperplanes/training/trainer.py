@@ -21,7 +21,7 @@ from hyperplanes.files import encode_png, write_json, write_whole
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.episodes import Episode, prepare_episode
+from hyperplanes.training.episodes import Episode, prepare_episode, prepare_subset
 from hyperplanes.training.prefetching import Prefetcher
 from hyperplanes.training.state import Curve, check_model, load_state, save_state
 from hyperplanes.training.watching import Samples, write_curve
@@ -50,6 +50,13 @@ class TrainingConfig:
         reference_objects: further objects a step, of which only the HyperPlanes are read. The hypernetwork standardises
             codes by the objects of the step, and cannot tell what one object alone has in common with the others.
         rays: query rays an object and step.
+        views: numbers of support views, for a field that takes any number of them. Each episode shows one of these
+            numbers of random views of its object, support and query alike, and draws rays from others. Empty: all
+            support views, in every step.
+        episodes: how many of those are at hand at a time; every step begins one and draws `tasks` of them, so that
+            views, masks and hulls are made ready once for several steps.
+        random_background: prediction and truth are composited over a random colour for every object and step, as far
+            as masks say what is background: over white alone, a white surface cannot be told from none.
         empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
             training sees nothing there, but a field that is rendered without masks must know.
         optimiser: of theta: "adam" as in the paper, or "muon" for the matrices of its hidden layers.
@@ -73,6 +80,9 @@ class TrainingConfig:
     tasks: Annotated[int, range(1, 4097)] = 4
     reference_objects: Annotated[int, range(4097)] = 0
     rays: Annotated[int, range(1, 2**24)] = 128
+    views: tuple[int, ...] = ()
+    episodes: Annotated[int, range(1, 4097)] = 16
+    random_background: bool = False
     empty_points: Annotated[int, range(2**24)] = 0
     optimiser: str = "adam"
     learning_rate: float = 1e-4
@@ -153,6 +163,13 @@ class Trainer:
         self.names = sorted(data.names("train"))
         if not self.names:
             raise ValueError("data: expected at least one training object, got none")
+        if config.views and (not model.any_order or min(config.views) < 1):
+            raise ValueError(
+                "training.views: expected numbers of at least 1, for a field that takes any number of views (any_order), "
+                f"got {list(config.views)} for {model.config.target}"
+            )
+        if config.random_background and model.config.coarse_network:
+            raise ValueError("training.random_background: expected a model without a coarse network, got one with")
         self.config = config = replace(config, steps=config.steps_for(len(self.names)))
         self._episodes: LRUCache[Episode] = LRUCache(config.memory, keep_last=True)
         self._prefetcher = Prefetcher(self._load, self._episodes)
@@ -191,7 +208,7 @@ class Trainer:
         started, first, reported = time.perf_counter(), self.step, (time.perf_counter(), self.step)
         while self.step < self.config.steps:
             ahead = range(self.step, min(self.step + 1 + self.config.prefetch, self.config.steps))
-            self._prefetcher.expect(name for step in ahead[1:] for name in self._drawn(self._generator(step)))
+            self._prefetcher.expect(name for step in ahead[1:] for name in self._drawn(step, self._generator(step)))
             loss = self.take_step()
             step, last = self.step, self.step == self.config.steps
             look = step % self.config.evaluate_every == 0 or last
@@ -229,7 +246,7 @@ class Trainer:
         self.model.train()
         for optimiser in self.optimisers:
             optimiser.zero_grad(set_to_none=True)
-        drawn = self._drawn(generator)
+        drawn = self._drawn(self.step, generator)
         with record_function("step:data"):
             episodes = [self._prefetcher.get(name) for name in drawn]
         loss = self.gradients(drawn, episodes, generator)
@@ -270,9 +287,15 @@ class Trainer:
             field = self.model.field(episode.prepared, self.model.theta + update)
             span = field.sampling.span
             with record_function("step:rays"), prefix_errors(name):
-                rays, truth = episode.query.sample_rays(config.rays, generator=generator, among=episode.live, span=span)
+                drawn_rays = episode.query.sample_masked_rays(
+                    config.rays, generator=generator, among=episode.live, span=span
+                )
+            rays, truth, opacity = drawn_rays
             with record_function("step:rendering"):
                 seen = field.trace(rays, generator)
+            if config.random_background:
+                colour = torch.rand(3, generator=generator).to(truth)
+                seen, truth = seen.over(colour), truth + (1 - opacity) * (colour - 1)
             if config.empty_points:
                 with record_function("step:emptiness"):
                     total = total + self._emptiness(field, generator)
@@ -307,9 +330,18 @@ class Trainer:
         """What everything random of a step is drawn from, its objects first."""
         return torch.Generator().manual_seed(self.config.seed * 1_000_003 + step)
 
-    def _drawn(self, generator: torch.Generator) -> list[str]:
+    def _numbered(self, number: int) -> str:
+        """An episode by its number: the name of its object, all of which come once before any comes again."""
+        epoch, place = divmod(number, len(self.names))
+        order = torch.randperm(len(self.names), generator=self._generator(-1 - epoch))
+        return f"{self.names[int(order[place])]}#{number}"
+
+    def _drawn(self, step: int, generator: torch.Generator) -> list[str]:
         """The objects of a step, different ones while there are enough: those to render, then the reference objects."""
         count, total = self.config.tasks, len(self.names)
+        if self.config.views:
+            places = torch.randperm(max(self.config.episodes, count), generator=generator)[:count]
+            return [self._numbered(step + place) for place in places.tolist()]
         if self.model.hypernetwork is not None:
             count += self.config.reference_objects
         if count == 1:
@@ -388,7 +420,11 @@ class Trainer:
         return self.model.config.sampling.needs_occupancy or self.config.empty_points > 0
 
     def _load(self, name: str) -> Episode:
-        return prepare_episode(self.model, self.data.task(name), carved=self._reads_hull)
+        if not self.config.views:
+            return prepare_episode(self.model, self.data.task(name), carved=self._reads_hull)
+        name, _, number = name.rpartition("#")
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + int(number))
+        return prepare_subset(self.model, self.data.task(name), self.config.views, generator)
 
 
 def train(
