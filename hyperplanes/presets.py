@@ -163,7 +163,7 @@ PRESETS: dict[str, Preset] = {
         ModelConfig(
             target="any_order",
             network=TargetConfig(depth=3, width=96, planes=8, point_octaves=6, direction_octaves=2),
-            hypernetwork=replace(ALL_LAYERS, join="mean", views=8),
+            hypernetwork=replace(ALL_LAYERS, join="mean", views=6, resolution=64),
             sampling=Marched(steps=64),
             hull_side=64,
         ),

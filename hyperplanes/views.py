@@ -107,10 +107,7 @@ class Views:
             span: as in `geometry.cast`.
 
         Returns:
-            The rays and their true colours.
-
-        Raises:
-            ValueError: no pixel to draw from.
+            The rays and their true colours. No pixel to draw from raises ValueError.
         """
         return self.sample_masked_rays(count, generator=generator, among=among, span=span)[:2]
 

@@ -7,11 +7,12 @@ number nor their order is built into its weights. The colour is a blend of what 
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import pad, relu, softplus
 
@@ -19,17 +20,14 @@ from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.encoding import encode, encoded_size
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.visibility import Visibility, VisibilityPlanes
+from hyperplanes.geometry.visibility import ANGLE, ChosenViews, Visibility, VisibilityPlanes
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
 __all__ = ["AnyOrderField", "AnyOrderNeRF"]
 
-UNSEEN = 8.0  # penalty of a view that does not show the point
-PARTLY = 2.0  # penalty where the mask is not whole, so that background is mixed into the colour
-WHOLE = 0.98  # opacity of a mask from which on it counts as whole
-ANGLE = 10.0  # radians of angle to the ray that a penalty of 1 counts for
 SMALLEST_ANGLE = 1e-2
+FADING = 10.0  # of the weights of colours in their mean, with the penalty of a view
 FALLOFF = 8.0  # of depths behind the hull, in 1 / radii, where tanh makes them inputs
 EMPTY = -4.0  # what the density head begins with outside the masks, before softplus
 SOLID = 4.0  # and within them
@@ -92,16 +90,6 @@ class AnyOrderNeRF(Target):
 
 
 @dataclass(frozen=True)
-class _Point:
-    """What the heads read: the trunk's output, the least coverage over the views, and the views themselves."""
-
-    hidden: Float[Tensor, "point width"]
-    coverage: Float[Tensor, " point"]
-    visibility: Visibility
-    penalty: Float[Tensor, "point view"]
-
-
-@dataclass(frozen=True)
 class AnyOrderField(Field):
     """The field of `AnyOrderNeRF`."""
 
@@ -109,78 +97,73 @@ class AnyOrderField(Field):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
         """Colour in [0, 1] and density per world unit at points seen along unit directions."""
-        here = self._read(points)
-        return self._colour(here, points, directions), self._density(here)
+        config = self.target.config
+        visibility = self.planes.choose(points, directions, best=config.planes, nearest=config.blended)
+        colours = self.planes.colours.lookup(points).colours
+        hidden = self._hidden(points, visibility, colours)
+        return self._colour(hidden, visibility, colours, directions), self._density(hidden, visibility)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit alone."""
-        return self._density(self._read(points))
+        visibility = self.planes.choose(points, best=self.target.config.planes)
+        return self._density(self._hidden(points, visibility, self.planes.colours.lookup(points).colours), visibility)
 
-    def _read(self, points: Tensor) -> _Point:
-        """The trunk at points: it reads the `config.planes` views of the least penalty, the best one first."""
-        config, planes = self.target.config, self.planes
-        visibility = planes.visibility(points)
-        hidden = (visibility.behind - planes.tolerance).clamp(0, 2)
-        penalty = torch.where(visibility.valid, hidden + PARTLY * (visibility.coverage < WHOLE), UNSEEN)
-        least, index = penalty.topk(min(config.planes, len(planes)), 1, largest=False)
-        seen, colours = _chosen(visibility, index), planes.colours.lookup(points, index).colours
-        colours = (2 * colours - 1) * seen.valid[..., None]
-        slots = torch.cat([colours, _described(seen), seen.directions * seen.valid[..., None]], -1)
+    def _hidden(self, points: Tensor, visibility: Visibility, shown: Tensor) -> Float[Tensor, "point width"]:
+        """The trunk at points, which reads the `config.planes` views that see them best; `shown` are all colours."""
+        config, seen = self.target.config, visibility.best
+        valid = seen.valid[..., None]
+        colours = (2 * _of(shown, seen.views) - 1) * valid
+        slots = torch.cat([colours, _described(seen), seen.directions * valid], -1)
 
-        weights = torch.exp(-ANGLE * least) * seen.valid
-        weights = (weights / weights.sum(1, keepdim=True).clamp_min(1e-6))[..., None]
+        weights = torch.exp(-FADING * seen.penalty.clamp_min(0))[..., None] * valid
+        weights = weights / weights.sum(1, keepdim=True).clamp_min(1e-6)
         mean = (weights * colours).sum(1)
         variance = (weights * (colours - mean[:, None]).square()).sum(1)
-        coverage = torch.where(visibility.valid, visibility.coverage, 1.0).amin(1)
-        number = visibility.valid.sum(1, keepdim=True).clamp_min(1).log()
-        overall = torch.cat([mean, variance, colours[:, 0] - mean, coverage[:, None], number], 1)
+        number = visibility.number.clamp_min(1).log()
+        overall = [mean, variance, colours[:, 0] - mean, torch.stack([visibility.coverage, number], 1)]
 
         here = encode(self.bounds.normalise(points), config.point_octaves)
-        inputs = torch.cat([here, _padded(slots, config.planes).flatten(1), overall], 1)
-        return _Point(self.trunk(inputs), coverage, visibility, penalty)
+        return self.trunk(torch.cat([here, _padded(slots, config.planes).flatten(1), *overall], 1))
 
-    def _density(self, here: _Point) -> Float[Tensor, " point"]:
-        raw = self.layer("density", torch.cat([here.hidden, here.coverage[:, None]], 1))[:, 0]
+    def _density(self, hidden: Tensor, visibility: Visibility) -> Float[Tensor, " point"]:
+        raw = self.layer("density", torch.cat([hidden, visibility.coverage[:, None]], 1))[:, 0]
         return softplus(raw) * (self.target.config.density_scale / self.bounds.radius)
 
-    def _colour(self, here: _Point, points: Tensor, directions: Tensor) -> Float[Tensor, "point 3"]:
+    def _colour(
+        self, hidden: Tensor, visibility: Visibility, shown: Tensor, directions: Tensor
+    ) -> Float[Tensor, "point 3"]:
         """A blend of the colours of the views nearest to the direction that see the point, and a shift of it.
 
         As in the unstructured lumigraph a view at angle a has the weight 1 / a - 1 / a_max, a_max being the angle of
         the next view; the network multiplies these weights and shifts the logit of the result.
         """
-        config, visibility, total = self.target.config, here.visibility, len(self.planes)
-        count = min(config.blended, total)
-        angle = torch.acos((visibility.directions * directions[:, None]).sum(-1).clamp(-1 + 1e-6, 1 - 1e-6))
-        nearest, index = (angle + ANGLE * here.penalty).topk(min(count + 1, total), 1, largest=False)
-        limit = nearest[:, -1:] if total > count else 2 * nearest[:, -1:]
-        nearest, index = nearest[:, :count].clamp_min(SMALLEST_ANGLE), index[:, :count]
-        weights = (1 / nearest - 1 / limit.clamp_min(1.01 * SMALLEST_ANGLE)).clamp_min(1e-6)
-        seen, colours = _chosen(visibility, index), self.planes.colours.lookup(points, index).colours
+        config, near = self.target.config, visibility.nearest
+        assert near is not None
+        angle = torch.acos((near.directions * directions[:, None]).sum(-1).clamp(-1 + 1e-6, 1 - 1e-6))
+        score = (angle + ANGLE * near.penalty.clamp_min(0)).clamp_min(SMALLEST_ANGLE)
+        count = min(config.blended, len(self.planes))
+        farthest = score[:, count:] if len(self.planes) > count else 2 * score[:, count - 1 :]
+        weights = (1 / score[:, :count] - 1 / (1.01 * farthest)).clamp_min(1e-6)
+        seen = ChosenViews(*(getattr(near, each.name)[:, :count] for each in dataclasses.fields(near)))
+        colours, valid = _of(shown, seen.views), seen.valid[..., None]
 
-        angles = (angle.gather(1, index) * seen.valid)[..., None]
-        slots = torch.cat([(2 * colours - 1) * seen.valid[..., None], angles, _described(seen)], -1)
+        slots = torch.cat([(2 * colours - 1) * valid, angle[:, :count, None] * valid, _described(seen)], -1)
         along = encode(directions, config.direction_octaves)
-        value = torch.cat([self.layer("feature", here.hidden), along, _padded(slots, config.blended).flatten(1)], 1)
+        value = torch.cat([self.layer("feature", hidden), along, _padded(slots, config.blended).flatten(1)], 1)
         factors, shift = self.layer("colour", relu(self.layer("view", value))).split([config.blended, 3], 1)
         weights = torch.softmax(weights.log() + factors[:, :count], 1)
         blend = (weights[..., None] * colours).sum(1)
         return torch.sigmoid(torch.logit(blend, 0.005) + shift)
 
 
-def _chosen(visibility: Visibility, index: Int[Tensor, "point chosen"]) -> Visibility:
-    """The chosen views of each point."""
-    return Visibility(
-        visibility.directions.gather(1, index[..., None].expand(-1, -1, 3)),
-        visibility.behind.gather(1, index),
-        visibility.coverage.gather(1, index),
-        visibility.valid.gather(1, index),
-    )
+def _of(colours: Float[Tensor, "point view 3"], views: Int[Tensor, "point chosen"]) -> Float[Tensor, "point chosen 3"]:
+    """The colours of the chosen views; looking up all of them takes less time than a few by their indices."""
+    return colours.gather(1, views[..., None].expand(-1, -1, 3))
 
 
-def _described(seen: Visibility) -> Float[Tensor, "point view 3"]:
+def _described(seen: ChosenViews) -> Float[Tensor, "point view 3"]:
     """Depth behind the hull, coverage and validity as inputs, zero where a view is not valid."""
-    valid: Bool[Tensor, "point view"] = seen.valid
+    valid = seen.valid
     return torch.stack([torch.tanh(FALLOFF * seen.behind) * valid, seen.coverage * valid, valid.to(seen.behind)], -1)
 
 

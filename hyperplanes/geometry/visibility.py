@@ -4,22 +4,60 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from importlib.util import find_spec
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.inputs import Numbers
+from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.rays import cast
+from hyperplanes.geometry.rays import Rays, cast
 
-__all__ = ["Visibility", "VisibilityPlanes", "first_hits"]
+__all__ = ["ANGLE", "UNSEEN", "ChosenViews", "Visibility", "VisibilityPlanes", "first_hits"]
 
 STEPS = 128  # along a diameter of the scene, where rays look for their first occupied voxel
-ROUND = 8  # of them at once
+ROUND = 8  # of them at once, without a compiler
+RAYS = 2048  # that one call of the kernel works on
+POINTS = 512  # that one call of the kernel works on
+
+DEEPEST = 2.0  # radii
+PARTLY = 2.0  # penalty of a mask that is not whole
+WHOLE = 0.98  # opacity of a mask from which on it counts as whole
+UNSEEN = 8.0  # penalty of a view that does not show the point
+ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
+
+
+@dataclass(frozen=True)
+class ChosenViews:
+    """Some views of each point, best first.
+
+    Attributes:
+        views: their indices.
+        directions: unit vectors from each camera's centre to the point, in the world.
+        behind: how far the point lies behind the first surface of the hull along the ray of each camera, in radii of
+            the scene; negative before it.
+        coverage: opacity of the mask where the point falls.
+        penalty: how badly the view sees the point; UNSEEN where it does not show it at all.
+    """
+
+    views: Int[Tensor, "point chosen"]
+    directions: Float[Tensor, "point chosen 3"]
+    behind: Float[Tensor, "point chosen"]
+    coverage: Float[Tensor, "point chosen"]
+    penalty: Float[Tensor, "point chosen"]
+
+    @property
+    def valid(self) -> Bool[Tensor, "point chosen"]:
+        """Whether each view shows the point: it falls into the image, and the view is not hidden."""
+        return self.penalty < UNSEEN
 
 
 @dataclass(frozen=True)
@@ -27,21 +65,24 @@ class Visibility:
     """How the planes see points.
 
     Attributes:
-        directions: unit vectors from each camera's centre to the point, in the world.
-        behind: how far the point lies behind the first surface of the hull along the ray of each camera, in radii of
-            the scene; negative before it.
-        coverage: opacity of the mask where the point falls.
-        valid: the point falls into the image, and the view is not hidden.
+        best: the views that see each point best.
+        nearest: those of similar viewing direction, which see it, one more than was asked for where there are so many.
+        coverage: the least opacity over the views that show the point; 1 where none does.
+        number: of the views that show the point.
     """
 
-    directions: Float[Tensor, "point view 3"]
-    behind: Float[Tensor, "point view"]
-    coverage: Float[Tensor, "point view"]
-    valid: Bool[Tensor, "point view"]
+    best: ChosenViews
+    nearest: ChosenViews | None
+    coverage: Float[Tensor, " point"]
+    number: Float[Tensor, " point"]
 
 
 class VisibilityPlanes:
     """ImagePlanes with the masks and the depth of the visual hull beside the colours.
+
+    A view's penalty at a point is how far the point lies behind the first surface that it sees, in radii of the scene
+    beyond the `tolerance` and at most DEEPEST; PARTLY more where its mask is not whole, so that background is mixed
+    into the colour; and UNSEEN where the point is not in the picture.
 
     Args:
         images: (view, 3, height, width), RGB in [0, 1].
@@ -60,9 +101,11 @@ class VisibilityPlanes:
         self.colours = ImagePlanes(images, cameras)
         self.occupancy = occupancy
         depth = first_hits(occupancy, cameras, masks).to(images)
-        opacity = torch.ones_like(images[:, :1]) if masks is None else masks.to(images)
-        self.guides = ImagePlanes(torch.cat([depth[:, None], opacity], 1), cameras, exact=True)
-        self._hidden: Bool[Tensor, " view"] | None = None
+        opacity = torch.ones_like(images[:, 0]) if masks is None else masks[:, 0].to(images)
+        self.guides: Float[Tensor, "view height width 2"] = torch.stack([depth, opacity], -1)
+        matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
+        self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
+        self._hidden = torch.zeros(len(images), dtype=torch.bool, device=images.device)
 
     def __len__(self) -> int:
         return len(self.colours)
@@ -79,21 +122,83 @@ class VisibilityPlanes:
             views: their indices.
         """
         result = copy.copy(self)
-        result._hidden = torch.zeros(len(self), dtype=torch.bool, device=views.device).index_fill_(0, views, True)
+        result._hidden = torch.zeros_like(self._hidden).index_fill_(0, views, True)
         return result
 
-    def visibility(self, points: Float[Tensor, "point 3"]) -> Visibility:
-        """How each plane sees each point; not differentiable in the points.
+    @torch.no_grad()
+    def choose(
+        self,
+        points: Float[Tensor, "point 3"],
+        directions: Float[Tensor, "point 3"] | None = None,
+        *,
+        best: int,
+        nearest: int = 0,
+    ) -> Visibility:
+        """The views that see each point best, and those nearest to a direction; without gradients.
 
         Args:
             points: in the world.
+            directions: unit vectors along which the points are seen; without them there are no nearest views.
+            best: how many views of the least penalty, at most all.
+            nearest: how many views of the least sum of the angle between the direction and theirs, in radians, and
+                ANGLE times their penalty, where that is positive. One more is returned, where there is one.
+
+        Returns:
+            The views. All of them are looked at; colours are looked up by who wants them.
         """
-        found = self.guides.lookup(points, return_directions=True)
+        best, nearest = min(best, len(self)), min(nearest + 1, len(self)) if directions is not None else 0
+        pinholes = not isinstance(self.colours.cameras, DistortedCamera)
+        compiled = find_spec("numba") and points.device.type == "cpu" and self.guides.numel() < 2**31
+        if compiled and points.dtype == torch.float32 and pinholes:
+            return self._choose_compiled(points, directions, best, nearest)
+        return self._choose_torch(points, directions, best, nearest)
+
+    def _choose_compiled(self, points: Tensor, directions: Tensor | None, best: int, nearest: int) -> Visibility:
+        """As `choose`, by the compiled kernel."""
+        count = len(points)
+        limits = (self.colours.nearest, 1 / self.occupancy.bounds.radius, self.tolerance, DEEPEST, PARTLY, WHOLE)
+        views = torch.empty(count, best, dtype=torch.long), torch.empty(count, nearest, dtype=torch.long)
+        values = torch.empty(count, best, 6), torch.empty(count, nearest, 6)
+        overall = torch.empty(count, 2)
+        along = points[:0] if directions is None else directions
+        cameras = torch.cat([self._cameras, (~self._hidden).to(points)[None]])
+        fixed = [each.contiguous().flatten().numpy() for each in (points, along, cameras, self.guides)]
+        shape = (*self.guides.shape[:3], best, nearest, len(self))
+        numbers = np.array([*limits, UNSEEN, ANGLE], np.float32)
+        outputs = [each.flatten().numpy() for each in (views[0], values[0], views[1], values[1], overall)]
+        kernel = compile_kernel("visibility.choose", torch.float32)
+        parallel_for(lambda a, b: kernel(*fixed, shape, numbers, *outputs, a, b), count, POINTS)
+        chosen = [ChosenViews(each, *_split(value)) for each, value in zip(views, values, strict=True)]
+        return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
+
+    def _choose_torch(self, points: Tensor, directions: Tensor | None, best: int, nearest: int) -> Visibility:
+        """As `choose`, in plain PyTorch."""
+        guides = ImagePlanes(self.guides.permute(0, 3, 1, 2), self.colours.cameras, exact=True)
+        found = guides.lookup(points, return_directions=True)
         assert found.directions is not None
         assert found.distances is not None
+        valid = found.valid & ~self._hidden
         depth, coverage = found.colours.unbind(-1)
-        valid = found.valid if self._hidden is None else found.valid & ~self._hidden
-        return Visibility(found.directions, (found.distances - depth) / self.occupancy.bounds.radius, coverage, valid)
+        coverage = torch.where(valid, coverage, 1.0)
+        behind = torch.where(valid, (found.distances - depth) / self.occupancy.bounds.radius, 0.0)
+        penalty = (behind - self.tolerance).clamp(-DEEPEST, DEEPEST) + PARTLY * (coverage < WHOLE)
+        penalty = torch.where(valid, penalty, UNSEEN)
+        values = torch.cat([found.directions, torch.stack([behind, coverage, penalty], -1)], -1)
+
+        def chosen(score: Tensor, count: int) -> ChosenViews:
+            index = score.sort(stable=True, dim=1).indices[:, :count]
+            return ChosenViews(index, *_split(values.gather(1, index[..., None].expand(-1, -1, 6))))
+
+        near = None
+        if directions is not None:
+            angle = torch.acos((found.directions * directions[:, None]).sum(-1).clamp(-1, 1))
+            near = chosen(angle + ANGLE * penalty.clamp_min(0), nearest)
+        return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
+
+
+def _split(values: Float[Tensor, "point chosen 6"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Directions, depths, coverages and penalties."""
+    return values[..., :3], values[..., 3], values[..., 4], values[..., 5]
 
 
 @torch.no_grad()
@@ -121,7 +226,26 @@ def first_hits(
         shown = torch.as_tensor(masks, device=device)[:, 0] > 0
     view, row, column = shown.nonzero().unbind(1)
     rays = cast(cameras, view, torch.stack([column, row], -1).to(result), occupancy.bounds)
-    step = 2 * occupancy.bounds.radius / STEPS
+    compiled = result.device.type == "cpu" and result.dtype == torch.float32 and find_spec("numba")
+    result[view, row, column] = (_hits_compiled if compiled else _hits_torch)(occupancy, rays)
+    return result
+
+
+def _hits_compiled(occupancy: Occupancy, rays: Rays) -> Float[Tensor, " ray"]:
+    """The distances, by the compiled kernel."""
+    bounds, side = occupancy.bounds, occupancy.occupied.shape[0]
+    corner = np.asarray(bounds.centre, np.float32) - np.float32(bounds.radius)
+    step, per_unit = np.float32(2 * bounds.radius / STEPS), np.float32(side / (2 * bounds.radius))
+    parts = [part.contiguous().numpy() for part in (rays.origins, rays.directions, rays.near, rays.far)]
+    occupied, nearest = occupancy.occupied.contiguous().numpy().view(np.uint8), np.empty(len(rays), np.float32)
+    kernel = compile_kernel("first_hits.first_hits", torch.float32)
+    parallel_for(lambda a, b: kernel(*parts, step, corner, per_unit, occupied, nearest, a, b), len(rays), RAYS)
+    return torch.from_numpy(nearest)
+
+
+def _hits_torch(occupancy: Occupancy, rays: Rays) -> Float[Tensor, " ray"]:
+    """The distances, in plain PyTorch: ROUND steps of all rays that are left at once."""
+    step, device = 2 * occupancy.bounds.radius / STEPS, rays.near.device
     nearest, left = rays.far.clone(), torch.arange(len(rays), device=device)
     for first in range(0, STEPS + 1, ROUND):
         part = rays[left]
@@ -132,5 +256,4 @@ def first_hits(
         left = left[~hit & (t[:, -1] < part.far)]
         if not len(left):
             break
-    result[view, row, column] = nearest
-    return result
+    return nearest

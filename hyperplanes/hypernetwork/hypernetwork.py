@@ -9,7 +9,7 @@ from typing import Annotated
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import relu, silu
+from torch.nn.functional import interpolate, relu, silu
 
 from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
 from hyperplanes.hypernetwork.standardisation import RunningStandardisation
@@ -32,6 +32,8 @@ class HyperNetworkConfig:
     Attributes:
         views: k, the number of HyperPlanes it reads; the most it reads with a field that takes any number of views.
         choice: which k of the n planes they are: the "farthest" apart, or the "first".
+        resolution: pixels a side that HyperPlanes are resized to before they are encoded, so that pictures of every
+            size are read alike; 0 leaves them as they are.
         encoder: "convnet" (ShapeNet 128) or "resnet101" (ShapeNet 200).
         normalisation: of the encoder: "batch" as in the paper, by running statistics in use; "batch_statistics", by the
             statistics of the HyperPlanes at hand in use too, as the published code does; or "group", image by image.
@@ -59,6 +61,7 @@ class HyperNetworkConfig:
 
     views: Annotated[int, range(1, 1025)] = 5
     choice: str = "farthest"
+    resolution: Annotated[int, range(8193)] = 0
     encoder: str = "convnet"
     normalisation: str = "batch"
     code: Annotated[int, range(1, 8193)] = 128
@@ -189,7 +192,10 @@ class HyperNetwork(nn.Module):
         present: Bool[Tensor, "object view"] | None = None,
     ) -> Float[Tensor, "object ..."]:
         """The codes of the images before their activation: (object, view, code), or (object, code) of their mean."""
-        codes = self.encoder(images.flatten(0, 1)).unflatten(0, images.shape[:2])
+        read = images.flatten(0, 1)
+        if self.config.resolution:
+            read = interpolate(read, (self.config.resolution,) * 2, mode="area")
+        codes = self.encoder(read).unflatten(0, images.shape[:2])
         if self.config.join == "mean":
             if not self.config.see_directions:
                 directions = torch.zeros_like(directions)

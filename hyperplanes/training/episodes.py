@@ -18,7 +18,7 @@ from hyperplanes.views import Task, Views, join_views
 
 __all__ = ["Episode", "prepare_episode", "prepare_subset"]
 
-QUERIES = 6  # views that rays are drawn from, of those that an episode does not show
+QUERIES = 4  # views that rays are drawn from, of those that an episode does not show
 
 
 @dataclass(frozen=True)

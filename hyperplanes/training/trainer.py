@@ -165,7 +165,7 @@ class Trainer:
             raise ValueError("data: expected at least one training object, got none")
         if config.views and (not model.any_order or min(config.views) < 1):
             raise ValueError(
-                "training.views: expected numbers of at least 1, for a field that takes any number of views (any_order), "
+                "training.views: expected numbers of at least 1, for the field any_order, which takes any of them, "
                 f"got {list(config.views)} for {model.config.target}"
             )
         if config.random_background and model.config.coarse_network:

@@ -1,0 +1,162 @@
+"""The CPU kernel of `visibility.VisibilityPlanes.choose`: every view of a point is judged, the best few are kept.
+
+The views of a point are judged at once, in loops that LLVM vectorises. Their numbers lie in one scratch array, one row
+of `pitch` values a quantity (the constants below).
+"""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+
+from hyperplanes.geometry.kernels.blocks import inlined, inner
+from hyperplanes.geometry.kernels.llvm import load, load_int, read, store, store_int
+from hyperplanes.geometry.lookup_torch import BORDER
+
+__all__ = ["choose"]
+
+# Rows of the scratch: the direction from the camera, depth behind the hull, opacity and penalty, which are results;
+# then the distance, whether the view shows the point, the fractions of a pixel, the pixel, the score by direction.
+X, Y, Z, BEHIND, OPACITY, PENALTY, DISTANCE, SHOWN, ACROSS, DOWN, AT, SCORE = range(12)
+RESULTS, ROWS = 6, 12
+
+
+@inlined
+@no_type_check
+def _acos(x):
+    """The arc cosine within 1e-7 (Abramowitz and Stegun, 4.4.46)."""
+    n = type(x)
+    a = abs(x)
+    series = n(-0.0012624911)
+    series = series * a + n(0.0066700901)
+    series = series * a + n(-0.0170881256)
+    series = series * a + n(0.0308918810)
+    series = series * a + n(-0.0501743046)
+    series = series * a + n(0.0889789874)
+    series = series * a + n(-0.2145988016)
+    series = series * a + n(1.5707963050)
+    angle = np.sqrt(max(n(1) - a, n(0))) * series
+    return angle if x >= 0 else n(np.pi) - angle
+
+
+@inner
+@no_type_check
+def _place(s, pitch, total, x, y, z, cameras, shape, min_z):
+    """Projects a point into every view: direction, distance, whether it is shown, the pixel and the fractions."""
+    number = s.dtype.type
+    zero, one = number(0), number(1)
+    height, width = np.int32(shape[1]), np.int32(shape[2])
+    low, right, bottom = number(-BORDER), number(width - 1 + BORDER), number(height - 1 + BORDER)
+    last_column, last_row = number(width - 1), number(height - 1)
+    most_column, most_row = number(max(width - 2, 0)), number(max(height - 2, 0))
+    for k in range(total):
+        dx, dy, dz = x - read(cameras, 0, k), y - read(cameras, pitch, k), z - read(cameras, 2 * pitch, k)
+        square = dx * dx + dy * dy + dz * dz
+        distance = np.sqrt(square)
+        reciprocal = one / max(distance, number(1e-30))
+        m = 3 * pitch
+        u = read(cameras, m, k) * x + read(cameras, m + pitch, k) * y
+        u += read(cameras, m + 2 * pitch, k) * z + read(cameras, m + 3 * pitch, k)
+        m += 4 * pitch
+        v = read(cameras, m, k) * x + read(cameras, m + pitch, k) * y
+        v += read(cameras, m + 2 * pitch, k) * z + read(cameras, m + 3 * pitch, k)
+        m += 4 * pitch
+        camera_z = read(cameras, m, k) * x + read(cameras, m + pitch, k) * y
+        camera_z += read(cameras, m + 2 * pitch, k) * z + read(cameras, m + 3 * pitch, k)
+        front = camera_z > min_z
+        per_z = one / (camera_z if front else one)
+        u, v = u * per_z, v * per_z
+        shown = front & (u >= low) & (u <= right) & (v >= low) & (v <= bottom) & (read(cameras, 15 * pitch, k) > zero)
+        u, v = (min(max(u, zero), last_column) if shown else zero), (min(max(v, zero), last_row) if shown else zero)
+        column, row = np.int32(min(u, most_column)), np.int32(min(v, most_row))
+        store(s, X * pitch + k, dx * reciprocal)
+        store(s, Y * pitch + k, dy * reciprocal)
+        store(s, Z * pitch + k, dz * reciprocal)
+        store(s, DISTANCE * pitch + k, distance)
+        store(s, SHOWN * pitch + k, one if shown else zero)
+        store(s, ACROSS * pitch + k, u - number(column))
+        store(s, DOWN * pitch + k, v - number(row))
+        store_int(s, AT * pitch, k, np.int32(2 * ((np.int32(k) * height + row) * width + column)))
+
+
+@inner
+@no_type_check
+def _judge(s, pitch, total, along_x, along_y, along_z, guides, shape, limits):
+    """Reads depth and opacity where a point falls into each view, and computes the penalties and scores."""
+    number = s.dtype.type
+    zero, one = number(0), number(1)
+    across_next, down_next = np.int32(2 * min(shape[2] - 1, 1)), np.int32(2 * shape[2] * min(shape[1] - 1, 1))
+    per_unit, tolerance, deepest = limits[1], limits[2], limits[3]
+    partly, whole, unseen, by_angle = limits[4], limits[5], limits[6], limits[7]
+    for k in range(total):
+        at, across, down = load_int(s, AT * pitch, k), load(s, ACROSS * pitch + k), load(s, DOWN * pitch + k)
+        right, below = np.int32(at + across_next), np.int32(at + down_next)
+        beyond = np.int32(below + across_next)
+        a, b = read(guides, 0, at), read(guides, 0, below)
+        a, b = a + across * (read(guides, 0, right) - a), b + across * (read(guides, 0, beyond) - b)
+        depth = a + down * (b - a)
+        a, b = read(guides, 1, at), read(guides, 1, below)
+        a, b = a + across * (read(guides, 1, right) - a), b + across * (read(guides, 1, beyond) - b)
+        opacity = a + down * (b - a)
+        shown = load(s, SHOWN * pitch + k) > zero
+        behind = (load(s, DISTANCE * pitch + k) - depth) * per_unit
+        penalty = min(max(behind - tolerance, -deepest), deepest) + (partly if opacity < whole else zero)
+        penalty = penalty if shown else unseen
+        cosine = along_x * load(s, X * pitch + k) + along_y * load(s, Y * pitch + k) + along_z * load(s, Z * pitch + k)
+        store(s, BEHIND * pitch + k, behind if shown else zero)
+        store(s, OPACITY * pitch + k, opacity if shown else one)
+        store(s, PENALTY * pitch + k, penalty)
+        store(s, SCORE * pitch + k, _acos(min(max(cosine, -one), one)) + by_angle * max(penalty, zero))
+
+
+@inner
+@no_type_check
+def _keep(s, pitch, total, row, count, views, values, scores, start):
+    """Writes the `count` views of the least numbers in a row of the scratch, best first, and their results."""
+    for place in range(count):
+        scores[place] = np.inf
+    for view in range(total):
+        score = load(s, row * pitch + view)
+        if score < scores[count - 1]:
+            place = count - 1
+            while place > 0 and scores[place - 1] > score:
+                scores[place], views[start + place] = scores[place - 1], views[start + place - 1]
+                place -= 1
+            scores[place], views[start + place] = score, view
+    for place in range(start, start + count):
+        for result in range(RESULTS):
+            values[RESULTS * place + result] = load(s, result * pitch + views[place])
+
+
+@no_type_check
+def choose(
+    points, directions, cameras, guides, shape, limits, best, best_values, near, near_values, overall, start, stop
+):
+    """Writes the chosen views of points start..stop. All arrays are flat.
+
+    `cameras` holds 16 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
+    matrix, and 0 where it is hidden. `guides` (view, row, column, 2) hold depth and opacity. `shape` is the number of
+    views, height, width, the numbers of chosen views, and the pitch; `limits` min_z, 1 / radius, the tolerance,
+    DEEPEST, PARTLY, WHOLE, UNSEEN and ANGLE. `best` and `near` (point, chosen) get indices of views, their values
+    (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each, and `overall` (point, 2) the least
+    opacity and the number of the views that show the point. Where there are no directions nothing is written to `near`.
+    """
+    number = limits.dtype.type
+    total, best_count, near_count, pitch = shape[0], shape[3], shape[4], shape[5]
+    s, scores = np.empty(ROWS * pitch, limits.dtype), np.empty(max(best_count, near_count), limits.dtype)
+    along_x, along_y, along_z = number(0), number(0), number(0)
+    for point in range(start, stop):
+        at = 3 * point
+        _place(s, pitch, total, points[at], points[at + 1], points[at + 2], cameras, shape, limits[0])
+        if near_count:
+            along_x, along_y, along_z = directions[at], directions[at + 1], directions[at + 2]
+        _judge(s, pitch, total, along_x, along_y, along_z, guides, shape, limits)
+        covered, seen = number(1), number(0)
+        for k in range(total):
+            covered = min(covered, load(s, OPACITY * pitch + k))
+            seen += load(s, SHOWN * pitch + k)
+        overall[2 * point], overall[2 * point + 1] = covered, seen
+        _keep(s, pitch, total, PENALTY, best_count, best, best_values, scores, point * best_count)
+        if near_count:
+            _keep(s, pitch, total, SCORE, near_count, near, near_values, scores, point * near_count)
