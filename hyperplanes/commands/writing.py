@@ -7,14 +7,19 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+from hyperplanes.utilities.processes import is_first_process
+
 __all__ = ["writes_to"]
 
 
-def writes_to(folder: Callable[[Any], Path]) -> Callable[[Callable[[Any], int]], Callable[[Any], int]]:
+def writes_to(
+    folder: Callable[[Any], Path], *, by_first_process: bool = False
+) -> Callable[[Callable[[Any], int]], Callable[[Any], int]]:
     """A decorator of a verb's `run`: it fails at once where another process writes into the same folder.
 
     Args:
         folder: from a verb's arguments the folder that it writes into, as in `files.one_writer`.
+        by_first_process: of several processes of one command, the first one alone writes.
 
     Returns:
         The decorator.
@@ -25,6 +30,8 @@ def writes_to(folder: Callable[[Any], Path]) -> Callable[[Callable[[Any], int]],
         def locked(arguments: Any) -> int:
             from hyperplanes.files import one_writer
 
+            if by_first_process and not is_first_process():
+                return run(arguments)
             with one_writer(folder(arguments)):
                 return run(arguments)
 

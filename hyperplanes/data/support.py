@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.views import Task, Tasks, Views
+from hyperplanes.views import Task, Tasks, Views, class_of
 
 __all__ = ["SingleView", "WithSupport"]
 
@@ -37,6 +37,10 @@ class WithSupport:
     def names(self, split: str) -> Sequence[str]:
         """The objects of a split."""
         return self.data.names(split)
+
+    def class_of(self, name: str) -> str:
+        """The class of one object, as the data set states it."""
+        return class_of(self.data, name)
 
     def task(self, name: str) -> Task:
         """One object.
