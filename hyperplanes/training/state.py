@@ -64,8 +64,11 @@ def save_state(
     (model if average is None else average.model).save(folder)
     document = {"step": step, "curve": curve, "config": dict(config), "state": name}
     kept = config.get("keep_last", 1)
+    beside = (folder / name).with_suffix(".json")
     if kept > 1:
-        write_json((folder / name).with_suffix(".json"), document)
+        write_json(beside, document)
+    else:
+        beside.unlink(missing_ok=True)
     write_json(folder / "training.json", document)
     _delete_old(folder, name, kept)
 

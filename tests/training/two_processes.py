@@ -144,19 +144,8 @@ def main():
 
     hyperplanes.training.start_training = start_later
     hyperplanes.data.dataset.open_datasets = lambda *given, **options: Data(3)
-    command = [
-        "train",
-        "--data",
-        str(folder),
-        "--out",
-        str(folder / "killed"),
-        "--devices",
-        "2",
-        "--steps",
-        "6",
-        *OPTIONS,
-    ]
-    return cli.main(command)
+    given = f"train --data any --out {folder / 'killed'} --devices 2 --steps 6".split()
+    return cli.main([*given, *OPTIONS])
 
 
 if __name__ == "__main__":
