@@ -150,4 +150,5 @@ class Processes:
                 "--out is to be a folder that every node sees"
             )
         for value in model.state_dict().values():
-            distributed.broadcast(value, 0)
+            if value.numel():
+                distributed.broadcast(value, 0)

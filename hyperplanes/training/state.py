@@ -10,6 +10,7 @@ best/                           the model of the look at held-out objects with t
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
-from hyperplanes.files import DataError, malformed, write_json
+from hyperplanes.files import DataError, encode_json, malformed, write_json
 from hyperplanes.optimisers import Muon
 from hyperplanes.training.averaging import WeightAverage
 
@@ -142,8 +143,8 @@ def _load(
             raise CheckpointError(f"{path}: expected an entry {name!r} ({kind.__name__}), found {found}; {REMEDY}")
     if saved["step"] < 0:
         raise CheckpointError(f"{path}: expected a number of steps, found {saved['step']}; {REMEDY}")
-    before = {**defaults, **saved["config"]}
-    differing = [name for name in config if name not in free and before[name] != config[name]]
+    wanted, before = (json.loads(encode_json(dict(each))) for each in (config, {**defaults, **saved["config"]}))
+    differing = [name for name in wanted if name not in free and before[name] != wanted[name]]
     if differing:
         raise CheckpointError(
             f"{path}: expected the same training to resume, found other {', '.join(differing)}; {REMEDY}"

@@ -197,7 +197,7 @@ class Trainer:
         if folder is not None:
             check_model(folder, model.config)
         resumed = folder is not None and (folder / "training.json").exists()
-        if not resumed:
+        if not resumed and self.processes.first:  # the others get it with the weights
             with prefix_errors(self.names[0]):
                 model.set_rig(data.task(self.names[0]).support)
         self.average = WeightAverage(model, config.average) if config.average else None
@@ -401,8 +401,8 @@ class Trainer:
     def look(self) -> tuple[float | None, Diagnostics | None]:
         """Mean PSNR in dB of two query views of some held-out objects, and the diagnostics of the hypernetwork there.
 
-        The objects are those of the "val" split, or of "test" where a data set has no other; nothing is chosen by these
-        numbers. None where there are no such objects, and no hypernetwork or a single object to compare updates of.
+        The objects are those of the "val" split, or of "test" where a data set has no other; these numbers choose nothing
+        but best/. None where there are no such objects, and no hypernetwork or a single object to compare updates of.
         `samples` holds the views themselves.
         """
         names = sorted(self.data.names("val")) or sorted(self.data.names("test"))
