@@ -220,7 +220,11 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
     return chosen.model.method, chosen
 
 
-@writes_to(lambda arguments: arguments.out, by_first_process=True)
+def _is_first(arguments: Arguments) -> bool:
+    return is_first_process(arguments.devices * arguments.nodes)
+
+
+@writes_to(lambda arguments: arguments.out, _is_first)
 def run(arguments: Arguments) -> int:
     """Train, from the start or from where it was interrupted."""
     from hyperplanes.training.distributed import ProcessEnded
@@ -228,7 +232,7 @@ def run(arguments: Arguments) -> int:
     try:
         return _run(arguments)
     except ProcessEnded:
-        if is_first_process():
+        if _is_first(arguments):
             raise
         return 0  # who ended first says why
 
@@ -244,7 +248,7 @@ def _run(arguments: Arguments) -> int:
     from hyperplanes.training.launching import count_processes, launched
     from hyperplanes.training.watching import TensorBoard
 
-    first = is_first_process()
+    first = _is_first(arguments)
     console = Console(silent=not first)
     method, chosen = resolve(arguments)
     data = open_datasets(arguments.data, chosen.training.memory, legacy=arguments.legacy)

@@ -7,19 +7,17 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
-from hyperplanes.utilities.processes import is_first_process
-
 __all__ = ["writes_to"]
 
 
 def writes_to(
-    folder: Callable[[Any], Path], *, by_first_process: bool = False
+    folder: Callable[[Any], Path], when: Callable[[Any], bool] = lambda arguments: True
 ) -> Callable[[Callable[[Any], int]], Callable[[Any], int]]:
     """A decorator of a verb's `run`: it fails at once where another process writes into the same folder.
 
     Args:
         folder: from a verb's arguments the folder that it writes into, as in `files.one_writer`.
-        by_first_process: of several processes of one command, the first one alone writes.
+        when: whether this process writes there at all; of the processes of one training, the first one alone does.
 
     Returns:
         The decorator.
@@ -30,7 +28,7 @@ def writes_to(
         def locked(arguments: Any) -> int:
             from hyperplanes.files import one_writer
 
-            if by_first_process and not is_first_process():
+            if not when(arguments):
                 return run(arguments)
             with one_writer(folder(arguments)):
                 return run(arguments)

@@ -401,9 +401,9 @@ class Trainer:
     def look(self) -> tuple[float | None, Diagnostics | None]:
         """Mean PSNR in dB of two query views of some held-out objects, and the diagnostics of the hypernetwork there.
 
-        The objects are those of the "val" split, or of "test" where a data set has no other; these numbers choose nothing
-        but best/. None where there are no such objects, and no hypernetwork or a single object to compare updates of.
-        `samples` holds the views themselves.
+        The objects are those of the "val" split, or of "test" where a data set has no other; nothing but best/ is
+        chosen by these numbers. None where there are no such objects, and no hypernetwork or a single object to compare
+        updates of. `samples` holds the views themselves.
         """
         names = sorted(self.data.names("val")) or sorted(self.data.names("test"))
         for name in names[: self.config.held_out]:

@@ -12,6 +12,8 @@ from hyperplanes.checkpoints import load_tensors, read_json
 from hyperplanes.commands.train import Arguments, resolve
 from hyperplanes.training import start_training
 from hyperplanes.training.distributed import Processes, check_shares
+from hyperplanes.training.launching import count_processes
+from hyperplanes.utilities.processes import is_first_process
 from tests.training.two_processes import KINDS, OPTIONS, Data, normalised, weights_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -99,6 +101,23 @@ def test_objects_that_cannot_be_shared_evenly_are_refused(joined):
     assert read_json(folder / "told-1.json")["shares"] == f"ValueError: {expected}"
     with pytest.raises(ValueError, match="reference_objects: .*, got 3; give --training.reference-objects 4"):
         check_shares(4, 3, 4)
+
+
+def test_torchrun_says_how_many_processes_there_are(monkeypatch):
+    assert count_processes(3, 1) == (3, 1)
+    assert is_first_process(1)
+    monkeypatch.setenv("NODE_RANK", "1")
+    assert is_first_process(1)  # nothing else takes part
+    assert not is_first_process(2)
+    with pytest.raises(ValueError, match="--nodes: .*NODE_RANK .0 to 1. in the environment .*, got no MASTER_ADDR"):
+        count_processes(1, 2)
+    monkeypatch.delenv("NODE_RANK")
+    for name, value in {"TORCHELASTIC_RUN_ID": "a", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "3", "RANK": "4"}.items():
+        monkeypatch.setenv(name, value)
+    assert count_processes(1, 1) == count_processes(3, 2) == (3, 2)
+    assert not is_first_process(1)
+    with pytest.raises(ValueError, match="--devices: expected the 3 processes on each of 2 .*, got 2 on each of 1"):
+        count_processes(2, 1)
 
 
 def test_shares_are_all_values_in_their_order():
