@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from hyperplanes.data.upright import upright_task
-from hyperplanes.views import Task, Tasks
+from hyperplanes.views import Task, Tasks, class_of
 
 __all__ = ["TasksOnDevice", "choose_device"]
 
@@ -47,6 +47,10 @@ class TasksOnDevice:
     def names(self, split: str) -> Sequence[str]:
         """The objects of a split."""
         return self.data.names(split)
+
+    def class_of(self, name: str) -> str:
+        """The class of one object, as the data set states it."""
+        return class_of(self.data, name)
 
     def task(self, name: str) -> Task:
         """One object."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 
-__all__ = ["Task", "Tasks", "Views", "join_views"]
+__all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views"]
 
 
 @dataclass(frozen=True)
@@ -173,3 +173,17 @@ class Tasks(Protocol):
     def task(self, name: str) -> Task:
         """One object."""
         ...
+
+
+@runtime_checkable
+class Classified(Protocol):
+    """Tasks whose objects have classes."""
+
+    def class_of(self, name: str) -> str:
+        """The class of one object; empty where it is not stated."""
+        ...
+
+
+def class_of(data: Tasks, name: str) -> str:
+    """The class of an object; empty where the data set does not state it."""
+    return data.class_of(name) if isinstance(data, Classified) else ""

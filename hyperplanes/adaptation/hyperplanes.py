@@ -223,7 +223,8 @@ class HyperPlanes(nn.Module):
             images = torch.stack([each.images for each in read])
             return cast("list[Parameters]", hypernetwork(images, torch.stack(directions), theta))
         assert isinstance(hypernetwork, HyperNetwork)
-        images = [_resized(each.images, read[0].size) for each in read]
+        side = hypernetwork.config.resolution
+        images = [_resized(each.images, (side, side) if side else read[0].size) for each in read]
         present = [torch.ones(len(each), device=each.device) for each in directions]
         batch = [pad_sequence(part, batch_first=True) for part in (images, directions, present)]
         return cast("list[Parameters]", hypernetwork(batch[0], batch[1], theta, batch[2] > 0))

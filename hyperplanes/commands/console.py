@@ -20,8 +20,8 @@ QUIET_SECONDS = 10.0
 class Bar:
     """Progress towards a known number: redrawn in place in a terminal, a line now and then elsewhere."""
 
-    def __init__(self, console: RichConsole, progress: Progress | None, title: str) -> None:
-        self._console, self._progress, self._title = console, progress, title
+    def __init__(self, console: RichConsole, errors: RichConsole, progress: Progress | None, title: str) -> None:
+        self._console, self._errors, self._progress, self._title = console, errors, progress, title
         self._task: TaskID | None = None
         self._printed = time.monotonic()
 
@@ -44,23 +44,28 @@ class Bar:
 
     def warn(self, line: str) -> None:
         """A line on standard error, above the progress line."""
-        _warn(line)
+        _show(self._errors, line)
 
 
 class Console:
-    """Standard output for results, standard error for warnings."""
+    """Standard output for results, standard error for warnings.
 
-    def __init__(self) -> None:
-        self._out = RichConsole(file=sys.stdout)
-        self._live = self._out.is_terminal
+    Args:
+        silent: nothing is shown, as in the processes of a training that another one speaks for.
+    """
+
+    def __init__(self, *, silent: bool = False) -> None:
+        self._out = RichConsole(file=sys.stdout, quiet=silent)
+        self._errors = RichConsole(file=sys.stderr, quiet=silent)
+        self._live = self._out.is_terminal and not silent
 
     def say(self, line: str) -> None:
         """A line of its own."""
-        self._out.print(line, markup=False, highlight=False, soft_wrap=True)
+        _show(self._out, line)
 
     def warn(self, line: str) -> None:
         """A line on standard error."""
-        _warn(line)
+        _show(self._errors, line)
 
     def table(self, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """A table; all columns but the first are aligned to the right."""
@@ -86,7 +91,7 @@ class Console:
             What shows it.
         """
         if not self._live:
-            yield Bar(self._out, None, title)
+            yield Bar(self._out, self._errors, None, title)
             return
         columns = (
             TextColumn("{task.description}"),
@@ -95,8 +100,8 @@ class Console:
             TextColumn("{task.fields[text]}", markup=False),
         )
         with Progress(*columns, console=self._out) as progress:
-            yield Bar(self._out, progress, title)
+            yield Bar(self._out, self._errors, progress, title)
 
 
-def _warn(line: str) -> None:
-    RichConsole(file=sys.stderr).print(line, markup=False, highlight=False, soft_wrap=True)
+def _show(console: RichConsole, line: str) -> None:
+    console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -3,7 +3,10 @@
 The model is evaluated on held-out objects at intervals. Checkpoints are written to --out on the way; interrupted, the
 same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once; SIGTERM, as a
 cluster sends it, stops after a checkpoint too. Beside the weights lie config.yaml, which --config takes, curve.csv, and
-samples/ with held-out views beside the truth.
+samples/ with held-out views beside the truth; best/ holds the model that was best on held-out objects.
+
+With --devices N, N processes of this machine share the objects of every step, one a GPU; --nodes M takes as many on
+each of M machines. Started by torchrun, it takes the processes that torchrun has started.
 
 Every field of the model and of the training is an option too, such as --model.hypernetwork.views 3 or
 --training.learning-rate 1e-3; `hyperplanes presets quick` prints all of them with their values, as a file for --config.
@@ -13,6 +16,7 @@ Example:
     hyperplanes train --data data/cars --preset quick --method point_multiplane --out runs/cars-baseline
     hyperplanes train --data data/cars --preset quick --method mv_meta --field nerf --out runs/cars-meta
     hyperplanes train --data data/cars --config runs/cars/config.yaml --model.hypernetwork.views 3 --out runs/cars-3
+    hyperplanes train --data data/cars data/chairs --preset small --devices 4 --out runs/both
 """
 
 from __future__ import annotations
@@ -39,6 +43,7 @@ from hyperplanes.commands.options import (
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.errors import Terminated
 from hyperplanes.utilities.formatting import format_duration, format_rate
+from hyperplanes.utilities.processes import is_first_process
 
 if TYPE_CHECKING:
     from hyperplanes.presets import Preset
@@ -73,6 +78,9 @@ class Arguments:
         legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.
         tensorboard: Write event files for TensorBoard to --out/tensorboard.
         device: auto, cpu or cuda.
+        devices: Processes on this machine that share the objects of every step: one a GPU, or several on the CPU.
+        nodes: Machines that take part, each started with the same command, with MASTER_ADDR, MASTER_PORT and NODE_RANK
+            in its environment; --out is a folder that all of them see.
     """
 
     data: tuple[Path, ...]
@@ -91,6 +99,8 @@ class Arguments:
     legacy: bool = False
     tensorboard: bool = False
     device: str = "auto"
+    devices: int = 1
+    nodes: int = 1
     settings: tyro.conf.Suppress[tuple[str, ...]] = ()
 
 
@@ -116,7 +126,7 @@ def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[list[type[Keyboar
 
     def note(number: int, _: object) -> None:
         heard.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
-        if trainer.stopping:
+        if len(heard) > 1:
             raise heard[-1]
         trainer.stopping = True
         bar.warn(f"{signal.Signals(number).name}: stopping after this step; once more to stop at once")
@@ -161,7 +171,7 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
                         "object; see docs/hypernetwork.md for options that prevent it"
                     )
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
-    if trainer.stopping and trainer.step < trainer.config.steps:
+    if trainer.stopping and trainer.step < trainer.config.steps and trainer.processes.first:
         advice = f"step {trainer.step} is saved, the same command goes on from there"
         if Terminated in heard:
             raise Terminated(advice)
@@ -210,18 +220,36 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
     return chosen.model.method, chosen
 
 
-@writes_to(lambda arguments: arguments.out)
+def _is_first(arguments: Arguments) -> bool:
+    return is_first_process(arguments.devices * arguments.nodes)
+
+
+@writes_to(lambda arguments: arguments.out, _is_first)
 def run(arguments: Arguments) -> int:
     """Train, from the start or from where it was interrupted."""
+    from hyperplanes.training.distributed import ProcessEnded
+
+    try:
+        return _run(arguments)
+    except ProcessEnded:
+        if _is_first(arguments):
+            raise
+        return 0  # who ended first says why
+
+
+def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.pretrained import find_checkpoints
     from hyperplanes.data.dataset import open_datasets
     from hyperplanes.data.support import WithSupport
     from hyperplanes.devices import choose_device
     from hyperplanes.experiment import write_experiment
     from hyperplanes.training import start_training
+    from hyperplanes.training.distributed import check_shares
+    from hyperplanes.training.launching import count_processes, launched
     from hyperplanes.training.watching import TensorBoard
 
-    console = Console()
+    first = _is_first(arguments)
+    console = Console(silent=not first)
     method, chosen = resolve(arguments)
     data = open_datasets(arguments.data, chosen.training.memory, legacy=arguments.legacy)
     shown = " ".join(map(str, arguments.data))
@@ -236,23 +264,29 @@ def run(arguments: Arguments) -> int:
     reference = None
     if arguments.checkpoint is not None:
         reference = find_checkpoints([arguments.checkpoint]).get("mv_meta", arguments.checkpoint)
-    device = choose_device(arguments.device)
-    trainer = start_training(chosen.model, chosen.training, tasks, arguments.out, device, reference)
-    write_experiment(arguments.out / "config.yaml", method, chosen)
+    processes = count_processes(arguments.devices, arguments.nodes)
+    objects = chosen.training.reference_objects if chosen.model.hypernetwork else 0
+    check_shares(chosen.training.tasks, objects, processes[0] * processes[1])
     held_out = len(data.names("test"))
-    console.say(
-        f"{method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "
-        f"{len(trainer.names)} objects to train on, {held_out} held out"
-    )
-    if trainer.step:
-        console.say(f"going on from step {trainer.step}")
-    board = TensorBoard(arguments.out / "tensorboard", trainer.step) if arguments.tensorboard else None
-    try:
-        with console.bar("training") as bar:
-            follow(trainer, bar, board)
-    finally:
-        if board is not None:
-            board.close()
+    with launched(*processes, choose_device(arguments.device)) as device:
+        trainer = start_training(chosen.model, chosen.training, tasks, arguments.out, device, reference)
+        if first:
+            write_experiment(arguments.out / "config.yaml", method, chosen)
+        shared = f", shared by {trainer.processes.count} processes" if trainer.processes.count > 1 else ""
+        console.say(
+            f"{method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "
+            f"{len(trainer.names)} objects to train on, {held_out} held out{shared}"
+        )
+        if trainer.step:
+            console.say(f"going on from step {trainer.step}")
+        watched = arguments.tensorboard and first
+        board = TensorBoard(arguments.out / "tensorboard", trainer.step) if watched else None
+        try:
+            with console.bar("training") as bar:
+                follow(trainer, bar, board)
+        finally:
+            if board is not None:
+                board.close()
     console.say(f"{arguments.out}: trained for {trainer.step} steps")
     if held_out:
         console.say(

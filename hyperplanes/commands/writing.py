@@ -10,11 +10,14 @@ from typing import Any
 __all__ = ["writes_to"]
 
 
-def writes_to(folder: Callable[[Any], Path]) -> Callable[[Callable[[Any], int]], Callable[[Any], int]]:
+def writes_to(
+    folder: Callable[[Any], Path], when: Callable[[Any], bool] = lambda arguments: True
+) -> Callable[[Callable[[Any], int]], Callable[[Any], int]]:
     """A decorator of a verb's `run`: it fails at once where another process writes into the same folder.
 
     Args:
         folder: from a verb's arguments the folder that it writes into, as in `files.one_writer`.
+        when: whether this process writes there at all; of the processes of one training, the first one alone does.
 
     Returns:
         The decorator.
@@ -25,6 +28,8 @@ def writes_to(folder: Callable[[Any], Path]) -> Callable[[Callable[[Any], int]],
         def locked(arguments: Any) -> int:
             from hyperplanes.files import one_writer
 
+            if not when(arguments):
+                return run(arguments)
             with one_writer(folder(arguments)):
                 return run(arguments)
 

@@ -76,6 +76,13 @@ class Dataset:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, all, got {split!r}")
         return list(self._catalogue.splits[split])
 
+    def class_of(self, name: str) -> str:
+        """The class of one object, as `generate` writes it into manifest.json; empty where that does not state it."""
+        objects = self.manifest.get("objects")
+        record = objects.get(name) if isinstance(objects, dict) else None
+        stated = record.get("class") if isinstance(record, dict) else None
+        return stated if isinstance(stated, str) else ""
+
     def task(self, name: str) -> Task:
         """The support and query views of one object, as float images over white.
 
@@ -165,6 +172,11 @@ class Datasets:
     def names(self, split: str = "all") -> list[str]:
         """The names of the objects of a split of all data sets, one after the other."""
         return [f"{part}/{name}" for part, data in self.parts.items() for name in data.names(split)]
+
+    def class_of(self, name: str) -> str:
+        """The class of one object; the name of its data set where that does not state it."""
+        part, _, own = name.partition("/")
+        return self.parts[part].class_of(own) or part
 
     def task(self, name: str) -> Task:
         """One object; as `Dataset.task`.

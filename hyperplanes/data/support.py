@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from hyperplanes.views import Task, Tasks, join_views
+from hyperplanes.views import Task, Tasks, class_of, join_views
 
 __all__ = ["SingleView", "WithSupport"]
 
@@ -34,6 +34,10 @@ class WithSupport:
     def names(self, split: str) -> Sequence[str]:
         """The objects of a split."""
         return self.data.names(split)
+
+    def class_of(self, name: str) -> str:
+        """The class of one object, as the data set states it."""
+        return class_of(self.data, name)
 
     def task(self, name: str) -> Task:
         """One object.

@@ -6,6 +6,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
+from hyperplanes.hypernetwork.synchronisation import BatchNorm2d
+
 __all__ = ["CHOICES", "ENCODERS", "NORMALISATIONS", "ConvNet", "ResNet101"]
 
 CHOICES = ("farthest", "first")
@@ -16,9 +18,9 @@ NORMALISATIONS = ("batch", "batch_statistics", "group")
 
 def _normalisation(name: str, channels: int) -> nn.Module:
     if name == "batch":
-        return nn.BatchNorm2d(channels)
+        return BatchNorm2d(channels)
     if name == "batch_statistics":
-        return nn.BatchNorm2d(channels, track_running_stats=False)
+        return BatchNorm2d(channels, track_running_stats=False)
     if name == "group":
         return nn.GroupNorm(8, channels)
     expected = ", ".join(map(repr, NORMALISATIONS))

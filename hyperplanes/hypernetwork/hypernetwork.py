@@ -193,7 +193,7 @@ class HyperNetwork(nn.Module):
     ) -> Float[Tensor, "object ..."]:
         """The codes of the images before their activation: (object, view, code), or (object, code) of their mean."""
         read = images.flatten(0, 1)
-        if self.config.resolution:
+        if self.config.resolution and read.shape[2:] != (self.config.resolution,) * 2:
             read = interpolate(read, (self.config.resolution,) * 2, mode="area")
         codes = self.encoder(read).unflatten(0, images.shape[:2])
         if self.config.join == "mean":

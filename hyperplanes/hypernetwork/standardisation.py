@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hyperplanes.hypernetwork.synchronisation import gather_objects
+
 __all__ = ["RunningStandardisation"]
 
 
@@ -41,6 +43,10 @@ class RunningStandardisation(nn.Module):
         """Codes of mean 0 and variance 1 over the objects of the training; updates the statistics in training."""
         if not self.training:
             return self._standardised(codes)
+        codes, own = gather_objects(codes)
+        return self._renormalised(codes)[own]
+
+    def _renormalised(self, codes: Tensor) -> Tensor:
         self._update(codes.detach())
         if len(codes) == 1:
             return self._standardised(codes)

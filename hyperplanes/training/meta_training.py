@@ -35,7 +35,7 @@ class _InitialisationTrainer(Trainer):
 
     def _adapted(self, episode: Episode) -> AdaptedField:
         settings = replace(self.initialisation.descent(self.config.rays), seed=self.config.seed)
-        return self.model.fine_tune(episode.prepared, self.initialisation.inner_steps, settings)
+        return self.evaluated.fine_tune(episode.prepared, self.initialisation.inner_steps, settings)
 
     def _set_gradients(self, gradient: Parameters) -> None:
         for name, value in self.model.networks.named_parameters():
@@ -58,11 +58,13 @@ class ReptileTrainer(_InitialisationTrainer):
         """Rays of all inner steps on all objects."""
         return super().rays_per_step * self.initialisation.inner_steps
 
-    def gradients(self, drawn: Sequence[str], episodes: Sequence[Episode], generator: torch.Generator) -> float:
+    def gradients(
+        self, drawn: Sequence[str], episodes: Sequence[Episode], generators: Sequence[torch.Generator]
+    ) -> float:
         """Reptile's gradient, averaged over the objects."""
         total, adapted = 0.0, []
         theta = self.model.theta.detach()
-        for episode in episodes:
+        for episode, generator in zip(episodes, generators, strict=True):
             free = Parameters((name, value.clone().requires_grad_(True)) for name, value in theta.items())
             field = self.model.field(episode.prepared, free)
             settings = replace(self.initialisation.descent(self.config.rays), seed=_seed(generator))
@@ -88,11 +90,13 @@ class MAMLTrainer(_InitialisationTrainer):
         """Rays of all inner steps and of the outer loss on all objects."""
         return super().rays_per_step * (self.initialisation.inner_steps + 1)
 
-    def gradients(self, drawn: Sequence[str], episodes: Sequence[Episode], generator: torch.Generator) -> float:
+    def gradients(
+        self, drawn: Sequence[str], episodes: Sequence[Episode], generators: Sequence[torch.Generator]
+    ) -> float:
         """MAML's gradient, averaged over the objects."""
         total, mean = 0.0, Parameters()
         initialisation, theta = self.initialisation, self.model.theta.detach()
-        for episode in episodes:
+        for episode, generator in zip(episodes, generators, strict=True):
             field = self.model.field(episode.prepared, theta)
             batches = [
                 _draw(episode, field, self.config.rays, generator, of_support=True)
@@ -147,10 +151,12 @@ class MatchedTrainer(_InitialisationTrainer):
         self.reference = reference.to(model.rig.device).eval().requires_grad_(False)
         model.rig.copy_(self.reference.rig)
 
-    def gradients(self, drawn: Sequence[str], episodes: Sequence[Episode], generator: torch.Generator) -> float:
+    def gradients(
+        self, drawn: Sequence[str], episodes: Sequence[Episode], generators: Sequence[torch.Generator]
+    ) -> float:
         """The gradient of the squared differences of the outputs, averaged over the objects."""
         total = torch.zeros((), device=self.model.rig.device)
-        for episode in episodes:
+        for episode, generator in zip(episodes, generators, strict=True):
             bounds = episode.prepared.occupancy.bounds
             points, directions = (_in_sphere(self.config.rays, generator, unit) for unit in (False, True))
             points = (points * bounds.radius + torch.tensor(bounds.centre)).to(total)

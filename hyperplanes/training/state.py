@@ -1,12 +1,16 @@
 """A training on disk: one consistent state at any moment, whenever the power goes.
 
 training.json                   step, curve, configuration, and the name of the file of that step; written last
-training-00000500.safetensors   weights and optimisers of step 500
-model.json, model.safetensors   the model alone, for everybody else
+training-00000500.safetensors   weights, their average where there is one, and optimisers of step 500
+training-00000500.json          what training.json was at step 500, where earlier steps are kept: copied over
+                                training.json, the training goes on from there
+model.json, model.safetensors   the model alone, for everybody else: of the averaged weights where there are some
+best/                           the model of the look at held-out objects with the highest PSNR
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,15 +21,16 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
-from hyperplanes.files import DataError, malformed, write_json
+from hyperplanes.files import DataError, encode_json, malformed, write_json
 from hyperplanes.optimisers import Muon
+from hyperplanes.training.averaging import WeightAverage
 
 __all__ = ["Curve", "check_model", "load_state", "save_state"]
 
 Curve: TypeAlias = list[dict[str, float]]
 
 ENTRIES = {"step": int, "curve": list, "config": dict, "state": str}
-STATE = re.compile(r"training-\d{8,}\.safetensors")
+STATE = re.compile(r"training-(\d{8,})\.safetensors")
 REMEDY = "give another --out folder or the same options"
 
 
@@ -36,8 +41,9 @@ def save_state(
     step: int,
     curve: Curve,
     config: Mapping[str, Any],
+    average: WeightAverage | None = None,
 ) -> None:
-    """Put a new state in the place of the last one.
+    """Put a new state in the place of the last one, or beside the last ones where the configuration keeps several.
 
     Args:
         folder: the checkpoint.
@@ -45,19 +51,44 @@ def save_state(
         optimisers: with their moments.
         step: steps done.
         curve: what was reported so far.
-        config: of the training.
+        config: of the training; its `keep_last` says how many states stay.
+        average: of the weights; the model of others is made of it.
     """
     name = f"training-{step:08d}.safetensors"
     tensors = {f"model.{key}": value for key, value in model.state_dict().items()}
     for index, optimiser in enumerate(optimisers):
         for place, entries in optimiser.state_dict()["state"].items():
             tensors |= {f"{index}.{place}.{key}": torch.as_tensor(value) for key, value in entries.items()}
+    if average is not None:
+        tensors |= {f"average.{key}": value for key, value in average.state_dict().items()}
     save_tensors(folder / name, tensors)
-    model.save(folder)
-    write_json(folder / "training.json", {"step": step, "curve": curve, "config": dict(config), "state": name})
-    for old in folder.glob("training-*.safetensors"):
-        if old.name != name and STATE.fullmatch(old.name):
-            old.unlink(missing_ok=True)
+    (model if average is None else average.model).save(folder)
+    document = {"step": step, "curve": curve, "config": dict(config), "state": name}
+    kept = config.get("keep_last", 1)
+    beside = (folder / name).with_suffix(".json")
+    if kept > 1:
+        write_json(beside, document)
+    else:
+        beside.unlink(missing_ok=True)
+    write_json(folder / "training.json", document)
+    _delete_old(folder, name, kept)
+
+
+def _delete_old(folder: Path, newest: str, kept: int) -> None:
+    """Delete all states but the newest and those of the last steps before it; later ones are of a run gone back on."""
+    states = sorted(path.name for path in folder.glob("training-*.safetensors") if STATE.fullmatch(path.name))
+    earlier = [name for name in states if _step(name) < _step(newest)]
+    staying = {newest, *earlier[len(earlier) - min(kept - 1, len(earlier)) :]}
+    for name in states:
+        if name not in staying:
+            (folder / name).with_suffix(".json").unlink(missing_ok=True)
+            (folder / name).unlink(missing_ok=True)
+
+
+def _step(name: str) -> int:
+    found = STATE.fullmatch(name)
+    assert found is not None
+    return int(found[1])
 
 
 def load_state(
@@ -66,6 +97,8 @@ def load_state(
     optimisers: Sequence[torch.optim.Optimizer],
     config: Mapping[str, Any],
     free: Sequence[str],
+    defaults: Mapping[str, Any],
+    average: WeightAverage | None = None,
 ) -> tuple[int, Curve]:
     """Continue where `save_state` stopped: weights and moments are set.
 
@@ -75,6 +108,8 @@ def load_state(
         optimisers: over the same parameters.
         config: of the training that is to go on.
         free: entries of it that may differ.
+        defaults: what entries are that a training of an earlier version has not.
+        average: of the weights, which is set too.
 
     Returns:
         The steps done, and the curve.
@@ -86,7 +121,7 @@ def load_state(
     saved = read_json(path)
     try:
         with malformed(path, "the state of a training"):
-            return _load(path, saved, model, optimisers, config, free)
+            return _load(path, saved, model, optimisers, config, free, defaults, average)
     except DataError as error:
         raise CheckpointError(str(error)) from error
 
@@ -98,6 +133,8 @@ def _load(
     optimisers: Sequence[torch.optim.Optimizer],
     config: Mapping[str, Any],
     free: Sequence[str],
+    defaults: Mapping[str, Any],
+    average: WeightAverage | None,
 ) -> tuple[int, Curve]:
     folder = path.parent
     for name, kind in ENTRIES.items():
@@ -106,7 +143,8 @@ def _load(
             raise CheckpointError(f"{path}: expected an entry {name!r} ({kind.__name__}), found {found}; {REMEDY}")
     if saved["step"] < 0:
         raise CheckpointError(f"{path}: expected a number of steps, found {saved['step']}; {REMEDY}")
-    differing = [name for name in config if name not in free and saved["config"].get(name, ...) != config[name]]
+    wanted, before = (json.loads(encode_json(dict(each))) for each in (config, {**defaults, **saved["config"]}))
+    differing = [name for name in wanted if name not in free and before[name] != wanted[name]]
     if differing:
         raise CheckpointError(
             f"{path}: expected the same training to resume, found other {', '.join(differing)}; {REMEDY}"
@@ -122,8 +160,11 @@ def _load(
             if f"{index}.{place}.{names[0]}" in found:  # absent where no gradient has reached the parameter yet
                 moments |= {f"{index}.{place}.{name}": parameter for name in names if name != "step"}
                 moments |= {f"{index}.{place}.{name}": torch.zeros(()) for name in names if name == "step"}
-    check_tensors(folder / saved["state"], found, {**weights, **moments})
+    averaged = {} if average is None else {f"average.{name}": value for name, value in average.state_dict().items()}
+    check_tensors(folder / saved["state"], found, {**weights, **moments, **averaged})
     model.load_state_dict({name: found[f"model.{name}"] for name in model.state_dict()})
+    if average is not None:
+        average.load_state_dict({name: found[f"average.{name}"] for name in average.state_dict()})
     for index, optimiser in enumerate(optimisers):
         state: dict[int, dict[str, Tensor]] = {}
         for key in moments:

@@ -21,19 +21,22 @@ from hyperplanes.files import encode_png, write_json, write_whole
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
 from hyperplanes.parameters import Parameters
+from hyperplanes.training.averaging import WeightAverage
+from hyperplanes.training.distributed import ProcessEnded, Processes, check_shares, other_processes
+from hyperplanes.training.drawing import draw, draw_balanced, episode_object, object_generator
 from hyperplanes.training.episodes import Episode, prepare_episode, prepare_subset
 from hyperplanes.training.prefetching import Prefetcher
 from hyperplanes.training.state import Curve, check_model, load_state, save_state
 from hyperplanes.training.watching import Samples, write_curve
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.utilities.lru_cache import LRUCache
-from hyperplanes.views import Tasks
+from hyperplanes.views import Tasks, class_of
 
 __all__ = ["Progress", "Trainer", "TrainingConfig", "train"]
 
 
 EMPTINESS = 0.01  # weight of the opacity of empty space beside the squared error of pixels
-FREE = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every", "memory", "prefetch")
+FREE = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every", "keep_last", "memory", "prefetch")
 """What may differ in a training that is resumed."""
 
 
@@ -67,9 +70,15 @@ class TrainingConfig:
         final: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
         alternating: theta and the hypernetwork move in turns, theta first, instead of both in every step. The paper
             speaks of separate gradient steps; its code moves both.
+        clip: the norm to which the gradient of all weights that a step moves is cut where it is longer; 0 leaves it.
+        average: decay of a moving average of the weights, which is evaluated and saved as the model, while the training
+            goes on from the weights themselves; 0 is none.
+        balanced: classes are drawn equally often, however many objects each has. Where a data set does not state them,
+            each data set is one.
         evaluate_every: steps between looks at held-out objects.
         held_out: how many of them are looked at: objects of the "val" split, or where there is none of "test".
         checkpoint_every: steps between checkpoints.
+        keep_last: how many of them are kept; older ones are deleted.
         memory: bytes of images, planes and hulls that are kept for later steps; the last object always is.
         prefetch: steps whose objects a thread makes ready ahead, beyond `memory`; 0 makes them when they are due.
         seed: of the objects, rays and samples of every step.
@@ -91,12 +100,22 @@ class TrainingConfig:
     warmup: Annotated[int, range(10**10)] = 0
     final: float = 1.0
     alternating: bool = False
+    clip: float = 0.0
+    average: float = 0.0
+    balanced: bool = False
     evaluate_every: Annotated[int, range(1, 10**10)] = 250
     held_out: Annotated[int, range(10**6)] = 4
     checkpoint_every: Annotated[int, range(1, 10**10)] = 500
+    keep_last: Annotated[int, range(1, 10**6)] = 1
     memory: Annotated[int, range(2**50)] = 2 * 2**30
     prefetch: Annotated[int, range(1025)] = 1
     seed: Annotated[int, range(2**40)] = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.average < 1:
+            raise ValueError(f"average: expected a decay from 0 to below 1, got {self.average}")
+        if not self.clip >= 0:
+            raise ValueError(f"clip: expected a norm of 0 or more, got {self.clip}")
 
     def steps_for(self, objects: int) -> int:
         """How many steps are taken with so many training objects.
@@ -138,8 +157,12 @@ class Progress:
 class Trainer:
     """The state of one training: model, two optimisers, step count, the curve so far.
 
-    Every step draws from a generator seeded by (seed, step), so a training that is stopped and resumed ends exactly
-    where an uninterrupted one does. It computes where the model is.
+    Every step draws its objects from a generator seeded by (seed, step), and each object its rays from one seeded by
+    (seed, step, place in the step), so a training that is stopped and resumed ends exactly where an uninterrupted one
+    does. It computes where the model is.
+
+    In a process of several (`launching.launched`) it renders its share of the objects of each step; the first process
+    alone writes files and looks at held-out objects.
 
     Args:
         model: trained in place.
@@ -148,18 +171,20 @@ class Trainer:
         folder: for checkpoints; a training that lies there already goes on.
 
     Raises:
-        ValueError: no object to train on.
+        ValueError: no object to train on, or objects that the processes cannot share evenly.
     """
 
     def __init__(self, model: HyperPlanes, data: Tasks, config: TrainingConfig, folder: Path | None = None) -> None:
         self.model = model
         self.data = data
-        self.folder = folder
+        self.processes = Processes.current()
+        self.folder = folder if self.processes.first else None
         self.step = 0
         self.curve: Curve = []
         self.diagnostics: Diagnostics | None = None
         self.samples: Samples | None = None
         self.stopping = False  # set by whoever wants `run` to end after the step at hand
+        self._stopped = False  # what the processes agreed on in the last step
         self.names = sorted(data.names("train"))
         if not self.names:
             raise ValueError("data: expected at least one training object, got none")
@@ -171,6 +196,10 @@ class Trainer:
         if config.random_background and model.config.coarse_network:
             raise ValueError("training.random_background: expected a model without a coarse network, got one with")
         self.config = config = replace(config, steps=config.steps_for(len(self.names)))
+        check_shares(config.tasks, self._reference_objects, self.processes.count)
+        self.classes: dict[str, list[str]] = {}
+        for name in self.names if config.balanced else ():
+            self.classes.setdefault(class_of(data, name), []).append(name)
         self._episodes: LRUCache[Episode] = LRUCache(config.memory, keep_last=True)
         self._prefetcher = Prefetcher(self._load, self._episodes)
         self._held_out: dict[str, Episode] = {}
@@ -184,23 +213,31 @@ class Trainer:
         self.rates = [optimiser.param_groups[0]["lr"] for optimiser in self.optimisers]
         if folder is not None:
             check_model(folder, model.config)
-        if folder is not None and (folder / "training.json").exists():
-            self.step, self.curve = load_state(folder, model, self.optimisers, asdict(config), FREE)
-        else:
+        resumed = folder is not None and (folder / "training.json").exists()
+        if not resumed and self.processes.first:  # the others get it with the weights
             with prefix_errors(self.names[0]):
                 model.set_rig(data.task(self.names[0]).support)
+        self.average = WeightAverage(model, config.average) if config.average else None
+        if folder is not None and resumed:
+            defaults = asdict(TrainingConfig())
+            loaded = load_state(folder, model, self.optimisers, asdict(config), FREE, defaults, self.average)
+            self.step, self.curve = loaded
+        with other_processes():
+            self.processes.agree(model, self.step)
 
     def run(self) -> Iterator[Progress]:
         """Train until the last step, reporting every 25 steps; checkpoints are written on the way and at the end.
 
-        With them come curve.csv and samples/STEP.png, held-out views beside the truth.
-        Once `stopping` is set, the step at hand is the last one, and a checkpoint of it is written.
+        With them come curve.csv and samples/STEP.png, held-out views beside the truth, and best/, the model of the look
+        with the highest PSNR. Once `stopping` is set in any process, the step at hand is the last one, and a checkpoint
+        of it is written.
 
         Yields:
             Where the training stands.
         """
         try:
-            yield from self._run()
+            with other_processes():
+                yield from self._run()
         finally:
             self._prefetcher.close()
 
@@ -208,29 +245,34 @@ class Trainer:
         started, first, reported = time.perf_counter(), self.step, (time.perf_counter(), self.step)
         while self.step < self.config.steps:
             ahead = range(self.step, min(self.step + 1 + self.config.prefetch, self.config.steps))
-            self._prefetcher.expect(name for step in ahead[1:] for name in self._drawn(step, self._generator(step)))
+            self._prefetcher.expect(
+                name for step in ahead[1:] for _, name in self._own(self._drawn(step, self._generator(step)))
+            )
             loss = self.take_step()
             step, last = self.step, self.step == self.config.steps
             look = step % self.config.evaluate_every == 0 or last
             report = look or step % 25 == 0
             now = time.perf_counter()
-            quality, diagnostics = self.look() if look else (None, None)
+            quality, diagnostics = self.look() if look and self.processes.first else (None, None)
             self.diagnostics = diagnostics or self.diagnostics
             seen = self.samples if look else None
+            if quality is not None and self.folder is not None and quality > self._best:
+                self.evaluated.save(self.folder / "best")
             if report:
                 row = {"step": step, "loss": loss, **self.norms()}
                 row |= {} if quality is None else {"psnr": quality}
                 row |= {} if seen is None or seen.ssim is None else {"ssim": seen.ssim}
                 row |= diagnostics.as_json() if diagnostics else {}
                 self.curve.append(row)
-            saving = step % self.config.checkpoint_every == 0 or last or self.stopping
+            stopping = self._stopped if self.processes.count > 1 else self.stopping
+            saving = step % self.config.checkpoint_every == 0 or last or stopping
             if self.folder is not None and (look or saving):
                 write_curve(self.folder / "curve.csv", self.curve)
                 if seen is not None:
                     write_whole(self.folder / "samples" / f"{step:08d}.png", encode_png(seen.sheet()))
             if saving:
                 self.save()
-            if self.stopping:
+            if stopping:
                 return
             if not report:
                 continue
@@ -247,19 +289,31 @@ class Trainer:
         for optimiser in self.optimisers:
             optimiser.zero_grad(set_to_none=True)
         drawn = self._drawn(self.step, generator)
+        own = self._own(drawn)
         with record_function("step:data"):
-            episodes = [self._prefetcher.get(name) for name in drawn]
-        loss = self.gradients(drawn, episodes, generator)
+            episodes = [self._prefetcher.get(name) for _, name in own]
+        generators = [object_generator(self.config.seed, self.step, place) for place, _ in own]
+        loss = self.gradients([name for _, name in own], episodes, generators)
+        with record_function("step:exchange"):
+            moved = [value for each in self.optimisers for group in each.param_groups for value in group["params"]]
+            loss, self._stopped = self.processes.average(moved, loss, self.stopping)
+        self.stopping = self.stopping or self._stopped
         if not math.isfinite(loss):
-            raise ValueError(
+            raise (ValueError if self.processes.first else ProcessEnded)(
                 f"step {self.step + 1}, on {', '.join(drawn)}: expected a finite loss, got {loss}; the last checkpoint "
                 "is kept; check the images of these objects, or train with lower rates"
             )
         for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
             optimiser.param_groups[0]["lr"] = rate * self._schedule()
         with record_function("step:optimisers"):
-            for optimiser in self._due():
+            due = self._due()
+            if self.config.clip:
+                moved = [value for each in due for group in each.param_groups for value in group["params"]]
+                torch.nn.utils.clip_grad_norm_(moved, self.config.clip)
+            for optimiser in due:
                 optimiser.step()
+            if self.average is not None:
+                self.average.update_parameters(self.model)
         self.step += 1
         return loss
 
@@ -268,22 +322,25 @@ class Trainer:
         """Rays of all objects of a step."""
         return self.config.rays * self.config.tasks
 
-    def gradients(self, drawn: Sequence[str], episodes: Sequence[Episode], generator: torch.Generator) -> float:
-        """Set the gradients of a step.
+    def gradients(
+        self, drawn: Sequence[str], episodes: Sequence[Episode], generators: Sequence[torch.Generator]
+    ) -> float:
+        """Set the gradients of this process's share of a step.
 
         Args:
-            drawn: names of the objects, those that are rendered first.
+            drawn: names of its objects, those that are rendered first.
             episodes: the objects.
-            generator: of rays and samples.
+            generators: of the rays and samples of each.
 
         Returns:
-            The loss.
+            The mean loss of these objects.
         """
         config = self.config
+        tasks = config.tasks // self.processes.count
         total = torch.zeros(())
         with record_function("step:update"):
             updates = self.model.updates([episode.prepared for episode in episodes])
-        for name, episode, update in list(zip(drawn, episodes, updates, strict=True))[: config.tasks]:
+        for name, episode, update, generator in list(zip(drawn, episodes, updates, generators, strict=True))[:tasks]:
             field = self.model.field(episode.prepared, self.model.theta + update)
             span = field.sampling.span
             with record_function("step:rays"), prefix_errors(name):
@@ -301,9 +358,9 @@ class Trainer:
                     total = total + self._emptiness(field, generator)
             total = total + ray_loss(seen, truth)
         with record_function("step:gradients"):
-            (total / config.tasks).backward()
+            (total / tasks).backward()
         self._updates = [update.detach() for update in updates]
-        return float(total.detach()) / config.tasks
+        return float(total.detach()) / tasks
 
     def _due(self) -> list[torch.optim.Optimizer]:
         """The optimisers of this step: all, or in turns those of theta and that of the hypernetwork."""
@@ -314,7 +371,10 @@ class Trainer:
 
     @torch.no_grad()
     def norms(self) -> dict[str, float]:
-        """Norms of the last step: of the gradient of each part, and of its objects' updates (root mean square)."""
+        """Norms of the last step: of the gradient of each part, and of its objects' updates (root mean square).
+
+        Gradients are clipped. Where there are several processes, all of them are to ask.
+        """
         parts = {"theta": self.model.networks, "hypernetwork": self.model.hypernetwork}
         found = {}
         for name, part in parts.items():
@@ -323,7 +383,7 @@ class Trainer:
                 found[f"gradient_{name}"] = float(torch.stack([each.norm() for each in gradients]).norm())
         if self.model.hypernetwork is not None and self._updates:
             squares = [value.square().sum() for update in self._updates for value in update.values()]
-            found["update"] = float((torch.stack(squares).sum() / len(self._updates)).sqrt())
+            found["update"] = float(self.processes.mean(torch.stack(squares).sum() / len(self._updates)).sqrt())
         return found
 
     def _generator(self, step: int) -> torch.Generator:
@@ -331,24 +391,37 @@ class Trainer:
         return torch.Generator().manual_seed(self.config.seed * 1_000_003 + step)
 
     def _numbered(self, number: int) -> str:
-        """An episode by its number: the name of its object, all of which come once before any comes again."""
-        epoch, place = divmod(number, len(self.names))
-        order = torch.randperm(len(self.names), generator=self._generator(-1 - epoch))
-        return f"{self.names[int(order[place])]}#{number}"
+        """The name of an episode: that of its object, and its number."""
+        return f"{episode_object(self.classes or {'': self.names}, number, self.config.seed)}#{number}"
 
     def _drawn(self, step: int, generator: torch.Generator) -> list[str]:
         """The objects of a step, different ones while there are enough: those to render, then the reference objects."""
-        count, total = self.config.tasks, len(self.names)
+        count = self.config.tasks + self._reference_objects
         if self.config.views:
             places = torch.randperm(max(self.config.episodes, count), generator=generator)[:count]
             return [self._numbered(step + place) for place in places.tolist()]
-        if self.model.hypernetwork is not None:
-            count += self.config.reference_objects
-        if count == 1:
-            return [self.names[int(torch.randint(total, (), generator=generator))]]
-        repeats = -(-count // total)
-        drawn = torch.cat([torch.randperm(total, generator=generator) for _ in range(repeats)])[:count]
-        return [self.names[index] for index in drawn.tolist()]
+        if self.classes:
+            return draw_balanced(self.classes, count, generator)
+        return draw(self.names, count, generator)
+
+    def _own(self, drawn: Sequence[str]) -> list[tuple[int, str]]:
+        """This process's share of the objects of a step, each with its place in the step."""
+        places, tasks = list(enumerate(drawn)), self.config.tasks
+        return [*self.processes.share(places[:tasks]), *self.processes.share(places[tasks:])]
+
+    @property
+    def _reference_objects(self) -> int:
+        return self.config.reference_objects if self.model.hypernetwork is not None else 0
+
+    @property
+    def _best(self) -> float:
+        """The highest quality of the looks so far."""
+        return max((row["psnr"] for row in self.curve if row.get("psnr") is not None), default=-math.inf)
+
+    @property
+    def evaluated(self) -> HyperPlanes:
+        """What is evaluated and saved: the model, or that of the averaged weights."""
+        return self.model if self.average is None else self.average.model
 
     def warm(self, name: str) -> None:
         """Have the planes and the hull of an object ready, as its first step otherwise makes them."""
@@ -358,9 +431,9 @@ class Trainer:
     def look(self) -> tuple[float | None, Diagnostics | None]:
         """Mean PSNR in dB of two query views of some held-out objects, and the diagnostics of the hypernetwork there.
 
-        The objects are those of the "val" split, or of "test" where a data set has no other; nothing is chosen by these
-        numbers. None where there are no such objects, and no hypernetwork or a single object to compare updates of.
-        `samples` holds the views themselves.
+        The objects are those of the "val" split, or of "test" where a data set has no other; nothing but best/ is
+        chosen by these numbers. None where there are no such objects, and no hypernetwork or a single object to compare
+        updates of. `samples` holds the views themselves.
         """
         names = sorted(self.data.names("val")) or sorted(self.data.names("test"))
         for name in names[: self.config.held_out]:
@@ -372,30 +445,32 @@ class Trainer:
         if not episodes:
             return None, None
         prepared, queries = [each.prepared for each in episodes], [each.query for each in episodes]
-        training = self.model.training
-        self.model.eval()
+        model = self.evaluated
+        training = model.training
+        model.eval()
         try:
             fields = [self._adapted(each) for each in episodes]
             pictures = [field.render(query.cameras).images for field, query in zip(fields, queries, strict=True)]
             self.samples = Samples(pictures, [query.images for query in queries])
             quality = float(torch.cat([psnr(*pair) for pair in self.samples.pairs]).mean())
-            if self.model.hypernetwork is None or len(episodes) < 2:
+            if model.hypernetwork is None or len(episodes) < 2:
                 return quality, None
-            _, gap = swap_gap(self.model, prepared, queries, quality)
-            return quality, replace(diagnose(self.model, prepared), swap_gap=gap)
+            _, gap = swap_gap(model, prepared, queries, quality)
+            return quality, replace(diagnose(model, prepared), swap_gap=gap)
         finally:
-            self.model.train(training)
+            model.train(training)
 
     def _adapted(self, episode: Episode) -> AdaptedField:
         """The field of a held-out object."""
-        return self.model.adapt(episode.prepared)
+        return self.evaluated.adapt(episode.prepared)
 
     def save(self) -> None:
         """Write model and training state to the folder, where there is one; whole or not at all."""
         if self.folder is not None:
             if self.diagnostics is not None:
                 write_json(self.folder / "diagnostics.json", self.diagnostics.as_json())
-            save_state(self.folder, self.model, self.optimisers, self.step, self.curve, asdict(self.config))
+            config = asdict(self.config)
+            save_state(self.folder, self.model, self.optimisers, self.step, self.curve, config, self.average)
 
     def _emptiness(self, field: AdaptedField, generator: torch.Generator) -> Tensor:
         """Mean opacity, a tenth of a radius thick, of random points of the sphere that the hull rules out."""

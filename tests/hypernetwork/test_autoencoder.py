@@ -46,8 +46,8 @@ def test_nothing_but_biases_of_reading_layers_is_shifted():
 
 def test_it_learns_what_tells_objects_apart(tmp_path):
     model = make(target="nerf")
-    rates = {"learning_rate": 1e-2, "hypernetwork_learning_rate": 1e-2}
-    config = TrainingConfig(steps=40, tasks=2, rays=32, evaluate_every=100, **rates)
+    rates = {"learning_rate": 5e-3, "hypernetwork_learning_rate": 5e-3}  # at 1e-2, some seeds end in one constant field
+    config = TrainingConfig(steps=40, tasks=3, rays=64, evaluate_every=100, **rates)
     trainer = Trainer(model, Balls(), config, tmp_path)
     losses = [trainer.take_step() for _ in range(40)]
     assert sum(losses[-5:]) < 0.6 * sum(losses[:5])

@@ -13,6 +13,7 @@ from hyperplanes.evaluation import evaluate
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Hierarchical
 from hyperplanes.training import Trainer, TrainingConfig, start_training
+from hyperplanes.training.drawing import object_generator
 from hyperplanes.training.meta_training import initialisation_trainer
 from hyperplanes.views import Task
 from tests.reference_rendering import Balls, small_model
@@ -59,8 +60,7 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, 
 def test_one_inner_step_of_reptile_is_a_gradient_step_on_support_rays():
     model = model_of("mv_meta", inner_steps=1, inner_rate=0.3)
     found = gradients_of(initialisation_trainer(model, Balls(train=1), replace(FAST, tasks=1), None))
-    generator = torch.Generator().manual_seed(0)
-    int(torch.randint(1, (), generator=generator))  # the object
+    generator = object_generator(0, 0, 0)
     rays_generator = torch.Generator().manual_seed(int(torch.randint(2**31, (), generator=generator)))
     trainer = Trainer(model_of("mv_meta"), Balls(train=1), FAST)
     episode = trainer._prefetcher.get("train0")

@@ -70,13 +70,17 @@ ALL_LAYERS = {"layers": ("all",), "update": "low_rank", "weights_seen": "all"}
 
 
 @pytest.mark.parametrize(
-    ("optimiser", "parts"),
-    [("adam", {"normalisation": "batch"}), ("muon", {"normalisation": "group"}), ("muon", ALL_LAYERS)],
+    ("optimiser", "parts", "changes"),
+    [
+        ("adam", {"normalisation": "batch"}, {"average": 0.5, "clip": 0.05}),
+        ("muon", {"normalisation": "group"}, {"balanced": True}),
+        ("muon", ALL_LAYERS, {}),
+    ],
     ids=str,
 )
-def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, optimiser, parts):
+def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, optimiser, parts, changes):
     shape = HyperNetworkConfig(**{"views": 2, "code": 8, "depth": 2, "width": 16, **parts})
-    config = with_(steps=5, warmup=2, final=0.1, optimiser=optimiser)
+    config = with_(steps=5, warmup=2, final=0.1, optimiser=optimiser, **changes)
     whole = train(small_model(hypernetwork=shape), Balls(), config, tmp_path / "whole")
 
     first = Trainer(small_model(hypernetwork=shape), Balls(), config, tmp_path / "parts")
@@ -90,6 +94,7 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, 
     assert resumed.step == 5
     assert resumed.curve == whole.curve
     assert same(resumed.model.state_dict(), whole.model.state_dict())
+    assert same(resumed.evaluated.state_dict(), whole.evaluated.state_dict())
     for one, other in zip(resumed.optimisers, whole.optimisers, strict=True):
         states = one.state_dict()["state"], other.state_dict()["state"]
         for place in states[0]:
@@ -352,11 +357,12 @@ def test_tensorboard_shows_the_curve_and_the_pictures(tmp_path):
 
 def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, monkeypatch):
     """Killed before each write of the second checkpoint in turn: the first or the second is there, never a mixture."""
-    trainer = Trainer(small_model(), Balls(), FAST, tmp_path)
-    states = {}
+    config = with_(average=0.5)
+    trainer = Trainer(small_model(), Balls(), config, tmp_path)
+    states, averages = {}, {}
     for step in (1, 2):
         trainer.take_step()
-        states[step] = state_of(trainer.model)
+        states[step], averages[step] = state_of(trainer.model), state_of(trainer.evaluated)
         if step == 1:
             trainer.save()
     write, found = files.write_whole, []
@@ -376,10 +382,11 @@ def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, 
             else:
                 trainer.save()
         loaded = HyperPlanes.from_pretrained(tmp_path)
-        assert any(same(loaded.state_dict(), state) for state in states.values())
-        resumed = Trainer(small_model(), Balls(), FAST, tmp_path)
+        assert any(same(loaded.state_dict(), state) for state in averages.values())
+        resumed = Trainer(small_model(), Balls(), config, tmp_path)
         found.append(resumed.step)
         assert same(resumed.model.state_dict(), states[resumed.step])
+        assert same(resumed.evaluated.state_dict(), averages[resumed.step])
         assert {int(o.state_dict()["state"][0]["step"]) for o in resumed.optimisers} == {resumed.step}
     assert found == [1, 1, 1, 1, 2]
     names = {"model.json", "model.safetensors", "training-00000002.safetensors", "training.json"}

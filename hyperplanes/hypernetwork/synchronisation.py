@@ -1,0 +1,86 @@
+"""Statistics over the objects of a step where processes share these objects; alone, a process has them all.
+
+The processes are those of torch.distributed's default group. In training, all of them come here equally often, in the
+same order; in evaluation nothing is exchanged.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, distributed, nn
+
+__all__ = ["BatchNorm2d", "gather_objects", "is_shared", "sum_over_processes"]
+
+
+def is_shared() -> bool:
+    """Whether there are other processes."""
+    return distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1
+
+
+class _Sum(torch.autograd.Function):
+    """The sum over processes; every process's loss counts, so its gradient is the sum of theirs."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        total = value.clone(memory_format=torch.contiguous_format)
+        distributed.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        total = gradient.clone(memory_format=torch.contiguous_format)
+        distributed.all_reduce(total)
+        return total
+
+
+def sum_over_processes(value: Tensor) -> Tensor:
+    """The sum of what each process has, with its gradient."""
+    return _Sum.apply(value)  # pyright: ignore[reportReturnType]
+
+
+def gather_objects(values: Tensor) -> tuple[Tensor, slice]:
+    """The values of the objects of all processes.
+
+    Args:
+        values: (object, ...) of the objects of this process; as many as each other process has.
+
+    Returns:
+        Those of all, process after process, with their gradient, and where this process's own ones are.
+    """
+    if not is_shared():
+        return values, slice(None)
+    rank, count = distributed.get_rank(), len(values)
+    own = slice(rank * count, (rank + 1) * count)
+    padded = values.new_zeros(distributed.get_world_size() * count, *values.shape[1:])
+    padded[own] = values
+    return sum_over_processes(padded), own
+
+
+class BatchNorm2d(nn.BatchNorm2d):
+    """Batch normalisation whose statistics in training are those of the images of all processes.
+
+    torch.nn.SyncBatchNorm computes the same, on GPUs alone.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - torch's name
+        """As torch.nn.BatchNorm2d."""
+        if not self.training or not is_shared():
+            return super().forward(input)
+        axes = (0, 2, 3)
+        count = sum_over_processes(input.new_tensor(float(input.numel() // input.shape[1])))
+        mean = sum_over_processes(input.sum(axes)) / count
+        centred = input - mean[:, None, None]
+        variance = sum_over_processes(centred.square().sum(axes)) / count
+        if self.track_running_stats:
+            assert self.running_mean is not None
+            assert self.running_var is not None
+            assert self.num_batches_tracked is not None
+            assert self.momentum is not None
+            with torch.no_grad():
+                self.num_batches_tracked += 1
+                self.running_mean.lerp_(mean, self.momentum)
+                self.running_var.lerp_(variance * count / (count - 1), self.momentum)
+        scale = torch.rsqrt(variance + self.eps) * self.weight
+        return centred * scale[:, None, None] + self.bias[:, None, None]

@@ -1,0 +1,72 @@
+"""Which objects a step is of, and what everything random about each is drawn from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+
+__all__ = ["draw", "draw_balanced", "episode_object", "object_generator"]
+
+
+def object_generator(seed: int, step: int, place: int) -> torch.Generator:
+    """What the rays and samples of one object of a step are drawn from, whoever else is in the step.
+
+    Args:
+        seed: of the training.
+        step: steps done before.
+        place: of the object in the step.
+    """
+    state = np.random.SeedSequence([seed, step, place]).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(state[0]))
+
+
+def draw(names: Sequence[str], count: int, generator: torch.Generator) -> list[str]:
+    """Objects of a step, different ones while there are enough.
+
+    Args:
+        names: to draw from.
+        count: how many.
+        generator: of the draws.
+    """
+    if count == 1:
+        return [names[int(torch.randint(len(names), (), generator=generator))]]
+    return [names[index] for index in _places(len(names), count, generator)]
+
+
+def draw_balanced(classes: Mapping[str, Sequence[str]], count: int, generator: torch.Generator) -> list[str]:
+    """Objects of a step in which the numbers of objects of any two classes differ by at most one.
+
+    Args:
+        classes: the objects of each.
+        count: how many.
+        generator: of the draws.
+
+    Returns:
+        Names, in an order of classes that is drawn too; different ones while a class has enough.
+    """
+    known = sorted(classes)
+    order = [known[index] for index in _places(len(known), count, generator)]
+    drawn = {name: iter(draw(classes[name], order.count(name), generator)) for name in sorted(set(order))}
+    return [next(drawn[name]) for name in order]
+
+
+def episode_object(classes: Mapping[str, Sequence[str]], number: int, seed: int) -> str:
+    """The object of an episode: classes in turn, and within each all objects once before any comes again.
+
+    Args:
+        classes: the objects of each.
+        number: of the episode, from 0.
+        seed: of the training.
+    """
+    turn, place = divmod(number, len(classes))
+    chosen = sorted(classes)[place]
+    epoch, index = divmod(turn, len(classes[chosen]))
+    order = torch.randperm(len(classes[chosen]), generator=object_generator(seed, epoch, place))
+    return classes[chosen][int(order[index])]
+
+
+def _places(total: int, count: int, generator: torch.Generator) -> list[int]:
+    repeats = -(-count // total)
+    return torch.cat([torch.randperm(total, generator=generator) for _ in range(repeats)])[:count].tolist()
