@@ -145,7 +145,7 @@ def _hidden(
 
 def _pixels_of(
     views: Int[Tensor, " chosen"], support: Views, pixels: Int[Tensor, " pixel"] | None
-) -> Int[Tensor, " pixel"]:
+) -> Int[Tensor, " among"]:
     """Flat indices of the pixels of some views: all of them, or those of `pixels`."""
     area = support.size[0] * support.size[1]
     if pixels is None:

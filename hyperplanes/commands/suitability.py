@@ -34,7 +34,7 @@ def misgivings(model: HyperPlanes, shown: Views) -> list[str]:
             "object; cut the object out (RGBA images, or a folder masks/)"
         )
     planes = model.config.network.planes
-    if len(shown) < planes:
+    if len(shown) < planes and not model.any_order:
         found.append(f"{len(shown)} views are shown and the model was trained with {planes}: some stand for several")
     unlike, angle = _unlikeness(model, shown)
     if unlike is not None and unlike > UNLIKE:
@@ -94,7 +94,7 @@ def left_out_check(model: HyperPlanes, shown: Views) -> tuple[float, float] | No
 
 
 def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
-    """Root mean square of the standardised codes, None without such, and the mean angle between standpoints."""
+    """Root mean square of the standardised codes, None without such, and the mean angle from the training's rig."""
     import torch
 
     from hyperplanes.geometry import cameras as camera
@@ -104,11 +104,13 @@ def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
         views = model.prepare(shown, carved=False).views
         centre = model.rig.new_tensor(views.bounds.centre)
         standing = torch.nn.functional.normalize(camera.centres(views.cameras).to(centre) - centre, dim=-1)
-        angle = float(torch.rad2deg(torch.acos((standing * model.rig).sum(-1).clamp(-1, 1))).mean())
+        angle = 0.0
+        if not model.any_order:
+            angle = float(torch.rad2deg(torch.acos((standing * model.rig).sum(-1).clamp(-1, 1))).mean())
         network = model.hypernetwork
         if network is None or not isinstance(network.code_normalisation, RunningStandardisation):
             return None, angle
-        chosen = model.hyperplanes()
+        chosen = model.hyperplanes(views)
         directions = camera.viewing_directions(views.cameras)[chosen]
         codes = network.encode(views.images[chosen][None], directions[None])
     return float(codes.square().mean().sqrt()), angle

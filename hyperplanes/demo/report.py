@@ -58,7 +58,7 @@ def write_report(
         chosen = sorted({len(truth) // 4, 3 * len(truth) // 4})
         looks = [Look(truth[i], _predictions(folder, settings, name, task.query.names[i])) for i in chosen]
         quality = {method: metrics[method]["objects"][name]["psnr"] for method in settings.methods}
-        read = model.hyperplanes().tolist()
+        read = model.hyperplanes(support).tolist()
         exhibits.append(
             Exhibit(name, to_pixels(support.images), read, looks, quality, encode_animation(frames, "webp"))
         )

@@ -85,4 +85,4 @@ def test_a_balanced_training_draws_by_class():
 
     trainer = Trainer(small_model(), Kinds(5), TrainingConfig(tasks=2, balanced=True))
     for step in range(20):
-        assert sum(name == "train0" for name in trainer._drawn(trainer._generator(step))) == 1
+        assert sum(name == "train0" for name in trainer._drawn(step, trainer._generator(step))) == 1

@@ -119,7 +119,7 @@ def test_reference_objects_take_what_objects_share_out_of_the_gradient_of_their_
 
 def test_only_the_objects_of_a_step_are_rendered():
     trainer = Trainer(small_model(), Balls(), with_(tasks=1, reference_objects=2))
-    drawn = trainer._drawn(trainer._generator(0))
+    drawn = trainer._drawn(0, trainer._generator(0))
     assert len(set(drawn)) == len(drawn) == 3
     for name in drawn[1:]:
         trainer._prefetcher.get(name).query.images.fill_(float("nan"))

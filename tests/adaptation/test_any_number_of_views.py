@@ -1,0 +1,130 @@
+"""Source of truth: what must not matter (order, what else is in a batch), and views that a step may not be shown."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.fine_tuning import FineTuning, minimise
+from hyperplanes.fields import TargetConfig
+from hyperplanes.geometry.cameras import centres
+from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
+from hyperplanes.metrics import psnr
+from hyperplanes.rendering import Marched
+from hyperplanes.rendering.compositing import Rendered
+from tests.reference_rendering import awaken, ball_views, ring
+
+SHAPE = HyperNetworkConfig(
+    views=3, normalisation="group", code=8, depth=2, width=16, join="mean", layers=("all",), update="low_rank", rank=1
+)
+NETWORK = TargetConfig(depth=2, width=16, planes=4, blended=2, point_octaves=2, direction_octaves=1)
+CONFIG = ModelConfig("any_order", NETWORK, SHAPE, sampling=Marched(24), hull_side=16)
+
+
+def model(**changes):
+    return awaken(HyperPlanes(replace(CONFIG, **changes))).eval()
+
+
+def views(count, colour=(0.8, 0.2, 0.1)):
+    return ball_views(ring(count), colour=colour)
+
+
+def picture(adapter, support):
+    return adapter.adapt(support).render(ring(2, (10, 13), shift=1)).images
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+def test_any_number_of_views_in_any_order_makes_the_same_picture(count):
+    adapter, support = model(), views(count)
+    expected = picture(adapter, support)
+    assert expected.isfinite().all()
+    for seed in range(2):
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+        torch.testing.assert_close(picture(adapter, support[order]), expected, atol=1e-5, rtol=1e-4)
+
+
+def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch():
+    """Objects of 1, 2 and 5 views, of which the hypernetwork reads at most 3, and of two picture sizes."""
+    adapter = model(hypernetwork=replace(SHAPE, resolution=16))
+    supports = [views(1), views(2, (0.1, 0.9, 0.3)), ball_views(ring(5, (20, 24)), colour=(0.2, 0.3, 0.9))]
+    with torch.no_grad():
+        prepared = [adapter.prepare(each) for each in supports]
+        together = adapter.updates(prepared)
+        for one, each in zip(together, prepared, strict=True):
+            for name, value in adapter.update(each).items():
+                torch.testing.assert_close(one[name], value, atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(together[0]["fine.density.weight"], together[1]["fine.density.weight"])
+
+
+def test_the_hypernetwork_reads_the_views_that_stand_farthest_apart():
+    chosen = views(8)[model().hyperplanes(views(8))]
+    standing = torch.nn.functional.normalize(centres(chosen.cameras), dim=1)
+    assert len(chosen) == 3
+    assert (standing @ standing.T).fill_diagonal_(-1).max() < 0.2  # three of eight, more than 78 degrees apart
+
+
+def test_a_saved_model_is_loaded_again(tmp_path):
+    before = model()
+    before.save(tmp_path)
+    assert torch.equal(picture(HyperPlanes.from_pretrained(tmp_path), views(3)), picture(before, views(3)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"hypernetwork": replace(SHAPE, join="concatenate")}, "'concatenate'"),
+        ({"hypernetwork": None, "autoencoder": AutoencoderConfig(views=2)}, "an autoencoder"),
+    ],
+)
+def test_what_needs_a_fixed_number_of_views_is_refused(changes, found):
+    with pytest.raises(ValueError, match=f"join 'mean'.*{found}"):
+        HyperPlanes(replace(CONFIG, **changes))
+
+
+class Recorder:
+    """A field of one variable that notes what it was not shown, and where rays come from."""
+
+    def __init__(self, support):
+        self.value = torch.zeros(3, requires_grad=True)
+        self.eyes, self.notes = centres(support.cameras), []
+
+    def __call__(self, hidden):
+        def trace(rays, generator=None):
+            sources = torch.cdist(rays.origins, self.eyes).argmin(1)
+            self.notes.append((None if hidden is None else set(hidden.tolist()), set(sources.tolist())))
+            return Rendered(torch.sigmoid(self.value).expand(len(rays), 3), torch.ones(len(rays)), rays.far, len(rays))
+
+        field = AdaptedField(lambda points, directions: (points, points[:, 0]), None, Marched())
+        object.__setattr__(field, "trace", trace)
+        return field
+
+
+@pytest.mark.parametrize("among", [False, True])
+def test_rays_come_from_hidden_views_only(among):
+    support = views(12)
+    pixels = (support.masks[:, 0] > 0).flatten().nonzero()[:, 0] if among else None
+    recorder = Recorder(support)
+    settings = FineTuning(rays=64, left_out=4)
+    assert list(minimise(recorder, [recorder.value], support, 8, settings, pixels=pixels, hiding=True))[-1] == 8
+    assert all(sources <= hidden and len(hidden) == 3 for hidden, sources in recorder.notes)
+    assert len(set.union(*(hidden for hidden, _ in recorder.notes))) > 6  # others in every step
+
+
+@pytest.mark.parametrize(("count", "settings"), [(2, FineTuning()), (12, FineTuning(hide=False))])
+def test_too_few_views_and_who_does_not_want_it_hide_none(count, settings):
+    recorder = Recorder(views(count))
+    list(minimise(recorder, [recorder.value], views(count), 3, settings, hiding=True))
+    assert [hidden for hidden, _ in recorder.notes] == [None] * 3
+
+
+def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is():
+    adapter, support, query = model(), views(8), ball_views(ring(3, shift=1))
+    before = {name: value.clone() for name, value in adapter.state_dict().items()}
+
+    def quality(field):
+        return float(psnr(field.render(query.cameras).images, query.images).mean())
+
+    assert quality(adapter.fine_tune(support, 30)) > quality(adapter.adapt(support)) + 1
+    assert all(torch.equal(value, before[name]) for name, value in adapter.state_dict().items())

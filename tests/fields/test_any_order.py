@@ -1,0 +1,144 @@
+"""Source of truth: what must not matter (the order of views, views that see nothing), and the visual hull of a ball."""
+
+import pytest
+import torch
+
+from hyperplanes.fields import AnyOrderNeRF, TargetConfig
+from hyperplanes.geometry import carve
+from hyperplanes.geometry.cameras import camera_from_world
+from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.metrics import psnr
+from hyperplanes.parameters import Parameters
+from hyperplanes.rendering import Marched, render
+from hyperplanes.views import Views, join_views
+from tests.reference_rendering import ball_views, camera_at, ring
+
+SMALL = TargetConfig(depth=3, width=16, planes=4, blended=2, point_octaves=2, direction_octaves=1)
+SIZE = (24, 24)
+
+
+def network(seed=0, config=SMALL):
+    torch.manual_seed(seed)
+    return AnyOrderNeRF(config)
+
+
+def coloured(count):
+    """Views of a ball with a pattern on every picture, so that no two views show the same colour."""
+    views = ball_views(ring(count, SIZE))
+    noise = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(3))
+    return Views(torch.where(views.masks > 0, 0.5 * views.images + 0.5 * noise, 1.0), views.cameras, views.masks)
+
+
+def bound(target, views, parameters=None, occupancy=None):
+    occupancy = occupancy or carve(views.masks, views.cameras, views.bounds, 32)
+    return target.bind(parameters or Parameters.of(target), target.planes_of(views, occupancy))
+
+
+def queries(count=200, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(count, 3, generator=generator) - 0.5
+    return points, torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+
+
+@torch.no_grad()
+def test_the_order_of_the_views_does_not_matter():
+    target, views, (points, directions) = network(), coloured(7), queries()
+    expected = bound(target, views)(points, directions)
+    for seed in range(3):
+        order = torch.randperm(7, generator=torch.Generator().manual_seed(seed))
+        for one, other in zip(bound(target, views[order])(points, directions), expected, strict=True):
+            torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 9])
+def test_any_number_of_views_makes_a_field(count):
+    colour, density = bound(network(), coloured(count))(*queries())
+    assert ((colour >= 0) & (colour <= 1)).all()
+    assert (density >= 0).all()
+    assert density.isfinite().all()
+
+
+@torch.no_grad()
+def test_a_view_that_sees_nothing_changes_nothing():
+    target, views, (points, directions) = network(), coloured(3), queries()
+    away = camera_at((0.0, 0.0, 3.0), SIZE, target=(0.0, 0.0, 9.0))
+    blind = Views(torch.rand(1, 3, *SIZE), away, torch.zeros(1, 1, *SIZE))
+    occupancy = carve(views.masks, views.cameras, views.bounds, 32)
+    expected = bound(target, views, occupancy=occupancy)(points, directions)
+    found = bound(target, join_views(views, blind), occupancy=occupancy)(points, directions)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_a_hidden_view_is_as_good_as_absent():
+    target, views, (points, directions) = network(), coloured(5), queries()
+    occupancy = carve(views.masks, views.cameras, views.bounds, 32)
+    hidden = target.planes_of(views, occupancy).hiding(torch.tensor([1, 4]))
+    expected = bound(target, views[[0, 2, 3]], occupancy=occupancy)(points, directions)
+    found = target.bind(Parameters.of(target), hidden)(points, directions)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_turning_and_moving_the_world_changes_only_what_reads_world_coordinates():
+    """Points and viewing directions are inputs; depths, coverage, angles and colours are not of any world."""
+    config = TargetConfig(depth=2, width=16, planes=4, blended=2, point_octaves=0, direction_octaves=0)
+    target, views, (points, directions) = network(config=config), coloured(5), queries()
+    parameters = Parameters({name: value.clone() for name, value in Parameters.of(target).items()})
+    for index in range(2):
+        first = parameters[f"layers.{index}.weight"]
+        first[:, :3] = 0  # the point
+        for slot in range(4):
+            first[:, 3 + 9 * slot + 6 : 3 + 9 * slot + 9] = 0  # directions of the views
+    parameters["view.weight"][:, 16:19] = 0  # the viewing direction
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0))).Q
+    turn = turn * torch.sign(torch.linalg.det(turn))
+    occupancy = carve(views.masks, views.cameras, views.bounds, 32)
+    pose = camera_from_world(views.cameras).clone()
+    pose[:, :3, :3] = pose[:, :3, :3] @ turn.T
+    cameras = type(views.cameras)(views.cameras.intrinsics, pose, views.cameras.height, views.cameras.width)
+    shown = target.planes_of(views, occupancy)
+    moved = VisibilityPlanes(views.images, cameras, views.masks, occupancy)
+    moved.guides = shown.guides  # the hull is turned with the world: depths are the same
+    expected = target.bind(parameters, shown)(points, directions)
+    found = target.bind(parameters, moved)(points @ turn.T, directions @ turn.T)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
+
+
+@torch.no_grad()
+def test_its_first_weights_are_the_visual_hull_in_the_colours_of_the_views():
+    views, query = ball_views(ring(12, (48, 48))), ball_views(ring(3, (48, 48), shift=1))
+    occupancy = carve(views.masks, views.cameras, views.bounds, 64)
+    target = network(config=TargetConfig(depth=3, width=32, planes=4))
+    field = bound(target, views, occupancy=occupancy)
+    pictures = render(field, query.cameras, Marched(128), occupancy=occupancy)
+    assert psnr(pictures.images, query.images).min() > 25  # measured: 26.2 and more
+    assert (pictures.opacity - query.masks).abs().mean() < 0.02
+    inside, outside = field.density(torch.tensor([[0.0, 0.0, 0.0], [0.62, 0.0, 0.0]]))
+    assert outside < 0.1 * inside
+
+
+def test_density_does_not_depend_on_the_direction_and_colour_does():
+    field, (points, directions) = bound(network(), coloured(5)), queries()
+    one, other = field(points, directions), field(points, -directions)
+    assert torch.equal(one[1], other[1])
+    torch.testing.assert_close(one[1], field.density(points))
+    assert not torch.allclose(one[0], other[0], atol=1e-3)
+
+
+def test_every_parameter_has_a_gradient():
+    target = network()
+    colour, density = bound(target, coloured(5))(*queries())
+    ((colour - 0.3).square().sum() + density.log1p().sum()).backward()
+    for name, value in target.named_parameters():
+        assert value.grad is not None, name
+        assert value.grad.abs().sum() > 0, name
+
+
+def test_no_view_at_all_is_refused():
+    with pytest.raises(ValueError, match="at least one view"):
+        network().bind(Parameters(), None)

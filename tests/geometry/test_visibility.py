@@ -1,0 +1,140 @@
+"""Source of truth: a ball, whose depth is known in closed form, and loops over points, views and steps."""
+
+import math
+
+import pytest
+import torch
+
+from hyperplanes.geometry import Sphere, carve, cast
+from hyperplanes.geometry import visibility as module
+from hyperplanes.geometry.cameras import centres, projection_matrices
+from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.rays import pixel_grid
+from hyperplanes.geometry.visibility import ANGLE, DEEPEST, PARTLY, UNSEEN, WHOLE, VisibilityPlanes, first_hits
+from tests.reference_rendering import ball_views, camera_at, ring
+
+SIZE = (20, 24)
+
+
+def ball(radius=0.5, side=64):
+    """A grid of the voxels whose centres lie in a ball about the origin."""
+    whole = full(Sphere(), side)
+    inside = whole.centres().norm(dim=1) < radius
+    return Occupancy(inside.reshape(side, side, side), Sphere())
+
+
+def planes(count=5):
+    views = ball_views(ring(count, SIZE))
+    return VisibilityPlanes(views.images, views.cameras, views.masks, carve(views.masks, views.cameras, Sphere(), 32))
+
+
+def queries(count, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    points = (torch.rand(count, 3, generator=generator) - 0.5) * 2.4  # some of them outside the pictures
+    return points, torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+
+
+def both_ways(monkeypatch, compute):
+    """What the kernels and plain PyTorch compute."""
+    compiled = compute()
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    return compiled, compute()
+
+
+def test_the_depth_of_a_ball_is_that_of_its_sphere():
+    cameras = ring(3, SIZE)
+    found = first_hits(ball(), cameras)
+    pixels = pixel_grid(*SIZE)
+    for view in range(3):
+        rays = cast(cameras, torch.full((len(pixels),), view), pixels, Sphere(radius=0.5))
+        hit = (rays.far - rays.near) > 0.2  # not where a ray only grazes it
+        error = found[view].flatten()[hit] - rays.near[hit]
+        assert error.abs().max() < 2 / 64 + 1 / 128  # a voxel, and half a step
+
+
+def test_rays_without_a_voxel_end_at_the_far_side_of_the_sphere_and_masked_ones_are_not_followed():
+    cameras = camera_at((0.0, 0.0, 3.0), SIZE)
+    empty = Occupancy(torch.zeros(8, 8, 8, dtype=torch.bool), Sphere())
+    rays = cast(cameras, torch.zeros(SIZE[0] * SIZE[1], dtype=torch.long), pixel_grid(*SIZE))
+    torch.testing.assert_close(first_hits(empty, cameras)[0].flatten(), rays.far)
+    masked = first_hits(ball(), cameras, torch.zeros(1, 1, *SIZE))
+    torch.testing.assert_close(masked, torch.full((1, *SIZE), 4.0))
+
+
+def test_kernel_and_plain_pytorch_find_the_same_depth(monkeypatch):
+    compiled, plain = both_ways(monkeypatch, lambda: first_hits(ball(side=16), ring(4, SIZE)))
+    assert (compiled - plain).abs().gt(1e-5).float().mean() < 1e-3  # samples on the side of a voxel may fall either way
+
+
+def slow_penalties(shown, points, hidden=()):
+    """Direction, depth, coverage and penalty of every view at every point, one after the other."""
+    matrices, eyes = projection_matrices(shown.colours.cameras), centres(shown.colours.cameras)
+    height, width = SIZE
+    rows = []
+    for point in points:
+        for view in range(len(shown)):
+            offset = point - eyes[view]
+            direction, distance = offset / offset.norm(), float(offset.norm())
+            u, v, w = (matrices[view] @ torch.cat([point, torch.ones(1)])).tolist()
+            inside = w > 1e-3 and -0.01 <= u / w <= width - 0.99 and -0.01 <= v / w <= height - 0.99
+            if not inside or view in hidden:
+                rows.append([*direction.tolist(), 0.0, 1.0, UNSEEN])
+                continue
+            u, v = min(max(u / w, 0), width - 1), min(max(v / w, 0), height - 1)
+            column, row = min(int(u), width - 2), min(int(v), height - 2)
+            corners = shown.guides[view, row : row + 2, column : column + 2]
+            top = corners[0, 0] * (1 - u + column) + corners[0, 1] * (u - column)
+            low = corners[1, 0] * (1 - u + column) + corners[1, 1] * (u - column)
+            depth, opacity = (top * (1 - v + row) + low * (v - row)).tolist()
+            behind = distance - depth
+            penalty = min(max(behind - shown.tolerance, -DEEPEST), DEEPEST) + (PARTLY if opacity < WHOLE else 0)
+            rows.append([*direction.tolist(), behind, opacity, penalty])
+    return torch.tensor(rows).reshape(len(points), len(shown), 6)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_chosen_views_are_those_of_the_definition(monkeypatch, compiled):
+    shown, (points, directions) = planes().hiding(torch.tensor([2])), queries(60)
+    if not compiled:
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    found = shown.choose(points, directions, best=3, nearest=2)
+    every = slow_penalties(shown, points, hidden=(2,))
+    angle = torch.acos((every[..., :3] * directions[:, None]).sum(-1).clamp(-1, 1))
+    score = angle + ANGLE * every[..., 5].clamp_min(0)
+    for chosen, order in ((found.best, every[..., 5]), (found.nearest, score)):
+        values = torch.cat([chosen.directions, torch.stack([chosen.behind, chosen.coverage, chosen.penalty], -1)], -1)
+        torch.testing.assert_close(
+            values, every.gather(1, chosen.views[..., None].expand(-1, -1, 6)), atol=2e-5, rtol=0
+        )
+        assert all(len(set(row)) == 3 for row in chosen.views.tolist())  # of two and the next one, or of three
+        least = order.sort(1).values[:, :3]
+        torch.testing.assert_close(order.gather(1, chosen.views), least, atol=1e-4, rtol=0)
+    unseen = every[..., 5] == UNSEEN
+    assert unseen[:, 2].all()
+    assert 0.2 < unseen.float().mean() < 0.8  # of both kinds
+    torch.testing.assert_close(found.coverage, every[..., 4].amin(1), atol=1e-5, rtol=0)
+    assert torch.equal(found.number, (~unseen).sum(1).float())
+    assert torch.equal(found.best.valid, ~unseen.gather(1, found.best.views))
+
+
+def test_a_point_on_a_ball_is_seen_from_its_side_and_lies_behind_it_from_the_other():
+    views = ball_views(ring(12, (64, 64)))
+    shown = VisibilityPlanes(views.images, views.cameras, views.masks, ball())
+    normal = torch.nn.functional.normalize(centres(views.cameras)[4] + 0.1, dim=0)
+    found = shown.choose(0.48 * normal[None], best=12).best
+    facing = (centres(views.cameras)[found.views[0]] / 3) @ normal
+    for behind, cosine in zip(found.behind[0].tolist(), facing.tolist(), strict=True):
+        if cosine > 0.5:
+            assert abs(behind) < 0.1
+        if cosine < -0.5:
+            assert behind == pytest.approx(2 * 0.48 * -cosine, abs=0.15)
+    assert facing[0] > 0.3  # the best view stands on the point's side
+    assert found.penalty[0].tolist() == sorted(found.penalty[0].tolist())
+
+
+def test_without_masks_every_picture_counts_as_opaque():
+    views = ball_views(ring(3, SIZE), masks=False)
+    shown = VisibilityPlanes(views.images, views.cameras, None, full(Sphere(), 4))
+    found = shown.choose(torch.zeros(1, 3), best=3)
+    assert torch.equal(found.coverage, torch.ones(1))
+    assert math.isclose(float(found.best.behind[0, 0]), 1.0, abs_tol=0.02)  # the centre lies a radius inside the sphere

@@ -1,0 +1,110 @@
+"""Trainings on random numbers of random views. Source of truth: counts, and pictures whose truth is known."""
+
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.fields import TargetConfig
+from hyperplanes.geometry.cameras import centres
+from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.rendering import Marched
+from hyperplanes.training import Trainer, TrainingConfig
+from hyperplanes.training.drawing import episode_object
+from hyperplanes.training.episodes import QUERIES, prepare_subset
+from hyperplanes.views import Task, Views
+from tests.reference_rendering import Balls, ball_views, ring, small_model
+
+MODEL = ModelConfig(
+    "any_order",
+    TargetConfig(depth=2, width=16, planes=4, blended=2, point_octaves=2, direction_octaves=1),
+    HyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16, join="mean"),
+    sampling=Marched(24),
+    hull_side=16,
+)
+TRAINING = TrainingConfig(
+    steps=6, tasks=2, rays=32, views=(1, 3), episodes=4, random_background=True, learning_rate=1e-3, held_out=0,
+    checkpoint_every=3,
+)  # fmt: skip
+
+
+def test_an_episode_shows_some_views_and_asks_for_others():
+    model, task = HyperPlanes(MODEL), Balls(views=6).task("train0")
+    known, shown = torch.cat([centres(task.support.cameras), centres(task.query.cameras)]), Counter()
+    for seed in range(60):
+        episode = prepare_subset(model, task, (1, 3, 5), torch.Generator().manual_seed(seed))
+        sources = [
+            torch.cdist(centres(part.cameras), known).argmin(1) for part in (episode.prepared.views, episode.query)
+        ]
+        assert not set(sources[0].tolist()) & set(sources[1].tolist())
+        assert len(episode.query) == min(QUERIES, 12 - len(sources[0]))
+        shown.update([len(sources[0])])
+    assert set(shown) == {1, 3, 5}
+    assert min(shown.values()) > 10
+    last = prepare_subset(model, task, (50,), torch.Generator().manual_seed(0))
+    assert (len(last.prepared.views), len(last.query)) == (11, 1)  # one is left to learn from
+
+
+def test_every_object_comes_once_in_a_round_and_classes_come_in_turn():
+    classes = {"car": ["a", "b", "c"], "chair": ["d"]}
+    drawn = [episode_object(classes, number, 0) for number in range(12)]
+    assert drawn[1::2] == ["d"] * 6
+    assert sorted(drawn[0:6:2]) == sorted(drawn[6:12:2]) == ["a", "b", "c"]
+
+
+def test_a_step_draws_of_the_episodes_at_hand_and_each_is_drawn_several_times():
+    trainer = Trainer(HyperPlanes(MODEL), Balls(train=5), replace(TRAINING, tasks=3, episodes=6))
+    numbers = Counter()
+    for step in range(200):
+        drawn = [int(name.partition("#")[2]) for name in trainer._drawn(step, trainer._generator(step))]
+        assert len(set(drawn)) == 3
+        assert all(step <= number < step + 6 for number in drawn)
+        numbers.update(drawn)
+    assert sum(numbers[number] for number in range(6, 200)) / 194 == pytest.approx(3, abs=0.1)  # as many as tasks
+
+
+def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):
+    whole = Trainer(HyperPlanes(MODEL), Balls(), TRAINING)
+    list(whole.run())
+    first = Trainer(HyperPlanes(MODEL), Balls(), TRAINING, tmp_path)
+    for _ in range(3):
+        first.take_step()
+    first.save()
+    second = Trainer(HyperPlanes(MODEL), Balls(), TRAINING, tmp_path)
+    assert second.step == 3
+    list(second.run())
+    for name, value in whole.model.state_dict().items():
+        assert torch.equal(value, second.model.state_dict()[name]), name
+
+
+class White(Balls):
+    """White balls over white: pictures of nothing, but for the masks."""
+
+    def task(self, name):
+        views = ball_views(ring(8))
+        white = Views(torch.ones_like(views.images), views.cameras, views.masks, views.bounds)
+        return Task(white[:4], white[4:], name)
+
+
+@pytest.mark.parametrize("random", [True, False])
+def test_only_random_backgrounds_tell_a_white_surface_from_none(random):
+    model = HyperPlanes(replace(MODEL, hypernetwork=None))
+    with torch.no_grad():
+        model.networks["fine"].density.bias.fill_(-50.0)  # empty everywhere
+    loss = Trainer(model, White(), replace(TRAINING, random_background=random)).take_step()
+    assert loss > 0.02 if random else loss == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("model", "training", "message"),
+    [
+        (small_model, TRAINING, "any_order"),
+        (lambda: HyperPlanes(MODEL), replace(TRAINING, views=(0, 3)), "at least 1"),
+        (lambda: small_model(coarse_network=True), replace(TRAINING, views=()), "coarse"),
+    ],
+)
+def test_settings_that_do_not_fit_the_model_are_refused(model, training, message):
+    with pytest.raises(ValueError, match=message):
+        Trainer(model(), Balls(), training)
