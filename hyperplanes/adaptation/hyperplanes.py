@@ -24,6 +24,7 @@ from hyperplanes.files import write_json
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.hypernetwork import Autoencoder, HyperNetwork
 from hyperplanes.parameters import Parameters
@@ -182,7 +183,7 @@ class HyperPlanes(nn.Module):
             first = int((standing @ standing.mean(0)).argmin())
         else:
             standing, first = self._known_rig(), 0
-        return torch.tensor(_farthest(standing, first, count), device=self.rig.device)
+        return torch.tensor(farthest_first(standing, first, count), device=self.rig.device)
 
     def _known_rig(self) -> Float[Tensor, "plane 3"]:
         """The rig on the CPU, where views are matched to it."""
@@ -386,16 +387,6 @@ def _in_use(module: nn.Module) -> Generator[None]:
 def _resized(images: Float[Tensor, "view 3 height width"], size: tuple[int, int]) -> Tensor:
     """Images of that size, by the mean of the pixels that one covers where there are more."""
     return images if images.shape[2:] == size else torch.nn.functional.interpolate(images, size, mode="area")
-
-
-def _farthest(points: Float[Tensor, "point 3"], first: int, count: int) -> list[int]:
-    """Indices of unit vectors: the first, and after it always the one farthest from those before."""
-    chosen = [first]
-    nearest = points @ points[first]
-    while len(chosen) < count:
-        chosen.append(int(nearest.argmin()))
-        nearest = torch.maximum(nearest, points @ points[chosen[-1]])
-    return chosen[:count]
 
 
 def _standpoints(views: Views) -> Float[Tensor, "view 3"]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hyperplanes.axes import flip_camera_axes
 
-__all__ = ["fibonacci_sphere", "look_at", "opencv_from_opengl", "opengl_from_opencv", "orbit"]
+__all__ = ["farthest_first", "fibonacci_sphere", "look_at", "opencv_from_opengl", "opengl_from_opencv", "orbit"]
 
 
 def opencv_from_opengl(world_from_camera: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
@@ -96,3 +96,25 @@ def fibonacci_sphere(views: int, distance: float, lowest: float = -1.0, highest:
     azimuth = torch.arange(views) * (math.pi * (3 - math.sqrt(5)))
     flat = (1 - height**2).clamp_min(0).sqrt()
     return look_at(distance * torch.stack([flat * azimuth.sin(), height, flat * azimuth.cos()], -1))
+
+
+def farthest_first(directions: Float[Tensor, "direction 3"], first: int, count: int) -> list[int]:
+    """Directions as far apart as they can be, one after the other (Gonzalez 1985).
+
+    >>> farthest_first(torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]), 0, 2)
+    [0, 2]
+
+    Args:
+        directions: unit vectors.
+        first: index of the one to begin with.
+        count: how many, at most all.
+
+    Returns:
+        Indices: the first, and after it always the one of the largest angle to the nearest of those before.
+    """
+    chosen = [first]
+    nearest = directions @ directions[first]
+    while len(chosen) < count:
+        chosen.append(int(nearest.argmin()))
+        nearest = torch.maximum(nearest, directions @ directions[chosen[-1]])
+    return chosen[:count]

@@ -1,0 +1,139 @@
+"""PSNR over the number of support views: a model that takes any number of them, beside what learns nothing.
+
+    python -m benchmarks views --checkpoint small --data data/cars data/chairs --json FILE
+
+Of every held-out object some query views are kept back to be judged by; of all others, support and query alike, so many
+are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
+(where there are masks); the same field from random weights; the model without its hypernetwork, with the update of
+another object of the data set, and with its own; and fine-tuned.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from benchmarks.reporting import Row, finish
+from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
+from hyperplanes.adaptation.base import AdaptedField, Adapter
+from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.pretrained import load_model
+from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.data import open_dataset
+from hyperplanes.evaluation import evaluate
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.views import Task, Tasks, Views, join_views
+
+QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_seconds")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Tasks of which so many views are shown, and others are asked for.
+
+    Attributes:
+        data: where the tasks come from.
+        count: views that are shown, at most all but the others.
+        query: how many of the query views are kept back, evenly chosen.
+    """
+
+    data: Tasks
+    count: int
+    query: int
+
+    def names(self, split: str) -> list[str]:
+        """The objects of a split."""
+        return list(self.data.names(split))
+
+    def task(self, name: str) -> Task:
+        """One object."""
+        task = self.data.task(name)
+        asked = torch.linspace(0, len(task.query) - 1, min(self.query, len(task.query))).round().long()
+        rest = [index for index in range(len(task.query)) if index not in asked.tolist()]
+        views = join_views(task.support, task.query[rest])
+        centre = torch.tensor(views.bounds.centre)
+        standing = torch.nn.functional.normalize(camera.centres(views.cameras) - centre, dim=-1)
+        chosen = farthest_first(standing, 0, min(self.count, len(views)))
+        return replace(task, support=views[torch.tensor(chosen)], query=task.query[asked])
+
+
+def main(arguments: list[str]) -> int:
+    """Measure, print, and write the rows where asked.
+
+    Args:
+        arguments: see --help.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks views", description=__doc__)
+    parser.add_argument("--checkpoint", default="small", help="a folder, or the name of a packaged model")
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets, or single scenes")
+    parser.add_argument("--counts", type=int, nargs="+", default=[1, 3, 5, 10, 25], help="numbers of support views")
+    parser.add_argument("--steps", type=int, nargs="*", default=[], help="of fine-tuning, and of the same field "
+                        "from random weights")  # fmt: skip
+    parser.add_argument("--objects", type=int, default=3, help="of each data set")
+    parser.add_argument("--query", type=int, default=3, help="views of each object to be judged by")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="beside the model itself")
+    parser.add_argument("--quick", action="store_true", help="one count and object: to see that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    chosen = parser.parse_args(arguments)
+    if chosen.quick:
+        chosen.counts, chosen.objects, chosen.query = [3], 2, 1
+    model, rows = load_model(Path(chosen.checkpoint)), []
+    for path in chosen.data:
+        data = open_dataset(path)
+        names = sorted(data.names("test"))[: chosen.objects]
+        for count in chosen.counts:
+            shown = Shown(data, count, chosen.query)
+            for method, adapter in adapters(model, shown, names, chosen.methods, chosen.steps).items():
+                row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
+                score = evaluate(method, adapter, shown, names)
+                row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
+                row["worst"] = min(each.psnr for each in score.objects)
+                rows.append(row)
+                print(rows[-1], flush=True)
+    return finish("views", rows, chosen.json)
+
+
+def adapters(
+    model: HyperPlanes, shown: Shown, names: list[str], wanted: list[str], steps: list[int]
+) -> Mapping[str, Adapter]:
+    """The rows by name."""
+    found: dict[str, Adapter] = {}
+    for name in wanted:
+        needs_others = name == "swapped" and (model.hypernetwork is None or len(names) < 2)
+        if not (needs_others or (name == "hull_blend" and shown.task(names[0]).support.masks is None)):
+            found[name] = METHODS[name](model, shown, names)
+    found["one_step"] = model
+    for each in steps:
+        found[f"{each}_steps"] = FineTuned(model, each)
+        found[f"scratch_{each}"] = FromScratch(model, each)
+    return found
+
+
+@dataclass(frozen=True)
+class _WithoutUpdate:
+    """A model whose field is that of theta alone."""
+
+    model: HyperPlanes
+
+    def adapt(self, support: Views) -> AdaptedField:
+        """The field of theta."""
+        with torch.no_grad():
+            return self.model.eval().field(self.model.prepare(support), self.model.theta)
+
+
+def _swapped(model: HyperPlanes, shown: Shown, names: list[str]) -> Adapter:
+    return Swapped(model, [shown.task(name).support for name in names])
+
+
+METHODS = {
+    "nearest_view": lambda *_: NearestView(),
+    "hull_blend": lambda *_: HullBlend(),
+    "random_weights": lambda model, *_: FromScratch(model, 0),
+    "theta": lambda model, *_: _WithoutUpdate(model),
+    "swapped": _swapped,
+}
