@@ -37,8 +37,8 @@ from hyperplanes.commands.options import (
     optional,
 )
 from hyperplanes.commands.writing import writes_to
-from hyperplanes.utilities.errors import Terminated
 from hyperplanes.utilities.formatting import format_duration, format_rate
+from hyperplanes.utilities.interrupts import Terminated
 
 if TYPE_CHECKING:
     from hyperplanes.presets import Preset
@@ -161,7 +161,7 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
                         "object; see docs/hypernetwork.md for options that prevent it"
                     )
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
-    if trainer.stopping and trainer.step < trainer.config.steps:
+    if trainer.stopping:
         advice = f"step {trainer.step} is saved, the same command goes on from there"
         if Terminated in heard:
             raise Terminated(advice)
