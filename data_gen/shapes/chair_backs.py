@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from data_gen.shapes.chair_frame import ChairFrame, Palette
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pair, pick
 from data_gen.shapes.primitives import box, cushion, panel, post, rod, tube
 
 __all__ = ["BACKS", "arms", "back"]
@@ -20,8 +20,8 @@ def _posts(frame: ChairFrame, palette: Palette, size: float, top: float = 1.0) -
     """The two uprights that carry a back."""
     x = frame.width / 2 - size / 2 - 0.012
     foot, head = frame.at_back(x, -_SINK / frame.back), frame.at_back(x, top)
-    left = Part.of("left_back_post", post(foot, head, size, 0.8 * size, 4 if palette.wooden else 8), palette.frame)
-    return [left, left.mirrored()]
+    upright = post(foot, head, size, 0.8 * size, palette.sides)
+    return pair(Part.of("left_back_post", upright, palette.frame))
 
 
 def _rail(frame: ChairFrame, palette: Palette, share: float, height: float, bow: float, name: str) -> Part:
@@ -157,9 +157,7 @@ def back(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[
     """Draw a back that suits the chair's kind, and build it; nothing for a stool."""
     if frame.back == 0:
         return []
-    choices = _CHOICES[frame.kind]
-    weights = np.array(list(choices.values()))
-    return BACKS[list(choices)[int(rng.choice(len(choices), p=weights / weights.sum()))]](rng, frame, palette)
+    return BACKS[pick(rng, _CHOICES[frame.kind])](rng, frame, palette)
 
 
 def arms(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
@@ -177,22 +175,15 @@ def arms(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[
         stand = Part.of("left_arm_stand", tube(path, 0.05, 0.02, sides=4), palette.metal)
         rest = box(0.07, 0.03, 0.6 * frame.depth, 0.02).moved(out + 0.015, high, 0.0)
         left = Part.of("left_arm", rest, palette.metal if rng.random() < 0.3 else palette.frame)
-        return [stand, stand.mirrored(), left, left.mirrored()]
+        return [*pair(stand), *pair(left)]
     else:
         lean = (high - frame.seat) * np.tan(np.radians(frame.lean))
         rest = box(0.055, 0.026, front - rear + 0.06 + lean, 0.012).moved(
             x - 0.012, high, (front + rear - lean) / 2 + 0.012
         )
         foot, head = (x - 0.03, frame.seat - 0.02, front - 0.03), (x - 0.014, high, front - 0.01)
-        stand = Part.of("left_arm_post", post(foot, head, 0.032, 0.028, 4 if palette.wooden else 8), palette.frame)
-        prop = post(
-            (x - 0.03, frame.seat - 0.02, rear + 0.03),
-            (x - 0.016, high, rear),
-            0.026,
-            0.024,
-            4 if palette.wooden else 8,
-        )
-        rear_stand = Part.of("left_arm_rear_post", prop, palette.frame)
-        left = Part.of("left_arm", rest, palette.frame)
-        return [stand, stand.mirrored(), rear_stand, rear_stand.mirrored(), left, left.mirrored()]
-    return [left, left.mirrored()]
+        stand = Part.of("left_arm_post", post(foot, head, 0.032, 0.028, palette.sides), palette.frame)
+        foot, head = (x - 0.03, frame.seat - 0.02, rear + 0.03), (x - 0.016, high, rear)
+        prop = Part.of("left_arm_rear_post", post(foot, head, 0.026, 0.024, palette.sides), palette.frame)
+        return [*pair(stand), *pair(prop), *pair(Part.of("left_arm", rest, palette.frame))]
+    return pair(left)

@@ -8,7 +8,7 @@ import numpy as np
 
 from data_gen.shapes.chair_frame import ChairFrame, Palette
 from data_gen.shapes.materials import plain
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pair, pick
 from data_gen.shapes.primitives import ball, cone, cylinder, post, rod, tapered, torus, tube
 from data_gen.shapes.solids import lathe
 
@@ -122,7 +122,7 @@ def _sled(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list
     runner = Part.of("left_runner", tube(path, width, sides=sides), palette.metal)
     bearer = Part.of("left_bearer", tube(cut, 0.96 * width, sides=sides), palette.metal)
     cross = rod((x, top, 0.5 * z), (-x, top, 0.5 * z), 0.8 * width, sides=8)
-    return [runner, bearer, runner.mirrored(), bearer.mirrored(), Part.of("bearer", cross, palette.metal)]
+    return [*pair(runner, bearer), Part.of("bearer", cross, palette.metal)]
 
 
 def _cantilever(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
@@ -144,7 +144,7 @@ def _cantilever(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -
     side = Part.of("left_tube", tube(path, width, sides=8), palette.metal)
     floor = rod((x, foot, -z + width), (-x, foot, -z + width), 0.96 * width, sides=8)
     rail = rod((x, top, -z + 0.06), (-x, top, -z + 0.06), 0.96 * width, sides=8)
-    return [side, side.mirrored(), Part.of("floor_rail", floor, palette.metal), Part.of("rail", rail, palette.metal)]
+    return [*pair(side), Part.of("floor_rail", floor, palette.metal), Part.of("rail", rail, palette.metal)]
 
 
 def _column(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
@@ -203,13 +203,12 @@ def _rockers(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> l
 
     along = np.linspace(-half - 0.08, half, 9)
     path = np.stack([np.full(9, x), height(along), along], 1)
-    runner = Part.of("left_rocker", tube(path, 0.032, 0.04, sides=4), palette.frame)
-    parts = [runner, runner.mirrored()]
+    parts = pair(Part.of("left_rocker", tube(path, 0.032, 0.04, sides=4), palette.frame))
     for end, at in (("front", z), ("rear", -z)):
         foot = (x, float(height(at)) - 0.005, at)
         leg = Part.of(f"{end}_left_leg", post(foot, (x, frame.under + _BITE, at), 0.8 * size, size, 8), palette.frame)
         bar = rod((x, 0.5 * frame.under, at), (-x, 0.5 * frame.under, at), 0.02)
-        parts += [leg, leg.mirrored(), Part.of(f"{end}_stretcher", bar, palette.frame)]
+        parts += [*pair(leg), Part.of(f"{end}_stretcher", bar, palette.frame)]
     return parts
 
 
@@ -236,9 +235,7 @@ _CHOICES = {
 
 def legs(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Draw a way to stand that suits the chair's kind, and build it."""
-    choices = _CHOICES[frame.kind]
-    weights = np.array(list(choices.values()))
-    name = list(choices)[int(rng.choice(len(choices), p=weights / weights.sum()))]
+    name = pick(rng, _CHOICES[frame.kind])
     if frame.round_seat and name in ("sled", "cantilever"):
         name = "four"
     return LEGS[name](rng, frame, palette)

@@ -13,7 +13,7 @@ import numpy as np
 from data_gen.shapes.lamp_shades import Shade, sample_cloth, sample_shade, shell
 from data_gen.shapes.lamp_stands import floor_stand, foot, sample_metal, table_body
 from data_gen.shapes.materials import Material, plain, tint
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pick
 from data_gen.shapes.primitives import ball, cone, cylinder, rod, tube
 from data_gen.shapes.solids import lathe
 
@@ -205,6 +205,5 @@ def lamp(rng: np.random.Generator) -> list[Part]:
     Returns:
         Its parts in metres, y up, front along +z.
     """
-    shares = [share for share, _ in KINDS.values()]
-    kind = list(KINDS)[int(rng.choice(len(KINDS), p=shares))]
+    kind = pick(rng, {name: share for name, (share, _) in KINDS.items()})
     return KINDS[kind][1](rng)

@@ -15,7 +15,7 @@ from data_gen.shapes.primitives import ball, cylinder, rod
 from data_gen.shapes.profiles import airfoil, rectangle, superellipse
 from data_gen.shapes.solids import Solid, lathe, loft
 
-__all__ = ["propeller", "fin", "fuselage", "jet_engine", "pair", "pylon", "undercarriage", "wing"]
+__all__ = ["propeller", "fin", "fuselage", "jet_engine", "pylon", "undercarriage", "wing"]
 
 _BLACK = plain((36, 36, 40), "black")
 
@@ -191,8 +191,3 @@ def pylon(bottom: tuple[float, float, float], top: tuple[float, float, float], w
     """Upright blade between an engine or a store and the wing above it, `chord` long."""
     outlines = [rectangle(chord, width) + (z, x) for x, _, z in (bottom, top)]
     return loft(outlines, [bottom[1], top[1]], "y").creased(20)
-
-
-def pair(parts: Sequence[Part]) -> list[Part]:
-    """The parts and their mirror images."""
-    return [*parts, *(part.mirrored() for part in parts)]
