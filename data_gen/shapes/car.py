@@ -45,9 +45,7 @@ def _wheels(rng: np.random.Generator, frame: CarFrame) -> list[Part]:
     rubber = plain((27, 27, 29), "rubber")
     alloy = wheel_face(rng)
     rim_share = rng.uniform(0.66, 0.76)
-    tyre = lathe(
-        [(0.9 * radius, -width / 2), (radius, -0.34 * width), (radius, 0.34 * width), (0.9 * radius, width / 2)], 18
-    )
+    tyre = lathe(np.array([(0.9, -0.5), (1, -0.34), (1, 0.34), (0.9, 0.5)]) * (radius, width), 18)
     rim = lathe([(rim_share * radius, -0.05), (rim_share * radius, 0.004), (0.25 * radius, 0.016), (0, 0.02)], 16)
     parts = []
     for where, axle in zip(("rear", "front"), frame.axles, strict=True):
@@ -110,11 +108,8 @@ def _mirrors(frame: CarFrame, material: Material) -> list[Part]:
     head = box(0.18, 0.12, 0.1, 0.03).moved(out + 0.09, y + 0.02, z)
     dark = plain((38, 38, 42), "arm")
     parts = [Part.of("left_mirror_arm", arm, dark), Part.of("left_mirror", head, material)]
-    doors = (
-        [0.55 * front + 0.45 * rear]
-        if frame.style in ("coupe", "sports", "pickup")
-        else [0.7 * front + 0.3 * rear, rear + 0.25]
-    )
+    two = frame.style in ("coupe", "sports", "pickup")
+    doors = [0.55 * front + 0.45 * rear] if two else [0.7 * front + 0.3 * rear, rear + 0.25]
     for k, door in enumerate(doors):
         handle = box(0.06, 0.035, 0.17).moved(float(frame.half_width(door)) - 0.02, frame.belt - 0.11, door)
         parts.append(Part.of(f"left_handle_{k}", handle, plain((168, 170, 176), "chrome")))

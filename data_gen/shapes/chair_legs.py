@@ -75,9 +75,8 @@ def _four(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list
             ("right", 0.018, 2 * z_edge + 0.016, -x_edge, 0.0),
         ):
             tall = height if x == 0 else height - 0.006
-            apron = tapered((wide, deep), (wide, deep), tall).moved(
-                x, frame.under - tall / 2 + 0.004 + 0.002 * (x == 0), z
-            )
+            y = frame.under - tall / 2 + 0.004 + 0.002 * (x == 0)
+            apron = tapered((wide, deep), (wide, deep), tall).moved(x, y, z)
             parts.append(Part.of(f"{name}_apron", apron, palette.frame))
     if frame.kind == "bar" or (frame.kind != "lounge" and rng.random() < 0.5):
         parts += _stretchers(rng, frame, palette, feet, heads)
@@ -177,16 +176,14 @@ def _star(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list
         angle = np.radians(72 * k + 18)
         x, z = float(np.sin(angle)), float(np.cos(angle))
         arm = rod((0.02 * x, 0.11, 0.02 * z), (reach * x, 0.075, reach * z), 0.042, 0.03, sides=4)
-        wheel = ball(0.028, 0.028, 0.028, 8, 6).moved(0.96 * reach * x, 0.028, 0.96 * reach * z)
-        fork = post(
-            (0.96 * reach * x, 0.03, 0.96 * reach * z), (0.96 * reach * x, 0.075, 0.96 * reach * z), 0.018, 0.018
-        )
+        x, z = 0.96 * reach * x, 0.96 * reach * z
+        wheel = ball(0.028, 0.028, 0.028, 8, 6).moved(x, 0.028, z)
+        fork = post((x, 0.03, z), (x, 0.075, z), 0.018, 0.018)
         for name, solid, material in (("arm", arm, arms), ("caster", wheel, black), ("fork", fork, black)):
             parts.append(Part.of(f"star_{name}_{k}", solid, material))
     low, high = 0.12, frame.under
-    parts.append(
-        Part.of("sleeve", cylinder(0.034, 0.55 * (high - low), 10).moved(0, low + 0.275 * (high - low)), black)
-    )
+    sleeve = cylinder(0.034, 0.55 * (high - low), 10).moved(0, low + 0.275 * (high - low))
+    parts.append(Part.of("sleeve", sleeve, black))
     parts.append(Part.of("spring", cylinder(0.02, high - low, 8).moved(0, (high + low) / 2 + 0.01), palette.metal))
     mount = tapered((0.12, 0.16), (0.24, 0.28), 0.04).moved(0, high - 0.012)
     return [*parts, Part.of("mount", mount, black)]

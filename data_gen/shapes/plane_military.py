@@ -80,9 +80,8 @@ def fighter(rng: np.random.Generator) -> list[Part]:
     parts = [Part.of("fuselage", body, main).painted(body.cells[:, 0] >= 6, radome)]
     canopy = ball(0.22 * width, 0.36 * height, 0.105 * length, 12, 8).moved(0, 0.33 * height, 0.24 * length)
     parts.append(Part.of("canopy", canopy, plain((56, 60, 64) if rng.random() < 0.6 else (132, 104, 52), "glass")))
-    intake = fuselage(
-        0.36 * length, 0.34 * width, 0.62 * height, ((0, 0.4, 0.5, 0), (0.25, 0.9, 0.9, 0), (1, 1, 1, 0)), 5, 12
-    )
+    duct = ((0, 0.4, 0.5, 0), (0.25, 0.9, 0.9, 0), (1, 1, 1, 0))
+    intake = fuselage(0.36 * length, 0.34 * width, 0.62 * height, duct, 5, 12)
     left = Part.of("left_intake", intake.moved(0.42 * width, -0.08 * height, 0.02 * length), main)
     parts += pair(left.capped(plain((30, 30, 34), "duct"), first=False))
     span = rng.uniform(3.9, 5.0)
@@ -114,11 +113,8 @@ def fighter(rng: np.random.Generator) -> list[Part]:
     else:
         parts.append(Part.of("fin", blade.scaled(1, 1.2, 1).moved(0, 0.2 * height, foot), main))
     radius = 0.25 * height if twin else 0.29 * height
-    nozzle = lathe(
-        [(0.72 * radius, -0.9), (0.78 * radius, -0.92), (radius, 0.5), (0.9 * radius, 0.5), (0.6 * radius, -0.2)],
-        14,
-        ring=True,
-    )
+    mouth = [(0.72 * radius, -0.9), (0.78 * radius, -0.92), (radius, 0.5), (0.9 * radius, 0.5), (0.6 * radius, -0.2)]
+    nozzle = lathe(mouth, 14, ring=True)
     flame = lathe([(0.75 * radius, -0.45), (0.8 * radius, 0.4)], 12)
     end = (0.24 * width if twin else 0.0, 0.02 * height, -0.5 * length - 0.1)
     ring = Part.of("left_nozzle", nozzle.turned("x", 90).moved(*end), plain((64, 62, 62), "nozzle"))
