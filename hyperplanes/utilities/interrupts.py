@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Generator
 from contextlib import contextmanager
+from typing import Any
 
 __all__ = ["Terminated", "interruptible"]
 
@@ -24,7 +25,7 @@ def interruptible() -> Generator[None]:
 
     Once is not enough: where native code calls Python (the compiler, the garbage collector), what is raised there is
     printed and lost. So a timer raises it again, except while it is being passed on through cleaning up. In threads
-    other than the main one, which signals do not reach, nothing is changed.
+    other than the main one, which signals do not reach, nothing is changed, nor is a signal that is ignored.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -33,11 +34,12 @@ def interruptible() -> Generator[None]:
 
     def note(number: int, _: object) -> None:
         heard.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
+        before.setdefault(signal.SIGALRM, signal.signal(signal.SIGALRM, again))
         signal.setitimer(signal.ITIMER_REAL, AGAIN_SECONDS, AGAIN_SECONDS)
         raise heard[-1]
 
     def again(*_: object) -> None:
-        if heard and not _is_passed_on():
+        if not _is_passed_on():
             raise heard[-1]
 
     def report(unraisable: sys.UnraisableHookArgs) -> None:
@@ -45,13 +47,16 @@ def interruptible() -> Generator[None]:
             hook(unraisable)
 
     hook = sys.unraisablehook
-    handlers = {signal.SIGINT: note, signal.SIGTERM: note, signal.SIGALRM: again}
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    before: dict[int, Any] = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell without job control starts what ends with &
+            before[number] = signal.signal(number, note)
     sys.unraisablehook = report
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        if heard:
+            signal.setitimer(signal.ITIMER_REAL, 0)
         sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, handler)

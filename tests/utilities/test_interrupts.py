@@ -72,6 +72,16 @@ def test_an_interrupt_that_a_callback_swallows_is_raised_again(capfd):
     assert signal.getitimer(signal.ITIMER_REAL) == (0, 0)
 
 
+def test_an_ignored_signal_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with interruptible():
+            signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_cleaning_up_is_not_interrupted_again(monkeypatch):
     monkeypatch.setattr("hyperplanes.utilities.interrupts.AGAIN_SECONDS", 0.01)
     ended = []
