@@ -51,7 +51,7 @@ DEPTH_TOLERANCE = 0.05  # radii of the scene
 
 HIDDEN = 0.35
 """Opacity in front of a point from which on a camera does not see it. The camera with the clearest look decides, so 0.5
-leaves dents in walls of fog. Of two cars after one step 94.0 % of the pixels of both were as far away as rendered, 94 %
+leaves dents in walls of fog. Of two cars after one step, from seven places, 94.0 % of the pixels were as far away as rendered, 94 %
 with 0.5, 90 % with 0.2, and 93 % by a level alone, which left holes."""
 
 
@@ -187,10 +187,13 @@ def _opacity_before(
     near, far = float(distances[seen].min()), float(distances[seen].max())
     side, voxel = len(density) // 2, 2 * bounds.radius / (len(density) - 1)
     through = first + pixel_grid(side, side, points.device) / (side - 1) * (last - first)
-    along = torch.linspace(near, far, math.ceil((far - near) / voxel) + 1, device=points.device)
+    along = torch.linspace(near, far, math.ceil((far - near) / voxel) + 2, device=points.device)
     rays = cast(cameras, torch.zeros(len(through), dtype=torch.long, device=points.device), through)
-    places = bounds.normalise(rays.origins)[:, None] + (along / bounds.radius)[:, None] * rays.directions[:, None]
-    values = grid_sample(density[None, None], places.flip(-1)[None, None], align_corners=True)[0, 0, 0]
+    values = []
+    for part in range(0, len(rays), side):  # a row of pixels at a time
+        places = bounds.normalise(rays[part : part + side].at(along.expand(side, -1)))
+        values.append(grid_sample(density[None, None], places.flip(-1)[None, None], align_corners=True)[0, 0, 0])
+    values = torch.cat(values)
     depth = (values.cumsum(-1) - values / 2) * ((far - near) / (len(along) - 1))
     opacity = (1 - torch.exp(-depth)).reshape(side, side, -1)
     wanted = torch.cat([((distances - near) / (far - near))[:, None], (pixels - first) / (last - first)], 1) * 2 - 1
