@@ -51,8 +51,9 @@ DEPTH_TOLERANCE = 0.05  # radii of the scene
 
 HIDDEN = 0.35
 """Opacity in front of a point from which on a camera does not see it. The camera with the clearest look decides, so 0.5
-leaves dents in walls of fog. Of two cars after one step, from seven places, 94.0 % of the pixels were as far away as rendered, 94 %
-with 0.5, 90 % with 0.2, and 93 % by a level alone, which left holes."""
+leaves dents in walls of fog. Of two cars after one step, seen from seven places, 94.0 % of the pixels were as far away
+as rendered, 94 % with 0.5, 90 % with 0.2, and 93 % by a level alone, which left holes; a chair that was fine-tuned for
+60 steps stayed as it was (94.6 %)."""
 
 
 @dataclass(frozen=True)
