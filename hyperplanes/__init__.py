@@ -23,11 +23,12 @@ if TYPE_CHECKING:
     from hyperplanes.adaptation.nearest_view import NearestView
     from hyperplanes.data import DataError, Dataset, open_dataset, read_task, read_views
     from hyperplanes.evaluation import evaluate
-    from hyperplanes.export import extract_mesh, save_images, save_mesh, save_turntable
+    from hyperplanes.export import save_images, save_turntable
     from hyperplanes.geometry import ImagePlanes, Lookup
     from hyperplanes.metrics import psnr, ssim
     from hyperplanes.presets import preset
     from hyperplanes.rendering.renderer import render
+    from hyperplanes.surface import extract_mesh, save_mesh
     from hyperplanes.training import Trainer
     from hyperplanes.views import Task, Views
 
@@ -45,7 +46,7 @@ _HOMES = {
     "Trainer": "training",
     "Views": "views",
     "evaluate": "evaluation",
-    "extract_mesh": "export",
+    "extract_mesh": "surface",
     "open_dataset": "data",
     "preset": "presets",
     "psnr": "metrics",
@@ -53,7 +54,7 @@ _HOMES = {
     "read_views": "data",
     "render": "rendering.renderer",
     "save_images": "export",
-    "save_mesh": "export",
+    "save_mesh": "surface",
     "save_turntable": "export",
     "ssim": "metrics",
 }

@@ -8,16 +8,13 @@ from __future__ import annotations
 import errno
 import inspect
 import os
-import signal
 import sys
-import threading
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 
 from hyperplanes.commands import EXAMPLES, find_verb, find_verbs, split_settings
-from hyperplanes.utilities.errors import Terminated
+from hyperplanes.utilities.interrupts import Terminated, interruptible
 
 __all__ = ["main"]
 
@@ -54,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         return _complain(f"hyperplanes: {error}")
     try:
-        with _terminable():
+        with interruptible():
             return _run(verb, module, rest)
     except KeyboardInterrupt as interrupt:
         advice = str(interrupt) or "the same command goes on where it can"
@@ -68,23 +65,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if traceback:
             raise
         return _complain(f"hyperplanes {verb}: {_one_line(error)}")
-
-
-@contextmanager
-def _terminable() -> Generator[None]:
-    """SIGTERM raises `Terminated` within."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def end(*_: object) -> None:
-        raise Terminated
-
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _run(verb: str, name: str, rest: list[str]) -> int:

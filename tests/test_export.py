@@ -9,25 +9,21 @@ import trimesh
 from PIL import Image
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.export import (
+from hyperplanes.export import encode_animation, orbit_cameras, save_images, save_turntable, to_pixels, upward
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering.renderer import Marched
+from hyperplanes.surface import (
     Agreement,
     Surface,
     agreement,
     choose_level,
     density_grid,
-    encode_animation,
     extract_mesh,
-    orbit_cameras,
-    save_images,
+    fill_hidden,
     save_mesh,
-    save_turntable,
-    to_pixels,
-    upward,
 )
-from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.occupancy import full
-from hyperplanes.geometry.rays import Sphere
-from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Views
 
 CENTRE, RADIUS = (0.3, -0.2, 0.1), 0.8
@@ -133,6 +129,35 @@ def test_a_hole_with_a_wall_behind_it_is_noticed_by_depth_and_closed_by_the_leve
     assert holed.depth == pytest.approx(1 - (0.4 / RADIUS) ** 2, abs=0.05)
     empty = Surface(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]]), np.ones((3, 3), np.float32))
     assert agreement(empty, adapted, cameras) == Agreement(0.0, 0.0)
+
+
+@pytest.mark.parametrize(("fog", "whole"), [(8.0, True), (0.1, False)])
+def test_what_no_camera_sees_into_is_filled_and_what_one_sees_through_is_not(fog, whole):
+    """Closed form: a ball of density 300 with a tunnel of fog, 0.6 wide, along x, which a level of 100 cuts out.
+
+    Of density 8 it is opaque from all sides, 0.3 of the light gone after 0.045, so the ball is whole (Euler number 2);
+    of density 0.1 a camera on the axis sees through it, by exp(-0.1 x 1.6) = 85 % of the light (0, as a torus).
+    """
+
+    def field(points, directions):
+        local = points - points.new_tensor(CENTRE)
+        dense = torch.where(local[:, 1:].norm(dim=-1) < 0.3, fog, 300.0)
+        return torch.ones_like(points), dense * (local.norm(dim=-1) < RADIUS)
+
+    adapted = AdaptedField(field, full(Sphere(CENTRE, 1.0), 16), Marched(steps=64))
+    eyes = torch.tensor(CENTRE) + 8 * torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0.1], [0, -1, 0.1], [0.1, 0.1, 1]])
+    pose = camera.look_at(eyes, CENTRE, (0.0, 0.0, 1.0))
+    cameras = camera.pinhole(camera.symmetric_intrinsics(64, 64, 0.3), pose, 64, 64)
+    density = density_grid(adapted, 64)
+    filled = fill_hidden(density, 100.0, adapted.occupancy.bounds, cameras)
+    assert (filled >= density).all()
+    for grid, expected in ((density, 0), (filled, 2 if whole else 0)):
+        surface = extract_mesh(adapted, level=100.0, density=grid)
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces)
+        assert mesh.is_watertight
+        assert mesh.euler_number == expected
+    if whole:
+        assert mesh.volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.08)
 
 
 def test_a_level_that_is_never_reached():

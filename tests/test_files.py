@@ -12,12 +12,11 @@ import pytest
 
 from data_gen.datasets.generate import Procedural, generate
 from hyperplanes.checkpoints import CheckpointError, load_tensors
-from hyperplanes.cli import _terminable, main
+from hyperplanes.cli import main
 from hyperplanes.data import open_dataset
 from hyperplanes.data.formats.npz import read_npz
 from hyperplanes.data.pictures.images import read_image
 from hyperplanes.files import DataError, inside, malformed, one_writer, read_bytes, read_json
-from hyperplanes.utilities.errors import Terminated
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -125,16 +124,6 @@ def test_a_name_that_no_file_can_have_is_refused(tmp_path):
     assert inside(tmp_path, "a" * 255, "images.bin") == tmp_path / ("a" * 255)
     with pytest.raises(DataError, match="images.bin: expected file names of at most 255 bytes"):
         inside(tmp_path, "images/" + "1" * 252 + ".png", "images.bin")
-
-
-def test_sigterm_ends_as_ctrl_c_does_with_another_code(monkeypatch, capsys):
-    before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(Terminated), _terminable():
-        signal.raise_signal(signal.SIGTERM)
-    assert signal.getsignal(signal.SIGTERM) is before
-    monkeypatch.setattr("hyperplanes.cli._run", lambda *_: signal.raise_signal(signal.SIGTERM))
-    assert main(["doctor"]) == 143
-    assert "hyperplanes doctor: terminated; the same command goes on where it can" in capsys.readouterr().err
 
 
 def test_an_absurd_count_is_refused_at_once(tmp_path):

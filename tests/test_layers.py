@@ -29,6 +29,7 @@ LAYERS = {
     "hyperplanes.data": 3,
     "hyperplanes.baking": 3,
     "hyperplanes.export": 3,
+    "hyperplanes.surface": 3,
     "hyperplanes.fields": 2,
     "hyperplanes.rendering": 2,
     "hyperplanes.views": 2,

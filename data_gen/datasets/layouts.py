@@ -83,12 +83,6 @@ def native(rendered: RenderedObject) -> dict[str, bytes]:
 
     Other channels are NAME/depth.npz, normals.npz, coordinates.npz, one float32 array under the channel's name each,
     and NAME/mesh.glb.
-
-    Args:
-        rendered: the object.
-
-    Returns:
-        The files.
     """
     name, rig = rendered.item.name, rendered.rig
     names = [f"images/{index:03d}.png" for index in range(len(rig))]
@@ -114,12 +108,6 @@ def learnit(rendered: RenderedObject) -> dict[str, bytes]:
 
     The JSON has camera_angle_x and the frames' OpenGL poses; pictures are RGBA with straight alpha beside it. Loaders
     take near 2 and far 6. CLASS_splits.json beside the class folder lists the names (Tancik et al., 2021).
-
-    Args:
-        rendered: the object.
-
-    Returns:
-        The files.
     """
     _check_lens(rendered.rig, "learnit-128", centred=True)
     item, rig = rendered.item, rendered.rig
@@ -149,12 +137,6 @@ def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
     Their loaders take 277.77 pixels as the focal length, near 2 and far 6, and split the files sorted by name 80/20.
     Read by `hyperplanes.data`, ignored by theirs: `rgba` uint8 with straight alpha, `focal` in pixels. Underscores in
     names become hyphens, for their loaders take what follows the last underscore as the name.
-
-    Args:
-        rendered: the object.
-
-    Returns:
-        The file.
     """
     _check_lens(rendered.rig, "hyperplanes-200", centred=True)
     item, rig = rendered.item, rendered.rig
@@ -174,12 +156,6 @@ def srn(rendered: RenderedObject) -> dict[str, bytes]:
     loader sees fits: 0.8 to 1.8, and 1.25 to 2.75 where the class is called chair. intrinsics.txt: focal length and
     principal point (half-pixel centres); the centre of the scene; near plane; scale; height and width. Pictures are RGB
     over white: the format has no alpha.
-
-    Args:
-        rendered: the object.
-
-    Returns:
-        The files.
     """
     _check_lens(rendered.rig, "srn", centred=False)
     item, rig = rendered.item, rendered.rig

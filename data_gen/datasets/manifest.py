@@ -6,17 +6,26 @@ datasets are not; so what exists, with its checksums, is kept here as one JSON.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from data_gen.datasets.sources import Item
-from hyperplanes.files import DataError, encode_json, inside, malformed, read_bytes, read_json, sha256, write_whole
+from hyperplanes.files import (
+    DataError,
+    encode_json,
+    inside,
+    malformed,
+    one_writer,
+    read_bytes,
+    read_json,
+    sha256,
+    write_whole,
+)
 
 __all__ = ["FORMAT", "MANIFEST", "GenerationState", "Verification", "build_manifest", "verify"]
 
@@ -142,15 +151,28 @@ class GenerationState:
         self.folder = out / PROGRESS_FOLDER
         self.scratch = self.folder / "unfinished"
         self.configuration = configuration
-        self._lock: IO[str] | None = None
 
     def __enter__(self) -> GenerationState:
-        """Check the folder and lock it."""
-        if self.out.exists() and not self.out.is_dir():
-            raise DataError(self.out, "a folder to write into", "a file", "name another one")
+        """Lock the folder and check it."""
+        with ExitStack() as stack:
+            stack.enter_context(one_writer(self.out))
+            self._check()
+            shutil.rmtree(self.scratch, ignore_errors=True)
+            self.scratch.mkdir(parents=True, exist_ok=True)  # a worker of a killed run may still be at its last file
+            (self.folder / "done").mkdir(exist_ok=True)
+            write_whole(self.folder / "configuration.json", encode_json(self.configuration), self.scratch)
+            self._held = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release the lock; finished objects stay."""
+        self._held.close()
+
+    def _check(self) -> None:
         existing = self._existing()
-        if existing is None and self.out.is_dir() and set(self.out.iterdir()) - {self.folder}:
-            found = ", ".join(sorted(child.name for child in self.out.iterdir())[:3])
+        others = {path.name for path in self.out.iterdir()} - {self.folder.name, ".lock"}
+        if existing is None and others:
+            found = ", ".join(sorted(others)[:3])
             raise DataError(self.out, "an empty folder or an unfinished data set", found, "name another one")
         if existing is not None and existing != self.configuration:
             changed = sorted(
@@ -160,22 +182,6 @@ class GenerationState:
                 ", ".join(f"{key} {source.get(key)}" for key in changed) for source in (existing, self.configuration)
             )
             raise DataError(self.out, f"the data set it holds ({was})", f"a request for {now}", "name another folder")
-        try:
-            self._acquire_lock()
-        except BlockingIOError as error:
-            self.__exit__()
-            raise DataError(self.out, "a folder of its own", "another generation at work", "wait for it") from error
-        except OSError as error:
-            self.__exit__()
-            found = error.strerror or str(error)
-            raise DataError(self.out, "a folder to write into", found, "name another one") from error
-        write_whole(self.folder / "configuration.json", encode_json(self.configuration), self.scratch)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Release the lock; finished objects stay."""
-        if self._lock is not None:
-            self._lock.close()
 
     def done(self) -> dict[str, Entry]:
         """The finished objects, by name, of which all files are as they were written, by their checksums.
@@ -224,14 +230,6 @@ class GenerationState:
         write_whole(self.out / MANIFEST, encode_json(manifest), self.scratch)
         with suppress(OSError):
             shutil.rmtree(self.folder)
-
-    def _acquire_lock(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = open(self.folder / "lock", "w")
-        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        shutil.rmtree(self.scratch, ignore_errors=True)
-        self.scratch.mkdir(exist_ok=True)  # a worker of a killed run may still be at its last file
-        (self.folder / "done").mkdir(exist_ok=True)
 
     def _existing(self) -> dict[str, Any] | None:
         if (self.folder / "configuration.json").is_file():

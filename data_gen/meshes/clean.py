@@ -1,4 +1,7 @@
-"""Repairs the geometry of a mesh, saying what was wrong: faces that cannot be drawn, normals that cannot be used."""
+"""Repairs the geometry of a mesh, saying what was wrong: faces that cannot be drawn, normals that cannot be used.
+
+trimesh's `process=True` says nothing of what it leaves out or merges, and looks at no winding and no normal.
+"""
 
 from __future__ import annotations
 

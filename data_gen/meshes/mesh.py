@@ -1,8 +1,8 @@
 """Loads any mesh file: read, checked, turned y up, and normalised.
 
-World convention: y up, the centre of the bounding box at the origin, the vertex farthest from it at distance 1
-(`fit="sphere"`), or the longest side of the bounding box 2 units long (`fit="cube"`). Nothing is lost silently:
-what cannot be drawn as the file states is named in `Mesh.warnings`, what cannot be drawn at all is a `MeshError`.
+World convention: y up, the centre of the bounding box at the origin, the vertex farthest from it at distance 1. Nothing
+is lost silently: what cannot be drawn as the file states is named in `Mesh.warnings`, what cannot be drawn at all is a
+`MeshError`.
 """
 
 from __future__ import annotations
@@ -68,7 +68,6 @@ def load_mesh(
     up: Literal["y", "z"] | None = None,
     name: str | None = None,
     max_faces: int = MAX_FACES,
-    fit: Literal["sphere", "cube"] = "sphere",
     within: Path | None = None,
 ) -> Mesh:
     """Read a mesh file.
@@ -78,7 +77,6 @@ def load_mesh(
         up: the axis that points up in the file. By default y, but what a COLLADA file declares.
         name: what to call it; the file's name by default.
         max_faces: triangles at most.
-        fit: what is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
         within: the folder that no file which the mesh refers to may leave; the model's own by default.
 
     Returns:
@@ -106,7 +104,6 @@ def load_mesh(
         name or safe_name(path.stem),
         up=up or ("z" if axis == "z" else "y"),
         max_faces=max_faces,
-        fit=fit,
         colours=colours,
         warnings=(*lost, *lines, *folder.notes),
         source=str(path),
@@ -120,7 +117,6 @@ def prepare_scene(
     *,
     up: Literal["y", "z"] = "y",
     max_faces: int = MAX_FACES,
-    fit: Literal["sphere", "cube"] = "sphere",
     colours: ColourSpace = "scene",
     warnings: tuple[str, ...] = (),
     source: str | None = None,
@@ -133,7 +129,6 @@ def prepare_scene(
         name: what to call the mesh.
         up: the axis that points up in the scene.
         max_faces: triangles at most.
-        fit: what is normalised to radius 1: the bounding sphere, or half the longest side of the bounding box.
         colours: `scene`: vertex and face colours are sRGB, factors of materials linear; `gltf`: all are linear;
             `srgb`: all are sRGB. Textures are always sRGB.
         warnings: what is already known to be lost.
@@ -146,12 +141,10 @@ def prepare_scene(
 
     Raises:
         MeshError: if there is nothing to draw, or too much.
-        ValueError: if `up` or `fit` is none of the two.
+        ValueError: if `up` is none of the two.
     """
     if up not in ("y", "z"):
         raise ValueError(f"up: expected 'y' or 'z', received {up!r}")
-    if fit not in ("sphere", "cube"):
-        raise ValueError(f"fit: expected 'sphere' or 'cube', received {fit!r}")
     source = source or name
     found = list(warnings)
     _refuse_too_many(scene, max_faces, source)
@@ -169,7 +162,7 @@ def prepare_scene(
             )
         parts, closed = smaller, False
         found.append(f"decimated from {faces} to {sum(len(part.faces) for part in parts)} triangles")
-    world_from_file = _normalising_transform(parts, up, fit, source, found)
+    world_from_file = _normalising_transform(parts, up, source, found)
     ready = trimesh.Scene()
     for number, part in enumerate(parts):
         key = f"part_{number:04d}"
@@ -262,7 +255,7 @@ def _transformed(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visu
 
 
 def _normalising_transform(
-    parts: list[trimesh.Trimesh], up: str, fit: str, source: str, found: list[str]
+    parts: list[trimesh.Trimesh], up: str, source: str, found: list[str]
 ) -> npt.NDArray[np.float64]:
     turn = _Y_FROM_Z if up == "z" else np.eye(4)
     points = np.concatenate([part.vertices for part in parts]) @ turn[:3, :3].T
@@ -271,8 +264,7 @@ def _normalising_transform(
         raise MeshError(f"{source}: expected coordinates below 1e30, found {largest:.3g}; export the mesh again")
     low, high = points.min(axis=0), points.max(axis=0)
     centre = (low + high) / 2
-    distance = np.linalg.norm(points - centre, axis=1)
-    radius = float(distance.max() if fit == "sphere" else (high - low).max() / 2)
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
     if not radius > 1e-12 * max(largest, 1e-12):
         raise MeshError(f"{source}: expected a mesh with an extent, found all vertices in one point; export it again")
     near = np.linalg.norm(points - np.median(points, axis=0), axis=1)

@@ -1,6 +1,7 @@
 """The folder of one model: gives a mesh loader its materials, textures and buffers, and nothing else.
 
 Every name in a mesh file is resolved here. Nothing outside the folder that was given is opened, and never the network.
+trimesh's FilePathResolver drops ShapeNet's `../images/x.jpg` without a warning, or is allowed to open any file.
 """
 
 from __future__ import annotations

@@ -7,12 +7,11 @@ all show in the subprocess, and none of them can crash the calling process.
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 __all__ = [
     "CHOICE_VARIABLE",
@@ -39,7 +38,6 @@ REMEDIES = {
 }
 """The command that should make a renderer work on Debian and Ubuntu."""
 
-_FOUND_VARIABLE = "HYPERPLANES_RENDERER_FOUND"
 _PROBE_SECONDS = 90.0
 _OPENGL_PLATFORMS = {"egl": "pyrender-egl", "osmesa": "pyrender-osmesa"}
 
@@ -116,9 +114,9 @@ def probe_all() -> list[ProbeResult]:
 def find_renderer(prefer: str | None = None) -> RendererInfo:
     """Find the best renderer that works here.
 
-    The answer is kept for this process and, through an environment variable, for those that it starts. Without
-    `prefer` the environment decides: HYPERPLANES_RENDERER names a renderer, which then must work; PYOPENGL_PLATFORM
-    (egl or osmesa) only puts one in front.
+    Each is tried once in a process; workers are told the name. Without `prefer` the environment decides:
+    HYPERPLANES_RENDERER names a renderer, which then must work; PYOPENGL_PLATFORM (egl or osmesa) only puts one in
+    front.
 
     Args:
         prefer: one of RENDERERS, which then must work, or None for the best that does.
@@ -133,9 +131,6 @@ def find_renderer(prefer: str | None = None) -> RendererInfo:
     chosen = prefer or os.environ.get(CHOICE_VARIABLE) or None
     if chosen is not None and chosen not in RENDERERS:
         raise ValueError(_unknown(chosen))
-    known = _found_before()
-    if known is not None and chosen in {None, known.name}:
-        return known
     if chosen is not None:
         outcome = probe(chosen)
         if not outcome.works:
@@ -143,7 +138,7 @@ def find_renderer(prefer: str | None = None) -> RendererInfo:
                 f"renderer {chosen!r}: expected it to draw a triangle, found: {outcome.message}. "
                 f"Remedy: {outcome.remedy}, or choose another of {', '.join(RENDERERS)}"
             )
-        return _remember(RendererInfo(chosen, outcome.message))
+        return RendererInfo(chosen, outcome.message)
     names = list(RENDERERS)
     first = _OPENGL_PLATFORMS.get(os.environ.get("PYOPENGL_PLATFORM", ""))
     if first is not None:
@@ -154,7 +149,7 @@ def find_renderer(prefer: str | None = None) -> RendererInfo:
         outcome = probe(name)
         if outcome.works:
             advice = () if name.startswith("pyrender") else tuple(_advice(failure) for failure in failures)
-            return _remember(RendererInfo(name, outcome.message, advice))
+            return RendererInfo(name, outcome.message, advice)
         failures.append(outcome)
     raise RendererError(
         f"no renderer works here ({'; '.join(f'{f.name}: {f.message}' for f in failures)}). "
@@ -170,31 +165,12 @@ def _advice(failure: ProbeResult) -> str:
     return f"{failure.name} does not work here ({failure.message}); to get it: {failure.remedy}"
 
 
-def _found_before() -> RendererInfo | None:
-    """What an earlier call, here or in a parent process, has found."""
-    text = os.environ.get(_FOUND_VARIABLE)
-    if not text:
-        return None
-    try:
-        record = json.loads(text)
-        found = RendererInfo(str(record["name"]), str(record["detail"]), tuple(map(str, record["advice"])))
-    except (ValueError, KeyError, TypeError):
-        return None
-    return found if found.name in RENDERERS else None
-
-
-def _remember(found: RendererInfo) -> RendererInfo:
-    os.environ[_FOUND_VARIABLE] = json.dumps(asdict(found))
-    return found
-
-
 def _run_probe(name: str) -> ProbeResult:
-    environment = {key: value for key, value in os.environ.items() if key != _FOUND_VARIABLE}
     command = [sys.executable, "-m", "data_gen.rendering.probe_process", name]
     start = time.monotonic()
     try:
         # The package may be imported from a folder that a fresh interpreter does not look in.
-        environment["PYTHONPATH"] = os.pathsep.join(entry for entry in sys.path if entry)
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
         done = subprocess.run(
             command, env=environment, capture_output=True, text=True, timeout=_PROBE_SECONDS, check=False
         )

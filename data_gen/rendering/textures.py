@@ -1,4 +1,7 @@
-"""Trilinear texture sampling in NumPy, as OpenGL does it: mipmaps, bilinear in a level, repeating."""
+"""Trilinear texture sampling in NumPy, as OpenGL does it: mipmaps, bilinear in a level, repeating.
+
+trimesh's `uv_to_interpolated_color` has no mipmaps: it skips texels of a texture that is small in the picture.
+"""
 
 from __future__ import annotations
 

@@ -8,16 +8,19 @@ from __future__ import annotations
 import numpy as np
 
 from data_gen.shapes.car_body import body
-from data_gen.shapes.car_frame import STYLES, CarFrame, sample_frame
+from data_gen.shapes.car_frame import CarFrame, sample_frame
 from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pair, pick
 from data_gen.shapes.patterns import wheel_face
 from data_gen.shapes.primitives import ball, box, cylinder, tapered
 from data_gen.shapes.profiles import ellipse
-from data_gen.shapes.solids import Solid, lathe, sweep
+from data_gen.shapes.solids import lathe, sweep
 
 __all__ = ["car"]
 
+_SHARES = {
+    "sedan": 3, "coupe": 1.5, "hatchback": 2.5, "wagon": 1.5, "suv": 2.5, "van": 1.5, "pickup": 1.5, "sports": 2
+}  # fmt: skip
 _PAINTS: tuple[tuple[float, float, float, float], ...] = (  # hue, saturation, value, weight
     (0.0, 0.85, 0.75, 3.0),
     (0.6, 0.75, 0.65, 3.0),
@@ -42,23 +45,15 @@ def _wheels(rng: np.random.Generator, frame: CarFrame) -> list[Part]:
     rubber = plain((27, 27, 29), "rubber")
     alloy = wheel_face(rng)
     rim_share = rng.uniform(0.66, 0.76)
-    tyre = lathe(
-        [(0.9 * radius, -width / 2), (radius, -0.34 * width), (radius, 0.34 * width), (0.9 * radius, width / 2)], 18
-    )
+    tyre = lathe(np.array([(0.9, -0.5), (1, -0.34), (1, 0.34), (0.9, 0.5)]) * (radius, width), 18)
     rim = lathe([(rim_share * radius, -0.05), (rim_share * radius, 0.004), (0.25 * radius, 0.016), (0, 0.02)], 16)
     parts = []
     for where, axle in zip(("rear", "front"), frame.axles, strict=True):
         outside = frame.width / 2 + 0.005 - width / 2
         wheel = Part.of(f"{where}_left_tyre", tyre.turned("z", -90).moved(outside, radius, axle), rubber)
-        face = Part.of(
-            f"{where}_left_rim", rim.turned("z", -90).projected("x").moved(outside + width / 2, radius, axle), alloy
-        )
-        hub = Part.of(
-            f"{where}_axle",
-            cylinder(0.09, 2 * outside, 8).turned("z", 90).moved(0, radius, axle),
-            rubber,
-        )
-        parts += [wheel, face, wheel.mirrored(), face.mirrored(), hub]
+        face = rim.turned("z", -90).projected("x").moved(outside + width / 2, radius, axle)
+        hub = cylinder(0.09, 2 * outside, 8).turned("z", 90).moved(0, radius, axle)
+        parts += [*pair(wheel, Part.of(f"{where}_left_rim", face, alloy)), Part.of(f"{where}_axle", hub, rubber)]
     return parts
 
 
@@ -83,23 +78,21 @@ def _ends(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> list[Part
     grille_width = 2 * front_half - rng.uniform(0.75, 0.95)
     grille = box(grille_width, grille_height, 0.1, 0.02)
     grille_y = max(lamp_y - rng.uniform(0, 0.06), low + 0.19 + grille_height / 2)
-    parts += [left, left.mirrored(), Part.of("grille", grille.moved(0, grille_y, half - 0.025), black)]
+    parts += [*pair(left), Part.of("grille", grille.moved(0, grille_y, half - 0.025), black)]
     if rng.random() < 0.6:
         bar = box(grille_width - 0.04, 0.03, 0.12)
         parts.append(Part.of("grille_bar", bar.moved(0, grille_y + rng.uniform(-0.02, 0.03), half - 0.022), chrome))
     bumper = box(2 * front_half + 0.04, 0.16, 0.22, 0.05)
     parts.append(Part.of("front_bumper", bumper.moved(0, low + 0.07, half - 0.05), trim))
     back_half = float(frame.half_width(-half))
-    parts.append(
-        Part.of("rear_bumper", box(2 * back_half + 0.03, 0.17, 0.2, 0.05).moved(0, low + 0.09, -half + 0.05), trim)
-    )
+    bumper = box(2 * back_half + 0.03, 0.17, 0.2, 0.05)
+    parts.append(Part.of("rear_bumper", bumper.moved(0, low + 0.09, -half + 0.05), trim))
     tall = frame.style in ("hatchback", "wagon", "suv", "van")
     tail_y = frame.deck - (0.2 if not tall else rng.uniform(0.24, 0.34))
     size = (0.14, rng.uniform(0.24, 0.36)) if tall else (rng.uniform(0.28, 0.42), 0.13)
     light = box(size[0], size[1], 0.12, 0.02).moved(back_half - size[0] / 2 - 0.03, tail_y, -half + 0.035)
-    tail = Part.of("left_tail_lamp", light, red)
+    parts += pair(Part.of("left_tail_lamp", light, red))
     plate = plain((222, 214, 160), "plate")
-    parts += [tail, tail.mirrored()]
     parts.append(Part.of("rear_plate", box(0.46, 0.12, 0.06).moved(0, low + 0.28, -half + 0.01), plate))
     parts.append(Part.of("front_plate", box(0.44, 0.1, 0.06).moved(0, low + 0.075, half + 0.045), plate))
     return parts
@@ -115,15 +108,12 @@ def _mirrors(frame: CarFrame, material: Material) -> list[Part]:
     head = box(0.18, 0.12, 0.1, 0.03).moved(out + 0.09, y + 0.02, z)
     dark = plain((38, 38, 42), "arm")
     parts = [Part.of("left_mirror_arm", arm, dark), Part.of("left_mirror", head, material)]
-    doors = (
-        [0.55 * front + 0.45 * rear]
-        if frame.style in ("coupe", "sports", "pickup")
-        else [0.7 * front + 0.3 * rear, rear + 0.25]
-    )
+    two = frame.style in ("coupe", "sports", "pickup")
+    doors = [0.55 * front + 0.45 * rear] if two else [0.7 * front + 0.3 * rear, rear + 0.25]
     for k, door in enumerate(doors):
         handle = box(0.06, 0.035, 0.17).moved(float(frame.half_width(door)) - 0.02, frame.belt - 0.11, door)
         parts.append(Part.of(f"left_handle_{k}", handle, plain((168, 170, 176), "chrome")))
-    return parts + [part.mirrored() for part in parts]
+    return pair(*parts)
 
 
 def _extras(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> list[Part]:
@@ -137,11 +127,10 @@ def _extras(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> list[Pa
         inner = float(frame.half_width(middle)) * 0.93
         parts.append(Part.of("bed", box(2 * inner - 0.24, 0.1, long - 0.22).moved(0, frame.deck + 0.01, middle), black))
         wall = plain(paint, "paint")
-        rail = Part.of(
-            "left_bed_wall", box(0.12, 0.26, long - 0.08).moved(inner - 0.06, frame.deck + 0.045, middle + 0.03), wall
-        )
+        side = box(0.12, 0.26, long - 0.08).moved(inner - 0.06, frame.deck + 0.045, middle + 0.03)
+        rail = Part.of("left_bed_wall", side, wall)
         gate = box(2 * inner - 0.2, 0.24, 0.1).moved(0, frame.deck + 0.04, -half + 0.13)
-        parts += [rail, rail.mirrored(), Part.of("tailgate", gate, wall)]
+        parts += [*pair(rail), Part.of("tailgate", gate, wall)]
         if rng.random() < 0.5:
             width = inner * frame.roof * 0.98
             hoop = [(width, frame.deck, tail - 0.2), (width * 0.95, frame.height - 0.05, tail - 0.14)]
@@ -149,10 +138,8 @@ def _extras(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> list[Pa
             parts.append(Part.of("roll_bar", sweep(hoop, ellipse(0.04, 0.04, 8), up=(0, 0, 1)), black))
     if frame.style in ("wagon", "suv") and rng.random() < 0.65 or frame.style == "van" and rng.random() < 0.3:
         x = float(frame.half_width(0)) * frame.roof - 0.12
-        bar = Part.of(
-            "left_roof_rail", box(0.05, 0.12, 0.85 * (front - rear)).moved(x, roof_y + 0.03, (front + rear) / 2), black
-        )
-        parts += [bar, bar.mirrored()]
+        bar = box(0.05, 0.12, 0.85 * (front - rear)).moved(x, roof_y + 0.03, (front + rear) / 2)
+        parts += pair(Part.of("left_roof_rail", bar, black))
         if rng.random() < 0.6:
             for k, share in enumerate((0.25, 0.75)):
                 cross = box(2 * x + 0.1, 0.03, 0.06).moved(0, roof_y + 0.085, rear + share * (front - rear))
@@ -162,21 +149,16 @@ def _extras(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> list[Pa
         height = rng.uniform(0.12, 0.24)
         for_paint = plain(paint, "paint") if rng.random() < 0.5 else black
         blade = box(2 * wide, 0.04, 0.28, 0.02).moved(0, frame.deck + height, -half + 0.16)
-        strut = Part.of(
-            "left_strut",
-            box(0.05, height + 0.12, 0.12).moved(0.7 * wide, frame.deck + height / 2 - 0.05, -half + 0.17),
-            black,
-        )
-        parts += [Part.of("spoiler", blade, for_paint), strut, strut.mirrored()]
+        strut = box(0.05, height + 0.12, 0.12).moved(0.7 * wide, frame.deck + height / 2 - 0.05, -half + 0.17)
+        parts += [Part.of("spoiler", blade, for_paint), *pair(Part.of("left_strut", strut, black))]
     if frame.style in ("sedan", "wagon") and rng.random() < 0.12:
         sign = tapered((0.5, 0.2), (0.42, 0.12), 0.2).moved(0, roof_y + 0.1, 0.4 * rear + 0.6 * front)
         parts.append(Part.of("roof_sign", sign, plain((236, 190, 40), "sign")))
     if rng.random() < 0.6:
-        pipe: Solid = (
-            cylinder(0.045, 0.3, 10).turned("x", 90).moved(0.5 * frame.width / 2, frame.floor + 0.1, -half + 0.02)
-        )
+        pipe = cylinder(0.045, 0.3, 10).turned("x", 90)
+        pipe = pipe.moved(0.5 * frame.width / 2, frame.floor + 0.1, -half + 0.02)
         exhaust = Part.of("left_exhaust", pipe, plain((140, 142, 146), "exhaust"))
-        parts += [exhaust, exhaust.mirrored()] if frame.style in ("sports", "coupe") else [exhaust]
+        parts += pair(exhaust) if frame.style in ("sports", "coupe") else [exhaust]
     return parts
 
 
@@ -189,8 +171,7 @@ def car(rng: np.random.Generator) -> list[Part]:
     Returns:
         Its parts in metres, y up, front along +z, standing on y = 0.
     """
-    names = list(STYLES)
-    frame = sample_frame(rng, names[rng.choice(len(names), p=np.array([3, 1.5, 2.5, 1.5, 2.5, 1.5, 1.5, 2]) / 16)])
+    frame = sample_frame(rng, pick(rng, _SHARES))
     weights = np.array([paint[3] for paint in _PAINTS])
     hue, saturation, value, _ = _PAINTS[rng.choice(len(_PAINTS), p=weights / weights.sum())]
     paint = tint(rng, hue, saturation, value, 0.08)

@@ -10,7 +10,7 @@ import numpy as np
 from data_gen.shapes.chair_backs import arms, back
 from data_gen.shapes.chair_frame import ChairFrame, Palette, sample_palette
 from data_gen.shapes.chair_legs import legs
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pick
 from data_gen.shapes.primitives import box, cushion
 from data_gen.shapes.solids import lathe
 
@@ -21,7 +21,7 @@ _KINDS = {"dining": 0.5, "lounge": 0.2, "office": 0.14, "bar": 0.08, "rocking": 
 
 def _frame(rng: np.random.Generator) -> ChairFrame:
     """Draw the kind of chair and its measures."""
-    kind = list(_KINDS)[int(rng.choice(len(_KINDS), p=list(_KINDS.values())))]
+    kind = pick(rng, _KINDS)
     width, depth = rng.uniform(0.4, 0.52), rng.uniform(0.4, 0.5)
     seat, back_height, lean = rng.uniform(0.43, 0.48), rng.uniform(0.38, 0.58), rng.uniform(3, 14)
     thick = rng.uniform(0.022, 0.06)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from data_gen.shapes.chair_frame import ChairFrame, Palette
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pair, pick
 from data_gen.shapes.primitives import box, cushion, panel, post, rod, tube
 
 __all__ = ["BACKS", "arms", "back"]
@@ -20,8 +20,8 @@ def _posts(frame: ChairFrame, palette: Palette, size: float, top: float = 1.0) -
     """The two uprights that carry a back."""
     x = frame.width / 2 - size / 2 - 0.012
     foot, head = frame.at_back(x, -_SINK / frame.back), frame.at_back(x, top)
-    left = Part.of("left_back_post", post(foot, head, size, 0.8 * size, 4 if palette.wooden else 8), palette.frame)
-    return [left, left.mirrored()]
+    upright = post(foot, head, size, 0.8 * size, palette.sides)
+    return pair(Part.of("left_back_post", upright, palette.frame))
 
 
 def _rail(frame: ChairFrame, palette: Palette, share: float, height: float, bow: float, name: str) -> Part:
@@ -61,15 +61,9 @@ def _panel(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> lis
     """A curved shell that rises from the seat, its head rounded off or square."""
     lean = frame.back * np.tan(np.radians(frame.lean))
     width = frame.width - 0.02
-    solid = panel(
-        width * rng.uniform(0.86, 1.0),
-        width * rng.uniform(0.8, 1.04),
-        frame.back + _SINK,
-        rng.uniform(0.02, 0.035),
-        rng.uniform(0.02, 0.09),
-        float(lean),
-        rng.choice([0.0, 0.25, 0.5, 0.8]),
-    )
+    bottom, top = width * rng.uniform(0.86, 1.0), width * rng.uniform(0.8, 1.04)
+    thick, bow, roundness = rng.uniform(0.02, 0.035), rng.uniform(0.02, 0.09), rng.choice([0.0, 0.25, 0.5, 0.8])
+    solid = panel(bottom, top, frame.back + _SINK, thick, bow, float(lean), roundness)
     z = -frame.depth / 2 + 0.05
     return [Part.of("back", solid.projected("z").moved(0, frame.seat - _SINK, z), palette.seat)]
 
@@ -82,9 +76,8 @@ def _framed(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> li
     parts.append(_rail(frame, palette, 0.2, 0.04, 0.0, "low_rail"))
     choice, x = rng.random(), frame.width / 2 - size
     if choice < 0.35:
-        parts.append(
-            Part.of("brace_0", rod(frame.at_back(x, 0.2), frame.at_back(-x, 0.94), 0.03, 0.016), palette.frame)
-        )
+        first = rod(frame.at_back(x, 0.2), frame.at_back(-x, 0.94), 0.03, 0.016)
+        parts.append(Part.of("brace_0", first, palette.frame))
         second = rod(frame.at_back(-x, 0.2, 0.004), frame.at_back(x, 0.94, 0.004), 0.03, 0.016)
         parts.append(Part.of("brace_1", second, palette.frame))
     elif choice < 0.65:
@@ -104,21 +97,16 @@ def _padded(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> li
     thick = rng.uniform(0.08, 0.13) * (1.25 if frame.kind == "lounge" else 0.8)
     wide = frame.width * rng.uniform(0.9, 1.0)
     pad = cushion(wide, thick, frame.back + 0.05, rng.uniform(0.2, 0.8)).turned("x", 90).projected("z")
-    pad = (
-        pad.moved(0, frame.back / 2)
-        .turned("x", -frame.lean)
-        .moved(0, frame.seat - 0.025, -frame.depth / 2 + thick * 0.5)
-    )
-    return [Part.of("back", pad, palette.seat)]
+    pad = pad.moved(0, frame.back / 2).turned("x", -frame.lean)
+    return [Part.of("back", pad.moved(0, frame.seat - 0.025, -frame.depth / 2 + thick * 0.5), palette.seat)]
 
 
 def _office(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """A pad on a bracket, with a headrest on some."""
     gap = rng.uniform(0.05, 0.12)
     wide = frame.width * rng.uniform(0.85, 0.98)
-    pad = panel(
-        wide * 0.9, wide, frame.back - gap, 0.05, 0.05, 0.5 * (frame.back - gap) * 0.3, rng.choice([0.2, 0.4, 0.6])
-    )
+    lean = 0.5 * (frame.back - gap) * 0.3
+    pad = panel(wide * 0.9, wide, frame.back - gap, 0.05, 0.05, lean, rng.choice([0.2, 0.4, 0.6]))
     z = -frame.depth / 2 + 0.02
     spine = [(0, frame.under + 0.015, -0.1), (0, frame.under + 0.015, z - 0.06), (0, frame.seat + gap + 0.18, z - 0.06)]
     parts = [
@@ -127,7 +115,7 @@ def _office(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> li
     ]
     if rng.random() < 0.35:
         top = frame.seat + frame.back
-        z_top = z - 0.5 * (frame.back - gap) * 0.3 - 0.025
+        z_top = z - lean - 0.025
         stem = rod((0, top - 0.1, z_top + 0.0), (0, top + 0.1, z_top), 0.03, 0.02)
         rest = box(0.27, 0.13, 0.06, 0.03).moved(0, top + 0.1, z_top + 0.012)
         parts += [Part.of("headrest_stem", stem, palette.metal), Part.of("headrest", rest, palette.seat)]
@@ -157,9 +145,7 @@ def back(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[
     """Draw a back that suits the chair's kind, and build it; nothing for a stool."""
     if frame.back == 0:
         return []
-    choices = _CHOICES[frame.kind]
-    weights = np.array(list(choices.values()))
-    return BACKS[list(choices)[int(rng.choice(len(choices), p=weights / weights.sum()))]](rng, frame, palette)
+    return BACKS[pick(rng, _CHOICES[frame.kind])](rng, frame, palette)
 
 
 def arms(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
@@ -177,22 +163,14 @@ def arms(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[
         stand = Part.of("left_arm_stand", tube(path, 0.05, 0.02, sides=4), palette.metal)
         rest = box(0.07, 0.03, 0.6 * frame.depth, 0.02).moved(out + 0.015, high, 0.0)
         left = Part.of("left_arm", rest, palette.metal if rng.random() < 0.3 else palette.frame)
-        return [stand, stand.mirrored(), left, left.mirrored()]
+        return [*pair(stand), *pair(left)]
     else:
         lean = (high - frame.seat) * np.tan(np.radians(frame.lean))
-        rest = box(0.055, 0.026, front - rear + 0.06 + lean, 0.012).moved(
-            x - 0.012, high, (front + rear - lean) / 2 + 0.012
-        )
+        rest = box(0.055, 0.026, front - rear + 0.06 + lean, 0.012)
+        rest = rest.moved(x - 0.012, high, (front + rear - lean) / 2 + 0.012)
         foot, head = (x - 0.03, frame.seat - 0.02, front - 0.03), (x - 0.014, high, front - 0.01)
-        stand = Part.of("left_arm_post", post(foot, head, 0.032, 0.028, 4 if palette.wooden else 8), palette.frame)
-        prop = post(
-            (x - 0.03, frame.seat - 0.02, rear + 0.03),
-            (x - 0.016, high, rear),
-            0.026,
-            0.024,
-            4 if palette.wooden else 8,
-        )
-        rear_stand = Part.of("left_arm_rear_post", prop, palette.frame)
-        left = Part.of("left_arm", rest, palette.frame)
-        return [stand, stand.mirrored(), rear_stand, rear_stand.mirrored(), left, left.mirrored()]
-    return [left, left.mirrored()]
+        stand = Part.of("left_arm_post", post(foot, head, 0.032, 0.028, palette.sides), palette.frame)
+        foot, head = (x - 0.03, frame.seat - 0.02, rear + 0.03), (x - 0.016, high, rear)
+        prop = Part.of("left_arm_rear_post", post(foot, head, 0.026, 0.024, palette.sides), palette.frame)
+        return [*pair(stand), *pair(prop), *pair(Part.of("left_arm", rest, palette.frame))]
+    return pair(left)

@@ -57,6 +57,11 @@ class Palette:
     metal: Material
     wooden: bool
 
+    @property
+    def sides(self) -> int:
+        """Of the section of an upright: square where it is of wood."""
+        return 4 if self.wooden else 8
+
 
 _WOODS: tuple[Colour, ...] = (
     (196, 146, 92),

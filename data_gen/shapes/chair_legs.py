@@ -8,7 +8,7 @@ import numpy as np
 
 from data_gen.shapes.chair_frame import ChairFrame, Palette
 from data_gen.shapes.materials import plain
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pair, pick
 from data_gen.shapes.primitives import ball, cone, cylinder, post, rod, tapered, torus, tube
 from data_gen.shapes.solids import lathe
 
@@ -75,9 +75,8 @@ def _four(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list
             ("right", 0.018, 2 * z_edge + 0.016, -x_edge, 0.0),
         ):
             tall = height if x == 0 else height - 0.006
-            apron = tapered((wide, deep), (wide, deep), tall).moved(
-                x, frame.under - tall / 2 + 0.004 + 0.002 * (x == 0), z
-            )
+            y = frame.under - tall / 2 + 0.004 + 0.002 * (x == 0)
+            apron = tapered((wide, deep), (wide, deep), tall).moved(x, y, z)
             parts.append(Part.of(f"{name}_apron", apron, palette.frame))
     if frame.kind == "bar" or (frame.kind != "lounge" and rng.random() < 0.5):
         parts += _stretchers(rng, frame, palette, feet, heads)
@@ -122,7 +121,7 @@ def _sled(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list
     runner = Part.of("left_runner", tube(path, width, sides=sides), palette.metal)
     bearer = Part.of("left_bearer", tube(cut, 0.96 * width, sides=sides), palette.metal)
     cross = rod((x, top, 0.5 * z), (-x, top, 0.5 * z), 0.8 * width, sides=8)
-    return [runner, bearer, runner.mirrored(), bearer.mirrored(), Part.of("bearer", cross, palette.metal)]
+    return [*pair(runner, bearer), Part.of("bearer", cross, palette.metal)]
 
 
 def _cantilever(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
@@ -144,7 +143,7 @@ def _cantilever(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -
     side = Part.of("left_tube", tube(path, width, sides=8), palette.metal)
     floor = rod((x, foot, -z + width), (-x, foot, -z + width), 0.96 * width, sides=8)
     rail = rod((x, top, -z + 0.06), (-x, top, -z + 0.06), 0.96 * width, sides=8)
-    return [side, side.mirrored(), Part.of("floor_rail", floor, palette.metal), Part.of("rail", rail, palette.metal)]
+    return [*pair(side), Part.of("floor_rail", floor, palette.metal), Part.of("rail", rail, palette.metal)]
 
 
 def _column(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
@@ -177,16 +176,14 @@ def _star(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list
         angle = np.radians(72 * k + 18)
         x, z = float(np.sin(angle)), float(np.cos(angle))
         arm = rod((0.02 * x, 0.11, 0.02 * z), (reach * x, 0.075, reach * z), 0.042, 0.03, sides=4)
-        wheel = ball(0.028, 0.028, 0.028, 8, 6).moved(0.96 * reach * x, 0.028, 0.96 * reach * z)
-        fork = post(
-            (0.96 * reach * x, 0.03, 0.96 * reach * z), (0.96 * reach * x, 0.075, 0.96 * reach * z), 0.018, 0.018
-        )
+        x, z = 0.96 * reach * x, 0.96 * reach * z
+        wheel = ball(0.028, 0.028, 0.028, 8, 6).moved(x, 0.028, z)
+        fork = post((x, 0.03, z), (x, 0.075, z), 0.018, 0.018)
         for name, solid, material in (("arm", arm, arms), ("caster", wheel, black), ("fork", fork, black)):
             parts.append(Part.of(f"star_{name}_{k}", solid, material))
     low, high = 0.12, frame.under
-    parts.append(
-        Part.of("sleeve", cylinder(0.034, 0.55 * (high - low), 10).moved(0, low + 0.275 * (high - low)), black)
-    )
+    sleeve = cylinder(0.034, 0.55 * (high - low), 10).moved(0, low + 0.275 * (high - low))
+    parts.append(Part.of("sleeve", sleeve, black))
     parts.append(Part.of("spring", cylinder(0.02, high - low, 8).moved(0, (high + low) / 2 + 0.01), palette.metal))
     mount = tapered((0.12, 0.16), (0.24, 0.28), 0.04).moved(0, high - 0.012)
     return [*parts, Part.of("mount", mount, black)]
@@ -203,13 +200,12 @@ def _rockers(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> l
 
     along = np.linspace(-half - 0.08, half, 9)
     path = np.stack([np.full(9, x), height(along), along], 1)
-    runner = Part.of("left_rocker", tube(path, 0.032, 0.04, sides=4), palette.frame)
-    parts = [runner, runner.mirrored()]
+    parts = pair(Part.of("left_rocker", tube(path, 0.032, 0.04, sides=4), palette.frame))
     for end, at in (("front", z), ("rear", -z)):
         foot = (x, float(height(at)) - 0.005, at)
         leg = Part.of(f"{end}_left_leg", post(foot, (x, frame.under + _BITE, at), 0.8 * size, size, 8), palette.frame)
         bar = rod((x, 0.5 * frame.under, at), (-x, 0.5 * frame.under, at), 0.02)
-        parts += [leg, leg.mirrored(), Part.of(f"{end}_stretcher", bar, palette.frame)]
+        parts += [*pair(leg), Part.of(f"{end}_stretcher", bar, palette.frame)]
     return parts
 
 
@@ -236,9 +232,7 @@ _CHOICES = {
 
 def legs(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Draw a way to stand that suits the chair's kind, and build it."""
-    choices = _CHOICES[frame.kind]
-    weights = np.array(list(choices.values()))
-    name = list(choices)[int(rng.choice(len(choices), p=weights / weights.sum()))]
+    name = pick(rng, _CHOICES[frame.kind])
     if frame.round_seat and name in ("sled", "cantilever"):
         name = "four"
     return LEGS[name](rng, frame, palette)

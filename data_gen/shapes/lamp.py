@@ -13,7 +13,7 @@ import numpy as np
 from data_gen.shapes.lamp_shades import Shade, sample_cloth, sample_shade, shell
 from data_gen.shapes.lamp_stands import floor_stand, foot, sample_metal, table_body
 from data_gen.shapes.materials import Material, plain, tint
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pick
 from data_gen.shapes.primitives import ball, cone, cylinder, rod, tube
 from data_gen.shapes.solids import lathe
 
@@ -94,9 +94,8 @@ def _desk(rng: np.random.Generator) -> list[Part]:
     """Two jointed arms and a turnable metal head."""
     colour = plain(tint(rng, rng.random(), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)), "paint")
     metal = colour if rng.random() < 0.5 else sample_metal(rng)
-    style = sample_shade(
-        rng, rng.uniform(0.085, 0.115), rng.uniform(0.12, 0.16), ("dome", "coolie", "bell", "empire", "tulip")
-    )
+    radius, high = rng.uniform(0.085, 0.115), rng.uniform(0.12, 0.16)
+    style = sample_shade(rng, radius, high, ("dome", "coolie", "bell", "empire", "tulip"))
     style = replace(style, cloth=colour, trim=None, segments=24)
     lower, upper = rng.uniform(0.22, 0.3), rng.uniform(0.2, 0.28)
     lean, forward = np.radians(rng.uniform(8, 32)), np.radians(rng.uniform(25, 60))
@@ -143,9 +142,8 @@ def _pendant(rng: np.random.Generator) -> list[Part]:
         if style.shape in ("dome", "coolie"):
             cover = lathe([(style.radius_at(1.0) - 0.004, 0.985 * style.height), (0.02, 1.12 * style.height)], 24)
             parts.append(Part.of("cover", cover, metal))
-            parts.append(
-                Part.of("collar", cylinder(0.019, 0.3 * style.height, 10).moved(0, 0.95 * style.height), metal)
-            )
+            collar = cylinder(0.019, 0.3 * style.height, 10).moved(0, 0.95 * style.height)
+            parts.append(Part.of("collar", collar, metal))
     cord = cylinder(0.009, drop + 0.1, 8).moved(0, top + drop / 2 - 0.05)
     return [*parts, Part.of("cord", cord, plain((46, 44, 44), "cord")), *_ceiling(top + drop, metal)]
 
@@ -205,6 +203,5 @@ def lamp(rng: np.random.Generator) -> list[Part]:
     Returns:
         Its parts in metres, y up, front along +z.
     """
-    shares = [share for share, _ in KINDS.values()]
-    kind = list(KINDS)[int(rng.choice(len(KINDS), p=shares))]
+    kind = pick(rng, {name: share for name, (share, _) in KINDS.items()})
     return KINDS[kind][1](rng)

@@ -81,9 +81,8 @@ def sample_shade(rng: np.random.Generator, radius: float, height: float, shapes:
     cloth = sample_cloth(rng)
     trim = plain(tint(rng, rng.random(), 0.6, 0.4), "trim") if rng.random() < 0.4 else None
     grow = rng.uniform(0.88, 1.12, 2)
-    return Shade(
-        shape, radius * float(grow[0]) * (1.15 if segments == 4 else 1), height * float(grow[1]), segments, cloth, trim
-    )
+    radius = radius * float(grow[0]) * (1.15 if segments == 4 else 1)
+    return Shade(shape, radius, height * float(grow[1]), segments, cloth, trim)
 
 
 def _hull(style: Shade) -> tuple[Solid, int]:

@@ -51,15 +51,8 @@ def foot(rng: np.random.Generator, radius: float, metal: Material) -> list[Part]
         profile = np.stack([radius * np.cos(angles), 0.01 + 0.45 * radius * np.sin(angles)], 1)
         solid = lathe([(radius, 0), *profile, (0.1 * radius, 0.01 + 0.45 * radius)], 24)
     elif choice == 2:
-        steps = [
-            (radius, 0),
-            (radius, 0.02),
-            (0.72 * radius, 0.024),
-            (0.72 * radius, 0.046),
-            (0.42 * radius, 0.05),
-            (0.4 * radius, 0.075),
-        ]
-        solid = lathe(steps, 24)
+        radii, levels = radius * np.array([1, 1, 0.72, 0.72, 0.42, 0.4]), (0, 0.02, 0.024, 0.046, 0.05, 0.075)
+        solid = lathe(np.stack([radii, levels], 1), 24)
     else:
         solid = box(1.7 * radius, 0.04, 1.7 * radius, 0.02, 2).moved(0, 0.02)
     return [Part.of("foot", solid.creased(30), metal)]
@@ -92,13 +85,10 @@ def table_body(rng: np.random.Generator, height: float, radius: float, metal: Ma
     choice = rng.random()
     if choice < 0.4:
         body = lathe(_vase(rng, height, radius), 20).repeated(2).creased(50)
-        parts = [Part.of("body", body, material)]
         if rng.random() < 0.5:
-            parts = [
-                Part.of("plinth", cylinder(0.8 * radius, 0.03, 20).moved(0, 0.013), metal),
-                Part.of("body", body.moved(0, 0.02), material),
-            ]
-        return parts
+            plinth = cylinder(0.8 * radius, 0.03, 20).moved(0, 0.013)
+            return [Part.of("plinth", plinth, metal), Part.of("body", body.moved(0, 0.02), material)]
+        return [Part.of("body", body, material)]
     if choice < 0.55:  # balls on one another
         count = int(rng.integers(2, 5))
         size = height / (2 * 0.92 * count)
@@ -128,11 +118,8 @@ def _tripod(rng: np.random.Generator, height: float, radius: float, material: Ma
         leg = post((radius * x, 0, radius * z), (0.02 * x, height, 0.02 * z), 0.7 * thick, thick, 6)
         parts.append(Part.of(f"leg_{k}", leg, material))
         if height > 0.8:
-            share = 0.45
-            tip = radius * (1 - share) + 0.02 * share
-            parts.append(
-                Part.of(f"brace_{k}", rod((0, share * height, 0), (tip * x, share * height, tip * z), 0.012), metal)
-            )
+            tip, y = radius * (1 - 0.45) + 0.02 * 0.45, 0.45 * height
+            parts.append(Part.of(f"brace_{k}", rod((0, y, 0), (tip * x, y, tip * z), 0.012), metal))
     return [*parts, Part.of("hub", cylinder(0.022 + 0.7 * thick, 0.07, 12).moved(0, height - 0.01), metal)]
 
 

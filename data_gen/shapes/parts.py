@@ -7,7 +7,7 @@ face, so nothing bleeds in at any distance; a pattern is a tile with its border 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from trimesh.visual.material import PBRMaterial
 from data_gen.shapes.materials import Material
 from data_gen.shapes.solids import Solid
 
-__all__ = ["Part", "atlas", "build_scene", "corner_normals"]
+__all__ = ["Part", "atlas", "build_scene", "corner_normals", "pair", "pick"]
 
 _WIDTH, _BLOCK, _MARGIN = 256, 16, 8
 
@@ -58,6 +58,17 @@ class Part:
     def mirrored(self) -> Part:
         """The part reflected in the plane x = 0, "left" in its name become "right"."""
         return replace(self, name=self.name.replace("left", "right"), solid=self.solid.mirrored())
+
+
+def pair(*parts: Part) -> list[Part]:
+    """The parts, all of them "left" ones, and their mirror images."""
+    return [*parts, *(part.mirrored() for part in parts)]
+
+
+def pick(rng: np.random.Generator, shares: Mapping[str, float]) -> str:
+    """One of the names, each as often as its share of all shares."""
+    weights = np.array(list(shares.values()))
+    return list(shares)[int(rng.choice(len(weights), p=weights / weights.sum()))]
 
 
 def atlas(materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pick
 from data_gen.shapes.plane_civil import airliner, turboprop
 from data_gen.shapes.plane_military import fighter
 from data_gen.shapes.plane_small import biplane, glider, light
@@ -36,6 +36,5 @@ def plane(rng: np.random.Generator) -> list[Part]:
     Returns:
         Its parts in metres, y up, nose along +z.
     """
-    shares = [share for share, _ in KINDS.values()]
-    kind = list(KINDS)[int(rng.choice(len(KINDS), p=shares))]
+    kind = pick(rng, {name: share for name, (share, _) in KINDS.items()})
     return KINDS[kind][1](rng)

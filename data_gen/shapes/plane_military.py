@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
-from data_gen.shapes.parts import Part
+from data_gen.shapes.parts import Part, pair
 from data_gen.shapes.plane_livery import camouflage
 from data_gen.shapes.plane_parts import fin, fuselage, pylon, wing
 from data_gen.shapes.primitives import ball
@@ -39,20 +39,14 @@ def _skins(rng: np.random.Generator) -> tuple[Material, Material]:
 def _store(name: str, x: float, y: float, z: float, size: float) -> list[Part]:
     """A missile under a pylon that reaches up into the wing."""
     body = lathe([(0.1, 0), (0.11, 0.1), (0.11, 2.2), (0.06, 2.5), (0, 2.65)], 8).creased(60).scaled(size, size, size)
-    parts = [
-        Part.of(name, body.turned("x", 90).moved(x, y - 0.42 * size, z - 1.2 * size), plain((196, 190, 176), "missile"))
-    ]
+    body = body.turned("x", 90).moved(x, y - 0.42 * size, z - 1.2 * size)
+    parts = [Part.of(name, body, plain((196, 190, 176), "missile"))]
     blade = pylon((x, y - 0.44 * size, z), (x, y + 0.05 * size, z), 0.08 * size, 0.9 * size)
     parts.append(Part.of(f"{name}_pylon", blade, plain((88, 92, 98), "pylon")))
     for angle in (45.0, 135.0):
         vane = pylon((0, -0.3 * size, 0), (0, 0.3 * size, 0), 0.02 * size, 0.3 * size).turned("z", angle)
-        parts.append(
-            Part.of(
-                f"{name}_vane_{angle:.0f}",
-                vane.moved(x, y - 0.42 * size, z - (0.95 + 0.0002 * angle) * size),
-                plain((120, 40, 36), "vane"),
-            )
-        )
+        vane = vane.moved(x, y - 0.42 * size, z - (0.95 + 0.0002 * angle) * size)
+        parts.append(Part.of(f"{name}_vane_{angle:.0f}", vane, plain((120, 40, 36), "vane")))
     return parts
 
 
@@ -86,29 +80,19 @@ def fighter(rng: np.random.Generator) -> list[Part]:
     parts = [Part.of("fuselage", body, main).painted(body.cells[:, 0] >= 6, radome)]
     canopy = ball(0.22 * width, 0.36 * height, 0.105 * length, 12, 8).moved(0, 0.33 * height, 0.24 * length)
     parts.append(Part.of("canopy", canopy, plain((56, 60, 64) if rng.random() < 0.6 else (132, 104, 52), "glass")))
-    intake = fuselage(
-        0.36 * length, 0.34 * width, 0.62 * height, ((0, 0.4, 0.5, 0), (0.25, 0.9, 0.9, 0), (1, 1, 1, 0)), 5, 12
-    )
+    duct = ((0, 0.4, 0.5, 0), (0.25, 0.9, 0.9, 0), (1, 1, 1, 0))
+    intake = fuselage(0.36 * length, 0.34 * width, 0.62 * height, duct, 5, 12)
     left = Part.of("left_intake", intake.moved(0.42 * width, -0.08 * height, 0.02 * length), main)
-    left = left.capped(plain((30, 30, 34), "duct"), first=False)
-    parts += [left, left.mirrored()]
+    parts += pair(left.capped(plain((30, 30, 34), "duct"), first=False))
     span = rng.uniform(3.9, 5.0)
     root = length * (rng.uniform(0.44, 0.52) if delta else rng.uniform(0.27, 0.33))
     tip = root * (rng.uniform(0.06, 0.12) if delta else rng.uniform(0.25, 0.4))
     sweep = root - tip - rng.uniform(0, 0.06) * root if delta else span * rng.uniform(0.6, 0.85)
     z = -0.5 * length + 0.1 * length + root if delta else 0.06 * length + 0.3 * root
-    panel = (
-        wing(root, tip, span, sweep, rng.uniform(-0.06, 0.02) * span, 0.05, 0.0)
-        .projected("y")
-        .moved(0, 0.04 * height, z)
-    )
-    wing_left = Part.of("left_wing", panel, main)
-    parts += [wing_left, wing_left.mirrored()]
-    edge = wing(0.3 * length, 0.03 * length, 0.34 * width, 0.26 * length, 0, 0.04, 0.24 * width).moved(
-        0, 0.06 * height, z + 0.2 * length - 0.1 * root
-    )
-    strake = Part.of("left_strake", edge, second)
-    parts += [strake, strake.mirrored()]
+    panel = wing(root, tip, span, sweep, rng.uniform(-0.06, 0.02) * span, 0.05, 0.0).projected("y")
+    parts += pair(Part.of("left_wing", panel.moved(0, 0.04 * height, z), main))
+    edge = wing(0.3 * length, 0.03 * length, 0.34 * width, 0.26 * length, 0, 0.04, 0.24 * width)
+    parts += pair(Part.of("left_strake", edge.moved(0, 0.06 * height, z + 0.2 * length - 0.1 * root), second))
     at = np.array([0.5 * width, 0.05 * height, -0.5 * length + 0.17 * length])
     if delta and rng.random() < 0.6:
         at[2] = 0.22 * length
@@ -118,40 +102,27 @@ def fighter(rng: np.random.Generator) -> list[Part]:
         small = wing(0.16 * length, 0.06 * length, 2.3, 0.11 * length, -0.05, 0.06, -0.4).projected("y")
         tailplane = Part.of("left_tailplane", small.moved(*at), main)
     if not delta or at[2] > 0:
-        parts += [tailplane, tailplane.mirrored()]
+        parts += pair(tailplane)
     fin_root, fin_height = length * rng.uniform(0.17, 0.21), rng.uniform(1.9, 2.5)
     blade = fin(fin_root, 0.4 * fin_root, fin_height, 0.8 * fin_height, 0.06)
     foot = -0.5 * length + 0.06 * length + fin_root
     if twin:
         cant = rng.uniform(0, 22)
-        upright = Part.of("left_fin", blade.turned("z", -cant).moved(0.33 * width, 0.18 * height, foot), main)
-        parts += [upright, upright.mirrored()]
+        upright = blade.turned("z", -cant).moved(0.33 * width, 0.18 * height, foot)
+        parts += pair(Part.of("left_fin", upright, main))
     else:
         parts.append(Part.of("fin", blade.scaled(1, 1.2, 1).moved(0, 0.2 * height, foot), main))
-    nozzle_x = (0.24 * width,) if twin else (0.0,)
     radius = 0.25 * height if twin else 0.29 * height
-    nozzle = lathe(
-        [(0.72 * radius, -0.9), (0.78 * radius, -0.92), (radius, 0.5), (0.9 * radius, 0.5), (0.6 * radius, -0.2)],
-        14,
-        ring=True,
-    )
+    mouth = [(0.72 * radius, -0.9), (0.78 * radius, -0.92), (radius, 0.5), (0.9 * radius, 0.5), (0.6 * radius, -0.2)]
+    nozzle = lathe(mouth, 14, ring=True)
     flame = lathe([(0.75 * radius, -0.45), (0.8 * radius, 0.4)], 12)
-    for x in nozzle_x:
-        ring = Part.of(
-            "left_nozzle",
-            nozzle.turned("x", 90).moved(x, 0.02 * height, -0.5 * length - 0.1),
-            plain((64, 62, 62), "nozzle"),
-        )
-        core = Part.of(
-            "left_burner",
-            flame.turned("x", 90).moved(x, 0.02 * height, -0.5 * length - 0.1),
-            plain((34, 30, 30), "burner"),
-        )
-        parts += [ring, core] + ([ring.mirrored(), core.mirrored()] if twin else [])
+    end = (0.24 * width if twin else 0.0, 0.02 * height, -0.5 * length - 0.1)
+    ring = Part.of("left_nozzle", nozzle.turned("x", 90).moved(*end), plain((64, 62, 62), "nozzle"))
+    core = Part.of("left_burner", flame.turned("x", 90).moved(*end), plain((34, 30, 30), "burner"))
+    parts += pair(ring, core) if twin else [ring, core]
     if rng.random() < 0.6:
         for k, share in enumerate((0.45, 0.68)[: int(rng.integers(1, 3))]):
             x = share * span
             chord = root + (tip - root) * share
-            store = _store(f"left_missile_{k}", x, 0.02 * height, z - sweep * share - 0.5 * chord, 1.0)
-            parts += store + [part.mirrored() for part in store]
+            parts += pair(*_store(f"left_missile_{k}", x, 0.02 * height, z - sweep * share - 0.5 * chord, 1.0))
     return parts

@@ -15,7 +15,7 @@ from data_gen.shapes.primitives import ball, cylinder, rod
 from data_gen.shapes.profiles import airfoil, rectangle, superellipse
 from data_gen.shapes.solids import Solid, lathe, loft
 
-__all__ = ["propeller", "fin", "fuselage", "jet_engine", "pair", "pylon", "undercarriage", "wing"]
+__all__ = ["propeller", "fin", "fuselage", "jet_engine", "pylon", "undercarriage", "wing"]
 
 _BLACK = plain((36, 36, 40), "black")
 
@@ -99,22 +99,13 @@ def fin(root: float, tip: float, height: float, sweep: float, thickness: float =
 def jet_engine(name: str, radius: float, length: float, at: tuple[float, float, float], cowl: Material) -> list[Part]:
     """A nacelle with an open intake and a core, its middle at a point, facing +z."""
     r, h = radius, length / 2
-    shell = [
-        (0.62 * r, -h),
-        (0.9 * r, -0.2 * h),
-        (r, 0.5 * h),
-        (0.95 * r, h),
-        (0.86 * r, 0.94 * h),
-        (0.6 * r, -0.5 * h),
-    ]
-    outlet = lathe(
-        [(0.42 * r, -1.35 * h), (0.56 * r, -0.9 * h), (0.8 * r, 0.2 * h), (0.86 * r, 0.66 * h), (0.2 * r, 0.72 * h)], 14
-    )
-    spinner = lathe([(0.24 * r, 0.6 * h), (0.14 * r, 0.82 * h), (0, 0.9 * h)], 10)
+    shell = np.array([(0.62, -1), (0.9, -0.2), (1, 0.5), (0.95, 1), (0.86, 0.94), (0.6, -0.5)]) * (r, h)
+    outlet = np.array([(0.42, -1.35), (0.56, -0.9), (0.8, 0.2), (0.86, 0.66), (0.2, 0.72)]) * (r, h)
+    spinner = np.array([(0.24, 0.6), (0.14, 0.82), (0, 0.9)]) * (r, h)
     parts = [
         (f"{name}_cowl", lathe(shell, 16, ring=True).creased(50), cowl),
-        (f"{name}_core", outlet.creased(50), plain((58, 60, 66), "core")),
-        (f"{name}_spinner", spinner, plain((120, 122, 128), "spinner")),
+        (f"{name}_core", lathe(outlet, 14).creased(50), plain((58, 60, 66), "core")),
+        (f"{name}_spinner", lathe(spinner, 10), plain((120, 122, 128), "spinner")),
     ]
     return [Part.of(part, solid.turned("x", 90).moved(*at), material) for part, solid, material in parts]
 
@@ -135,26 +126,13 @@ def propeller(
     Returns:
         The parts.
     """
-    hub = lathe(
-        [
-            (0.16 * radius, -0.12 * radius),
-            (0.15 * radius, 0.08 * radius),
-            (0.09 * radius, 0.24 * radius),
-            (0, 0.32 * radius),
-        ],
-        12,
-    )
+    hub = lathe(np.array([(0.16, -0.12), (0.15, 0.08), (0.09, 0.24), (0, 0.32)]) * radius, 12)
     parts = [Part.of(f"{name}_spinner", hub.creased(50).turned("x", 90).moved(*at), spinner)]
     tipped = plain((214, 168, 40), "blade_tip")
+    outline = np.array([(-0.02, -0.035), (0.02, -0.055), (0.02, 0.035), (-0.02, 0.055)]) * radius
+    outlines = [outline * size for size in (0.8, 1.2, 1.0, 0.6)]
     for k in range(blades):
-        blade = loft(
-            [
-                np.array([(-0.02, -0.035), (0.02, -0.055), (0.02, 0.035), (-0.02, 0.055)]) * radius * s
-                for s in (0.8, 1.2, 1.0, 0.6)
-            ],
-            [0.02 * radius, 0.5 * radius, 0.86 * radius, radius],
-            "y",
-        ).creased(40)
+        blade = loft(outlines, radius * np.array([0.02, 0.5, 0.86, 1.0]), "y").creased(40)
         part = Part.of(f"{name}_blade_{k}", blade.turned("z", turn + 360 * k / blades).moved(*at), _BLACK)
         parts.append(part.painted(blade.cells[:, 0] == 2, tipped).capped(tipped, first=False))
     return parts
@@ -166,15 +144,7 @@ def undercarriage(
     """A leg with a wheel at its foot, in a streamlined fairing if a material is given for one."""
     x, y, z = foot
     leg = rod(top, foot, 0.4 * radius, 0.22 * radius)
-    wheel = lathe(
-        [
-            (0.75 * radius, -0.18 * radius),
-            (radius, -0.1 * radius),
-            (radius, 0.1 * radius),
-            (0.75 * radius, 0.18 * radius),
-        ],
-        14,
-    )
+    wheel = lathe(np.array([(0.75, -0.18), (1, -0.1), (1, 0.1), (0.75, 0.18)]) * radius, 14)
     disc = cylinder(0.5 * radius, 0.44 * radius, 10)
     parts = [
         Part.of(f"{name}_leg", leg, plain((120, 124, 130), "strut")),
@@ -191,8 +161,3 @@ def pylon(bottom: tuple[float, float, float], top: tuple[float, float, float], w
     """Upright blade between an engine or a store and the wing above it, `chord` long."""
     outlines = [rectangle(chord, width) + (z, x) for x, _, z in (bottom, top)]
     return loft(outlines, [bottom[1], top[1]], "y").creased(20)
-
-
-def pair(parts: Sequence[Part]) -> list[Part]:
-    """The parts and their mirror images."""
-    return [*parts, *(part.mirrored() for part in parts)]

@@ -38,8 +38,8 @@ class Arguments:
         turntable: The format of the turntable.
         mesh_format: The format of the mesh.
         voxels: Along each side of the grid that the mesh is cut from.
-        level: Density at the surface; the one whose silhouettes and depth agree best with the rendered ones when not
-            given.
+        level: Density at the surface, and nothing else; when not given the one whose silhouettes and depth agree best
+            with the rendered ones, and what no shown camera sees into is filled.
         all_views: Show the model every view, not only the support half.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held. What is written has y up.
@@ -74,15 +74,8 @@ def run(arguments: Arguments) -> int:
     """Adapt and write what was asked for."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.devices import choose_device
-    from hyperplanes.export import (
-        agreement,
-        choose_level,
-        density_grid,
-        extract_mesh,
-        save_images,
-        save_mesh,
-        save_turntable,
-    )
+    from hyperplanes.export import save_images, save_turntable
+    from hyperplanes.surface import agreement, choose_level, density_grid, extract_mesh, fill_hidden, save_mesh
 
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device)
@@ -105,7 +98,10 @@ def run(arguments: Arguments) -> int:
     if "mesh" in arguments.what:
         solid = field if isinstance(field, AdaptedField) else field.adapted
         density = density_grid(solid, arguments.voxels)
-        level = arguments.level if arguments.level is not None else choose_level(solid, density, shown.cameras)
+        level = arguments.level
+        if level is None:
+            level = choose_level(solid, density, shown.cameras)
+            density = fill_hidden(density, level, solid.occupancy.bounds, shown.cameras)
         surface = extract_mesh(solid, level=level, density=density)
         found = agreement(surface, solid, query.cameras)
         path = save_mesh(surface, out / f"mesh.{arguments.mesh_format}")

@@ -41,8 +41,8 @@ from hyperplanes.commands.options import (
     optional,
 )
 from hyperplanes.commands.writing import writes_to
-from hyperplanes.utilities.errors import Terminated
 from hyperplanes.utilities.formatting import format_duration, format_rate
+from hyperplanes.utilities.interrupts import Terminated
 from hyperplanes.utilities.processes import is_first_process
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
                         "object; see docs/hypernetwork.md for options that prevent it"
                     )
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
-    if trainer.stopping and trainer.step < trainer.config.steps and trainer.processes.first:
+    if trainer.stopping and trainer.processes.first:
         advice = f"step {trainer.step} is saved, the same command goes on from there"
         if Terminated in heard:
             raise Terminated(advice)

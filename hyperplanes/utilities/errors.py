@@ -1,15 +1,11 @@
-"""Errors that say which object or file they are about, and the end that SIGTERM asks for."""
+"""Errors that say which object or file they are about."""
 
 from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
 
-__all__ = ["Terminated", "prefix_errors"]
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM, as `kill` and clusters send it: ends a verb as Ctrl-C does, with another exit code."""
+__all__ = ["prefix_errors"]
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from hyperplanes.metrics import psnr
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer, TrainingConfig, train
 from hyperplanes.training.watching import TensorBoard
-from hyperplanes.utilities.errors import Terminated
+from hyperplanes.utilities.interrupts import Terminated
 from tests.reference_rendering import Balls, awaken, small_model
 
 FAST = TrainingConfig(steps=6, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)

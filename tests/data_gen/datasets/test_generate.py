@@ -24,6 +24,7 @@ from data_gen.datasets.sources import list_items
 from data_gen.rigs import RIG_PRESETS, fixed, make_rig
 from hyperplanes.data import DataError, Dataset
 from hyperplanes.data.inspection.describe import describe
+from hyperplanes.files import one_writer
 from hyperplanes.geometry import cameras as camera
 
 SMALL = {"views": 4, "resolution": 16, "workers": 1}
@@ -147,13 +148,8 @@ def test_a_folder_with_other_things_in_it_is_refused(tmp_path):
 
 
 def test_two_generations_do_not_write_into_one_folder(tmp_path):
-    import fcntl
-
-    (tmp_path / ".progress").mkdir()
-    with open(tmp_path / ".progress/lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(DataError, match="found another generation at work"):
-            generate(CARS, tmp_path, GenerationConfig(**SMALL))
+    with one_writer(tmp_path), pytest.raises(DataError, match="found another hyperplanes at work there"):
+        generate(CARS, tmp_path, GenerationConfig(**SMALL))
 
 
 def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path):

@@ -1,0 +1,72 @@
+"""Ctrl-C and SIGTERM as exceptions that end a command, wherever it is."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any
+
+__all__ = ["Terminated", "interruptible"]
+
+AGAIN_SECONDS = 0.2
+"""After which an interrupt that was swallowed is raised again."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, as `kill` and clusters send it: ends a verb as Ctrl-C does, with another exit code."""
+
+
+@contextmanager
+def interruptible() -> Generator[None]:
+    """SIGINT raises KeyboardInterrupt and SIGTERM `Terminated` within, until the exception leaves it.
+
+    Once is not enough: where native code calls Python (the compiler, the garbage collector), what is raised there is
+    printed and lost. So a timer raises it again, except while it is being passed on through cleaning up. In threads
+    other than the main one, which signals do not reach, nothing is changed, nor is a signal that is ignored.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard: list[type[KeyboardInterrupt]] = []
+
+    def note(number: int, _: object) -> None:
+        heard.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
+        before.setdefault(signal.SIGALRM, signal.signal(signal.SIGALRM, again))
+        signal.setitimer(signal.ITIMER_REAL, AGAIN_SECONDS, AGAIN_SECONDS)
+        raise heard[-1]
+
+    def again(*_: object) -> None:
+        if not _is_passed_on():
+            raise heard[-1]
+
+    def report(unraisable: sys.UnraisableHookArgs) -> None:
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            hook(unraisable)
+
+    hook = sys.unraisablehook
+    before: dict[int, Any] = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell without job control starts what ends with &
+            before[number] = signal.signal(number, note)
+    sys.unraisablehook = report
+    try:
+        yield
+    finally:
+        if heard:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        sys.unraisablehook = hook
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _is_passed_on() -> bool:
+    """Whether the main thread is in a `finally` or `except` of an interrupt, or in that of a generator being closed."""
+    error = sys.exception()
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt | GeneratorExit):
+            return True
+        error = error.__context__
+    return False

@@ -1,0 +1,99 @@
+"""Ctrl-C and SIGTERM against what every verb promises: one line, an exit code, and nothing half-written left behind."""
+
+import os
+import signal
+import weakref
+from pathlib import Path
+
+import pytest
+from small_demo import demo_folder, first_object
+
+from hyperplanes.cli import main
+from hyperplanes.utilities.interrupts import Terminated, interruptible
+
+SCENE = ["--checkpoint", "{demo}", "--views", "{scene}", "--out"]
+CALLS = {
+    "generate": ["--class", "car", "--count", "3", "--resolution", "16", "--views", "4", "--out", "{out}"],
+    "train": ["--data", "{demo}/data", "--model.network.planes", "6", "--out", "{out}"],
+    "evaluate": ["--data", "{demo}/data", "--method", "nearest_view", "--json", "{out}/scores.json"],
+    "adapt": [*SCENE, "{out}", "--steps", "2"],
+    "render": [*SCENE, "{out}"],
+    "export": [*SCENE, "{out}", "--what", "turntable", "--frames", "2"],
+    "bake": [*SCENE, "{out}/baked.safetensors", "--voxels", "16"],
+    "inspect": ["{demo}/data", "--out", "{out}"],
+    "demo": ["--quick-check", "--out", "{out}"],
+    "reproduce": ["target", "--scale", "smoke", "--out", "{out}"],
+}
+
+
+def children():
+    tasks = Path("/proc/self/task").glob("*/children")
+    return {pid for task in tasks for pid in task.read_text().split()}
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("verb", CALLS)
+def test_a_signal_while_a_file_is_written_leaves_nothing_behind(verb, number, code, tmp_path, monkeypatch, capsys):
+    sync = os.fsync
+
+    def signalled(descriptor):
+        monkeypatch.setattr(os, "fsync", sync)
+        signal.raise_signal(number)
+
+    demo, out, before = demo_folder(), tmp_path / "out", children()
+    given = [each.format(demo=demo, scene=first_object(demo), out=out) for each in CALLS[verb]]
+    monkeypatch.setattr(os, "fsync", signalled)
+    capsys.readouterr()
+    assert main([verb, *given]) == code
+    ending = "interrupted" if code == 130 else "terminated"
+    assert capsys.readouterr().err == f"hyperplanes {verb}: {ending}; the same command goes on where it can\n"
+    assert not [path for path in out.rglob("*") if path.suffix == ".part" or path.name == ".lock"]
+    assert children() <= before
+
+
+def test_an_interrupt_that_a_callback_swallows_is_raised_again(capfd):
+    """Python prints what a weak reference's callback raises and goes on: this loop would never end."""
+    before = signal.getsignal(signal.SIGTERM)
+
+    class Value:
+        pass
+
+    def wait():
+        value = Value()
+        reference = weakref.ref(value, lambda _: signal.raise_signal(signal.SIGTERM))
+        del value
+        while reference() is None:
+            pass
+
+    with pytest.raises(Terminated), interruptible():
+        wait()
+    assert capfd.readouterr().err == ""
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0, 0)
+
+
+def test_an_ignored_signal_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with interruptible():
+            signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_cleaning_up_is_not_interrupted_again(monkeypatch):
+    monkeypatch.setattr("hyperplanes.utilities.interrupts.AGAIN_SECONDS", 0.01)
+    ended = []
+
+    def work():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.pause()  # until the timer
+            signal.pause()
+            ended.append(True)
+
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        work()
+    assert ended
