@@ -113,7 +113,7 @@ def training(folder):
 
 def go_on(folder):
     model = load_model(folder)
-    load_state(folder, model, [torch.optim.Adam(model.parameters())], CONFIG, ("steps",))
+    load_state(folder, model, [torch.optim.Adam(model.parameters())], CONFIG, ("steps",), {})
 
 
 def baked(folder):
