@@ -3,7 +3,7 @@
 import sys
 from importlib import import_module
 
-NAMES = ("generation", "hypernetwork", "lookup", "rendering", "training", "views")
+NAMES = ("any_order", "generation", "hypernetwork", "lookup", "rendering", "training", "views")
 
 
 def main(arguments: list[str]) -> int:

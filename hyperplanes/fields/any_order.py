@@ -70,7 +70,9 @@ class AnyOrderNeRF(Target):
         """The views with their masks and the depth of the hull."""
         return VisibilityPlanes(views.images, views.cameras, views.masks, occupancy)
 
-    def bind(self, parameters: Parameters, planes: VisibilityPlanes | None, bounds: Sphere | None = None) -> Field:
+    def bind(
+        self, parameters: Parameters, planes: VisibilityPlanes | None, bounds: Sphere | None = None
+    ) -> AnyOrderField:
         """The field that these parameters and planes make.
 
         Args:
@@ -152,8 +154,13 @@ class AnyOrderField(Field):
         value = torch.cat([self.layer("feature", hidden), along, _padded(slots, config.blended).flatten(1)], 1)
         factors, shift = self.layer("colour", relu(self.layer("view", value))).split([config.blended, 3], 1)
         weights = torch.softmax(weights.log() + factors[:, :count], 1)
-        blend = (weights[..., None] * colours).sum(1)
-        return torch.sigmoid(torch.logit(blend, 0.005) + shift)
+        return torch.sigmoid(torch.logit(self.blended(weights, colours), 0.005) + shift)
+
+    def blended(
+        self, weights: Float[Tensor, "point chosen"], colours: Float[Tensor, "point chosen 3"]
+    ) -> Float[Tensor, "point 3"]:
+        """The mean of the colours, by weights that sum to one."""
+        return (weights[..., None] * colours).sum(1)
 
 
 def _of(colours: Float[Tensor, "point view 3"], views: Int[Tensor, "point chosen"]) -> Float[Tensor, "point chosen 3"]:
