@@ -31,6 +31,8 @@ from hyperplanes.presets import Preset, preset
 from hyperplanes.training import Trainer
 from hyperplanes.views import Views
 
+__all__ = ["VARIANTS", "configured", "main", "trained"]
+
 
 class _WithoutDepth(AnyOrderNeRF):
     """Every view that shows a point counts as seeing it."""

@@ -15,14 +15,16 @@ __all__ = ["held_out"]
 FIRST_SEED = 900_000
 
 
-def held_out(count: int, size: int, views: int = 50, device: torch.device | str = "cpu") -> list[Task]:
-    """Procedural cars never trained on, half of the views support and half query, on the training rig."""
+def held_out(
+    count: int, size: int, views: int = 50, device: torch.device | str = "cpu", kind: str = "car"
+) -> list[Task]:
+    """Procedural objects never trained on, half of the views support and half query, on the fixed rig."""
     rig = fixed(views, size)
     cameras = rig.cameras(dtype=torch.float32)
     tasks = []
     with MeshRenderer() as renderer:
         for seed in range(FIRST_SEED, FIRST_SEED + count):
-            mesh = prepare_scene(make("car", seed), f"car-{seed}")
+            mesh = prepare_scene(make(kind, seed), f"{kind}-{seed}")
             pixels = torch.tensor(renderer.render(mesh_parts(mesh), rig).rgba).permute(0, 3, 1, 2).float() / 255
             masks = pixels[:, 3:]
             seen = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks).to(device)

@@ -29,6 +29,8 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.views import Task, Tasks, Views, join_views
 
+__all__ = ["METHODS", "Shown", "adapters", "main"]
+
 QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_seconds")
 
 

@@ -14,6 +14,7 @@ from benchmarks.objects import held_out
 from hyperplanes.adaptation import HyperPlanes, diagnose, swap_gap
 from hyperplanes.fields import TargetConfig
 from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.metrics import psnr
 from hyperplanes.training import Trainer, TrainingConfig
 from tests.reference_rendering import Balls, small_model
 
@@ -97,7 +98,12 @@ def cars():
     return held_out(3, 64)
 
 
-@pytest.fixture(params=["cars-64"])
+@cache
+def lamps():
+    return held_out(2, 64, kind="lamp")
+
+
+@pytest.fixture(params=["cars-64", "small"])
 def packaged(request):
     return HyperPlanes.from_pretrained(request.param)
 
@@ -116,6 +122,28 @@ def test_packaged_models_read_the_pictures(packaged):
     assert moved > 0.1 * found.norm
 
 
-def test_swapping_updates_of_packaged_models_costs_decibels(packaged):
-    prepared = [packaged.prepare(task.support) for task in cars()]
-    assert swap_gap(packaged, prepared, [task.query[::8] for task in cars()])[1] > 0.1
+def test_swapping_updates_of_cars_costs_decibels():
+    model = HyperPlanes.from_pretrained("cars-64")
+    prepared = [model.prepare(task.support) for task in cars()]
+    assert swap_gap(model, prepared, [task.query[::8] for task in cars()])[1] > 0.1
+
+
+def test_a_lamp_with_the_update_of_a_car_is_worse_the_fewer_the_views():
+    model = HyperPlanes.from_pretrained("small")
+    few, many = (lamp_with_the_update_of_a_car(model, count) for count in (3, 25))
+    assert few > 2  # measured: 5.0
+    assert many > 0.5  # measured: 1.1
+
+
+@torch.no_grad()
+def lamp_with_the_update_of_a_car(model, count):
+    """What it costs in dB, mean over lamps, where so many views are shown of both."""
+    total = 0.0
+    for lamp, car in zip(lamps(), cars(), strict=False):
+        shown, other = (model.prepare(task.support[:: 25 // count][:count]) for task in (lamp, car))
+        own, foreign = model.updates([shown, other])
+        query = lamp.query[::8]
+        fields = [model.field(shown, model.theta + update) for update in (own, foreign)]
+        right, wrong = (float(psnr(field.render(query.cameras).images, query.images).mean()) for field in fields)
+        total += (right - wrong) / len(lamps())
+    return total
