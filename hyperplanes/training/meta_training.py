@@ -17,8 +17,9 @@ from hyperplanes.adaptation.meta_learning import maml_gradient, reptile_gradient
 from hyperplanes.data.support import SingleView
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters
+from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.episodes import Episode
-from hyperplanes.training.trainer import Trainer, TrainingConfig
+from hyperplanes.training.trainer import Trainer
 from hyperplanes.views import Tasks
 
 __all__ = ["MAMLTrainer", "MatchedTrainer", "ReptileTrainer", "initialisation_trainer"]

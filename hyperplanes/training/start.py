@@ -9,8 +9,9 @@ import torch
 from hyperplanes.adaptation.configuration import ModelConfig
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.devices import TasksOnDevice
+from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.meta_training import initialisation_trainer
-from hyperplanes.training.trainer import Trainer, TrainingConfig
+from hyperplanes.training.trainer import Trainer
 from hyperplanes.views import Tasks
 
 __all__ = ["start_training"]

@@ -1,0 +1,124 @@
+"""How a model is trained, and where a training stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from hyperplanes.adaptation.diagnostics import Diagnostics
+
+__all__ = ["Progress", "TrainingConfig"]
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a model is trained (HyperPlanes, Appendix B: one task a step, 512 rays, learning rates 1e-4, no schedule).
+
+    Four objects of 128 rays a step cost what one of 512 does and end 0.5 dB higher; the paper's presets say one.
+
+    Attributes:
+        steps: Adam steps.
+        epochs: how often each training object is drawn, on average, instead of `steps`; 0 takes `steps`.
+        tasks: objects a step.
+        reference_objects: further objects a step, of which only the HyperPlanes are read. The hypernetwork standardises
+            codes by the objects of the step, and cannot tell what one object alone has in common with the others.
+        rays: query rays an object and step.
+        views: numbers of support views, for a field that takes any number of them. Each episode shows one of these
+            numbers of random views of its object, support and query alike, and draws rays from others. Empty: all
+            support views, in every step.
+        episodes: how many of those are at hand at a time; every step begins one and draws `tasks` of them, so that
+            views, masks and hulls are made ready once for several steps.
+        random_background: prediction and truth are composited over a random colour for every object and step, as far
+            as masks say what is background: over white alone, a white surface cannot be told from none.
+        empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
+            training sees nothing there, but a field that is rendered without masks must know.
+        optimiser: of theta: "adam" as in the paper, or "muon" for the matrices of its hidden layers.
+        learning_rate: of theta, by Adam.
+        muon_learning_rate: of the matrices of theta that Muon optimises.
+        hypernetwork_learning_rate: of the hypernetwork.
+        warmup: steps in which the learning rates rise from zero.
+        final: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
+        alternating: theta and the hypernetwork move in turns, theta first, instead of both in every step. The paper
+            speaks of separate gradient steps; its code moves both.
+        clip: the norm to which the gradient of all weights that a step moves is cut where it is longer; 0 leaves it.
+        average: decay of a moving average of the weights, which is evaluated and saved as the model, while the training
+            goes on from the weights themselves; 0 is none.
+        balanced: classes are drawn equally often, however many objects each has. Where a data set does not state them,
+            each data set is one.
+        evaluate_every: steps between looks at held-out objects.
+        held_out: how many of them are looked at: objects of the "val" split, or where there is none of "test".
+        checkpoint_every: steps between checkpoints.
+        keep_last: how many of them are kept; older ones are deleted.
+        memory: bytes of images, planes and hulls that are kept for later steps; the last object always is.
+        prefetch: steps whose objects a thread makes ready ahead, beyond `memory`; 0 makes them when they are due.
+        seed: of the objects, rays and samples of every step.
+    """
+
+    steps: Annotated[int, range(1, 10**10)] = 2000
+    epochs: Annotated[int, range(10**7)] = 0
+    tasks: Annotated[int, range(1, 4097)] = 4
+    reference_objects: Annotated[int, range(4097)] = 0
+    rays: Annotated[int, range(1, 2**24)] = 128
+    views: tuple[int, ...] = ()
+    episodes: Annotated[int, range(1, 4097)] = 16
+    random_background: bool = False
+    empty_points: Annotated[int, range(2**24)] = 0
+    optimiser: str = "adam"
+    learning_rate: float = 1e-4
+    muon_learning_rate: float = 0.02
+    hypernetwork_learning_rate: float = 1e-4
+    warmup: Annotated[int, range(10**10)] = 0
+    final: float = 1.0
+    alternating: bool = False
+    clip: float = 0.0
+    average: float = 0.0
+    balanced: bool = False
+    evaluate_every: Annotated[int, range(1, 10**10)] = 250
+    held_out: Annotated[int, range(10**6)] = 4
+    checkpoint_every: Annotated[int, range(1, 10**10)] = 500
+    keep_last: Annotated[int, range(1, 10**6)] = 1
+    memory: Annotated[int, range(2**50)] = 2 * 2**30
+    prefetch: Annotated[int, range(1025)] = 1
+    seed: Annotated[int, range(2**40)] = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.average < 1:
+            raise ValueError(f"average: expected a decay from 0 to below 1, got {self.average}")
+        if not self.clip >= 0:
+            raise ValueError(f"clip: expected a norm of 0 or more, got {self.clip}")
+
+    def steps_for(self, objects: int) -> int:
+        """How many steps are taken with so many training objects.
+
+        >>> TrainingConfig(epochs=10, tasks=4).steps_for(150)
+        375
+
+        Args:
+            objects: to train on.
+        """
+        return -(-self.epochs * objects // self.tasks) if self.epochs else self.steps
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training stands.
+
+    Attributes:
+        step: steps done.
+        steps: steps to do.
+        loss: mean squared error of the last step's rays.
+        rays_per_second: since the last report.
+        psnr: in dB, of some views of held-out objects, where this step looked at them.
+        seconds_left: by the speed so far.
+        diagnostics: of the hypernetwork on those objects.
+        ssim: of the same views, where they are large enough for it.
+    """
+
+    step: int
+    steps: int
+    loss: float
+    rays_per_second: float
+    psnr: float | None
+    seconds_left: float
+    diagnostics: Diagnostics | None = None
+    ssim: float | None = None
