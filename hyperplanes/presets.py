@@ -162,17 +162,18 @@ PRESETS: dict[str, Preset] = {
     "small": Preset(
         ModelConfig(
             target="any_order",
-            network=TargetConfig(depth=3, width=96, planes=8, point_octaves=6, direction_octaves=2),
-            hypernetwork=replace(ALL_LAYERS, join="mean", views=6, resolution=64),
+            network=TargetConfig(depth=4, width=128, planes=8, grid=8, point_octaves=6, direction_octaves=2),
+            hypernetwork=replace(ALL_LAYERS, encoder="volume", code=256),
             sampling=Marched(steps=64),
             hull_side=64,
         ),
         TrainingConfig(
             steps=30_000,
             tasks=4,
-            rays=128,
+            rays=256,
             views=(1, 2, 3, 4, 5, 7, 10, 15, 25, 40),
             random_background=True,
+            completion=0.1,
             optimiser="muon",
             learning_rate=2e-3,
             hypernetwork_learning_rate=1e-3,

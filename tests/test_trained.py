@@ -117,7 +117,7 @@ def test_packaged_models_read_the_pictures(packaged):
     noise = torch.rand(first.views.images.shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         own = packaged.update(first)
-        other = packaged.update(replace(first, views=replace(first.views, images=noise)))
+        other = packaged.update(packaged.prepare(replace(cars()[0].support, images=noise)))
     moved = sum(float((own[name] - other[name]).square().sum()) for name in own) ** 0.5
     assert moved > 0.1 * found.norm
 

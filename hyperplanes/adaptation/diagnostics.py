@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
 from hyperplanes.checkpoints import CheckpointError
-from hyperplanes.hypernetwork import Autoencoder, HyperNetwork
+from hyperplanes.hypernetwork import Autoencoder, Reader
 from hyperplanes.metrics import psnr
 from hyperplanes.views import Views
 
@@ -138,7 +138,7 @@ def swap_gap(
     return own, own - quality(1)
 
 
-def _activated(hypernetwork: HyperNetwork | Autoencoder) -> list[torch.nn.Module]:
+def _activated(hypernetwork: Reader) -> list[torch.nn.Module]:
     """The modules whose outputs go through an activation function."""
     if isinstance(hypernetwork, Autoencoder):
         return [hypernetwork.latent]

@@ -26,7 +26,8 @@ from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.visibility import VisibilityPlanes
-from hyperplanes.hypernetwork import Autoencoder, HyperNetwork
+from hyperplanes.geometry.volume import CHANNELS, SIDE, volume_of
+from hyperplanes.hypernetwork import VOLUME, Autoencoder, HyperNetwork, Reader, VolumeHyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views
@@ -42,11 +43,13 @@ class Prepared:
         views: the support views in the order of the model's rig, one a plane; as given where any order will do.
         planes: the same as the field reads them.
         occupancy: the visual hull of all support masks.
+        volume: what the planes show on a grid over the scene, for a hypernetwork that reads it.
     """
 
     views: Views
     planes: ImagePlanes | VisibilityPlanes
     occupancy: Occupancy
+    volume: Float[Tensor, "channel x y z"] | None = None
 
     def hiding(self, views: Int[Tensor, " hidden"]) -> Prepared:
         """The same object, of which some views show the field nothing; for a model that takes any number of views.
@@ -85,11 +88,18 @@ class HyperPlanes(nn.Module):
         planes = config.network.planes
         reader = config.hypernetwork or config.autoencoder
         self.any_order = targets[config.target].any_order
-        if self.any_order and reader and (config.hypernetwork is None or config.hypernetwork.join != "mean"):
+        self.reads_volume = config.hypernetwork is not None and config.hypernetwork.encoder == VOLUME
+        if self.reads_volume and not self.any_order:
+            raise ValueError(
+                f"encoder: expected one that reads images for {config.target}, which knows views by their places, "
+                f"got {VOLUME!r}"
+            )
+        takes_any = self.reads_volume or (config.hypernetwork and config.hypernetwork.join == "mean")
+        if self.any_order and reader and not takes_any:
             found = "an autoencoder" if config.hypernetwork is None else repr(config.hypernetwork.join)
             raise ValueError(
-                f"{config.target}: expected a hypernetwork with join 'mean', which takes HyperPlanes in any number and "
-                f"order, got {found}"
+                f"{config.target}: expected a hypernetwork with encoder {VOLUME!r}, or with join 'mean', which takes "
+                f"HyperPlanes in any number and order, got {found}"
             )
         if reader and reader.views > planes and not self.any_order:
             raise ValueError(f"views: expected at most as many HyperPlanes as planes, {planes}, got {reader.views}")
@@ -101,8 +111,10 @@ class HyperPlanes(nn.Module):
             if config.coarse_network:
                 self.networks["coarse"] = make(config.network)
             shapes = {name: value.shape for name, value in self.networks.named_parameters()}
-            self.hypernetwork: HyperNetwork | Autoencoder | None = None
-            if config.hypernetwork:
+            self.hypernetwork: Reader | None = None
+            if config.hypernetwork and self.reads_volume:
+                self.hypernetwork = VolumeHyperNetwork(config.hypernetwork, shapes, CHANNELS, SIDE)
+            elif config.hypernetwork:
                 self.hypernetwork = HyperNetwork(config.hypernetwork, shapes)
             elif config.autoencoder:
                 read = cast(Target, self.networks["fine"]).reading_layers
@@ -154,7 +166,8 @@ class HyperPlanes(nn.Module):
 
         Args:
             support: the views of one object, on any device and in any precision.
-            carved: without, one voxel that may hold anything stands for the hull, for who never asks it.
+            carved: without, one voxel that may hold anything stands for the hull, for who never asks it. A hypernetwork
+                that reads the hull has it carved in any case.
 
         Returns:
             All that depends on the support views and not on weights.
@@ -162,18 +175,22 @@ class HyperPlanes(nn.Module):
         support = self._to_own(support)
         views = self.arrange(support)
         side = self.config.hull_side
+        carved = carved or self.reads_volume
         region = hull(support, side) if carved else full(support.bounds, 1, support.images.device)
-        return Prepared(views, cast(Target, self.networks["fine"]).planes_of(views, region), region)
+        planes = cast(Target, self.networks["fine"]).planes_of(views, region)
+        return Prepared(views, planes, region, volume_of(planes) if self.reads_volume else None)
 
     def hyperplanes(self, views: Views | None = None) -> Int[Tensor, " k"]:
         """Which planes the hypernetwork reads: k of the rig, spread as far apart as they can be, or the first k.
 
         Args:
-            views: arranged; they count for a model of any order, which reads at most k of them.
+            views: arranged; they count for a model of any order, which reads at most k of them, or all as a volume.
 
         Returns:
             Indices of planes. A model that was never shown its rig raises ValueError.
         """
+        if self.reads_volume and views is not None:
+            return torch.arange(len(views), device=self.rig.device)
         count = self.hypernetwork.config.views if self.hypernetwork else 0
         standing = _standpoints(views).cpu() if self.any_order and views is not None else None
         count = count if standing is None else min(count, len(standing))
@@ -198,7 +215,7 @@ class HyperPlanes(nn.Module):
         """The views where the weights are, in their precision or at least single."""
         return support.to(self.rig.device, torch.promote_types(self.rig.dtype, torch.float32))
 
-    def update(self, prepared: Prepared, hypernetwork: HyperNetwork | Autoencoder | None = None) -> Parameters:
+    def update(self, prepared: Prepared, hypernetwork: Reader | None = None) -> Parameters:
         """The update of theta, in one forward pass (HyperPlanes, Eq. 7); empty without a hypernetwork.
 
         Args:
@@ -210,14 +227,15 @@ class HyperPlanes(nn.Module):
         """
         return self.updates([prepared], hypernetwork)[0]
 
-    def updates(
-        self, prepared: Sequence[Prepared], hypernetwork: HyperNetwork | Autoencoder | None = None
-    ) -> list[Parameters]:
+    def updates(self, prepared: Sequence[Prepared], hypernetwork: Reader | None = None) -> list[Parameters]:
         """The updates of several objects, whose HyperPlanes are encoded in one batch; as `update`."""
         theta = self.theta if hypernetwork is None else self.theta.detach()
         hypernetwork = hypernetwork or self.hypernetwork
         if hypernetwork is None:
             return [Parameters() for _ in prepared]
+        if isinstance(hypernetwork, VolumeHyperNetwork):
+            volumes = [each.volume for each in prepared if each.volume is not None]
+            return hypernetwork(torch.stack(volumes), theta)
         read = [each.views[self.hyperplanes(each.views)] for each in prepared]
         directions = [camera.viewing_directions(each.cameras) for each in read]
         if not self.any_order:

@@ -37,16 +37,18 @@ class Arguments:
 def row(name: str, preset: Preset) -> tuple[str, ...]:
     """One preset as the cells of the table."""
     from hyperplanes.fields import find_targets
+    from hyperplanes.hypernetwork import VOLUME
 
     model, training = preset.model, preset.training
     hyper, anyhow = model.hypernetwork, find_targets()[model.target].any_order
     planes = "any" if anyhow else model.network.planes
+    read = "all" if hyper and hyper.encoder == VOLUME else hyper.views if hyper else 0
     return (
         name,
         str(preset.resolution),
         f"{model.network.depth} x {model.network.width}",
         hyper.encoder if hyper else "-",
-        f"{hyper.views if hyper else 0} of {planes}",
+        f"{read} of {planes}",
         model.sampling.summary,
         f"{training.steps:,}",
         str(training.rays * training.tasks),

@@ -98,10 +98,12 @@ def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
     import torch
 
     from hyperplanes.geometry import cameras as camera
+    from hyperplanes.hypernetwork import VolumeHyperNetwork
     from hyperplanes.hypernetwork.standardisation import RunningStandardisation
 
     with torch.no_grad():
-        views = model.prepare(shown, carved=False).views
+        prepared = model.prepare(shown, carved=False)
+        views = prepared.views
         centre = model.rig.new_tensor(views.bounds.centre)
         standing = torch.nn.functional.normalize(camera.centres(views.cameras).to(centre) - centre, dim=-1)
         angle = 0.0
@@ -110,7 +112,11 @@ def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
         network = model.hypernetwork
         if network is None or not isinstance(network.code_normalisation, RunningStandardisation):
             return None, angle
-        chosen = model.hyperplanes(views)
-        directions = camera.viewing_directions(views.cameras)[chosen]
-        codes = network.encode(views.images[chosen][None], directions[None])
+        if isinstance(network, VolumeHyperNetwork):
+            assert prepared.volume is not None
+            codes = network.encode(prepared.volume[None])
+        else:
+            chosen = model.hyperplanes(views)
+            directions = camera.viewing_directions(views.cameras)[chosen]
+            codes = network.encode(views.images[chosen][None], directions[None])
     return float(codes.square().mean().sqrt()), angle

@@ -29,6 +29,7 @@ class TargetConfig:
         width: of each of them.
         planes: number of ImagePlanes the network is made for; of "any_order", the views that are read at a point.
         blended: views whose colours "any_order" blends; the other fields have none.
+        grid: features of the cells of a grid over the scene that "any_order" reads beside the views; 0 is no grid.
         point_octaves: of the positional encoding of points.
         direction_octaves: of the positional encoding of viewing directions.
         density_scale: what the density head is multiplied with; an object of unit radius is a few voxels deep, so
@@ -39,6 +40,7 @@ class TargetConfig:
     width: Annotated[int, range(1, 8193)] = 256
     planes: Annotated[int, range(1, 1025)] = 25
     blended: Annotated[int, range(1, 65)] = 4
+    grid: Annotated[int, range(65)] = 0
     point_octaves: Annotated[int, range(33)] = 10
     direction_octaves: Annotated[int, range(33)] = 4
     density_scale: float = 25.0

@@ -32,6 +32,7 @@ DEEPEST = 2.0  # radii
 PARTLY = 2.0  # penalty of a mask that is not whole
 WHOLE = 0.98  # opacity of a mask from which on it counts as whole
 UNSEEN = 8.0  # penalty of a view that does not show the point
+FADING = 10.0  # of the weights of views, with their penalty
 ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
 
 
@@ -58,6 +59,12 @@ class ChosenViews:
     def valid(self) -> Bool[Tensor, "point chosen"]:
         """Whether each view shows the point: it falls into the image, and the view is not hidden."""
         return self.penalty < UNSEEN
+
+    @property
+    def weights(self) -> Float[Tensor, "point chosen"]:
+        """Weights that fall with the penalty and sum to one; all zero where no view shows the point."""
+        weights = torch.exp(-FADING * self.penalty.clamp_min(0)) * self.valid
+        return weights / weights.sum(1, keepdim=True).clamp_min(1e-6)
 
 
 @dataclass(frozen=True)

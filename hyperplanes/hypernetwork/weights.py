@@ -17,8 +17,8 @@ class LowRankReader(nn.Module):
     """Every weight of a network becomes one code, by few learned numbers.
 
     Of a matrix W (out x in) the products U W V are read, U (4 x out) and V (in x 4) being learned, 16 numbers; of a
-    bias b as many, U b. A linear layer makes the code of all of them. At depth 8 and width 256 that is a hundred
-    thousand learned numbers, where a linear layer over theta itself would take 80 million.
+    bias b as many, U b; grids of features are left out. A linear layer makes the code of all of them. At depth 8 and
+    width 256 that is a hundred thousand learned numbers, where a linear layer over theta itself would take 80 million.
 
     Args:
         shapes: of the parameters by name.
@@ -27,9 +27,9 @@ class LowRankReader(nn.Module):
 
     def __init__(self, shapes: Mapping[str, torch.Size], code: int) -> None:
         super().__init__()
-        self.names = tuple(shapes)
+        self.names = tuple(name for name, shape in shapes.items() if len(shape) <= 2)
         self.left, self.right = nn.ParameterList(), nn.ParameterList()
-        for shape in shapes.values():
+        for shape in (shapes[name] for name in self.names):
             rows = RANK if len(shape) == 2 else RANK**2
             self.left.append(nn.Parameter(torch.randn(rows, shape[0]) / shape[0] ** 0.5))
             columns = (shape[1], RANK) if len(shape) == 2 else (1, 1)

@@ -32,6 +32,9 @@ class TrainingConfig:
             as masks say what is background: over white alone, a white surface cannot be told from none.
         empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
             training sees nothing there, but a field that is rendered without masks must know.
+        completion: weight of a loss beside that of rays, for a hypernetwork that reads a volume: the first features of
+            the target's grid are to be the hull and the colours of all views of the object, so that every cell teaches
+            what is behind what few views show, and not only those that a ray meets; 0 is none.
         optimiser: of theta: "adam" as in the paper, or "muon" for the matrices of its hidden layers.
         learning_rate: of theta, by Adam.
         muon_learning_rate: of the matrices of theta that Muon optimises.
@@ -63,6 +66,7 @@ class TrainingConfig:
     episodes: Annotated[int, range(1, 4097)] = 16
     random_background: bool = False
     empty_points: Annotated[int, range(2**24)] = 0
+    completion: float = 0.0
     optimiser: str = "adam"
     learning_rate: float = 1e-4
     muon_learning_rate: float = 0.02

@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-__all__ = ["draw", "draw_balanced", "episode_object", "object_generator"]
+__all__ = ["draw", "draw_balanced", "episode_generator", "episode_object", "object_generator"]
+
+EPISODES, ORDERS = 1, 2  # set the streams of these apart from those of rays
 
 
 def object_generator(seed: int, step: int, place: int) -> torch.Generator:
@@ -18,8 +20,17 @@ def object_generator(seed: int, step: int, place: int) -> torch.Generator:
         step: steps done before.
         place: of the object in the step.
     """
-    state = np.random.SeedSequence([seed, step, place]).generate_state(1, np.uint64)
-    return torch.Generator().manual_seed(int(state[0]))
+    return _generator(seed, step, place)
+
+
+def episode_generator(seed: int, number: int) -> torch.Generator:
+    """What the views of an episode are drawn from.
+
+    Args:
+        seed: of the training.
+        number: of the episode, from 0.
+    """
+    return _generator(seed, number, 0, EPISODES)
 
 
 def draw(names: Sequence[str], count: int, generator: torch.Generator) -> list[str]:
@@ -63,8 +74,14 @@ def episode_object(classes: Mapping[str, Sequence[str]], number: int, seed: int)
     turn, place = divmod(number, len(classes))
     chosen = sorted(classes)[place]
     epoch, index = divmod(turn, len(classes[chosen]))
-    order = torch.randperm(len(classes[chosen]), generator=object_generator(seed, epoch, place))
+    order = torch.randperm(len(classes[chosen]), generator=_generator(seed, epoch, place, ORDERS))
     return classes[chosen][int(order[index])]
+
+
+def _generator(*numbers: int) -> torch.Generator:
+    """A generator whose stream has nothing to do with that of other numbers, or of another count of them."""
+    state = np.random.SeedSequence(numbers).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(state[0]))
 
 
 def _places(total: int, count: int, generator: torch.Generator) -> list[int]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
@@ -16,7 +16,9 @@ from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.views import Task, Views, join_views
 
-__all__ = ["Episode", "prepare_episode", "prepare_subset"]
+__all__ = ["COMPLETED", "Episode", "prepare_episode", "prepare_subset", "whole_of"]
+
+COMPLETED = 4  # channels of a volume that are completed: the share that is occupied, and the mean colour
 
 QUERIES = 4  # views that rays are drawn from, of those that an episode does not show
 
@@ -29,11 +31,13 @@ class Episode:
         prepared: its support side.
         query: the views that the loss is taken on.
         live: flat indices of the query pixels that look into the hull; None where all are drawn from.
+        whole: of `whole_of`, where the training completes volumes.
     """
 
     prepared: Prepared
     query: Views
     live: Int[Tensor, " pixel"] | None
+    whole: Float[Tensor, "4 x y z"] | None = None
 
     @cached_property
     def support_live(self) -> Int[Tensor, " pixel"] | None:
@@ -75,7 +79,13 @@ def prepare_episode(model: HyperPlanes, task: Task, *, carved: bool = True) -> E
     return Episode(prepared, query, live)
 
 
-def prepare_subset(model: HyperPlanes, task: Task, counts: Sequence[int], generator: torch.Generator) -> Episode:
+def prepare_subset(
+    model: HyperPlanes,
+    task: Task,
+    counts: Sequence[int],
+    generator: torch.Generator,
+    whole: Float[Tensor, "4 x y z"] | None = None,
+) -> Episode:
     """An object shown by a random number of random views, some others of which are the query views.
 
     Args:
@@ -83,6 +93,7 @@ def prepare_subset(model: HyperPlanes, task: Task, counts: Sequence[int], genera
         task: the object; which of its views are support and which query does not matter.
         counts: of the views that are shown, each as likely as the others; one is left for the query.
         generator: of the choice.
+        whole: of `whole_of`.
 
     Returns:
         The object, made ready for steps of training.
@@ -91,4 +102,20 @@ def prepare_subset(model: HyperPlanes, task: Task, counts: Sequence[int], genera
     count = counts[int(torch.randint(len(counts), (), generator=generator))]
     count = min(count, len(views) - 1)
     order = torch.randperm(len(views), generator=generator).to(views.images.device)
-    return prepare_episode(model, Task(views[order[:count]], views[order[count : count + QUERIES]], task.name))
+    shown, asked = views[order[:count]], views[order[count : count + QUERIES]]
+    return replace(prepare_episode(model, Task(shown, asked, task.name)), whole=whole)
+
+
+def whole_of(model: HyperPlanes, task: Task) -> Float[Tensor, "4 x y z"]:
+    """What all views of an object together show of each cell: the share that the hull occupies, and the mean colour.
+
+    Args:
+        model: whose hypernetwork reads a volume.
+        task: the object.
+
+    Returns:
+        The first channels of `volume_of`, in half precision: they are kept for every object of a training.
+    """
+    volume = model.prepare(join_views(task.support, task.query)).volume
+    assert volume is not None
+    return volume[:COMPLETED].half()

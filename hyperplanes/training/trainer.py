@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -21,16 +22,17 @@ from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.averaging import WeightAverage
+from hyperplanes.training.completion import completion_loss
 from hyperplanes.training.configuration import Progress, TrainingConfig
 from hyperplanes.training.distributed import ProcessEnded, Processes, check_shares, other_processes
-from hyperplanes.training.drawing import draw, draw_balanced, episode_object, object_generator
-from hyperplanes.training.episodes import Episode, prepare_episode, prepare_subset
+from hyperplanes.training.drawing import draw, draw_balanced, episode_generator, episode_object, object_generator
+from hyperplanes.training.episodes import COMPLETED, Episode, prepare_episode, prepare_subset, whole_of
 from hyperplanes.training.prefetching import Prefetcher
 from hyperplanes.training.state import Curve, check_model, load_state, save_state
 from hyperplanes.training.watching import Samples, write_curve
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.utilities.lru_cache import LRUCache
-from hyperplanes.views import Tasks, class_of
+from hyperplanes.views import Task, Tasks, class_of
 
 __all__ = ["Trainer", "train"]
 
@@ -81,6 +83,11 @@ class Trainer:
             )
         if config.random_background and model.config.coarse_network:
             raise ValueError("training.random_background: expected a model without a coarse network, got one with")
+        if config.completion and not (model.reads_volume and model.config.network.grid >= COMPLETED and config.views):
+            raise ValueError(
+                f"training.completion: expected training.views, a hypernetwork with encoder 'volume' and a grid of at "
+                f"least {COMPLETED} features, got another model or training"
+            )
         self.config = config = replace(config, steps=config.steps_for(len(self.names)))
         check_shares(config.tasks, self._reference_objects, self.processes.count)
         self.classes: dict[str, list[str]] = {}
@@ -88,6 +95,8 @@ class Trainer:
             self.classes.setdefault(class_of(data, name), []).append(name)
         self._episodes: LRUCache[Episode] = LRUCache(config.memory, keep_last=True)
         self._prefetcher = Prefetcher(self._load, self._episodes)
+        self._lock = threading.Lock()  # of `_wholes`, which the prefetching thread uses too
+        self._wholes: LRUCache[Tensor] = LRUCache(config.memory // 2)
         self._held_out: dict[str, Episode] = {}
         self._updates: list[Parameters] = []
         theta = list(model.networks.parameters())
@@ -227,7 +236,8 @@ class Trainer:
         with record_function("step:update"):
             updates = self.model.updates([episode.prepared for episode in episodes])
         for name, episode, update, generator in list(zip(drawn, episodes, updates, generators, strict=True))[:tasks]:
-            field = self.model.field(episode.prepared, self.model.theta + update)
+            weights = self.model.theta + update
+            field = self.model.field(episode.prepared, weights)
             span = field.sampling.span
             with record_function("step:rays"), prefix_errors(name):
                 drawn_rays = episode.query.sample_masked_rays(
@@ -243,6 +253,8 @@ class Trainer:
                 with record_function("step:emptiness"):
                     total = total + self._emptiness(field, generator)
             total = total + ray_loss(seen, truth)
+            if config.completion:
+                total = total + config.completion * completion_loss(weights, episode)
         with record_function("step:gradients"):
             (total / tasks).backward()
         self._updates = [update.detach() for update in updates]
@@ -384,8 +396,21 @@ class Trainer:
         if not self.config.views:
             return prepare_episode(self.model, self.data.task(name), carved=self._reads_hull)
         name, _, number = name.rpartition("#")
-        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + int(number))
-        return prepare_subset(self.model, self.data.task(name), self.config.views, generator)
+        generator = episode_generator(self.config.seed, int(number))
+        task = self.data.task(name)
+        return prepare_subset(self.model, task, self.config.views, generator, self._whole(task))
+
+    def _whole(self, task: Task) -> Tensor | None:
+        """What all views of an object show, where the training completes volumes; made once while there is room."""
+        if not self.config.completion:
+            return None
+        with self._lock:
+            kept = self._wholes.get(task.name)
+        if kept is None:
+            kept = whole_of(self.model, task)
+            with self._lock:
+                self._wholes.add(task.name, kept)
+        return kept
 
 
 def train(

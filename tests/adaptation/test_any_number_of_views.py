@@ -19,7 +19,10 @@ from tests.reference_rendering import awaken, ball_views, ring
 SHAPE = HyperNetworkConfig(
     views=3, normalisation="group", code=8, depth=2, width=16, join="mean", layers=("all",), update="low_rank", rank=1
 )
+VOLUME = replace(SHAPE, encoder="volume")
 NETWORK = TargetConfig(depth=2, width=16, planes=4, blended=2, point_octaves=2, direction_octaves=1)
+GRID = replace(NETWORK, grid=5)
+READERS = {"images": {}, "volume": {"network": GRID, "hypernetwork": VOLUME}}
 CONFIG = ModelConfig("any_order", NETWORK, SHAPE, sampling=Marched(24), hull_side=16)
 
 
@@ -35,9 +38,10 @@ def picture(adapter, support):
     return adapter.adapt(support).render(ring(2, (10, 13), shift=1)).images
 
 
+@pytest.mark.parametrize("reader", READERS)
 @pytest.mark.parametrize("count", [1, 2, 3, 6])
-def test_any_number_of_views_in_any_order_makes_the_same_picture(count):
-    adapter, support = model(), views(count)
+def test_any_number_of_views_in_any_order_makes_the_same_picture(count, reader):
+    adapter, support = model(**READERS[reader]), views(count)
     expected = picture(adapter, support)
     assert expected.isfinite().all()
     for seed in range(2):
@@ -65,8 +69,9 @@ def test_the_hypernetwork_reads_the_views_that_stand_farthest_apart():
     assert (standing @ standing.T).fill_diagonal_(-1).max() < 0.2  # three of eight, more than 78 degrees apart
 
 
-def test_a_saved_model_is_loaded_again(tmp_path):
-    before = model()
+@pytest.mark.parametrize("reader", READERS)
+def test_a_saved_model_is_loaded_again(tmp_path, reader):
+    before = model(**READERS[reader])
     before.save(tmp_path)
     assert torch.equal(picture(HyperPlanes.from_pretrained(tmp_path), views(3)), picture(before, views(3)))
 
@@ -81,6 +86,21 @@ def test_a_saved_model_is_loaded_again(tmp_path):
 def test_what_needs_a_fixed_number_of_views_is_refused(changes, found):
     with pytest.raises(ValueError, match=f"join 'mean'.*{found}"):
         HyperPlanes(replace(CONFIG, **changes))
+
+
+def test_the_grid_of_an_object_is_that_of_its_own_volume():
+    adapter = model(**READERS["volume"])
+    with torch.no_grad():
+        ball, other = (adapter.prepare(views(3, colour)) for colour in ((0.8, 0.2, 0.1), (0.1, 0.9, 0.3)))
+        assert not torch.allclose(adapter.update(ball)["fine.grid.weight"], adapter.update(other)["fine.grid.weight"])
+        swapped = replace(ball, volume=other.volume)
+        torch.testing.assert_close(adapter.update(swapped), adapter.update(other))
+    assert torch.equal(adapter.prepare(views(3), carved=False).volume, adapter.prepare(views(3)).volume)
+
+
+def test_fields_that_know_views_by_their_places_have_no_use_for_a_volume():
+    with pytest.raises(ValueError, match="encoder: expected one that reads images"):
+        HyperPlanes(replace(CONFIG, target="point_multiplane", hypernetwork=VOLUME))
 
 
 class Recorder:
@@ -119,8 +139,9 @@ def test_too_few_views_and_who_does_not_want_it_hide_none(count, settings):
     assert [hidden for hidden, _ in recorder.notes] == [None] * 3
 
 
-def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is():
-    adapter, support, query = model(), views(8), ball_views(ring(3, shift=1))
+@pytest.mark.parametrize("reader", READERS)
+def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is(reader):
+    adapter, support, query = model(**READERS[reader]), views(8), ball_views(ring(3, shift=1))
     before = {name: value.clone() for name, value in adapter.state_dict().items()}
 
     def quality(field):

@@ -215,7 +215,7 @@ def test_wrong_shapes_of_the_network_are_refused():
         ValueError, match=r"layers: expected \('all',\) or some of \['0', 'colour', 'density'\], got \['sigma'\]"
     ):
         make(replace(CONFIG, layers=("sigma",)))
-    with pytest.raises(ValueError, match=r"encoder: expected one of 'convnet', 'resnet101', got 'vgg'"):
+    with pytest.raises(ValueError, match=r"encoder: expected one of 'convnet', 'resnet101', 'volume', got 'vgg'"):
         replace(CONFIG, encoder="vgg")
     images, directions, theta = inputs()
     with pytest.raises(ValueError, match="HyperPlanes: expected 3 images and directions, got 2 and 2"):

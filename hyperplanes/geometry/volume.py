@@ -1,0 +1,66 @@
+"""What all views show, as a coarse grid over the scene: the same for any number of views in any order."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d, grid_sample
+
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.visibility import VisibilityPlanes
+
+__all__ = ["CHANNELS", "SIDE", "interpolate_grid", "volume_of"]
+
+SIDE = 32  # cells an axis
+CHANNELS = 9  # of a cell: occupied share, mean and variance of the colours, penalty of the best view, number of views
+BEST = 8  # views of a cell that count
+WORST = 2.0  # what penalties are cut to
+
+
+@torch.no_grad()
+def volume_of(planes: VisibilityPlanes, side: int = SIDE) -> Float[Tensor, "channel x y z"]:
+    """What the views show of each cell of a grid over the scene; zero in cells outside the visual hull.
+
+    Args:
+        planes: of one object.
+        side: cells an axis.
+
+    Returns:
+        Nine channels: the share of the cell that the hull occupies; mean and variance of the colours, in [-1, 1], that
+        the views which see the cell best show at its centre; how badly the best of them sees it, as
+        `VisibilityPlanes.choose` says; and the logarithm of the number of views that show it.
+    """
+    occupancy = planes.occupancy
+    share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.guides), side)[0, 0]
+    cells = (share > 0).nonzero()
+    unit = (cells.to(share) + 0.5) * (2 / side) - 1
+    points = unit * occupancy.bounds.radius + unit.new_tensor(occupancy.bounds.centre)
+    visibility = planes.choose(points, best=BEST)
+    seen = visibility.best
+    shown = planes.colours.lookup(points).colours
+    colours = 2 * shown.gather(1, seen.views[..., None].expand(-1, -1, 3)) - 1
+    weights = seen.weights[..., None]
+    mean = (weights * colours).sum(1)
+    variance = (weights * (colours - mean[:, None]).square()).sum(1)
+    number = visibility.number.clamp_min(1).log()
+    x, y, z = cells.unbind(1)
+    penalty = seen.penalty[:, 0].clamp(-WORST, WORST)
+    values = torch.cat([share[x, y, z][:, None], mean, variance, penalty[:, None], number[:, None]], 1)
+    volume = share.new_zeros(CHANNELS, side, side, side)
+    volume[:, x, y, z] = values.T
+    return volume
+
+
+def interpolate_grid(
+    grid: Float[Tensor, "channel x y z"], points: Float[Tensor, "point 3"], bounds: Sphere
+) -> Float[Tensor, "point channel"]:
+    """Trilinear interpolation of values at the centres of the cells of a grid over the cube around a sphere.
+
+    Args:
+        grid: values; the outermost ones hold up to the border and beyond.
+        points: in the world.
+        bounds: the sphere.
+    """
+    where = bounds.normalise(points).flip(-1)[None, None, None]
+    return grid_sample(grid[None], where, padding_mode="border", align_corners=False)[0, :, 0, 0].T

@@ -1,0 +1,62 @@
+"""A hypernetwork that reads what all views show on a grid over the scene, instead of images one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hyperplanes.hypernetwork.configuration import ACTIVATIONS, HyperNetworkConfig
+from hyperplanes.hypernetwork.update_writer import UpdateWriter
+from hyperplanes.hypernetwork.volume_network import VolumeNetwork
+from hyperplanes.parameters import Parameters
+
+__all__ = ["VolumeHyperNetwork"]
+
+
+class VolumeHyperNetwork(UpdateWriter):
+    """H(V, theta; delta), where V is what all views show on a grid over the scene (`geometry.volume.volume_of`).
+
+    A grid of features among the weights of the target gets an update for every cell, from the convolutions of
+    `VolumeNetwork`; all other layers get theirs from its code, as in `HyperNetwork`. Neither the number of the views
+    nor their order matters. The outputs start at zero here too.
+
+    Args:
+        config: its encoder is "volume".
+        shapes: of the parameters by name; those of four dimensions are grids of features, with as many cells as V.
+        channels: numbers that V has of a cell.
+        side: cells of V an axis.
+
+    Raises:
+        ValueError: layers that the target does not have.
+    """
+
+    def __init__(self, config: HyperNetworkConfig, shapes: Mapping[str, torch.Size], channels: int, side: int) -> None:
+        super().__init__(config, shapes)
+        self.grids = {name: shape for name, shape in self.shapes.items() if len(shape) == 4}
+        self.shapes = {name: shape for name, shape in self.shapes.items() if name not in self.grids}
+        self.encoder = VolumeNetwork(channels, side, config.code, sum(shape[0] for shape in self.grids.values()))
+        self.code_normalisation = self.make_normalisation((config.code,))
+        self.make_head(config.code, shapes)
+
+    def forward(self, volumes: Float[Tensor, "object channel x y z"], theta: Mapping[str, Tensor]) -> list[Parameters]:
+        """The update of theta for each of several objects.
+
+        Args:
+            volumes: V of each.
+            theta: the target's parameters.
+
+        Returns:
+            For each object one tensor a named parameter of the chosen layers, of its shape.
+        """
+        codes, features = self.encoder(volumes)
+        updates = self.written(ACTIVATIONS[self.config.code_activation](self.code_normalisation(codes)), theta)
+        for update, cells in zip(updates, features, strict=True):
+            update.update(zip(self.grids, cells.split([shape[0] for shape in self.grids.values()]), strict=True))
+        return updates
+
+    def encode(self, volumes: Float[Tensor, "object channel x y z"]) -> Float[Tensor, "object code"]:
+        """The codes of objects before their activation."""
+        return self.code_normalisation(self.encoder(volumes)[0])

@@ -1,0 +1,100 @@
+"""The loss of completion. Source of truth: grids that are right by construction, and what a step must not touch."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.fields import TargetConfig
+from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.parameters import Parameters
+from hyperplanes.rendering import Marched
+from hyperplanes.training import Trainer, TrainingConfig
+from hyperplanes.training.completion import completion_loss
+from hyperplanes.training.episodes import prepare_subset, whole_of
+from tests.reference_rendering import Balls
+
+MODEL = ModelConfig(
+    "any_order",
+    TargetConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_octaves=2, direction_octaves=1),
+    HyperNetworkConfig(encoder="volume", code=8, depth=1, width=16, layers=("all",), update="low_rank", rank=1),
+    sampling=Marched(24),
+    hull_side=32,
+)
+TRAINING = TrainingConfig(
+    steps=4, tasks=2, rays=32, views=(1, 3), episodes=4, completion=0.1, hypernetwork_learning_rate=3e-3, held_out=0
+)
+
+
+def episode(model, count=2, seed=0):
+    task = Balls(views=8, size=(24, 24)).task("train0")
+    return prepare_subset(model, task, (count,), torch.Generator().manual_seed(seed), whole_of(model, task))
+
+
+def weights(grid):
+    return Parameters({"fine.grid.weight": grid})
+
+
+def test_the_true_hull_and_colours_have_the_least_loss():
+    model = HyperPlanes(MODEL)
+    shown = episode(model)
+    whole = shown.whole.float()
+    share = whole[:1].clamp(1e-4, 1 - 1e-4)
+    right = torch.cat([torch.logit(share), whole[1:], torch.zeros(1, *share.shape[1:])])
+    least = float(completion_loss(weights(right), shown))
+    for wrong in (torch.zeros_like(right), right + 0.5, right.flip(1)):
+        assert float(completion_loss(weights(wrong), shown)) > least + 0.01
+
+
+def test_only_cells_of_the_hull_that_is_shown_count_and_only_the_first_features():
+    model = HyperPlanes(MODEL)
+    shown = episode(model)
+    left = shown.prepared.volume[0] > 0
+    assert bool((left & (shown.whole[0] == 0)).any())  # few views leave more than all do
+    grid = torch.zeros(5, *left.shape, requires_grad=True)
+    completion_loss(weights(grid), shown).backward()
+    assert bool((grid.grad[0, left] != 0).all())
+    assert not grid.grad[:, ~left].any()
+    assert not grid.grad[4:].any()
+
+
+def test_a_training_learns_what_is_behind_the_views_that_are_shown():
+    model = HyperPlanes(MODEL)
+    trainer = Trainer(model, Balls(views=8, size=(24, 24)), replace(TRAINING, steps=40, completion=1.0))
+    shown = episode(model)
+
+    def loss():
+        with torch.no_grad():
+            return float(completion_loss(model.theta + model.eval().update(shown.prepared), shown))
+
+    before = loss()
+    while trainer.step < 40:
+        trainer.take_step()
+    assert loss() < 0.7 * before
+
+
+def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):
+    whole = Trainer(HyperPlanes(MODEL), Balls(), TRAINING)
+    list(whole.run())
+    first = Trainer(HyperPlanes(MODEL), Balls(), TRAINING, tmp_path)
+    first.take_step()
+    first.take_step()
+    first.save()
+    second = Trainer(HyperPlanes(MODEL), Balls(), TRAINING, tmp_path)
+    list(second.run())
+    for name, value in whole.model.state_dict().items():
+        assert torch.equal(value, second.model.state_dict()[name]), name
+
+
+@pytest.mark.parametrize(
+    ("changes", "training"),
+    [
+        ({"network": replace(MODEL.network, grid=3)}, TRAINING),
+        ({"hypernetwork": replace(MODEL.hypernetwork, encoder="convnet", join="mean")}, TRAINING),
+        ({}, replace(TRAINING, views=())),
+    ],
+)
+def test_models_and_trainings_without_what_it_needs_are_refused(changes, training):
+    with pytest.raises(ValueError, match=r"training\.completion: expected"):
+        Trainer(HyperPlanes(replace(MODEL, **changes)), Balls(), training)
