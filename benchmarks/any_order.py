@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.reporting import Row, finish
-from benchmarks.views import Shown
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data.dataset import Dataset, open_dataset, open_datasets
+from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TARGETS, AnyOrderNeRF
 from hyperplanes.fields.any_order import AnyOrderField

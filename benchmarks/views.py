@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -24,44 +24,13 @@ from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.data import open_dataset
+from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
-from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.poses import farthest_first
-from hyperplanes.views import Task, Tasks, Views, join_views
+from hyperplanes.views import Views
 
-__all__ = ["METHODS", "Shown", "adapters", "main"]
+__all__ = ["METHODS", "adapters", "main"]
 
 QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_seconds")
-
-
-@dataclass(frozen=True)
-class Shown:
-    """Tasks of which so many views are shown, and others are asked for.
-
-    Attributes:
-        data: where the tasks come from.
-        count: views that are shown, at most all but the others.
-        query: how many of the query views are kept back, evenly chosen.
-    """
-
-    data: Tasks
-    count: int
-    query: int
-
-    def names(self, split: str) -> list[str]:
-        """The objects of a split."""
-        return list(self.data.names(split))
-
-    def task(self, name: str) -> Task:
-        """One object."""
-        task = self.data.task(name)
-        asked = torch.linspace(0, len(task.query) - 1, min(self.query, len(task.query))).round().long()
-        rest = [index for index in range(len(task.query)) if index not in asked.tolist()]
-        views = join_views(task.support, task.query[rest])
-        centre = torch.tensor(views.bounds.centre)
-        standing = torch.nn.functional.normalize(camera.centres(views.cameras) - centre, dim=-1)
-        chosen = farthest_first(standing, 0, min(self.count, len(views)))
-        return replace(task, support=views[torch.tensor(chosen)], query=task.query[asked])
 
 
 def main(arguments: list[str]) -> int:

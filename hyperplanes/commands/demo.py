@@ -1,11 +1,13 @@
 """The whole method once, small: procedural cars, training, new views of cars it has never seen, and a page about it.
 
-Takes minutes on two cores. Everything goes to --out: the data set, the checkpoints, metrics.json and report.html.
+Before that, the packaged model shows what needs no training, in first.html. Takes minutes on two cores. Everything goes
+to --out: the data sets, the checkpoints, metrics.json and report.html.
 Interrupted, the same command goes on; run again, it does only what is not done yet.
 
 Example:
     hyperplanes demo
     hyperplanes demo --class chair --out runs/chairs
+    hyperplanes demo --first-only --meshes my-models
     hyperplanes demo --quick-check --out runs/check
 """
 
@@ -18,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from hyperplanes.commands.console import Console
+from hyperplanes.commands.options import OptionalFolder
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
 
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
     from hyperplanes.demo.stages import Stage, Stages
 
 __all__ = ["Arguments", "run", "settings_of"]
+
+MOST = 12  # objects on the first page
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,8 @@ class Arguments:
         resolution: Pixels along a side.
         preset: What is trained; see `hyperplanes presets`.
         steps: Training steps; so few that all is done in ten minutes on two cores.
+        meshes: A folder with a few mesh files that the packaged model shows first, beside procedural objects.
+        first_only: End after the packaged model's page.
         seed: Of everything.
         quick_check: Only see that everything runs: a few tiny objects and networks that learn nothing.
         device: auto, cpu or cuda.
@@ -52,6 +59,8 @@ class Arguments:
     resolution: int = 64
     preset: str = "quick"
     steps: int = 800
+    meshes: OptionalFolder = None
+    first_only: bool = False
     seed: int = 0
     quick_check: bool = False
     device: str = "auto"
@@ -82,6 +91,7 @@ def settings_of(arguments: Arguments) -> DemoSettings:
         preset=arguments.preset,
         steps=arguments.steps,
         seed=arguments.seed,
+        meshes=arguments.meshes,
     )
 
 
@@ -93,6 +103,7 @@ def run(arguments: Arguments) -> int:
 
     console, settings = Console(), settings_of(arguments)
     todo, record = stages(settings), Stages(arguments.out)
+    todo = todo[:1] if arguments.first_only else todo
     for number, stage in enumerate(todo, 1):
         heading = f"[{number}/{len(todo)}] {stage.name}"
         if record.done(stage):
@@ -101,15 +112,19 @@ def run(arguments: Arguments) -> int:
         console.say(heading)
         with record.work(stage):
             _work(stage, settings, arguments, console, record)
-    _finish(arguments.out, console)
+    if not arguments.first_only:
+        _finish(arguments.out, console)
     return 0
 
 
 def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: Console, record: Stages) -> None:
     from hyperplanes.data import open_dataset
-    from hyperplanes.demo.pipeline import MODELS, configurations
+    from hyperplanes.demo.pipeline import FIRST, MODELS, configurations
 
     out = arguments.out
+    if stage.name == FIRST:
+        _show_first(settings, out, console)
+        return
     if stage.name == "data":
         _generate(settings, out)
         return
@@ -139,6 +154,33 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
                 bar.show(done, len(names), f"{score.name} {score.psnr:.2f} dB")
 
             score_method(method, data, out, show, arguments.device)
+
+
+def _show_first(settings: DemoSettings, out: Path, console: Console) -> None:
+    """Objects that no training saw, and the page on which the packaged model shows them."""
+    from importlib import import_module
+
+    from hyperplanes.commands import find_verb
+    from hyperplanes.data.dataset import open_dataset, open_datasets
+    from hyperplanes.demo.first_look import write_first_look
+
+    generate = import_module(find_verb("generate").module)
+    sizes = {"resolution": settings.first_resolution, "rig": "random", "seed": settings.seed}
+    folders = {out / "first" / name: {"class_name": name, "count": 1} for name in settings.first}
+    if settings.meshes is not None:
+        folders[out / "first" / "meshes"] = {"meshes": settings.meshes}
+    for folder, what in folders.items():
+        generate.run(generate.Arguments(folder, held_out=1, **what, **sizes))
+    names = [name for folder in folders for name in open_dataset(folder).names()]
+    page = write_first_look(
+        out / "first.html",
+        open_datasets(list(folders)),
+        names[:MOST],
+        settings.frames,
+        lambda name, psnr: console.say(f"{name}: {psnr:.2f} dB"),
+        settings.first_counts,
+    )
+    console.say(f"the first page: {page.resolve().as_uri()}")
 
 
 def _generate(settings: DemoSettings, out: Path) -> None:

@@ -6,9 +6,13 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.views import Task, Tasks, class_of, join_views
 
-__all__ = ["SingleView", "WithSupport"]
+__all__ = ["Shown", "SingleView", "WithSupport"]
 
 
 @dataclass(frozen=True)
@@ -69,3 +73,33 @@ class SingleView:
         task = self.data.task(name)
         chosen = zlib.crc32(name.encode()) % len(task.support)
         return replace(task, support=task.support[[chosen]])
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Tasks of which so many views are shown, as far apart as they stand, and some query views are kept back.
+
+    Attributes:
+        data: where the tasks come from.
+        count: views that are shown, support and query alike, at most all but those that are kept back.
+        query: how many of the query views are kept back, evenly chosen.
+    """
+
+    data: Tasks
+    count: int
+    query: int
+
+    def names(self, split: str) -> Sequence[str]:
+        """The objects of a split."""
+        return self.data.names(split)
+
+    def task(self, name: str) -> Task:
+        """One object."""
+        task = self.data.task(name)
+        asked = torch.linspace(0, len(task.query) - 1, min(self.query, len(task.query))).round().long()
+        rest = [index for index in range(len(task.query)) if index not in asked.tolist()]
+        views = join_views(task.support, task.query[rest])
+        centre = torch.tensor(views.bounds.centre)
+        standing = torch.nn.functional.normalize(camera.centres(views.cameras) - centre, dim=-1)
+        chosen = farthest_first(standing, 0, min(self.count, len(views)))
+        return replace(task, support=views[torch.tensor(chosen)], query=task.query[asked])

@@ -88,7 +88,8 @@ class Report:
         method: the one that is shown first.
         exhibits: held-out objects.
         table: one row a method.
-        curves: by method, training entries with "step", "loss" and at times "psnr".
+        curves: by method, training entries with "step", "loss" and at times "psnr"; without any, nothing is said of
+            training and fine-tuning.
         tuning: by method, PSNR in dB after numbers of fine-tuning steps.
         diagnostics: what the updates of the hypernetwork have and have not in common, in words.
         facts: how it was made, label and value.

@@ -12,6 +12,7 @@ import torch
 
 from hyperplanes.adaptation.base import Adapter, Pictures
 from hyperplanes.checkpoints import read_json
+from hyperplanes.demo.first_look import COUNTS
 from hyperplanes.demo.stages import Stage
 from hyperplanes.devices import TasksOnDevice, choose_device
 from hyperplanes.evaluation import ObjectScore, evaluate
@@ -23,6 +24,7 @@ from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Task, Tasks
 
 __all__ = [
+    "FIRST",
     "MODELS",
     "TUNED",
     "DemoSettings",
@@ -37,6 +39,11 @@ __all__ = [
 
 TUNED = ("hyperplanes", "scratch")
 """Methods whose PSNR over fine-tuning steps is drawn."""
+
+FIRST = "packaged model"
+"""The stage that shows what needs no training."""
+
+CLASSES = ("car", "chair", "plane", "lamp")
 
 MODELS = ("hyperplanes", "point_multiplane")
 """What is trained, each into a folder of its name."""
@@ -61,6 +68,10 @@ class DemoSettings:
         fine_tuned: numbers of fine-tuning steps of the rows of the table, a few and many.
         tuning: numbers of fine-tuning steps in the chart of fine-tuning.
         tuned_objects: held-out objects that it is drawn of.
+        first: classes of which the packaged model shows one object each, before anything is trained.
+        first_resolution: of their images.
+        first_counts: numbers of views that it is shown of each.
+        meshes: a folder of mesh files that it shows too.
         tiny: networks so small that nothing is learnt: to see that everything runs.
     """
 
@@ -78,6 +89,10 @@ class DemoSettings:
     fine_tuned: tuple[int, int] = (10, 100)
     tuning: tuple[int, ...] = (0, 1, 3, 10, 30, 100, 300)
     tuned_objects: int = 1
+    first: tuple[str, ...] = CLASSES
+    first_resolution: int = 128
+    first_counts: tuple[int, ...] = COUNTS
+    meshes: Path | None = None
     tiny: bool = False
 
     @property
@@ -115,6 +130,9 @@ class DemoSettings:
             fine_tuned=(1, 2),
             tuning=(0, 2, 5),
             tuned_objects=1,
+            first=("car",),
+            first_resolution=24,
+            first_counts=(3, 8),
             tiny=True,
         )
 
@@ -143,10 +161,11 @@ def _tiny(chosen: Preset, views: int) -> Preset:
 
 def stages(settings: DemoSettings) -> list[Stage]:
     """The stages in their order, each with all that decides its result."""
-    described = json.loads(json.dumps(asdict(settings)))
+    described = json.loads(json.dumps(asdict(settings), default=str))
     deciding = ("class_name", "objects", "held_out", "unseen_objects", "resolution", "views", "seed")
     data = {key: described[key] for key in deciding}
-    result = [Stage("data", data, ["data", "unseen"])]
+    first = {key: described[key] for key in ("first", "first_resolution", "first_counts", "meshes", "seed", "frames")}
+    result = [Stage(FIRST, first, ["first", "first.html"]), Stage("data", data, ["data", "unseen"])]
     models: dict[str, Any] = {}
     for name, chosen in configurations(settings).items():
         models[name] = {"model": chosen.model.as_json(), "training": asdict(chosen.training)}
