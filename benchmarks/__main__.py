@@ -3,7 +3,7 @@
 import sys
 from importlib import import_module
 
-NAMES = ("any_order", "generation", "hypernetwork", "lookup", "rendering", "training", "views")
+NAMES = ("any_order", "generation", "hypernetwork", "lookup", "rendering", "training", "views", "visibility")
 
 
 def main(arguments: list[str]) -> int:

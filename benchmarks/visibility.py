@@ -1,0 +1,83 @@
+"""Which views see a point: the compiled kernel beside the same in plain PyTorch, and what is built on it.
+
+    python -m benchmarks visibility --json FILE
+
+Points in the visual hull of a procedural car, seen by 25 and by 50 views of 128 x 128 pixels; every way in turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from pathlib import Path
+
+import torch
+
+from benchmarks._timing import interleaved, ratio
+from benchmarks.objects import held_out
+from benchmarks.reporting import Row, finish
+from hyperplanes.adaptation.base import hull
+from hyperplanes.geometry.visibility import Visibility, VisibilityPlanes
+from hyperplanes.geometry.volume import volume_of
+from hyperplanes.views import join_views
+
+__all__ = ["main"]
+
+BEST, NEAREST = 8, 4
+
+
+def main(arguments: list[str]) -> int:
+    """Measure, print, and write the rows where asked.
+
+    Args:
+        arguments: see --help.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks visibility", description=__doc__)
+    parser.add_argument("--points", type=int, default=20_000)
+    parser.add_argument("--size", type=int, default=128, help="pixels a side")
+    parser.add_argument("--views", type=int, nargs="+", default=[25, 50])
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--quick", action="store_true", help="few points and pixels: to see that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    chosen = parser.parse_args(arguments)
+    if chosen.quick:
+        chosen.points, chosen.size, chosen.views, chosen.repeats = 500, 32, [5], 2
+    task, rows = held_out(1, chosen.size)[0], []
+    views = join_views(task.support, task.query)
+    for count in chosen.views:
+        shown = views[:count]
+        region = hull(shown, 64)
+        generator = torch.Generator().manual_seed(0)
+        inside = region.centres()
+        points = inside[torch.randint(len(inside), (chosen.points,), generator=generator)]
+        points = points + (torch.rand(points.shape, generator=generator) - 0.5) * region.voxel
+        directions = torch.nn.functional.normalize(torch.randn(points.shape, generator=generator), dim=1)
+        planes = VisibilityPlanes(shown.images, shown.cameras, shown.masks, region)
+
+        def compiled(planes: VisibilityPlanes = planes, at=points, along=directions) -> Visibility:
+            return planes.choose(at, along, best=BEST, nearest=NEAREST)
+
+        def plain(planes: VisibilityPlanes = planes, at=points, along=directions) -> Visibility:
+            with torch.no_grad():
+                return planes._choose_torch(at, along, BEST, NEAREST + 1)
+
+        first, second = compiled(), plain()
+        agreeing = float((first.best.penalty - second.best.penalty).abs().lt(1e-3).float().mean())
+        times = interleaved(
+            {
+                "choose, compiled": compiled,
+                "choose, PyTorch": plain,
+                "colours of all views": lambda planes=planes, at=points: planes.colours.lookup(at),
+                "volume": lambda planes=planes: volume_of(planes),
+            },
+            chosen.repeats,
+        )
+        for name, found in times.items():
+            seconds = statistics.median(found.wall)
+            row: Row = {"name": name, "views": count, "seconds": seconds, "threads": torch.get_num_threads()}
+            if name != "volume":
+                row["microseconds_a_point"] = seconds / chosen.points * 1e6
+            if name == "choose, compiled":
+                row |= {**ratio(times["choose, PyTorch"].wall, found.wall), "agreeing": agreeing}
+            rows.append(row)
+    return finish("visibility", rows, chosen.json)
