@@ -11,11 +11,12 @@ another object of the data set, and with its own; and fine-tuned.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
@@ -26,6 +27,9 @@ from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
+from hyperplanes.export import to_pixels
+from hyperplanes.files import encode_png, write_whole
+from hyperplanes.metrics import psnr
 from hyperplanes.views import Views
 
 __all__ = ["METHODS", "adapters", "main"]
@@ -47,26 +51,48 @@ def main(arguments: list[str]) -> int:
                         "from random weights")  # fmt: skip
     parser.add_argument("--objects", type=int, default=3, help="of each data set")
     parser.add_argument("--query", type=int, default=3, help="views of each object to be judged by")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="beside the model itself")
+    parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS), help="beside the model itself")
+    parser.add_argument("--pictures", type=Path, metavar="FILE", help="PNG: of each data set the best, the median and "
+                        "the worst view by the most views shown; columns are the truth and the numbers of views, "
+                        "ascending")  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="one count and object: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)
     if chosen.quick:
         chosen.counts, chosen.objects, chosen.query = [3], 2, 1
-    model, rows = load_model(Path(chosen.checkpoint)), []
+    model, rows, sheet = load_model(Path(chosen.checkpoint)), [], []
     for path in chosen.data:
         data = open_dataset(path)
         names = sorted(data.names("test"))[: chosen.objects]
+        seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count: truth and prediction of every view
         for count in chosen.counts:
             shown = Shown(data, count, chosen.query)
             for method, adapter in adapters(model, shown, names, chosen.methods, chosen.steps).items():
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
-                score = evaluate(method, adapter, shown, names)
+                made = seen.setdefault(count, []) if method == "one_step" else []
+                score = evaluate(
+                    method,
+                    adapter,
+                    shown,
+                    names,
+                    lambda _, task, found, made=made: made.extend(zip(task.query.images, found.images, strict=True)),
+                )
                 row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
                 row["worst"] = min(each.psnr for each in score.objects)
                 rows.append(row)
                 print(rows[-1], flush=True)
+        sheet += _best_median_worst(seen)
+    if chosen.pictures is not None:
+        write_whole(chosen.pictures, encode_png(to_pixels(torch.cat(sheet, 1)[None])[0], small=True))
     return finish("views", rows, chosen.json)
+
+
+def _best_median_worst(seen: Mapping[int, Sequence[tuple[Tensor, Tensor]]]) -> list[Tensor]:
+    """Three rows of pictures: the truth, and what was predicted from ever more views."""
+    most = seen[max(seen)]
+    order = sorted(range(len(most)), key=lambda view: -float(psnr(most[view][1][None], most[view][0][None])))
+    chosen = (order[0], order[len(order) // 2], order[-1])
+    return [torch.cat([most[view][0], *(seen[count][view][1] for count in sorted(seen))], 2) for view in chosen]
 
 
 def adapters(
