@@ -357,10 +357,18 @@ class HyperPlanes(nn.Module):
             return None
         return footprint(prepared.occupancy, views.cameras).flatten().nonzero()[:, 0]
 
-    def save(self, folder: Path | str) -> None:
-        """Write model.json and model.safetensors."""
-        folder = Path(folder)
-        save_tensors(folder / "model.safetensors", self.state_dict())
+    def save(self, folder: Path | str, dtype: torch.dtype | None = None) -> None:
+        """Write model.json and model.safetensors.
+
+        Args:
+            folder: made where absent.
+            dtype: of the weights in the file, such as float16, which halves it; their own where absent. Statistics stay
+                as they are, and `from_pretrained` makes single precision of all.
+        """
+        folder, weights = Path(folder), self.state_dict()
+        if dtype is not None:
+            weights |= {name: value.to(dtype) for name, value in self.named_parameters()}
+        save_tensors(folder / "model.safetensors", weights)
         write_json(folder / "model.json", self.config.as_json())
 
     @classmethod

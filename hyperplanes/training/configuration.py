@@ -110,7 +110,7 @@ class Progress:
     Attributes:
         step: steps done.
         steps: steps to do.
-        loss: mean squared error of the last step's rays.
+        loss: mean squared error of the last step's rays, plus what `completion` and `empty_points` add.
         rays_per_second: since the last report.
         psnr: in dB, of some views of held-out objects, where this step looked at them.
         seconds_left: by the speed so far.

@@ -76,6 +76,17 @@ def test_a_saved_model_is_loaded_again(tmp_path, reader):
     assert torch.equal(picture(HyperPlanes.from_pretrained(tmp_path), views(3)), picture(before, views(3)))
 
 
+def test_half_precision_halves_the_file_and_hardly_changes_the_pictures(tmp_path):
+    before = model(**READERS["volume"])
+    before.save(tmp_path / "whole")
+    before.save(tmp_path / "half", torch.float16)
+    whole, half = ((tmp_path / name / "model.safetensors").stat().st_size for name in ("whole", "half"))
+    assert half < 0.52 * whole
+    after = HyperPlanes.from_pretrained(tmp_path / "half")
+    assert {value.dtype for value in after.parameters()} == {torch.float32}
+    torch.testing.assert_close(picture(after, views(3)), picture(before, views(3)), atol=2e-3, rtol=0)
+
+
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
