@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
+from hyperplanes.adaptation.fine_tuning import GRID_RATES, FineTuning, Steps
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.fields import find_targets
 from hyperplanes.views import Views
@@ -17,7 +17,8 @@ from hyperplanes.views import Views
 __all__ = ["SCRATCH_RATES", "FieldFromScratch", "FineTuned", "FromScratch", "random_model", "shuffled"]
 
 SCRATCH_RATES = {"learning_rate": 4e-3, "muon_learning_rate": 0.05}
-"""Of Adam and of Muon from random weights: higher than those of fine-tuning, docs/adaptation.md."""
+"""Of Adam and of Muon from random weights: higher than those of fine-tuning, docs/adaptation.md. Those of a field with
+a grid of features are GRID_RATES."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ class FromScratch:
         """The field after so many steps from random weights."""
         fresh = random_model(self.model.config, self.settings.seed)
         fresh.rig.copy_(self.model.rig)
-        return fresh.to(self.model.rig.device).fine_tune(support, self.steps, _rated(self.settings), on_step=on_step)
+        settings = _rated(self.settings, self.model.config)
+        return fresh.to(self.model.rig.device).fine_tune(support, self.steps, settings, on_step=on_step)
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ class FieldFromScratch:
         planes = self.config.network.planes if find_targets()[self.config.target].any_order else len(support)
         network = replace(self.config.network, planes=planes)
         fresh = random_model(replace(self.config, network=network, order="file"), self.settings.seed).to(self.device)
-        return fresh.fine_tune(support, self.steps, _rated(self.settings), on_step=on_step)
+        settings = _rated(self.settings, self.config)
+        return fresh.fine_tune(support, self.steps, settings, on_step=on_step)
 
 
 def random_model(config: ModelConfig, seed: int) -> HyperPlanes:
@@ -94,11 +97,9 @@ def random_model(config: ModelConfig, seed: int) -> HyperPlanes:
     return HyperPlanes(replace(config, hypernetwork=None, autoencoder=None, initialisation=None), seed=seed)
 
 
-def _rated(settings: FineTuning) -> FineTuning:
-    """The settings with all weights free and, where they state no rate, the rates of SCRATCH_RATES."""
-    stated = {name: getattr(settings, name) for name in SCRATCH_RATES}
-    rates = {name: SCRATCH_RATES[name] if rate is None else rate for name, rate in stated.items()}
-    return replace(settings, free="weights", **rates)
+def _rated(settings: FineTuning, config: ModelConfig) -> FineTuning:
+    """The settings with all weights free and, where they state no rate, those from random weights."""
+    return replace(settings, free="weights").with_rates(GRID_RATES if config.network.grid else SCRATCH_RATES)
 
 
 @torch.no_grad()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import torch
@@ -16,7 +16,7 @@ from hyperplanes.optimisers import make_optimisers
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
 
-__all__ = ["FineTuning", "Hiding", "Steps", "best_stop", "minimise", "ray_loss"]
+__all__ = ["GRID_RATES", "FineTuning", "Hiding", "Steps", "best_stop", "minimise", "ray_loss"]
 
 Steps: TypeAlias = int | Literal["auto"]
 
@@ -33,6 +33,9 @@ RATES: dict[str, tuple[str, float, float]] = {
 """What is optimised: by which optimiser, the learning rate of Adam, that of Muon. Chosen by measurement, see
 docs/adaptation.md."""
 
+GRID_RATES = {"learning_rate": 2e-2, "muon_learning_rate": 0.05}
+"""Of the weights of a field with a grid of features, trained or random; docs/any_order.md."""
+
 
 @dataclass(frozen=True)
 class FineTuning:
@@ -43,8 +46,9 @@ class FineTuning:
             theta is frozen, as in the paper.
         rays: a step, drawn from all support views.
         optimiser: "muon", "adam" or "sgd"; the best for what is free, see RATES, where None.
-        learning_rate: of Adam or of plain gradient descent at the first step; that of RATES where None.
-        muon_learning_rate: of Muon at the first step; that of RATES where None.
+        learning_rate: of Adam or of plain gradient descent at the first step; that of RATES where None, or of
+            GRID_RATES.
+        muon_learning_rate: of Muon at the first step; likewise.
         final: what the rates fall to along half a cosine, as a fraction.
         longest: the most steps that "auto" may choose.
         left_out: every so many-th support view is left out of the planes and of the rays while "auto" chooses.
@@ -63,6 +67,10 @@ class FineTuning:
     left_out: int = 6
     hide: bool = True
     seed: int = 0
+
+    def with_rates(self, rates: Mapping[str, float]) -> FineTuning:
+        """The settings with these rates where they state none; `rates` are fields of the settings by name."""
+        return replace(self, **{name: rate for name, rate in rates.items() if getattr(self, name) is None})
 
     def optimisers(self, variables: Sequence[Tensor]) -> list[torch.optim.Optimizer]:
         """The optimisers of what is free, at the rates of the first step."""

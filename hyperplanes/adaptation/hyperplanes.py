@@ -17,7 +17,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
-from hyperplanes.adaptation.fine_tuning import FineTuning, Hiding, Steps, best_stop, minimise
+from hyperplanes.adaptation.fine_tuning import GRID_RATES, FineTuning, Hiding, Steps, best_stop, minimise
 from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.fields import Target, find_targets
 from hyperplanes.files import write_json
@@ -294,6 +294,8 @@ class HyperPlanes(nn.Module):
                 than 3 views.
         """
         settings = settings or FineTuning()
+        if self.config.network.grid and settings.free == "weights":
+            settings = settings.with_rates(GRID_RATES)
         if settings.free == "hypernetwork" and self.hypernetwork is None:
             raise ValueError("fine_tune: expected a model with a hypernetwork, got one without")
         if steps != "auto" and steps < 0:
