@@ -441,8 +441,18 @@ def test_the_demonstration_does_nothing_twice(capsys):
     before = {path: path.stat().st_mtime_ns for path in demo.rglob("*") if path.is_file()}
     capsys.readouterr()
     assert main(["demo", "--quick-check", "--out", str(demo)]) == 0
-    assert capsys.readouterr().out.count("done before") == 16
+    assert capsys.readouterr().out.count("done before") == 17
     assert {path: path.stat().st_mtime_ns for path in demo.rglob("*") if path.is_file()} == before
+
+
+def test_the_demonstration_shows_the_packaged_model_before_anything_is_trained(tmp_path, capsys):
+    page = (demo_folder() / "first.html").read_text(encoding="utf-8")
+    assert all(words in page for words in ("3 views", "8 views", "car_test_00000", "data:image/webp"))
+    assert "How it learned" not in page
+    assert (
+        main(["demo", "--quick-check", "--first-only", "--meshes", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    )
+    assert str(tmp_path) in capsys.readouterr().err.strip().splitlines()[-1]  # a folder without a mesh
 
 
 def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_path, monkeypatch, capsys):

@@ -13,7 +13,7 @@ Example:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -75,7 +75,7 @@ def settings_of(arguments: Arguments) -> DemoSettings:
     from hyperplanes.demo.pipeline import DemoSettings
 
     if arguments.quick_check:
-        return DemoSettings.quick_check(arguments.seed)
+        return replace(DemoSettings.quick_check(arguments.seed), meshes=arguments.meshes)
     if not 1 < arguments.held_out < arguments.objects:
         raise ValueError(
             "expected --held-out above 1, so that updates can be swapped, and below --objects, "

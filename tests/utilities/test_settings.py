@@ -129,7 +129,10 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
         (["--training.rays", "1.5"], "--training.rays: 1.5 instead of a whole number from 1 to"),
         (["--model.hypernetwork.views", "0"], "--model.hypernetwork.views: 0 instead of a whole number from 1 to 1024"),
         (["--model.protocol", "guessed"], "guessed"),
-        (["--model.hypernetwork.encoder", "vgg"], "encoder: expected one of 'convnet', 'resnet101', got 'vgg'"),
+        (
+            ["--model.hypernetwork.encoder", "vgg"],
+            "encoder: expected one of 'convnet', 'resnet101', 'volume', got 'vgg'",
+        ),
         (["--model.network", "3"], "--model.network: 3 instead of its entries"),
         (["--training.rays", "["], "--training.rays: expected a plain value"),
         (["--method", "magic"], "method: expected one of hyperplanes, "),
