@@ -447,7 +447,9 @@ def test_the_demonstration_does_nothing_twice(capsys):
 
 def test_the_demonstration_shows_the_packaged_model_before_anything_is_trained(tmp_path, capsys):
     page = (demo_folder() / "first.html").read_text(encoding="utf-8")
-    assert all(words in page for words in ("3 views", "8 views", "car_test_00000", "data:image/webp"))
+    assert all(
+        words in page for words in ("3 views", "8 views", "car_test_00000", "lamp_test_00000", "data:image/webp")
+    )
     assert "How it learned" not in page
     assert (
         main(["demo", "--quick-check", "--first-only", "--meshes", str(tmp_path), "--out", str(tmp_path / "out")]) == 2

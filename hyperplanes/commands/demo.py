@@ -161,7 +161,7 @@ def _show_first(settings: DemoSettings, out: Path, console: Console) -> None:
     from importlib import import_module
 
     from hyperplanes.commands import find_verb
-    from hyperplanes.data.dataset import open_dataset, open_datasets
+    from hyperplanes.data.dataset import open_datasets
     from hyperplanes.demo.first_look import write_first_look
 
     generate = import_module(find_verb("generate").module)
@@ -171,12 +171,12 @@ def _show_first(settings: DemoSettings, out: Path, console: Console) -> None:
         folders[out / "first" / "meshes"] = {"meshes": settings.meshes}
     for folder, what in folders.items():
         generate.run(generate.Arguments(folder, held_out=1, **what, **sizes))
-    names = [name for folder in folders for name in open_dataset(folder).names()]
+    data = open_datasets(list(folders))
     page = write_first_look(
         out / "first.html",
-        open_datasets(list(folders)),
-        names[:MOST],
-        settings.frames,
+        data,
+        data.names()[:MOST],
+        settings.frames // 2,
         lambda name, psnr: console.say(f"{name}: {psnr:.2f} dB"),
         settings.first_counts,
     )

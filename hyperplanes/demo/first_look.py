@@ -61,16 +61,16 @@ def write_first_look(
         scores[row] = evaluate(row, adapter, Shown(data, count, LOOKS), names, keep)
         report(about, scores[row].mean("psnr"))
     exhibits = []
-    for index, name in enumerate(names):
+    for name in names:
         task = Shown(data, most, LOOKS).task(name)
         truth = to_pixels(task.query.images)
         made = {row: to_pixels(found[name].images) for row, found in pictures.items()}
         looks = [Look(truth[view], {row: made[row][view] for row in rows}) for view in range(len(truth))]
         quality = {row: next(each.psnr for each in scores[row].objects if each.name == name) for row in rows}
-        around = orbit_cameras(task.support, frames, size=None if index else 2 * truth.shape[1])
+        around = orbit_cameras(task.support, frames)
         turntable = encode_animation(to_pixels(model.adapt(task.support).render(around).images), "webp")
         support = to_pixels(task.support.images)
-        exhibits.append(Exhibit(name, support, range(len(support)), looks, quality, turntable))
+        exhibits.append(Exhibit(name.rpartition("/")[2], support, range(len(support)), looks, quality, turntable))
     last = scores[f"views_{most}"]
     page = Report(
         title="New views of objects it has never seen",

@@ -130,7 +130,7 @@ class DemoSettings:
             fine_tuned=(1, 2),
             tuning=(0, 2, 5),
             tuned_objects=1,
-            first=("car",),
+            first=("car", "lamp"),
             first_resolution=24,
             first_counts=(3, 8),
             tiny=True,
