@@ -68,7 +68,7 @@ def main(arguments: list[str]) -> int:
         if options.plot:
             plot(rows, options.plot)
         return finish("training", rows, options.json)
-    for name in ("quick",) if options.quick else ("quick", "small", "paper-128"):
+    for name in ("quick",) if options.quick else ("quick", "small-paper", "paper-128"):
         chosen = preset(name).by_protocol("fast")
         tasks = held_out(2 + UNSEEN, chosen.resolution, device=options.device)
         rows += compare(name, chosen, Objects(tasks), 3 if options.quick else 8)

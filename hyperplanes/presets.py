@@ -96,11 +96,13 @@ class Preset:
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
-        return replace(self, model=replace(self.model, hypernetwork=None))
+        training = replace(self.training, completion=0.0)  # of what a hypernetwork reads
+        return replace(self, model=replace(self.model, hypernetwork=None), training=training)
 
     def with_autoencoder(self) -> Preset:
         """The same target with the code of an encoder as an input, in place of a hypernetwork."""
-        return replace(self, model=replace(self.model, hypernetwork=None, autoencoder=self.autoencoder))
+        plain = self.without_hypernetwork()
+        return replace(plain, model=replace(plain.model, autoencoder=self.autoencoder))
 
     def learning_initialisation(self, method: str) -> Preset:
         """The same target as a learned initialisation: one object a step, Adam on the initialisation, no schedule.
@@ -110,14 +112,13 @@ class Preset:
         """
         changes: dict[str, int] = {"inner_steps": MAML_STEPS} if method.startswith("maml") else {}
         initialisation = replace(self.initialisation, method=method, **changes)
-        training = replace(self.training, optimiser="adam", learning_rate=self.outer_rate)
+        plain = self.without_hypernetwork()
+        training = replace(plain.training, optimiser="adam", learning_rate=self.outer_rate)
         if method == "mv_matched":
             training = replace(training, learning_rate=MATCHING_RATE)
         else:
             training = replace(training, tasks=1, rays=128, warmup=0, final=1.0)
-        return replace(
-            self, model=replace(self.model, hypernetwork=None, initialisation=initialisation), training=training
-        )
+        return replace(plain, model=replace(plain.model, initialisation=initialisation), training=training)
 
 
 MAML_STEPS = 4

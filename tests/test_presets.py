@@ -68,7 +68,7 @@ def test_every_preset_survives_json_and_fits_its_own_parts(name):
     assert ModelConfig.of_json(chosen.model.as_json()) == chosen.model
     assert chosen.model.hypernetwork.views <= chosen.model.network.planes
     assert chosen.without_hypernetwork().model == replace(chosen.model, hypernetwork=None)
-    assert chosen.without_hypernetwork().training == chosen.training
+    assert chosen.without_hypernetwork().training == replace(chosen.training, completion=0.0)
     assert "\n" not in chosen.about
 
 
@@ -97,6 +97,12 @@ def test_the_fast_protocol_leaves_a_fast_preset_as_it_is():
     for name in ("quick", "small", "paper-128-brief"):
         assert preset(name).by_protocol("fast") == preset(name)
     assert isinstance(preset("paper-128-brief").model.sampling, Marched)  # what the benchmarks' weights were trained by
+
+
+@pytest.mark.parametrize("method", ["any_order", "mv_meta", "maml"])
+def test_what_a_hypernetwork_learns_is_not_asked_of_a_method_without_one(method):
+    made = preset("small").by_method(method, None if method == "any_order" else "any_order")
+    Trainer(HyperPlanes(made.model), Balls(), replace(made.training, held_out=0))  # is refused otherwise
 
 
 def test_an_unknown_preset_is_refused():

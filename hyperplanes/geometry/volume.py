@@ -19,12 +19,11 @@ WORST = 2.0  # what penalties are cut to
 
 
 @torch.no_grad()
-def volume_of(planes: VisibilityPlanes, side: int = SIDE) -> Float[Tensor, "channel x y z"]:
+def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
     """What the views show of each cell of a grid over the scene; zero in cells outside the visual hull.
 
     Args:
         planes: of one object.
-        side: cells an axis.
 
     Returns:
         Nine channels: the share of the cell that the hull occupies; mean and variance of the colours, in [-1, 1], that
@@ -32,9 +31,9 @@ def volume_of(planes: VisibilityPlanes, side: int = SIDE) -> Float[Tensor, "chan
         `VisibilityPlanes.choose` says; and the logarithm of the number of views that show it.
     """
     occupancy = planes.occupancy
-    share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.guides), side)[0, 0]
+    share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.guides), SIDE)[0, 0]
     cells = (share > 0).nonzero()
-    unit = (cells.to(share) + 0.5) * (2 / side) - 1
+    unit = (cells.to(share) + 0.5) * (2 / SIDE) - 1
     points = unit * occupancy.bounds.radius + unit.new_tensor(occupancy.bounds.centre)
     visibility = planes.choose(points, best=BEST)
     seen = visibility.best
@@ -47,7 +46,7 @@ def volume_of(planes: VisibilityPlanes, side: int = SIDE) -> Float[Tensor, "chan
     x, y, z = cells.unbind(1)
     penalty = seen.penalty[:, 0].clamp(-WORST, WORST)
     values = torch.cat([share[x, y, z][:, None], mean, variance, penalty[:, None], number[:, None]], 1)
-    volume = share.new_zeros(CHANNELS, side, side, side)
+    volume = share.new_zeros(CHANNELS, SIDE, SIDE, SIDE)
     volume[:, x, y, z] = values.T
     return volume
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
+from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
 from hyperplanes.parameters import Parameters
 
@@ -38,11 +39,7 @@ class AutoencoderConfig:
     latent: Annotated[int, range(1, 8193)] = 128
 
     def __post_init__(self) -> None:
-        known = {"choice": CHOICES, "encoder": ENCODERS, "normalisation": NORMALISATIONS}
-        for name, values in known.items():
-            if getattr(self, name) not in values:
-                expected = ", ".join(map(repr, values))
-                raise ValueError(f"{name}: expected one of {expected}, got {getattr(self, name)!r}")
+        check_choices(self, {"choice": CHOICES, "encoder": ENCODERS, "normalisation": NORMALISATIONS})
 
 
 class Autoencoder(nn.Module):

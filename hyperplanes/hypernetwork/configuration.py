@@ -9,6 +9,7 @@ from typing import Annotated
 from torch import Tensor
 from torch.nn.functional import relu, silu
 
+from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
 from hyperplanes.hypernetwork.updates import UPDATES
 
@@ -79,17 +80,17 @@ class HyperNetworkConfig:
     gain: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, known in (
-            ("choice", CHOICES),
-            ("encoder", (*ENCODERS, VOLUME)),
-            ("normalisation", NORMALISATIONS),
-            ("code_activation", ACTIVATIONS),
-            ("code_normalisation", CODE_NORMALISATIONS),
-            ("join", JOINS),
-            ("activation", ACTIVATIONS),
-            ("update", UPDATES),
-            ("weights_seen", WEIGHTS_SEEN),
-        ):
-            if getattr(self, name) not in known:
-                expected = ", ".join(map(repr, known))
-                raise ValueError(f"{name}: expected one of {expected}, got {getattr(self, name)!r}")
+        check_choices(
+            self,
+            {
+                "choice": CHOICES,
+                "encoder": (*ENCODERS, VOLUME),
+                "normalisation": NORMALISATIONS,
+                "code_activation": ACTIVATIONS,
+                "code_normalisation": CODE_NORMALISATIONS,
+                "join": JOINS,
+                "activation": ACTIVATIONS,
+                "update": UPDATES,
+                "weights_seen": WEIGHTS_SEEN,
+            },
+        )

@@ -21,7 +21,8 @@ class VolumeHyperNetwork(UpdateWriter):
 
     A grid of features among the weights of the target gets an update for every cell, from the convolutions of
     `VolumeNetwork`; all other layers get theirs from its code, as in `HyperNetwork`. Neither the number of the views
-    nor their order matters. The outputs start at zero here too.
+    nor their order matters. The outputs start at zero here too. `centre` is of the other layers: the update of a grid
+    has a part that all objects share.
 
     Args:
         config: its encoder is "volume".

@@ -150,13 +150,14 @@ def test_too_few_views_and_who_does_not_want_it_hide_none(count, settings):
     assert [hidden for hidden, _ in recorder.notes] == [None] * 3
 
 
+@pytest.mark.parametrize(("free", "gain"), [("weights", 1.0), ("hypernetwork", 0.3)])  # measured: 2.1, 8.2; 0.7, 3.5
 @pytest.mark.parametrize("reader", READERS)
-def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is(reader):
+def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is(reader, free, gain):
     adapter, support, query = model(**READERS[reader]), views(8), ball_views(ring(3, shift=1))
     before = {name: value.clone() for name, value in adapter.state_dict().items()}
 
     def quality(field):
         return float(psnr(field.render(query.cameras).images, query.images).mean())
 
-    assert quality(adapter.fine_tune(support, 30)) > quality(adapter.adapt(support)) + 1
+    assert quality(adapter.fine_tune(support, 30, FineTuning(free))) > quality(adapter.adapt(support)) + gain
     assert all(torch.equal(value, before[name]) for name, value in adapter.state_dict().items())
