@@ -27,6 +27,7 @@ CONFIG = ModelConfig("any_order", NETWORK, SHAPE, sampling=Marched(24), hull_sid
 
 
 def model(**changes):
+    torch.manual_seed(0)  # what `awaken` draws from
     return awaken(HyperPlanes(replace(CONFIG, **changes))).eval()
 
 
@@ -150,7 +151,7 @@ def test_too_few_views_and_who_does_not_want_it_hide_none(count, settings):
     assert [hidden for hidden, _ in recorder.notes] == [None] * 3
 
 
-@pytest.mark.parametrize(("free", "gain"), [("weights", 1.0), ("hypernetwork", 0.3)])  # measured: 2.1, 8.2; 0.7, 3.5
+@pytest.mark.parametrize(("free", "gain"), [("weights", 1.0), ("hypernetwork", 0.3)])  # measured: 2.3, 8.0; 1.5, 4.8
 @pytest.mark.parametrize("reader", READERS)
 def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is(reader, free, gain):
     adapter, support, query = model(**READERS[reader]), views(8), ball_views(ring(3, shift=1))
