@@ -11,8 +11,8 @@ another object of the data set, and with its own; and fine-tuned.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -29,10 +29,12 @@ from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
 from hyperplanes.export import to_pixels
 from hyperplanes.files import encode_png, write_whole
+from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.metrics import psnr
+from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-__all__ = ["METHODS", "adapters", "main"]
+__all__ = ["METHODS", "PARTS", "adapters", "main"]
 
 QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_seconds")
 
@@ -51,7 +53,9 @@ def main(arguments: list[str]) -> int:
                         "from random weights")  # fmt: skip
     parser.add_argument("--objects", type=int, default=3, help="of each data set")
     parser.add_argument("--query", type=int, default=3, help="views of each object to be judged by")
-    parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS), help="beside the model itself")
+    parser.add_argument(
+        "--methods", nargs="*", choices=(*METHODS, *PARTS), default=list(METHODS), help="beside the model itself"
+    )
     parser.add_argument("--pictures", type=Path, metavar="FILE", help="PNG: of each data set the best, the median and "
                         "the worst view by the most views shown; columns are the truth and the numbers of views, "
                         "ascending")  # fmt: skip
@@ -103,7 +107,7 @@ def adapters(
     for name in wanted:
         needs_others = name == "swapped" and (model.hypernetwork is None or len(names) < 2)
         if not (needs_others or (name == "hull_blend" and shown.task(names[0]).support.masks is None)):
-            found[name] = METHODS[name](model, shown, names)
+            found[name] = (METHODS | PARTS)[name](model, shown, names)
     found["one_step"] = model
     for each in steps:
         found[f"{each}_steps"] = FineTuned(model, each)
@@ -112,15 +116,29 @@ def adapters(
 
 
 @dataclass(frozen=True)
-class _WithoutUpdate:
-    """A model whose field is that of theta alone."""
+class _Partly:
+    """A model with a part of its update, or whose hypernetwork reads a part of the volume; not trained to be used so.
+
+    Attributes:
+        model: the model.
+        written: which parameters are updated, by name.
+        hidden: channels of the volume that are set to zero.
+    """
 
     model: HyperPlanes
+    written: Callable[[str], bool] = lambda name: True
+    hidden: tuple[int, ...] = ()
 
+    @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The field of theta."""
-        with torch.no_grad():
-            return self.model.eval().field(self.model.prepare(support), self.model.theta)
+        """The field of theta and what is left of the update."""
+        model, prepared = self.model.eval(), self.model.prepare(support)
+        if prepared.volume is not None:
+            kept = [float(channel not in self.hidden) for channel in range(CHANNELS)]
+            volume = prepared.volume * prepared.volume.new_tensor(kept)[:, None, None, None]
+            prepared = replace(prepared, volume=volume)
+        update = Parameters((name, value) for name, value in model.update(prepared).items() if self.written(name))
+        return model.field(prepared, model.theta + update)
 
 
 def _swapped(model: HyperPlanes, shown: Shown, names: list[str]) -> Adapter:
@@ -131,6 +149,17 @@ METHODS = {
     "nearest_view": lambda *_: NearestView(),
     "hull_blend": lambda *_: HullBlend(),
     "random_weights": lambda model, *_: FromScratch(model, 0),
-    "theta": lambda model, *_: _WithoutUpdate(model),
+    "theta": lambda model, *_: _Partly(model, lambda name: False),
     "swapped": _swapped,
 }
+
+PARTS = {
+    "grid_alone": lambda model, *_: _Partly(model, lambda name: ".grid." in name),
+    "without_grid": lambda model, *_: _Partly(model, lambda name: ".grid." not in name),
+    "without_share": lambda model, *_: _Partly(model, hidden=(0,)),
+    "without_colours": lambda model, *_: _Partly(model, hidden=(1, 2, 3)),
+    "without_variance": lambda model, *_: _Partly(model, hidden=(4, 5, 6)),
+    "without_penalty": lambda model, *_: _Partly(model, hidden=(7,)),
+    "without_number": lambda model, *_: _Partly(model, hidden=(8,)),
+}
+"""Parts of what a hypernetwork that reads a volume reads and writes, left out at use."""
