@@ -111,7 +111,7 @@ def upward(cameras: PinholeCamera) -> tuple[float, float, float]:
 def orbit_cameras(
     views: Views, count: int, *, size: int | None = None, elevation: float = math.radians(20.0)
 ) -> PinholeCamera:
-    """Cameras on a level circle around what the views show, as far away and with the same lens.
+    """Cameras on a level circle around what the views show, as far away and with the lens of one of them.
 
     Args:
         views: posed images of the object.
@@ -120,7 +120,8 @@ def orbit_cameras(
         elevation: above the horizon of `upward`, in radians.
 
     Returns:
-        A batch of cameras; the first stands where the first view does, seen from above.
+        A batch of cameras; the first stands where the first view does, seen from above. Their lens is that of the view
+        with the squarest pixels: a portrait among landscapes was scaled to their size.
 
     Raises:
         ValueError: no camera asked for.
@@ -142,7 +143,9 @@ def orbit_cameras(
     x, y, z = up.tolist()
     pose = camera.look_at(eyes, views.bounds.centre, (x, y, z)).to(cameras.extrinsics)
     height, width = views.size
-    batch = camera.with_poses(camera.select(cameras, [0] * count), pose)
+    focal = camera.intrinsics(cameras)[:, [0, 1], [0, 1]].log()
+    squarest = int((focal[:, 0] - focal[:, 1]).abs().round(decimals=3).argmin())
+    batch = camera.with_poses(camera.select(cameras, [squarest] * count), pose)
     if size is None:
         return batch
     scale = size / max(height, width)

@@ -8,8 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
+from hyperplanes.adaptation.base import hull
 from hyperplanes.data import DataError, read_task, read_views
 from hyperplanes.data.pictures.posed import Posed
+from hyperplanes.export import orbit_cameras
 from hyperplanes.geometry import cameras as camera
 
 
@@ -120,13 +122,29 @@ def test_pictures_of_several_sizes_become_one(scene, tmp_path):
         with Image.open(tmp_path / name) as image:
             large = image.resize((96, 72), Image.Resampling.BICUBIC)
         large.save(tmp_path / name)
-    Image.new("RGBA", (24, 32)).save(tmp_path / scene.names[4])
-    left_out = r"1 of 8 pictures have another shape and are left out: images/004\.png"
-    scaled = "2 pictures of other sizes scaled to 32 x 24 pixels"
-    with pytest.warns(UserWarning, match=left_out), pytest.warns(UserWarning, match=scaled):
+    with pytest.warns(UserWarning, match="2 pictures of other sizes scaled to 32 x 24 pixels"):
         views = read_views(folder)
-    assert len(views) == 7
+    assert len(views) == 8
     assert max(balls(views, views.masks[:, 0] > 0.5)) < 0.6
+
+
+def test_portraits_among_landscapes_keep_their_geometry(scene, tmp_path):
+    """Property: the ball's centre still projects onto the middle of every silhouette, and the hull is that of landscapes."""
+    folder = scene.write(tmp_path)
+    landscapes = read_views(folder)
+    upright = type(scene)(size=(40, 30))
+    for at in (0, 4, 6):
+        Image.fromarray(upright.pictures[at]).save(tmp_path / scene.names[at])
+    with pytest.warns(UserWarning, match="3 pictures of other sizes scaled to 32 x 24 pixels"):
+        views = read_views(folder)
+    focal = camera.intrinsics(views.cameras)[:, [0, 1], [0, 1]].numpy()
+    np.testing.assert_allclose(focal[1], scene.matrix[0, 0], rtol=1e-6)
+    np.testing.assert_allclose(focal[4], upright.matrix[0, 0] * np.array([32 / 30, 24 / 40]), rtol=1e-6)
+    assert max(balls(views, views.masks[:, 0] > 0.5)) < 0.6
+    volumes = [float(hull(each, 64).occupied.sum()) * each.bounds.radius**3 for each in (views, landscapes)]
+    assert volumes[0] == pytest.approx(volumes[1], rel=0.05)
+    orbit = camera.intrinsics(orbit_cameras(views, 3))
+    torch.testing.assert_close(orbit[:, 0, 0], orbit[:, 1, 1])
 
 
 def test_scaling_down_keeps_the_geometry(scene, tmp_path):

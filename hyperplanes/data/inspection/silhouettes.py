@@ -117,7 +117,7 @@ def _silhouettes(
             continue
         picture = torch.zeros(1, height, width)
         picture[0, row[inside], column[inside]] = 1.0
-        focal = float(camera.intrinsics(cameras)[view, 0, 0])
+        focal = float(camera.intrinsics(cameras)[view, [0, 1], [0, 1]].max())
         reach = int(focal * hull.voxel / 2 / float(front[:, 2].median()))
         seen[view] = max_pool2d(picture, 2 * reach + 1, 1, reach)[0] > 0
     return seen

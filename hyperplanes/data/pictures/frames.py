@@ -91,9 +91,9 @@ def assemble(
     """Read the pictures of frames and bring them to one size.
 
     Where at least two thirds of the pictures are there, the others are left out and named. Pictures of several sizes
-    but one aspect ratio are scaled to the commonest; those of another aspect ratio are left out by the same rule of two
-    thirds. EXIF's orientation is applied where the size that the file states asks for it. Distorted pictures are
-    undistorted with the same calibration.
+    are scaled to the commonest one, and their calibrations with them; those of another aspect ratio, as portraits among
+    landscapes, by another factor for each axis, so that their pixels are no longer square. EXIF's orientation is applied
+    where the size that the file states asks for it. Distorted pictures are undistorted with the same calibration.
 
     Args:
         frames: what a file lists.
@@ -108,10 +108,7 @@ def assemble(
     """
     kept, notes = _present(frames, source, complete)
     found = [_examine(frames[index], source) for index in kept]
-    size, fitting = _common_size(found, source)
-    if left := [one.frame.name for at, one in enumerate(found) if at not in fitting]:
-        notes.append(f"{len(left)} of {len(found)} pictures have another shape and are left out: {listed(left)}")
-    kept, found = [kept[at] for at in fitting], [found[at] for at in fitting]
+    size = _common_size([one.size for one in found])
     if scaled := [one.frame.name for one in found if one.size != size]:
         notes.append(f"{len(scaled)} pictures of other sizes scaled to {size[1]} x {size[0]} pixels: {listed(scaled)}")
     if turns := [one.frame.name for one in found if one.turn != 1]:
@@ -212,23 +209,10 @@ def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(width / wide * tall - height) < ROUNDING or abs(height / tall * wide - width) < ROUNDING
 
 
-def _common_size(found: Sequence[_Found], source: str | Path) -> tuple[tuple[int, int], list[int]]:
-    """The commonest size, and which pictures have its shape."""
-    counts = Counter(one.size for one in found)
-    if len(counts) == 1:
-        return found[0].size, list(range(len(found)))
-    size = max(counts, key=lambda each: (sum(n for s, n in counts.items() if _same_shape(s, each)), counts[each]))
-    fitting = [at for at, one in enumerate(found) if _same_shape(one.size, size)]
-    if len(fitting) < ENOUGH * len(found):
-        text = ", ".join(f"{number} of {each[1]} x {each[0]}" for each, number in counts.most_common(4))
-        other = next(one for one in found if one.size != size)
-        raise DataError(
-            source,
-            "pictures of one shape, or two thirds of them",
-            f"{text} ({other.frame.name})",
-            "give all images of a scene one aspect ratio",
-        )
-    return size, fitting
+def _common_size(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """The commonest size of those of the commonest shape."""
+    counts = Counter(sizes)
+    return max(counts, key=lambda each: (sum(n for s, n in counts.items() if _same_shape(s, each)), counts[each]))
 
 
 def _factor(size: tuple[int, int], downscale: int | None, complete: bool, source: str | Path) -> int:
