@@ -129,7 +129,7 @@ def test_pictures_of_several_sizes_become_one(scene, tmp_path):
 
 
 def test_portraits_among_landscapes_keep_their_geometry(scene, tmp_path):
-    """Property: the ball's centre still projects onto the middle of every silhouette, and the hull is that of landscapes."""
+    """Property: the ball's centre is projected onto the middle of every silhouette; the hull is that of landscapes."""
     folder = scene.write(tmp_path)
     landscapes = read_views(folder)
     upright = type(scene)(size=(40, 30))

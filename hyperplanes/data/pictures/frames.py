@@ -92,8 +92,9 @@ def assemble(
 
     Where at least two thirds of the pictures are there, the others are left out and named. Pictures of several sizes
     are scaled to the commonest one, and their calibrations with them; those of another aspect ratio, as portraits among
-    landscapes, by another factor for each axis, so that their pixels are no longer square. EXIF's orientation is applied
-    where the size that the file states asks for it. Distorted pictures are undistorted with the same calibration.
+    landscapes, by another factor for each axis, so that their pixels are no longer square. EXIF's orientation is
+    applied where the size that the file states asks for it. Distorted pictures are undistorted with the same
+    calibration.
 
     Args:
         frames: what a file lists.
