@@ -11,6 +11,7 @@ another object of the data set, and with its own; and fine-tuned.
 from __future__ import annotations
 
 import argparse
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -141,6 +142,12 @@ class _Partly:
         return model.field(prepared, model.theta + update)
 
 
+def _second_pass(model: HyperPlanes) -> HyperPlanes:
+    found = copy.copy(model)
+    found.config = replace(model.config, second_pass=True)
+    return found
+
+
 def _swapped(model: HyperPlanes, shown: Shown, names: list[str]) -> Adapter:
     return Swapped(model, [shown.task(name).support for name in names])
 
@@ -151,6 +158,7 @@ METHODS = {
     "random_weights": lambda model, *_: FromScratch(model, 0),
     "theta": lambda model, *_: _Partly(model, lambda name: False),
     "swapped": _swapped,
+    "second_pass": lambda model, *_: _second_pass(model),
 }
 
 PARTS = {

@@ -370,6 +370,8 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     assert "steps: expected 0 with a baked file" in complaint(capsys)
     assert main(["adapt", "--checkpoint", str(out), *scene]) == 2
     assert "expected a checkpoint's folder to adapt with, got a file" in complaint(capsys)
+    assert main(["render", "--checkpoint", str(out), *scene, "--second-pass"]) == 2
+    assert "expected a checkpoint's folder to take a second pass with, got a file" in complaint(capsys)
     assert main([*command, "--voxels", "7"]) == 2
     assert "7" in complaint(capsys)
 
@@ -401,6 +403,22 @@ def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tm
     assert config["sampling"] == {"coarse": 64, "fine": 128, "placement": "intervals"}
     assert main(["evaluate", "--data", data, "--checkpoint", str(run), "--method", "nerf"]) == 0
     assert "nerf " in capsys.readouterr().out
+
+
+def test_a_second_pass_is_taken_by_models_that_judge_what_views_see_and_refused_by_others(tmp_path, capsys):
+    views = ["--views", str(first_object(demo_folder()))]
+    once, twice, adapted = (str(tmp_path / name) for name in ("once", "twice", "adapted"))
+    assert main(["render", "--checkpoint", "small", *views, "--out", once]) == 0
+    assert main(["render", "--checkpoint", "small", *views, "--out", twice, "--second-pass"]) == 0
+    assert main(["adapt", "--checkpoint", "small", *views, "--out", adapted, "--second-pass"]) == 0
+    assert main(["render", "--checkpoint", adapted, *views, "--out", str(tmp_path / "by-weights")]) == 0
+    names = sorted(path.name for path in (tmp_path / "once").glob("*.png"))
+    pictures = [[pixels(tmp_path / each / name) for name in names] for each in ("once", "twice", "by-weights")]
+    assert max(abs(one - two).max() for one, two in zip(*pictures[:2], strict=True)) > 4
+    assert max(abs(one - two).max() for one, two in zip(*pictures[1:], strict=True)) <= 1
+    capsys.readouterr()
+    assert main(["render", "--checkpoint", str(demo_folder()), *views, "--out", once, "--second-pass"]) == 2
+    assert "expected a model of the field any_order, such as small" in complaint(capsys)
 
 
 def test_views_of_a_world_with_z_up_are_adapted_to_as_if_y_were(tmp_path):

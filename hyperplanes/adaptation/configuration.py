@@ -38,6 +38,8 @@ class ModelConfig:
         hull_side: voxels an axis of the visual hull.
         order: which support view a plane is: the one "matched" to the standpoint that it had in training, or views in
             the order of their "file", as the paper takes them.
+        second_pass: a field of any number of views renders those that it is shown, and then takes colours from the
+            views that see the surface found there, and not that of the visual hull. Training does without.
     """
 
     target: str = "point_multiplane"
@@ -49,6 +51,7 @@ class ModelConfig:
     sampling: Hierarchical | Marched = field(default_factory=Marched)
     hull_side: Annotated[int, range(1, 513)] = 64
     order: str = "matched"
+    second_pass: bool = False
 
     def __post_init__(self) -> None:
         if self.order not in ORDERS:

@@ -103,6 +103,8 @@ class HyperPlanes(nn.Module):
             )
         if reader and reader.views > planes and not self.any_order:
             raise ValueError(f"views: expected at most as many HyperPlanes as planes, {planes}, got {reader.views}")
+        if config.second_pass and not self.any_order:
+            raise ValueError(f"second_pass: expected a field that judges what views see, got {config.target}")
         self.config = config
         make = targets[config.target]
         with torch.random.fork_rng(devices=[]):
@@ -264,7 +266,17 @@ class HyperPlanes(nn.Module):
         """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6)."""
         prepared = support if isinstance(support, Prepared) else self.prepare(support)
         with _in_use(self):
-            return self.field(prepared, self.theta + self.update(prepared))
+            weights = self.theta + self.update(prepared)
+            return self.field(self._second_pass(prepared, weights), weights)
+
+    def _second_pass(self, prepared: Prepared, weights: Parameters) -> Prepared:
+        """The planes with the surface that these weights show to each of them, where the model takes two passes."""
+        if not self.config.second_pass:
+            return prepared
+        planes = prepared.planes
+        assert isinstance(planes, VisibilityPlanes)
+        seen = self.field(prepared, weights).render(prepared.views.cameras)
+        return replace(prepared, planes=planes.with_surface(seen.depth[:, 0], seen.opacity[:, 0]))
 
     def fine_tune(
         self,
@@ -339,10 +351,13 @@ class HyperPlanes(nn.Module):
             tuned = copy.deepcopy(self.hypernetwork)
             assert tuned is not None
             tuned = tuned.eval().requires_grad_(True)
+            with torch.no_grad():
+                prepared = self._second_pass(prepared, self.theta + self.update(prepared, tuned))
             theta, variables = self.theta.detach(), [*tuned.parameters()]
         else:
             with torch.no_grad(), _in_use(self):
                 start = self.theta + self.update(prepared)
+                prepared = self._second_pass(prepared, start)
             free = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
             tuned, theta, variables = None, free, list(free.values())
 

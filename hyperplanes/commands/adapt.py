@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, refuse_baked
+from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
 from hyperplanes.commands.options import Free, OptionalInt, Steps, ViewsUp
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.commands.writing import writes_to
@@ -33,6 +33,8 @@ class Arguments:
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
             single forward pass.
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
+        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
+            visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held.
@@ -46,6 +48,7 @@ class Arguments:
     out: Path
     steps: Steps = 0
     fine_tune: Free = "weights"
+    second_pass: bool = False
     all_views: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
@@ -57,12 +60,12 @@ def run(arguments: Arguments) -> int:
     """Adapt and write the weights."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.adaptation.fine_tuning import FineTuning
-    from hyperplanes.adaptation.pretrained import adapted_model, load_model
+    from hyperplanes.adaptation.pretrained import adapted_model
     from hyperplanes.devices import choose_device
 
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "adapt")
-    model = load_model(arguments.checkpoint).to(device)
+    model = load_adaptable(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, up = read_scene(
         arguments.views,
         console,

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, refuse_baked
+from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
 from hyperplanes.commands.options import OptionalInt, ViewsUp, optional
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.commands.writing import writes_to
@@ -42,6 +42,8 @@ class Arguments:
         orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
         size: Pixels along the longer side of the turntable; as the images when not given.
         turntable: The format of the turntable.
+        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
+            visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held. What is written has y up.
@@ -58,6 +60,7 @@ class Arguments:
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"
+    second_pass: bool = False
     all_views: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
@@ -74,7 +77,6 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
 def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
     from hyperplanes.adaptation.base import AdaptedField
-    from hyperplanes.adaptation.pretrained import load_model
     from hyperplanes.baking import BakedScene, bake
     from hyperplanes.devices import choose_device
     from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
@@ -86,7 +88,7 @@ def run(arguments: Arguments) -> int:
         raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "bake")
-    model = load_model(arguments.checkpoint).to(device)
+    model = load_adaptable(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, _ = read_scene(
         arguments.views,
         console,

@@ -40,6 +40,8 @@ class Arguments:
         voxels: Along each side of the grid that the mesh is cut from.
         level: Density at the surface, and nothing else; when not given the one whose silhouettes and depth agree best
             with the rendered ones, and what no shown camera sees into is filled.
+        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
+            visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held. What is written has y up.
@@ -59,6 +61,7 @@ class Arguments:
     mesh_format: Literal["ply", "glb", "obj"] = "ply"
     voxels: int = 128
     level: Annotated[float | None, optional("DENSITY")] = None
+    second_pass: bool = False
     all_views: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
@@ -78,7 +81,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.surface import agreement, choose_level, density_grid, extract_mesh, fill_hidden, save_mesh
 
     console, device, out = Console(), choose_device(arguments.device), arguments.out
-    source = load_source(arguments.checkpoint, device)
+    source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, _ = read_scene(
         arguments.views,
         console,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -21,24 +22,47 @@ if TYPE_CHECKING:
     from hyperplanes.rendering.renderer import Sampler
     from hyperplanes.views import Views
 
-__all__ = ["adapt_to", "load_source", "refuse_baked", "render_views"]
+__all__ = ["adapt_to", "load_adaptable", "load_source", "refuse_baked", "render_views"]
 
 
-def load_source(path: Path, device: torch.device) -> HyperPlanes | BakedScene:
+def load_source(path: Path, device: torch.device, *, second_pass: bool = False) -> HyperPlanes | BakedScene:
     """The model of a checkpoint, or the scene of a file that `bake` wrote.
 
     Args:
         path: a folder, the name of a packaged model, or a file.
         device: where the model goes; a baked scene is rendered on the CPU.
+        second_pass: as in `load_adaptable`; a baked scene takes none.
     """
     if path.is_file():
+        if second_pass:
+            refuse_baked(path, "take a second pass")
         from hyperplanes.baking import BakedScene
         from hyperplanes.fields.baked import BakedField
 
         return BakedScene(BakedField.load(path))
+    return load_adaptable(path, device, second_pass=second_pass)
+
+
+def load_adaptable(path: Path, device: torch.device, *, second_pass: bool = False) -> HyperPlanes:
+    """The model of a checkpoint.
+
+    Args:
+        path: a folder, or the name of a packaged model.
+        device: where it goes.
+        second_pass: it takes one, whatever its checkpoint says.
+
+    Raises:
+        ValueError: a second pass of a model whose field does not judge what views see.
+    """
     from hyperplanes.adaptation.pretrained import load_model
 
-    return load_model(path).to(device)
+    model = load_model(path).to(device)
+    if second_pass:
+        if not model.any_order:
+            found = f"{path}, a model of {model.config.target}"
+            raise ValueError(f"second_pass: expected a model of the field any_order, such as small, got {found}")
+        model.config = replace(model.config, second_pass=True)
+    return model
 
 
 def refuse_baked(path: Path, verb: str) -> None:

@@ -40,6 +40,8 @@ class Arguments:
         orbit: So many pictures evenly around the object, and a turntable, instead of the query poses.
         size: Pixels along the longer side of an orbit's pictures; as the images when not given.
         turntable: The format of the turntable.
+        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
+            visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held.
@@ -57,6 +59,7 @@ class Arguments:
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"
+    second_pass: bool = False
     all_views: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
@@ -78,7 +81,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.presets import PROTOCOLS
 
     console, device = Console(), choose_device(arguments.device)
-    source = load_source(arguments.checkpoint, device)
+    source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, _ = read_scene(
         arguments.views,
         console,

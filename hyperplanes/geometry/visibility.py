@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -111,6 +111,7 @@ class VisibilityPlanes:
         opacity = torch.ones_like(images[:, 0]) if masks is None else masks[:, 0].to(images)
         self.guides: Float[Tensor, "view height width 2"] = torch.stack([depth, opacity], -1)
         matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
+        self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
         self._hidden = torch.zeros(len(images), dtype=torch.bool, device=images.device)
 
@@ -130,6 +131,21 @@ class VisibilityPlanes:
         """
         result = copy.copy(self)
         result._hidden = torch.zeros_like(self._hidden).index_fill_(0, views, True)
+        return result
+
+    def with_surface(
+        self, distances: Float[Tensor, "view height width"], opacity: Float[Tensor, "view height width"]
+    ) -> VisibilityPlanes:
+        """The same planes, of which those nearest to a direction are judged by another surface than the hull's.
+
+        Args:
+            distances: from each camera to the surface, along the rays of its pixels.
+            opacity: where it is 0.5 or less, and where the surface lies before that of the hull, the hull's counts.
+        """
+        result = copy.copy(self)
+        hull, mask = self.guides.unbind(-1)
+        surface = torch.where(opacity > 0.5, torch.maximum(distances, hull), hull)
+        result._surface = torch.stack([surface, mask], -1)
         return result
 
     @torch.no_grad()
@@ -156,11 +172,16 @@ class VisibilityPlanes:
         best, nearest = min(best, len(self)), min(nearest + 1, len(self)) if directions is not None else 0
         pinholes = not isinstance(self.colours.cameras, DistortedCamera)
         compiled = find_spec("numba") and points.device.type == "cpu" and self.guides.numel() < 2**31
-        if compiled and points.dtype == torch.float32 and pinholes:
-            return self._choose_compiled(points, directions, best, nearest)
-        return self._choose_torch(points, directions, best, nearest)
+        fast = compiled and points.dtype == torch.float32 and pinholes
+        choose = self._choose_compiled if fast else self._choose_torch
+        if self._surface is None or directions is None:
+            return choose(points, directions, best, nearest, self.guides)
+        near = choose(points, directions, 1, nearest, self._surface).nearest
+        return replace(choose(points, None, best, 0, self.guides), nearest=near)
 
-    def _choose_compiled(self, points: Tensor, directions: Tensor | None, best: int, nearest: int) -> Visibility:
+    def _choose_compiled(
+        self, points: Tensor, directions: Tensor | None, best: int, nearest: int, guides: Tensor
+    ) -> Visibility:
         """As `choose`, by the compiled kernel."""
         count = len(points)
         limits = (self.colours.nearest, 1 / self.occupancy.bounds.radius, self.tolerance, DEEPEST, PARTLY, WHOLE)
@@ -169,8 +190,8 @@ class VisibilityPlanes:
         overall = torch.empty(count, 2)
         along = points[:0] if directions is None else directions
         cameras = torch.cat([self._cameras, (~self._hidden).to(points)[None]])
-        fixed = [each.contiguous().flatten().numpy() for each in (points, along, cameras, self.guides)]
-        shape = (*self.guides.shape[:3], best, nearest, len(self))
+        fixed = [each.contiguous().flatten().numpy() for each in (points, along, cameras, guides)]
+        shape = (*guides.shape[:3], best, nearest, len(self))
         numbers = np.array([*limits, UNSEEN, ANGLE], np.float32)
         outputs = [each.flatten().numpy() for each in (views[0], values[0], views[1], values[1], overall)]
         kernel = compile_kernel("visibility.choose", torch.float32)
@@ -178,10 +199,12 @@ class VisibilityPlanes:
         chosen = [ChosenViews(each, *_split(value)) for each, value in zip(views, values, strict=True)]
         return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
 
-    def _choose_torch(self, points: Tensor, directions: Tensor | None, best: int, nearest: int) -> Visibility:
+    def _choose_torch(
+        self, points: Tensor, directions: Tensor | None, best: int, nearest: int, guides: Tensor
+    ) -> Visibility:
         """As `choose`, in plain PyTorch."""
-        guides = ImagePlanes(self.guides.permute(0, 3, 1, 2), self.colours.cameras, exact=True)
-        found = guides.lookup(points, return_directions=True)
+        planes = ImagePlanes(guides.permute(0, 3, 1, 2), self.colours.cameras, exact=True)
+        found = planes.lookup(points, return_directions=True)
         assert found.directions is not None
         assert found.distances is not None
         valid = found.valid & ~self._hidden

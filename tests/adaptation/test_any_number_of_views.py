@@ -115,6 +115,24 @@ def test_fields_that_know_views_by_their_places_have_no_use_for_a_volume():
         HyperPlanes(replace(CONFIG, target="point_multiplane", hypernetwork=VOLUME))
 
 
+def test_a_second_pass_takes_colours_by_the_surface_that_the_first_one_shows_every_view():
+    once, twice, support = model(**READERS["volume"]), model(**READERS["volume"], second_pass=True), views(6)
+    first = once.adapt(support)
+    seen = first.render(support.cameras)
+    planes = first.field.planes.with_surface(seen.depth[:, 0], seen.opacity[:, 0])
+    expected = replace(first, field=replace(first.field, planes=planes)).render(ring(2, (10, 13), shift=1)).images
+    assert torch.equal(picture(twice, support), expected)
+    assert not torch.allclose(picture(once, support), expected, atol=1e-4)
+    for free in ("weights", "hypernetwork"):
+        tuned = twice.fine_tune(support, 0, FineTuning(free=free))
+        torch.testing.assert_close(tuned.render(ring(2, (10, 13), shift=1)).images, expected)
+
+
+def test_a_second_pass_is_refused_where_the_field_does_not_judge_what_views_see():
+    with pytest.raises(ValueError, match="second_pass: .* got point_multiplane"):
+        HyperPlanes(ModelConfig(second_pass=True))
+
+
 class Recorder:
     """A field of one variable that notes what it was not shown, and where rays come from."""
 

@@ -138,3 +138,27 @@ def test_without_masks_every_picture_counts_as_opaque():
     found = shown.choose(torch.zeros(1, 3), best=3)
     assert torch.equal(found.coverage, torch.ones(1))
     assert math.isclose(float(found.best.behind[0, 0]), 1.0, abs_tol=0.02)  # the centre lies a radius inside the sphere
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_nearest_views_are_judged_by_the_surface_that_is_given_and_the_best_by_the_hull(monkeypatch, compiled):
+    """A hull that fills the scene, and the ball in it: told the ball's surface, planes choose as those of the ball."""
+    views, (points, directions) = ball_views(ring(5, SIZE)), queries(60)
+    if not compiled:
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    loose, tight = (
+        VisibilityPlanes(views.images, views.cameras, views.masks, grid) for grid in (full(Sphere(), 64), ball())
+    )
+    surface, everywhere = tight.guides[..., 0], torch.ones(len(views), *SIZE)
+    hidden = torch.tensor([2])
+    wanted = loose.with_surface(surface, everywhere).hiding(hidden).choose(points, directions, best=3, nearest=2)
+    by_hull, by_ball = (each.hiding(hidden).choose(points, directions, best=3, nearest=2) for each in (loose, tight))
+    assert not torch.equal(by_hull.nearest.behind, by_ball.nearest.behind)
+    for found, expected in ((wanted.nearest, by_ball.nearest), (wanted.best, by_hull.best)):
+        assert torch.equal(found.views, expected.views)
+        torch.testing.assert_close(found.behind, expected.behind)
+        torch.testing.assert_close(found.penalty, expected.penalty)
+    assert torch.equal(wanted.number, by_hull.number)
+    for distances, opacity in ((surface, 0.0), (0 * surface, 1.0)):  # nothing found, or before the hull's
+        same = loose.with_surface(distances, opacity * everywhere).hiding(hidden)
+        assert torch.equal(same.choose(points, directions, best=3, nearest=2).nearest.behind, by_hull.nearest.behind)
