@@ -28,7 +28,7 @@ class ModelConfig:
     """What a model is made of; saved beside its weights.
 
     Attributes:
-        target: which field: "point_multiplane", "multiplane" or "nerf".
+        target: which field: "point_multiplane", "multiplane", "nerf" or "any_order".
         network: the shape of the target.
         hypernetwork: the shape of the hypernetwork, or None for one set of weights for all objects.
         autoencoder: the shape of an encoder whose code the target reads, in place of a hypernetwork.
@@ -38,6 +38,8 @@ class ModelConfig:
         hull_side: voxels an axis of the visual hull.
         order: which support view a plane is: the one "matched" to the standpoint that it had in training, or views in
             the order of their "file", as the paper takes them.
+        plane_dropout: how likely a step of training hides a plane of an object, for a field that knows planes by their
+            places: it learns to do without any of them, and fine-tuning hides those that the rays of a step come from.
         second_pass: a field of any number of views renders those that it is shown, and then takes colours from the
             views that see the surface found there, and not that of the visual hull. Training does without.
     """
@@ -51,9 +53,12 @@ class ModelConfig:
     sampling: Hierarchical | Marched = field(default_factory=Marched)
     hull_side: Annotated[int, range(1, 513)] = 64
     order: str = "matched"
+    plane_dropout: float = 0.0
     second_pass: bool = False
 
     def __post_init__(self) -> None:
+        if not 0 <= self.plane_dropout < 1:
+            raise ValueError(f"plane_dropout: expected a probability from 0 to below 1, got {self.plane_dropout}")
         if self.order not in ORDERS:
             raise ValueError(f"order: expected one of {', '.join(map(repr, ORDERS))}, got {self.order!r}")
         chosen = [name for name in ("hypernetwork", "autoencoder", "initialisation") if getattr(self, name) is not None]

@@ -52,12 +52,11 @@ class Prepared:
     volume: Float[Tensor, "channel x y z"] | None = None
 
     def hiding(self, views: Int[Tensor, " hidden"]) -> Prepared:
-        """The same object, of which some views show the field nothing; for a model that takes any number of views.
+        """The same object, of which some views show the field nothing.
 
         Args:
             views: their indices.
         """
-        assert isinstance(self.planes, VisibilityPlanes)
         return replace(self, planes=self.planes.hiding(views))
 
 
@@ -103,6 +102,8 @@ class HyperPlanes(nn.Module):
             )
         if reader and reader.views > planes and not self.any_order:
             raise ValueError(f"views: expected at most as many HyperPlanes as planes, {planes}, got {reader.views}")
+        if config.plane_dropout and (self.any_order or config.target == "nerf"):
+            raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
         if config.second_pass and not self.any_order:
             raise ValueError(f"second_pass: expected a field that judges what views see, got {config.target}")
         self.config = config
@@ -122,6 +123,11 @@ class HyperPlanes(nn.Module):
                 read = cast(Target, self.networks["fine"]).reading_layers
                 self.hypernetwork = Autoencoder(config.autoencoder, shapes, read)
         self.register_buffer("rig", torch.zeros(0 if self.any_order else planes, 3))
+
+    @property
+    def may_hide(self) -> bool:
+        """Whether the field was made or trained to do without some of its planes."""
+        return self.any_order or self.config.plane_dropout > 0
 
     @property
     def theta(self) -> Parameters:
@@ -317,7 +323,7 @@ class HyperPlanes(nn.Module):
         prepared = given if isinstance(given, Prepared) else self.prepare(support)
         field, variables = self._tunable(prepared, settings)
         pixels = self._live_pixels(prepared, support)
-        for done in minimise(field, variables, support, schedule, settings, pixels=pixels, hiding=self.any_order):
+        for done in minimise(field, variables, support, schedule, settings, pixels=pixels, hiding=self.may_hide):
             if on_step is not None:
                 on_step(done)
             if done == stop:
@@ -342,7 +348,7 @@ class HyperPlanes(nn.Module):
             settings,
             pixels=self._live_pixels(prepared, shown),
             judged=self._live_pixels(prepared, judged),
-            hiding=self.any_order,
+            hiding=self.may_hide,
         )
 
     def _tunable(self, prepared: Prepared, settings: FineTuning) -> tuple[Hiding, Sequence[Tensor]]:

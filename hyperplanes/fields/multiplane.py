@@ -17,10 +17,14 @@ __all__ = ["MultiPlaneNeRF", "PointMultiPlaneNeRF"]
 def plane_features(points: Float[Tensor, "point 3"], planes: ImagePlanes) -> Float[Tensor, "point five_planes"]:
     """z(x, I): the colours and coordinates of a point on every plane, 5 n numbers, all in [-1, 1].
 
-    Where a point is not seen, the lookup's background colour and clamped coordinate stand.
+    Where a point is not seen, the lookup's background colour and clamped coordinate stand; a hidden plane is zeros.
     """
     found = planes.lookup(points)
-    return torch.cat([(2 * found.colours - 1).flatten(1), found.coordinates.flatten(1)], -1)
+    colours, coordinates = 2 * found.colours - 1, found.coordinates
+    if planes.hidden is not None:
+        shown = ~planes.hidden[:, None]
+        colours, coordinates = colours * shown, coordinates * shown
+    return torch.cat([colours.flatten(1), coordinates.flatten(1)], -1)
 
 
 class MultiPlaneNeRF(Target):

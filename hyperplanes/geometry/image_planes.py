@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import torch
+from jaxtyping import Bool, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -61,10 +63,22 @@ class ImagePlanes:
         self.backend = backend
         self.exact = exact
         self.nearest = MIN_Z * camera.scale(cameras)
+        self.hidden: Bool[Tensor, " view"] | None = None
         self._packed: tuple[int, PackedImages | None] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def hiding(self, views: Int[Tensor, " hidden"]) -> ImagePlanes:
+        """The same planes, some of which show no point: their colours are the background, and nothing is valid.
+
+        Args:
+            views: their indices.
+        """
+        result = copy.copy(self)
+        result.hidden = torch.zeros(len(self), dtype=torch.bool, device=self.images.device)
+        result.hidden[views] = True
+        return result
 
     def lookup(
         self,
@@ -102,6 +116,9 @@ class ImagePlanes:
                 packed=self._packed_images(points),
                 backend=self.backend,
             )
+        if self.hidden is not None:
+            shown = found.valid & ~(self.hidden if views is None else self.hidden[views])
+            found = replace(found, colours=torch.where(shown[..., None], found.colours, self.background), valid=shown)
         if not return_directions:
             return found
         centres = camera.centres(self.cameras).to(points)

@@ -16,7 +16,7 @@ from torch.profiler import record_function
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
 from hyperplanes.adaptation.fine_tuning import ray_loss
-from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
 from hyperplanes.files import encode_png, write_json, write_whole
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
@@ -237,7 +237,7 @@ class Trainer:
             updates = self.model.updates([episode.prepared for episode in episodes])
         for name, episode, update, generator in list(zip(drawn, episodes, updates, generators, strict=True))[:tasks]:
             weights = self.model.theta + update
-            field = self.model.field(episode.prepared, weights)
+            field = self.model.field(self._with_dropout(episode.prepared, generator), weights)
             span = field.sampling.span
             with record_function("step:rays"), prefix_errors(name):
                 drawn_rays = episode.query.sample_masked_rays(
@@ -259,6 +259,14 @@ class Trainer:
             (total / tasks).backward()
         self._updates = [update.detach() for update in updates]
         return float(total.detach()) / tasks
+
+    def _with_dropout(self, prepared: Prepared, generator: torch.Generator) -> Prepared:
+        """The object without the planes that this step hides, where the model is trained to do without some."""
+        chance = self.model.config.plane_dropout
+        if not chance:
+            return prepared
+        hidden = torch.rand(len(prepared.views), generator=generator) < chance
+        return prepared.hiding(hidden.nonzero()[:, 0])
 
     def _due(self) -> list[torch.optim.Optimizer]:
         """The optimisers of this step: all, or in turns those of theta and that of the hypernetwork."""

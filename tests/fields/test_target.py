@@ -227,6 +227,18 @@ def test_what_no_plane_sees_is_fed_as_background():
     torch.testing.assert_close(z[0, 3 * PLANES :], found.coordinates.flatten())
 
 
+def test_a_hidden_plane_is_five_zeros():
+    points, _ = queries()
+    target, shown = make("multiplane"), planes()
+    before = target.inputs(points, shown, Sphere())
+    found = target.inputs(points, shown.hiding(torch.tensor([1])), Sphere())
+    gone = torch.tensor([3, 4, 5, 9 + 2, 9 + 3])  # three colours a plane, then two coordinates a plane
+    assert before[:, gone].abs().amin() > 0
+    assert torch.equal(found[:, gone], torch.zeros(len(points), 5))
+    before[:, gone] = 0
+    assert torch.equal(found, before)
+
+
 def test_an_abstract_target_says_so():
     with pytest.raises(TypeError, match="Target does not say what it reads"):
         Target(SMALL)

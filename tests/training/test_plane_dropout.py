@@ -1,0 +1,61 @@
+"""Source of truth: taking away. A field trained with dropout of planes does without some; without it, it does not."""
+
+from functools import cache
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.metrics import psnr
+from hyperplanes.training import Trainer, TrainingConfig
+from tests.reference_rendering import Balls, small_model
+
+CONFIG = TrainingConfig(steps=200, tasks=4, rays=48, learning_rate=3e-3, held_out=0)
+
+
+@cache
+def trained(dropout):
+    model = small_model(hypernetwork=None, plane_dropout=dropout)
+    trainer = Trainer(model, Balls(train=8, test=2), CONFIG)
+    while trainer.step < CONFIG.steps:
+        trainer.take_step()
+    return model.eval()
+
+
+def quality(model, hidden):
+    """Mean PSNR of the held-out balls, in dB."""
+    found = []
+    for name in ("test0", "test1"):
+        task = Balls(train=8, test=2).task(name)
+        prepared = model.prepare(task.support).hiding(torch.tensor(hidden, dtype=torch.long))
+        with torch.no_grad():
+            pictures = model.field(prepared, model.theta).render(task.query.cameras)
+        found.append(psnr(pictures.images, task.query.images).mean())
+    return float(torch.stack(found).mean())
+
+
+def test_a_field_trained_with_dropout_does_without_some_planes():
+    with_it, without = trained(0.3), trained(0.0)
+    assert quality(with_it, []) > quality(without, []) - 0.5  # measured: the same
+    for hidden, gain in (([0], 0.5), ([1, 2], 1.0)):  # measured: 1.2 and 2.8 dB
+        assert quality(with_it, hidden) > quality(without, hidden) + gain
+
+
+def test_fine_tuning_hides_planes_of_fields_trained_with_dropout_alone():
+    task = Balls().task("test0")
+    for dropout in (0.3, 0.0):
+        model, seen = small_model(hypernetwork=None, plane_dropout=dropout), []
+        bind = model.networks["fine"].bind
+        model.networks["fine"].bind = lambda weights, planes, bounds, bind=bind, seen=seen: (
+            seen.append(planes.hidden) or bind(weights, planes, bounds)
+        )
+        model.fine_tune(task.support, 3)
+        assert [hidden is not None and int(hidden.sum()) for hidden in seen[:3]] == [bool(dropout)] * 3
+
+
+@pytest.mark.parametrize("target", ["nerf", "any_order"])
+def test_fields_without_a_plane_at_a_place_of_its_own_take_no_dropout(target):
+    with pytest.raises(ValueError, match=f"plane_dropout: .* got {target}"):
+        HyperPlanes(ModelConfig(target=target, hypernetwork=None, plane_dropout=0.1))
+    with pytest.raises(ValueError, match="plane_dropout: expected a probability from 0 to below 1, got 1"):
+        ModelConfig(plane_dropout=1.0)
