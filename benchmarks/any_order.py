@@ -166,7 +166,7 @@ def _judged(model: HyperPlanes, data: Dataset, count: int, objects: int) -> floa
 
 
 def configured(name: str, steps: int, seed: int) -> Preset:
-    """The preset "small" with a network of 3 x 96 and 128 rays an object, and one thing else.
+    """The preset "small" with a network of 3 x 96, a hull of 64 voxels an axis and 128 rays an object, and one change.
 
     Args:
         name: of VARIANTS, "white" or HYPERNETWORKS; only the last have a hypernetwork.
@@ -189,9 +189,8 @@ def configured(name: str, steps: int, seed: int) -> Preset:
         made.model.network, depth=3, width=96, grid=made.model.network.grid if wanted and wanted.grid else 0
     )
     reader = replace(made.model.hypernetwork, **wanted.changes) if wanted and made.model.hypernetwork else None
-    return replace(
-        made, model=replace(made.model, target=name, network=network, hypernetwork=reader), training=training
-    )
+    model = replace(made.model, target=name, network=network, hypernetwork=reader, hull_side=64)
+    return replace(made, model=model, training=training)
 
 
 def trained(made: Preset, data: Any) -> HyperPlanes:

@@ -166,7 +166,7 @@ PRESETS: dict[str, Preset] = {
             network=TargetConfig(depth=4, width=128, planes=8, grid=8, point_octaves=6, direction_octaves=2),
             hypernetwork=replace(ALL_LAYERS, encoder="volume", code=256),
             sampling=Marched(steps=64),
-            hull_side=64,
+            hull_side=96,
         ),
         TrainingConfig(
             steps=30_000,
