@@ -38,12 +38,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     traceback = "--traceback" in given or os.environ.get(TRACEBACK_VARIABLE, "") not in ("", "0")
     given = [argument for argument in given if argument != "--traceback"]
     if not given or given[0] in ("-h", "--help", "help"):
-        print(_overview())
+        _say(_overview())
         return 0 if given else 2
     if given[0] == "--version":
         from importlib.metadata import version
 
-        print(f"hyperplanes {version('hyperplanes')}")
+        _say(f"hyperplanes {version('hyperplanes')}")
         return 0
     verb, *rest = given
     try:
@@ -91,6 +91,13 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror or error}; check the path and its permissions"
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def _say(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        sys.stdout = None  # as in `main`
 
 
 def _complain(line: str) -> int:

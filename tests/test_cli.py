@@ -69,6 +69,18 @@ def test_help_loads_nothing_heavy():
     assert all(verb in done.stdout for verb in find_verbs())
 
 
+@pytest.mark.parametrize("asked", ["--help", "--version", "presets"])
+def test_the_module_is_the_command_and_a_reader_who_leaves_early_is_no_error(asked):
+    command = [sys.executable, "-m", "hyperplanes", asked]
+    whole = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert "hyperplanes" in whole.stdout or "preset" in whole.stdout
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as pipe:
+        left = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, text=True, check=False, cwd=ROOT)
+    assert (left.returncode, left.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("verb", find_verbs())
 def test_every_verb_has_help_with_an_example_and_no_torch(verb):
     script = (

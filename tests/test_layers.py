@@ -7,6 +7,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYERS = {
     "hyperplanes": 7,
     "hyperplanes.cli": 7,
+    "hyperplanes.__main__": 7.5,
     "hyperplanes.commands": 7,
     "data_gen.commands": 7.5,
     "benchmarks": 6,

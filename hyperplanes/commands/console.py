@@ -47,6 +47,13 @@ class Bar:
         _show(self._errors, line)
 
 
+class _Stream(RichConsole):
+    """Rich's console, which leaves it to the caller what a reader who has gone means; its own exit code is 1."""
+
+    def on_broken_pipe(self) -> None:
+        raise
+
+
 class Console:
     """Standard output for results, standard error for warnings.
 
@@ -55,8 +62,8 @@ class Console:
     """
 
     def __init__(self, *, silent: bool = False) -> None:
-        self._out = RichConsole(file=sys.stdout, quiet=silent)
-        self._errors = RichConsole(file=sys.stderr, quiet=silent)
+        self._out = _Stream(file=sys.stdout, quiet=silent)
+        self._errors = _Stream(file=sys.stderr, quiet=silent)
         self._live = self._out.is_terminal and not silent
 
     def say(self, line: str) -> None:

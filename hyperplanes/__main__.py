@@ -1,0 +1,10 @@
+"""`python -m hyperplanes`: the command `hyperplanes`, where its folder is not on the path."""
+
+import sys
+
+from hyperplanes.cli import main
+
+__all__: list[str] = []
+
+if __name__ == "__main__":
+    sys.exit(main())
