@@ -11,7 +11,6 @@ another object of the data set, and with its own; and fine-tuned.
 from __future__ import annotations
 
 import argparse
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,6 +56,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--methods", nargs="*", choices=(*METHODS, *PARTS), default=list(METHODS), help="beside the model itself"
     )
+    parser.add_argument("--second-pass", action="store_true", help="the model takes one, in all its rows")
     parser.add_argument("--pictures", type=Path, metavar="FILE", help="PNG: of each data set the best, the median and "
                         "the worst view by the most views shown; columns are the truth and the numbers of views, "
                         "ascending")  # fmt: skip
@@ -66,6 +66,7 @@ def main(arguments: list[str]) -> int:
     if chosen.quick:
         chosen.counts, chosen.objects, chosen.query = [3], 2, 1
     model, rows, sheet = load_model(Path(chosen.checkpoint)), [], []
+    model.config = replace(model.config, second_pass=chosen.second_pass or model.config.second_pass)
     for path in chosen.data:
         data = open_dataset(path)
         names = sorted(data.names("test"))[: chosen.objects]
@@ -74,6 +75,7 @@ def main(arguments: list[str]) -> int:
             shown = Shown(data, count, chosen.query)
             for method, adapter in adapters(model, shown, names, chosen.methods, chosen.steps).items():
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
+                row |= {"second_pass": True} if chosen.second_pass else {}
                 made = seen.setdefault(count, []) if method == "one_step" else []
                 score = evaluate(
                     method,
@@ -142,12 +144,6 @@ class _Partly:
         return model.field(prepared, model.theta + update)
 
 
-def _second_pass(model: HyperPlanes) -> HyperPlanes:
-    found = copy.copy(model)
-    found.config = replace(model.config, second_pass=True)
-    return found
-
-
 def _swapped(model: HyperPlanes, shown: Shown, names: list[str]) -> Adapter:
     return Swapped(model, [shown.task(name).support for name in names])
 
@@ -158,7 +154,6 @@ METHODS = {
     "random_weights": lambda model, *_: FromScratch(model, 0),
     "theta": lambda model, *_: _Partly(model, lambda name: False),
     "swapped": _swapped,
-    "second_pass": lambda model, *_: _second_pass(model),
 }
 
 PARTS = {
