@@ -35,7 +35,8 @@ class ModelConfig:
         initialisation: how the weights were learned as an initialisation, if they were.
         coarse_network: whether a second network of the same shape proposes where to sample (NeRF's coarse network).
         sampling: how fields are rendered by default, in training too.
-        hull_side: voxels an axis of the visual hull.
+        hull_side: voxels an axis of the visual hull; at least, where a field of any number of views is shown larger
+            pictures, up to 192.
         order: which support view a plane is: the one "matched" to the standpoint that it had in training, or views in
             the order of their "file", as the paper takes them.
         plane_dropout: how likely a step of training hides a plane of an object, for a field that knows planes by their

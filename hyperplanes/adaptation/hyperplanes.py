@@ -34,6 +34,9 @@ from hyperplanes.views import Views
 
 __all__ = ["HyperPlanes", "ModelConfig", "Prepared"]
 
+VOXELS_PER_PIXEL = 3 / 4  # of a side of the pictures: 96 voxels for 128 pixels, as the preset "small" is trained
+FINEST_HULL = 192
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -182,11 +185,17 @@ class HyperPlanes(nn.Module):
         """
         support = self._to_own(support)
         views = self.arrange(support)
-        side = self.config.hull_side
         carved = carved or self.reads_volume
-        region = hull(support, side) if carved else full(support.bounds, 1, support.images.device)
+        region = hull(support, self._hull_side(support)) if carved else full(support.bounds, 1, support.images.device)
         planes = cast(Target, self.networks["fine"]).planes_of(views, region)
         return Prepared(views, planes, region, volume_of(planes) if self.reads_volume else None)
+
+    def _hull_side(self, support: Views) -> int:
+        """Voxels an axis of the hull; for a field of any order more than configured where pictures are larger."""
+        side = self.config.hull_side
+        if not self.any_order or support.masks is None:
+            return side
+        return max(side, min(FINEST_HULL, round(VOXELS_PER_PIXEL * max(support.size))))
 
     def hyperplanes(self, views: Views | None = None) -> Int[Tensor, " k"]:
         """Which planes the hypernetwork reads: k of the rig, spread as far apart as they can be, or the first k.

@@ -50,6 +50,15 @@ def test_any_number_of_views_in_any_order_makes_the_same_picture(count, reader):
         torch.testing.assert_close(picture(adapter, support[order]), expected, atol=1e-5, rtol=1e-4)
 
 
+def test_larger_pictures_carve_a_finer_hull():
+    sides = []
+    for size in ((16, 16), (20, 40), (300, 200)):
+        task = ball_views(ring(4, size))
+        sides.append(model().prepare(task).occupancy.occupied.shape[0])
+    assert sides == [16, 30, 192]  # as configured, three quarters of the longer side, and the most
+    assert model().prepare(replace(task, masks=None)).occupancy.occupied.shape[0] == 16
+
+
 def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch():
     """Objects of 1, 2 and 5 views, of which the hypernetwork reads at most 3, and of two picture sizes."""
     adapter = model(hypernetwork=replace(SHAPE, resolution=16))
