@@ -40,7 +40,8 @@ class ModelConfig:
         order: which support view a plane is: the one "matched" to the standpoint that it had in training, or views in
             the order of their "file", as the paper takes them.
         plane_dropout: how likely a step of training hides a plane of an object, for a field that knows planes by their
-            places: it learns to do without any of them, and fine-tuning hides those that the rays of a step come from.
+            places. It learns to do without any of them, and where there are fewer views than planes, each stands at one
+            plane and the others are hidden, not filled with views that stand elsewhere.
         second_pass: a field of any number of views renders those that it is shown, and then takes colours from the
             views that see the surface found there, and not that of the visual hull. Training does without.
     """

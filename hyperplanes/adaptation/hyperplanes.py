@@ -128,11 +128,6 @@ class HyperPlanes(nn.Module):
         self.register_buffer("rig", torch.zeros(0 if self.any_order else planes, 3))
 
     @property
-    def may_hide(self) -> bool:
-        """Whether the field was made or trained to do without some of its planes."""
-        return self.any_order or self.config.plane_dropout > 0
-
-    @property
     def theta(self) -> Parameters:
         """The universal weights, shared with the module."""
         return Parameters.of(self.networks)
@@ -159,18 +154,30 @@ class HyperPlanes(nn.Module):
         Raises:
             ValueError: no view, or a model that was never shown its rig.
         """
-        from scipy.optimize import linear_sum_assignment
-
         if not len(support):
             raise ValueError("support: expected at least one view, got none")
-        if self.any_order:
-            return support
+        return support if self.any_order else support[self._places(support)]
+
+    def _places(self, support: Views) -> Int[Tensor, " plane"]:
+        """The index of the view at each plane, as `arrange` places them."""
+        from scipy.optimize import linear_sum_assignment
+
+        device = support.images.device
         if self.config.order == "file":
-            return support[torch.arange(len(self.rig), device=support.images.device) % len(support)]
+            return torch.arange(len(self.rig), device=device) % len(support)
         cost = (1 - self._known_rig() @ _standpoints(support).cpu().T).double().numpy()
         repeats = -(-len(self.rig) // len(support))
         _, column = linear_sum_assignment(np.tile(cost, (1, repeats)))
-        return support[torch.as_tensor(column % len(support), device=support.images.device)]
+        return torch.as_tensor(column % len(support), device=device)
+
+    def _superfluous(self, support: Views) -> Int[Tensor, " hidden"]:
+        """All planes but one of each view: that whose view stood nearest in training, or the first."""
+        places = self._places(support).cpu()
+        near = torch.zeros(len(places))
+        if self.config.order != "file":
+            near = (self._known_rig() * _standpoints(support).cpu()[places]).sum(1)
+        kept = {int(places[plane]): plane for plane in near.argsort(descending=True, stable=True).flip(0).tolist()}
+        return torch.tensor(sorted(set(range(len(places))) - set(kept.values())), device=self.rig.device)
 
     def prepare(self, support: Views, *, carved: bool = True) -> Prepared:
         """The planes in order and the hull.
@@ -188,6 +195,8 @@ class HyperPlanes(nn.Module):
         carved = carved or self.reads_volume
         region = hull(support, self._hull_side(support)) if carved else full(support.bounds, 1, support.images.device)
         planes = cast(Target, self.networks["fine"]).planes_of(views, region)
+        if self.config.plane_dropout and len(support) < len(views):
+            planes = planes.hiding(self._superfluous(support))
         return Prepared(views, planes, region, volume_of(planes) if self.reads_volume else None)
 
     def _hull_side(self, support: Views) -> int:
@@ -332,7 +341,7 @@ class HyperPlanes(nn.Module):
         prepared = given if isinstance(given, Prepared) else self.prepare(support)
         field, variables = self._tunable(prepared, settings)
         pixels = self._live_pixels(prepared, support)
-        for done in minimise(field, variables, support, schedule, settings, pixels=pixels, hiding=self.may_hide):
+        for done in minimise(field, variables, support, schedule, settings, pixels=pixels, hiding=self.any_order):
             if on_step is not None:
                 on_step(done)
             if done == stop:
@@ -357,7 +366,7 @@ class HyperPlanes(nn.Module):
             settings,
             pixels=self._live_pixels(prepared, shown),
             judged=self._live_pixels(prepared, judged),
-            hiding=self.may_hide,
+            hiding=self.any_order,
         )
 
     def _tunable(self, prepared: Prepared, settings: FineTuning) -> tuple[Hiding, Sequence[Tensor]]:

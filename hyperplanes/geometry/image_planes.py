@@ -70,14 +70,14 @@ class ImagePlanes:
         return len(self.images)
 
     def hiding(self, views: Int[Tensor, " hidden"]) -> ImagePlanes:
-        """The same planes, some of which show no point: their colours are the background, and nothing is valid.
+        """The same planes, some more of which show no point: their colours are the background, and nothing is valid.
 
         Args:
             views: their indices.
         """
+        hidden = torch.zeros(len(self), dtype=torch.bool, device=self.images.device).index_fill_(0, views, True)
         result = copy.copy(self)
-        result.hidden = torch.zeros(len(self), dtype=torch.bool, device=self.images.device)
-        result.hidden[views] = True
+        result.hidden = hidden if self.hidden is None else hidden | self.hidden
         return result
 
     def lookup(

@@ -41,16 +41,21 @@ def test_a_field_trained_with_dropout_does_without_some_planes():
         assert quality(with_it, hidden) > quality(without, hidden) + gain
 
 
-def test_fine_tuning_hides_planes_of_fields_trained_with_dropout_alone():
-    task = Balls().task("test0")
-    for dropout in (0.3, 0.0):
-        model, seen = small_model(hypernetwork=None, plane_dropout=dropout), []
-        bind = model.networks["fine"].bind
-        model.networks["fine"].bind = lambda weights, planes, bounds, bind=bind, seen=seen: (
-            seen.append(planes.hidden) or bind(weights, planes, bounds)
-        )
-        model.fine_tune(task.support, 3)
-        assert [hidden is not None and int(hidden.sum()) for hidden in seen[:3]] == [bool(dropout)] * 3
+@pytest.mark.parametrize("order", ["matched", "file"])
+def test_where_there_are_fewer_views_than_planes_each_stands_at_one_plane_and_the_others_are_hidden(order):
+    support, seen = Balls(train=8, test=2).task("test0").support, torch.tensor([2, 0])
+    filled, dropped = (
+        small_model(hypernetwork=None, plane_dropout=chance, order=order).prepare(support[seen]) for chance in (0, 0.3)
+    )
+    assert filled.planes.hidden is None
+    assert (
+        dropped.planes.hidden.tolist()
+        == {"matched": [False, True, False, True], "file": [False, False, True, True]}[order]
+    )
+    assert torch.equal(filled.views.images, dropped.views.images)
+    both = dropped.hiding(torch.tensor([0]))  # what is hidden stays so
+    assert both.planes.hidden.sum() == 3
+    assert small_model(hypernetwork=None, plane_dropout=0.3, order=order).prepare(support).planes.hidden is None
 
 
 @pytest.mark.parametrize("target", ["nerf", "any_order"])
