@@ -26,6 +26,14 @@ CALLS = {
 }
 
 
+@pytest.fixture(autouse=True)
+def _interruptible():
+    """Ctrl-C as Python has it: a suite that a script runs in its background inherits an ignored SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def children():
     tasks = Path("/proc/self/task").glob("*/children")
     return {pid for task in tasks for pid in task.read_text().split()}
