@@ -26,7 +26,9 @@ from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
 from hyperplanes.commands import find_verbs
-from hyperplanes.data import read_task
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.scene import read_scene
+from hyperplanes.data import DataError, read_task
 from hyperplanes.demo.pipeline import DemoSettings, configurations
 from hyperplanes.export import to_pixels
 from hyperplanes.fields.baked import BakedField
@@ -415,6 +417,15 @@ def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tm
     assert config["sampling"] == {"coarse": 64, "fine": 128, "placement": "intervals"}
     assert main(["evaluate", "--data", data, "--checkpoint", str(run), "--method", "nerf"]) == 0
     assert "nerf " in capsys.readouterr().out
+
+
+def test_the_scene_that_comes_with_the_package_has_a_name(tmp_path, monkeypatch):
+    task, up = read_scene(Path("example-car"), Console(silent=True))
+    assert (len(task.support), len(task.query), task.name, up) == (25, 25, "example-car", "y")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "example-car").mkdir()  # a folder of that name goes first
+    with pytest.raises(DataError, match="example-car"):
+        read_scene(Path("example-car"), Console(silent=True))
 
 
 def test_a_second_pass_is_taken_by_models_that_judge_what_views_see_and_refused_by_others(tmp_path, capsys):

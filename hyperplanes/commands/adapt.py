@@ -28,7 +28,7 @@ class Arguments:
 
     Attributes:
         checkpoint: What `train` or `demo` wrote.
-        views: The posed images of the object.
+        views: The posed images of the object; example-car comes with the package.
         out: The folder for the weights.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
             single forward pass.

@@ -35,7 +35,7 @@ class Arguments:
 
     Attributes:
         checkpoint: What `train`, `adapt` or `demo` wrote.
-        views: The posed images of the object.
+        views: The posed images of the object; example-car comes with the package.
         out: The file to write.
         voxels: Along each side of the grid; two for every pixel that the object is wide lose little.
         steps: Fine-tuning steps on the shown views.

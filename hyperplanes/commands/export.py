@@ -29,7 +29,7 @@ class Arguments:
 
     Attributes:
         checkpoint: What `train`, `adapt` or `demo` wrote, or a file that `bake` wrote.
-        views: The posed images of the object.
+        views: The posed images of the object; example-car comes with the package.
         out: The folder to write to.
         what: Any of the three.
         steps: Fine-tuning steps on the shown views.

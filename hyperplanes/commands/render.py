@@ -32,7 +32,7 @@ class Arguments:
 
     Attributes:
         checkpoint: What `train`, `adapt` or `demo` wrote, or a file that `bake` wrote.
-        views: The posed images of the object.
+        views: The posed images of the object; example-car comes with the package.
         out: The folder for the pictures.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
             single forward pass.

@@ -20,7 +20,7 @@ def read_scene(
     What was left out, turned or scaled is a warning; which way is up, where it was guessed, a line.
 
     Args:
-        path: of the posed images.
+        path: of the posed images, or the name of a scene that comes with the package.
         console: where it is said.
         all_views: whether all are shown.
         up: the direction that points up in their world, as in `y_up_from`, or auto: as the cameras are held.
@@ -29,11 +29,13 @@ def read_scene(
     Returns:
         Views of a world with y up, and the direction that was up before.
     """
+    from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.formats.recognise import read_posed, read_posed_task
     from hyperplanes.data.upright import guess_up, upright_task
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.views import Task
 
+    path = locate_scene(path)
     if all_views:
         scene = read_posed(path, downscale)
         views, notes = scene.views(), scene.notes

@@ -16,7 +16,7 @@ from hyperplanes.files import DataError, malformed
 from hyperplanes.utilities.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
 
-__all__ = ["Dataset", "Datasets", "open_dataset", "open_datasets", "read_task", "read_views"]
+__all__ = ["Dataset", "Datasets", "locate_scene", "open_dataset", "open_datasets", "read_task", "read_views"]
 
 DEFAULT_BUDGET = 2 * 2**30
 EXAMPLES = Path(__file__).parent.parent / "examples"  # a folder a scene, by its name
@@ -230,7 +230,7 @@ def read_views(path: str | Path, downscale: int | None = None) -> Views:
         The views in the order of the files; masks where the files have alpha. Where pictures were left out, turned or
         scaled, a UserWarning says which. As `recognise.read_posed`, it raises DataError.
     """
-    path = _located(path)
+    path = locate_scene(path)
     with malformed(path, "posed images of one scene"):
         scene = read_posed(path, downscale)
         views = scene.views()
@@ -238,8 +238,12 @@ def read_views(path: str | Path, downscale: int | None = None) -> Views:
     return views
 
 
-def _located(path: str | Path) -> Path:
-    """The path, or where a bare name stands for nothing else, the scene of that name that comes with the package."""
+def locate_scene(path: str | Path) -> Path:
+    """The path, or where a bare name stands for nothing else, the scene of that name that comes with the package.
+
+    Args:
+        path: of posed images, or such as "example-car".
+    """
     path = Path(path)
     packaged = EXAMPLES / path.name
     return packaged if len(path.parts) == 1 and not path.exists() and packaged.is_dir() else path
@@ -257,7 +261,7 @@ def read_task(path: str | Path, downscale: int | None = None) -> Task:
     Returns:
         The task; its name is the folder's. It warns as `read_views`, and raises DataError.
     """
-    path = _located(path)
+    path = locate_scene(path)
     with malformed(path, "posed images of one scene"):
         task = read_posed_task(path, downscale)
         made = task.task()
