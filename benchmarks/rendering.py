@@ -38,16 +38,24 @@ __all__ = ["main"]
 CHECKPOINT = Path(__file__).parent / "weights" / "paper-network"
 PAPER = Hierarchical(64, 128)
 RAYS_OF_A_LARGE_VIEW = 8192
+VIEWS = {64: 3, 128: 3, 200: 2, 400: 1}  # how many of so many pixels a side
 
 
 def main(arguments: list[str]) -> int:
     """Measure, print, and write the rows where asked.
 
     Args:
-        arguments: --quick, --json FILE, --plot FILE, --checkpoint FOLDER, --device NAME.
+        arguments: see --help.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks rendering", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="64 pixels alone, about a minute")
+    parser.add_argument(
+        "--sizes",
+        type=int,
+        nargs="+",
+        choices=VIEWS,
+        help="pixels of a side, and nothing else: all, and more, if absent",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="a trained model (default: %(default)s)")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the growth goes (PNG)")
@@ -58,13 +66,14 @@ def main(arguments: list[str]) -> int:
     if options.memory:
         return large_view(model)
     rows: list[Row] = []
-    for size, count in ((64, 2),) if options.quick else ((64, 3), (128, 3), (200, 2), (400, 1)):
+    sizes = {64: 2} if options.quick else {size: VIEWS[size] for size in options.sizes or VIEWS}
+    for size, count in sizes.items():
         print(f"{size} pixels", file=sys.stderr)
         tasks = held_out(count, size, device=options.device)
         rows += compare(model, tasks)
         rows += parts(model, tasks[0])
         rows += [] if options.quick or size > 200 else baked(model, tasks[0])
-    if not options.quick:
+    if not options.quick and not options.sizes:
         rows.append(fifty_views(model, held_out(1, 200, device=options.device)[0]))
         rows.append(peak_memory(options.checkpoint, options.device))
     if options.plot:
