@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -18,6 +17,7 @@ from torch.nn.utils.rnn import pad_sequence
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
 from hyperplanes.adaptation.fine_tuning import GRID_RATES, FineTuning, Hiding, Steps, best_stop, minimise
+from hyperplanes.adaptation.matching import match, standpoints, superfluous
 from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.fields import Target, find_targets
 from hyperplanes.files import write_json
@@ -143,7 +143,7 @@ class HyperPlanes(nn.Module):
                 f"support: expected at least {len(self.rig)} views, got {len(support)}; `train --support "
                 f"{len(self.rig)}` takes query views too (support and query unified)"
             )
-        self.rig.copy_(_standpoints(support)[: len(self.rig)])
+        self.rig.copy_(standpoints(support)[: len(self.rig)])
 
     def arrange(self, support: Views) -> Views:
         """One support view a plane, each the nearest to where the training rig has one; all as they are for any order.
@@ -160,24 +160,11 @@ class HyperPlanes(nn.Module):
 
     def _places(self, support: Views) -> Int[Tensor, " plane"]:
         """The index of the view at each plane, as `arrange` places them."""
-        from scipy.optimize import linear_sum_assignment
-
-        device = support.images.device
         if self.config.order == "file":
-            return torch.arange(len(self.rig), device=device) % len(support)
-        cost = (1 - self._known_rig() @ _standpoints(support).cpu().T).double().numpy()
-        repeats = -(-len(self.rig) // len(support))
-        _, column = linear_sum_assignment(np.tile(cost, (1, repeats)))
-        return torch.as_tensor(column % len(support), device=device)
-
-    def _superfluous(self, support: Views) -> Int[Tensor, " hidden"]:
-        """All planes but one of each view: that whose view stood nearest in training, or the first."""
-        places = self._places(support).cpu()
-        near = torch.zeros(len(places))
-        if self.config.order != "file":
-            near = (self._known_rig() * _standpoints(support).cpu()[places]).sum(1)
-        kept = {int(places[plane]): plane for plane in near.argsort(descending=True, stable=True).flip(0).tolist()}
-        return torch.tensor(sorted(set(range(len(places))) - set(kept.values())), device=self.rig.device)
+            places = torch.arange(len(self.rig)) % len(support)
+        else:
+            places = match(self._known_rig(), standpoints(support).cpu())
+        return places.to(support.images.device)
 
     def prepare(self, support: Views, *, carved: bool = True) -> Prepared:
         """The planes in order and the hull.
@@ -196,7 +183,10 @@ class HyperPlanes(nn.Module):
         region = hull(support, self._hull_side(support)) if carved else full(support.bounds, 1, support.images.device)
         planes = cast(Target, self.networks["fine"]).planes_of(views, region)
         if self.config.plane_dropout and len(support) < len(views):
-            planes = planes.hiding(self._superfluous(support))
+            places, near = self._places(support), torch.zeros(len(views))
+            if self.config.order != "file":
+                near = (self._known_rig() * standpoints(views).cpu()).sum(1)
+            planes = planes.hiding(superfluous(places, near).to(self.rig.device))
         return Prepared(views, planes, region, volume_of(planes) if self.reads_volume else None)
 
     def _hull_side(self, support: Views) -> int:
@@ -218,7 +208,7 @@ class HyperPlanes(nn.Module):
         if self.reads_volume and views is not None:
             return torch.arange(len(views), device=self.rig.device)
         count = self.hypernetwork.config.views if self.hypernetwork else 0
-        standing = _standpoints(views).cpu() if self.any_order and views is not None else None
+        standing = standpoints(views).cpu() if self.any_order and views is not None else None
         count = count if standing is None else min(count, len(standing))
         if self.hypernetwork and self.hypernetwork.config.choice == "first":
             return torch.arange(count, device=self.rig.device)
@@ -454,9 +444,3 @@ def _in_use(module: nn.Module) -> Generator[None]:
 def _resized(images: Float[Tensor, "view 3 height width"], size: tuple[int, int]) -> Tensor:
     """Images of that size, by the mean of the pixels that one covers where there are more."""
     return images if images.shape[2:] == size else torch.nn.functional.interpolate(images, size, mode="area")
-
-
-def _standpoints(views: Views) -> Float[Tensor, "view 3"]:
-    """Unit vectors from the scene's centre to the cameras."""
-    standing = camera.centres(views.cameras)
-    return torch.nn.functional.normalize(standing - standing.new_tensor(views.bounds.centre), dim=-1).float()
