@@ -17,6 +17,7 @@ Example:
     hyperplanes train --data data/cars --preset quick --method mv_meta --field nerf --out runs/cars-meta
     hyperplanes train --data data/cars --config runs/cars/config.yaml --model.hypernetwork.views 3 --out runs/cars-3
     hyperplanes train --data data/cars data/chairs --preset small --devices 4 --out runs/both
+    hyperplanes train --data data/ships --preset small --checkpoint small --steps 2000 --out runs/ships
 """
 
 from __future__ import annotations
@@ -68,7 +69,8 @@ class Arguments:
             mv_meta).
         field: Which target network: the preset's, or for learned initialisations NeRF, when not given.
         support: Support views and ImagePlanes an object; more than there are go on with the query views.
-        checkpoint: What mv_matched is to match: a checkpoint of mv_meta.
+        checkpoint: Weights to begin with instead of random ones: a checkpoint, or a packaged model such as small; for
+            mv_matched the checkpoint of mv_meta that it is to match.
         protocol: How rays are sampled: paper is 64 + 128 times each on every ray, fast only where something is; as the
             preset says where not given.
         steps: Other than the preset's.
@@ -263,7 +265,9 @@ def _run(arguments: Arguments) -> int:
     tasks = data if arguments.support is None else WithSupport(data, arguments.support)
     reference = None
     if arguments.checkpoint is not None:
-        reference = find_checkpoints([arguments.checkpoint]).get("mv_meta", arguments.checkpoint)
+        reference = arguments.checkpoint
+        if method == "mv_matched":
+            reference = find_checkpoints([reference]).get("mv_meta", reference)
     processes = count_processes(arguments.devices, arguments.nodes)
     objects = chosen.training.reference_objects if chosen.model.hypernetwork else 0
     check_shares(chosen.training.tasks, objects, processes[0] * processes[1])

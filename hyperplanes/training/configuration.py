@@ -28,6 +28,10 @@ class TrainingConfig:
             support views, in every step.
         episodes: how many of those are at hand at a time; every step begins one and draws `tasks` of them, so that
             views, masks and hulls are made ready once for several steps.
+        rotations: share of the episodes of `views` whose object is rotated about the vertical axis by a random angle. A
+            grid of features and what reads it know objects as they stand in the training; photographs come with any
+            heading.
+        recolouring: share of those episodes whose colour channels are permuted and darkened at random.
         random_background: prediction and truth are composited over a random colour for every object and step, as far
             as masks say what is background: over white alone, a white surface cannot be told from none.
         empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
@@ -64,6 +68,8 @@ class TrainingConfig:
     rays: Annotated[int, range(1, 2**24)] = 128
     views: tuple[int, ...] = ()
     episodes: Annotated[int, range(1, 4097)] = 16
+    rotations: float = 0.0
+    recolouring: float = 0.0
     random_background: bool = False
     empty_points: Annotated[int, range(2**24)] = 0
     completion: float = 0.0
@@ -90,6 +96,12 @@ class TrainingConfig:
             raise ValueError(f"average: expected a decay from 0 to below 1, got {self.average}")
         if not self.clip >= 0:
             raise ValueError(f"clip: expected a norm of 0 or more, got {self.clip}")
+        for name in ("rotations", "recolouring"):
+            share = getattr(self, name)
+            if not 0 <= share <= 1:
+                raise ValueError(f"{name}: expected a share from 0 to 1, got {share}")
+            if share and not self.views:
+                raise ValueError(f"{name}: expected 0 without training.views, got {share}")
 
     def steps_for(self, objects: int) -> int:
         """How many steps are taken with so many training objects.

@@ -33,15 +33,32 @@ def start_training(
         data: tasks with a "train" split.
         folder: for checkpoints.
         device: where to compute.
-        reference: the checkpoint of mv_meta that mv_matched is to match.
+        reference: the checkpoint whose weights a new training begins with; for mv_matched that of mv_meta, which it is
+            to match.
 
     Returns:
         A trainer; its `step` says how far it is. CheckpointError where the folder holds another model or training.
+
+    Raises:
+        ValueError: a reference with other weights than `config` says.
     """
     matching = config.initialisation is not None and config.initialisation.method == "mv_matched"
     model = HyperPlanes(config, training.seed + matching).to(device)  # not the weights that mv_meta began with
     tasks = TasksOnDevice(data, torch.device(device))
+    found = None if reference is None else HyperPlanes.from_pretrained(reference)
+    if matching:
+        return initialisation_trainer(model, tasks, training, folder, found)
+    if found is not None:
+        differing = _differing_weights(model, found)
+        if differing:
+            raise ValueError(f"checkpoint: expected weights of the configured model, got others of {differing[0]}")
+        model.load_state_dict(found.state_dict())
     if config.initialisation is None:
         return Trainer(model, tasks, training, folder)
-    matched = None if reference is None else HyperPlanes.from_pretrained(reference)
-    return initialisation_trainer(model, tasks, training, folder, matched)
+    return initialisation_trainer(model, tasks, training, folder)
+
+
+def _differing_weights(model: HyperPlanes, other: HyperPlanes) -> list[str]:
+    """Names of the weights that one of two models lacks, or that are of another shape."""
+    mine, others = ({name: value.shape for name, value in each.state_dict().items()} for each in (model, other))
+    return sorted(name for name in mine | others if mine.get(name) != others.get(name))

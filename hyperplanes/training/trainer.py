@@ -21,6 +21,7 @@ from hyperplanes.files import encode_png, write_json, write_whole
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
 from hyperplanes.parameters import Parameters
+from hyperplanes.training.augmentation import draw_augmentation
 from hyperplanes.training.averaging import WeightAverage
 from hyperplanes.training.completion import completion_loss
 from hyperplanes.training.configuration import Progress, TrainingConfig
@@ -405,8 +406,13 @@ class Trainer:
             return prepare_episode(self.model, self.data.task(name), carved=self._reads_hull)
         name, _, number = name.rpartition("#")
         generator = episode_generator(self.config.seed, int(number))
-        task = self.data.task(name)
-        return prepare_subset(self.model, task, self.config.views, generator, self._whole(task))
+        task, config = self.data.task(name), self.config
+        whole = self._whole(task)
+        if config.rotations or config.recolouring:
+            drawn = draw_augmentation(config.rotations, config.recolouring, generator)
+            task = Task(drawn.views(task.support), drawn.views(task.query), task.name)
+            whole = None if whole is None else drawn.volume(whole)
+        return prepare_subset(self.model, task, config.views, generator, whole)
 
     def _whole(self, task: Task) -> Tensor | None:
         """What all views of an object show, where the training completes volumes; made once while there is room."""
