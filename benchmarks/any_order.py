@@ -13,21 +13,24 @@ import argparse
 import dataclasses
 import time
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import conv2d, relu
 
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data.dataset import Dataset, open_dataset, open_datasets
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
-from hyperplanes.fields import TARGETS, AnyOrderNeRF
-from hyperplanes.fields.any_order import AnyOrderField
+from hyperplanes.fields import TARGETS, AnyOrderNeRF, TargetConfig
+from hyperplanes.fields.any_order import READ, AnyOrderField
+from hyperplanes.geometry import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.visibility import Visibility, VisibilityPlanes
+from hyperplanes.geometry.visibility import ChosenViews, Visibility, VisibilityPlanes
 from hyperplanes.presets import Preset, preset
 from hyperplanes.training import Trainer
 from hyperplanes.views import Views
@@ -95,6 +98,88 @@ class _RandomStart(AnyOrderNeRF):
         torch.nn.init.constant_(self.density.bias, -2.0)
 
 
+POOLED = 32  # features of a view that are pooled
+
+
+@dataclass(frozen=True)
+class _PooledField(AnyOrderField):
+    """The views of a point in no order: weighted mean and variance of learned features, as in IBRNet."""
+
+    def joined(self, slots: Tensor) -> Tensor:
+        features = relu(self.layer("of_view", slots))
+        seen = slots[..., 5:6]  # validity
+        scores = self.layer("weight", features) + 1e4 * (seen - 1)
+        weights = torch.softmax(scores, 1) * seen
+        mean = (weights * features).sum(1)
+        return torch.cat([mean, (weights * (features - mean[:, None]).square()).sum(1)], 1)
+
+
+class _Pooled(AnyOrderNeRF):
+    field_type: ClassVar[type[AnyOrderField]] = _PooledField
+
+    def __init__(self, config: TargetConfig) -> None:
+        super().__init__(config)
+        self.of_view, self.weight = nn.Linear(self.slot_size, POOLED), nn.Linear(POOLED, 1)
+
+    @property
+    def slot_size(self) -> int:
+        return READ
+
+    @property
+    def views_size(self) -> int:
+        return 2 * POOLED
+
+    def bind(self, *given: Any) -> AnyOrderField:
+        made = super().bind(*given)
+        return self.field_type(made.target, made.parameters, made.planes, made.bounds)
+
+
+CHANNELS = 8  # of an encoder of the views
+
+
+class _FeatureField(AnyOrderField):
+    """Beside the colours, the features of a convolutional encoder are looked up."""
+
+    def slots(self, points: Tensor, seen: ChosenViews, colours: Tensor) -> Tensor:
+        features = self._features.lookup(points).colours
+        features = features.gather(1, seen.views[..., None].expand(-1, -1, CHANNELS)) * seen.valid[..., None]
+        return torch.cat([super().slots(points, seen, colours), features], -1)
+
+    @cached_property
+    def _features(self) -> ImagePlanes:
+        planes, weights = self.planes.colours, self.parameters
+        value = relu(conv2d(2 * planes.images - 1, weights["encoder.0.weight"], weights["encoder.0.bias"], padding=1))
+        value = conv2d(value, weights["encoder.2.weight"], weights["encoder.2.bias"], padding=2, dilation=2)
+        return ImagePlanes(value, planes.cameras)
+
+
+class _WithFeatures(AnyOrderNeRF):
+    def __init__(self, config: TargetConfig) -> None:
+        super().__init__(config)
+        layers = (nn.Conv2d(3, 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, CHANNELS, 3, padding=2, dilation=2))
+        self.encoder = nn.Sequential(*layers)
+
+    @property
+    def views_size(self) -> int:
+        return (READ + CHANNELS) * self.config.planes
+
+    def bind(self, *given: Any) -> AnyOrderField:
+        made = super().bind(*given)
+        return _FeatureField(made.target, made.parameters, made.planes, made.bounds)
+
+
+class _PooledFeatureField(_PooledField, _FeatureField):
+    """Both."""
+
+
+class _PooledWithFeatures(_Pooled, _WithFeatures):
+    field_type: ClassVar[type[AnyOrderField]] = _PooledFeatureField
+
+    @property
+    def slot_size(self) -> int:
+        return READ + CHANNELS
+
+
 @dataclass(frozen=True)
 class _Reader:
     """What of the hypernetwork is changed or left out."""
@@ -122,6 +207,9 @@ VARIANTS: dict[str, type[AnyOrderNeRF]] = {
     "without_order": _WithoutOrder,
     "without_blending": _WithoutBlending,
     "random_start": _RandomStart,
+    "pooled": _Pooled,
+    "features": _WithFeatures,
+    "pooled_features": _PooledWithFeatures,
 }
 
 

@@ -83,7 +83,12 @@ class AnyOrderNeRF(Target):
     def input_size(self) -> int:
         """The encoded point, what the best views show, and what all of them have in common."""
         config = self.config
-        return encoded_size(config.point_octaves) + READ * config.planes + OVERALL + config.grid
+        return encoded_size(config.point_octaves) + self.views_size + OVERALL + config.grid
+
+    @property
+    def views_size(self) -> int:
+        """How many numbers the trunk reads of the single views of a point."""
+        return READ * self.config.planes
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> VisibilityPlanes:
         """The views with their masks and the depth of the hull."""
@@ -134,7 +139,7 @@ class AnyOrderField(Field):
         config, seen = self.target.config, visibility.best
         valid = seen.valid[..., None]
         colours = (2 * _of(shown, seen.views) - 1) * valid
-        slots = torch.cat([colours, _described(seen), seen.directions * valid], -1)
+        slots = self.slots(points, seen, colours)
 
         weights = seen.weights[..., None]
         mean = (weights * colours).sum(1)
@@ -143,11 +148,27 @@ class AnyOrderField(Field):
         overall = [mean, variance, colours[:, 0] - mean, torch.stack([visibility.coverage, number], 1)]
 
         inputs = [encode(self.bounds.normalise(points), config.point_octaves)]
-        inputs += [_padded(slots, config.planes).flatten(1), *overall]
+        inputs += [self.joined(slots), *overall]
         if config.grid:
             features = interpolate_grid(self.parameters["grid.weight"], points, self.bounds)
             inputs += [torch.sigmoid(features[:, :1]), features[:, 1:]]
         return self.trunk(torch.cat(inputs, 1))
+
+    def slots(
+        self, points: Float[Tensor, "point 3"], seen: ChosenViews, colours: Float[Tensor, "point chosen 3"]
+    ) -> Float[Tensor, "point chosen number"]:
+        """What the trunk reads of each of the best views; zero where a view is not valid.
+
+        Args:
+            points: in the world.
+            seen: the views.
+            colours: of the points there, in [-1, 1].
+        """
+        return torch.cat([colours, _described(seen), seen.directions * seen.valid[..., None]], -1)
+
+    def joined(self, slots: Float[Tensor, "point chosen number"]) -> Float[Tensor, "point views_size"]:
+        """What the trunk reads of all of them: one after the other, the best first."""
+        return _padded(slots, self.target.config.planes).flatten(1)
 
     def _density(self, hidden: Tensor, visibility: Visibility) -> Float[Tensor, " point"]:
         raw = self.layer("density", torch.cat([hidden, visibility.coverage[:, None]], 1))[:, 0]
