@@ -162,3 +162,22 @@ def test_what_is_learned_helps_on_an_object_that_was_not_trained_on(method, rate
     reached = quality(model)
     assert reached > quality(shuffled(model)) + 1
     assert reached > quality(untrained) + 1
+
+
+def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not_fit(tmp_path):
+    given = small_model()
+    torch.nn.init.normal_(given.networks.fine.colour.weight)
+    given.save(tmp_path / "given")
+    trainer = start_training(given.config, FAST, Balls(), tmp_path / "out", reference=tmp_path / "given")
+    for name, value in given.networks.state_dict().items():
+        assert torch.equal(trainer.model.networks.state_dict()[name], value), name
+    trainer.take_step()
+    trainer.save()
+    resumed = start_training(given.config, FAST, Balls(), tmp_path / "out", reference=tmp_path / "given")
+    assert resumed.step == 1  # an interrupted training goes on from where it was, not from there
+    for name, value in trainer.model.state_dict().items():
+        assert torch.equal(resumed.model.state_dict()[name], value), name
+
+    wider = replace(given.config, network=replace(given.config.network, width=32))
+    with pytest.raises(ValueError, match="checkpoint: expected weights of the configured model, got others of"):
+        start_training(wider, FAST, Balls(), tmp_path / "other", reference=tmp_path / "given")

@@ -1,0 +1,58 @@
+"""Benchmarks of quality. Source of truth: the same figure computed beside them, and gradients of every weight."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from small_demo import demo_folder
+
+from benchmarks import any_order, views
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.data import open_dataset
+from hyperplanes.data.support import Shown
+from hyperplanes.evaluation import evaluate
+from hyperplanes.training import Trainer
+from tests.reference_rendering import Balls
+from tests.training.test_completion import MODEL
+
+
+@pytest.mark.parametrize("name", [*any_order.VARIANTS, *any_order.HYPERNETWORKS])
+def test_every_weight_of_every_variant_is_trained(name):
+    made = any_order.configured(name, 4, 0)
+    small = replace(made.model.network, depth=2, width=16, planes=3)
+    model = HyperPlanes(replace(made.model, network=small, hull_side=16))
+    trainer = Trainer(model, Balls(views=6, size=(24, 24)), replace(made.training, rays=48, views=(3, 5), episodes=4))
+    for _ in range(3):  # outputs of a hypernetwork that start at zero let nothing through in the first step
+        trainer.take_step()
+    dead = {key for key, value in model.named_parameters() if value.grad is None or not value.grad.any()}
+    assert not {key for key in dead if not key.startswith("hypernetwork")}, name
+
+
+def test_pooling_reads_the_views_of_a_point_in_no_order():
+    made = any_order.configured("pooled", 4, 0)
+    model = HyperPlanes(replace(made.model, hull_side=16))
+    task = Balls(views=6, size=(24, 24)).task("train0")
+    field = model.adapt(task.support).field
+    slots = torch.randn(5, 4, 9).index_fill_(2, torch.tensor(5), 1.0)
+    torch.testing.assert_close(field.joined(slots), field.joined(slots[:, [2, 0, 3, 1]]))
+    slots[:, 1, 5] = 0.0  # a view that does not see the point counts nothing
+    changed = slots.clone()
+    changed[:, 1, :3] = 7.0
+    torch.testing.assert_close(field.joined(slots), field.joined(changed))
+
+
+def test_the_second_pass_of_the_benchmark_of_views_is_that_of_the_model(tmp_path):
+    data = demo_folder() / "data"
+    model = HyperPlanes(MODEL)
+    model.save(tmp_path / "model")
+    options = ["--checkpoint", str(tmp_path / "model"), "--data", str(data), "--quick", "--second-pass"]
+    assert views.main([*options, "--methods", "--json", str(tmp_path / "rows.json")]) == 0
+    (row,) = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert (row["name"], row["views"], row["second_pass"]) == ("one_step", 3, True)
+
+    opened = open_dataset(data)
+    names = sorted(opened.names("test"))[:2]
+    model.config = replace(model.config, second_pass=True)
+    again = evaluate("one_step", model, Shown(opened, 3, 1), names)
+    assert row["psnr"] == pytest.approx(again.mean("psnr"), abs=1e-6)
