@@ -14,7 +14,7 @@ __all__ = ["WeightAverage"]
 class WeightAverage(AveragedModel):
     """After each step: decay times the average plus (1 - decay) times the weights; the first step's weights at first.
 
-    Buffers, such as running statistics, are those of the last step.
+    Running statistics are averaged alike: those of the last step do not fit the activations of averaged weights.
 
     Args:
         model: whose weights are averaged.
@@ -22,7 +22,7 @@ class WeightAverage(AveragedModel):
     """
 
     def __init__(self, model: HyperPlanes, decay: float) -> None:
-        super().__init__(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        super().__init__(model, multi_avg_fn=get_ema_multi_avg_fn(decay), use_buffers=True)
         self.requires_grad_(False)
 
     @property

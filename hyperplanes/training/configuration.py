@@ -48,8 +48,8 @@ class TrainingConfig:
         alternating: theta and the hypernetwork move in turns, theta first, instead of both in every step. The paper
             speaks of separate gradient steps; its code moves both.
         clip: the norm to which the gradient of all weights that a step moves is cut where it is longer; 0 leaves it.
-        average: decay of a moving average of the weights, which is evaluated and saved as the model, while the training
-            goes on from the weights themselves; 0 is none.
+        average: decay of a moving average of weights and running statistics, which is evaluated and saved as the model,
+            while the training goes on from the weights themselves; 0 is none.
         balanced: classes are drawn equally often, however many objects each has. Where a data set does not state them,
             each data set is one.
         evaluate_every: steps between looks at held-out objects.
