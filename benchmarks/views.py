@@ -17,6 +17,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
@@ -89,9 +90,12 @@ def main(arguments: list[str]) -> int:
                 rows.append(row)
                 print(rows[-1], flush=True)
         sheet += _best_median_worst(seen)
+    finish("views", rows, chosen.json)
     if chosen.pictures is not None:
+        widest = max(row.shape[2] for row in sheet)
+        sheet = [pad(row, (0, widest - row.shape[2]), value=1.0) for row in sheet]
         write_whole(chosen.pictures, encode_png(to_pixels(torch.cat(sheet, 1)[None])[0], small=True))
-    return finish("views", rows, chosen.json)
+    return 0
 
 
 def _best_median_worst(seen: Mapping[int, Sequence[tuple[Tensor, Tensor]]]) -> list[Tensor]:
@@ -141,7 +145,7 @@ class _Partly:
             volume = prepared.volume * prepared.volume.new_tensor(kept)[:, None, None, None]
             prepared = replace(prepared, volume=volume)
         update = Parameters((name, value) for name, value in model.update(prepared).items() if self.written(name))
-        return model.field(prepared, model.theta + update)
+        return model.rendering_field(prepared, model.theta + update)
 
 
 def _swapped(model: HyperPlanes, shown: Shown, names: list[str]) -> Adapter:

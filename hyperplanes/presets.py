@@ -92,7 +92,16 @@ class Preset:
             chosen, target = self.learning_initialisation(method), target or "nerf"
         elif self.model.hypernetwork is None:
             raise ValueError("method: expected a configuration with a hypernetwork for hyperplanes, got one without")
-        return replace(chosen, model=replace(chosen.model, target=target or chosen.model.target))
+        target = target or chosen.model.target
+        if not targets[target].any_order:
+            chosen = chosen.for_known_places()
+        return replace(chosen, model=replace(chosen.model, target=target))
+
+    def for_known_places(self) -> Preset:
+        """Without what only a field of any number of views has: the grid of features, episodes of some of the views."""
+        network = replace(self.model.network, grid=0)
+        training = replace(self.training, views=(), rotations=0.0, recolouring=0.0, completion=0.0)
+        return replace(self, model=replace(self.model, network=network), training=training)
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
@@ -113,7 +122,16 @@ class Preset:
         changes: dict[str, int] = {"inner_steps": MAML_STEPS} if method.startswith("maml") else {}
         initialisation = replace(self.initialisation, method=method, **changes)
         plain = self.without_hypernetwork()
-        training = replace(plain.training, optimiser="adam", learning_rate=self.outer_rate)
+        training = replace(
+            plain.training,
+            optimiser="adam",
+            learning_rate=self.outer_rate,
+            views=(),
+            rotations=0.0,
+            recolouring=0.0,
+            random_background=False,
+            empty_points=0,
+        )
         if method == "mv_matched":
             training = replace(training, learning_rate=MATCHING_RATE)
         else:

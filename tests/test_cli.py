@@ -121,7 +121,9 @@ def test_version(capsys):
         (["train", "--data", "DATA", "--preset", "huge", "--out", "OUT/run"], ["quick", "huge"]),
         (["train", "--data", "DATA", "--steps", "0", "--out", "OUT/run"], ["steps", "0"]),
         (["train", "--data", "DATA", "--device", "abacus", "--out", "OUT/run"], ["device", "abacus"]),
+        (["train", "--data", "DATA", "--preset", "small", "--support", "5", "--out", "OUT/run"], ["--training.views"]),
         (["evaluate", "--data", "DATA", "--method", "magic"], ["nearest_view", "magic"]),
+        (["evaluate", "--data", "DATA", "--method", "nearest_view", "--boxes", "OUT/a.gfi"], ["OUT/a.gfi", "png"]),
         (["evaluate", "--data", "DATA", "--method", "hyperplanes"], ["checkpoint", "hyperplanes train"]),
         (
             ["render", "--checkpoint", "OUT/none", "--views", "DATA", "--out", "OUT"],

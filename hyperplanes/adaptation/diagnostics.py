@@ -130,7 +130,7 @@ def swap_gap(
     def quality(shift: int) -> float:
         values = []
         for index, (each, query) in enumerate(zip(prepared, queries, strict=True)):
-            field = model.field(each, model.theta + updates[(index + shift) % len(updates)])
+            field = model.rendering_field(each, model.theta + updates[(index + shift) % len(updates)])
             values.append(psnr(field.render(query.cameras).images, query.images))
         return float(torch.cat(values).mean())
 

@@ -91,7 +91,7 @@ class FineTuning:
 def ray_loss(seen: Rendered, truth: Tensor) -> Tensor:
     """Mean squared error of the colours of rays, that of the coarse pass added where there was one (Eq. 2)."""
     loss = (seen.colour - truth).square().mean()
-    return loss if seen.coarse is None else loss + (seen.coarse - truth).square().mean()
+    return loss if seen.coarse is None else loss + (seen.coarse.colour - truth).square().mean()
 
 
 def minimise(
@@ -176,7 +176,7 @@ def best_stop(
     """After how many steps of a schedule of `settings.longest` the field shows left-out views best; 0 for none.
 
     Judged on the squared error of the same JUDGED rays at 0 steps and at every CHECKS-th part of the schedule; ends
-    early after two checks without improvement.
+    early after three checks without improvement.
 
     Args:
         field: as in `minimise`.

@@ -58,7 +58,8 @@ class HullBlend:
         solid = AdaptedField(shape, region, sampling, densities=(shape.density,))
         distance = solid.render(support.cameras).depth
         distance = torch.where(distance > 0, distance, torch.inf).expand(-1, 3, -1, -1)
-        far = 4 * float((camera.centres(support.cameras).norm(dim=1)).max() + support.bounds.radius)
+        eyes = camera.centres(support.cameras)
+        far = 2 * float((eyes - eyes.new_tensor(support.bounds.centre)).norm(dim=1).max() + support.bounds.radius)
         depths = ImagePlanes(distance.clamp_max(far).contiguous(), support.cameras, background=far, exact=True)
         colours = ImagePlanes(support.images, support.cameras)
         tolerance = 2 * region.voxel

@@ -280,8 +280,11 @@ class HyperPlanes(nn.Module):
         """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6)."""
         prepared = support if isinstance(support, Prepared) else self.prepare(support)
         with _in_use(self):
-            weights = self.theta + self.update(prepared)
-            return self.field(self._second_pass(prepared, weights), weights)
+            return self.rendering_field(prepared, self.theta + self.update(prepared))
+
+    def rendering_field(self, prepared: Prepared, parameters: Parameters) -> AdaptedField:
+        """As `field`, after a second pass where the model takes two."""
+        return self.field(self._second_pass(prepared, parameters), parameters)
 
     def _second_pass(self, prepared: Prepared, weights: Parameters) -> Prepared:
         """The planes with the surface that these weights show to each of them, where the model takes two passes."""

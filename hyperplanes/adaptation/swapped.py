@@ -44,7 +44,7 @@ class Swapped:
         known = list(self._updates)
         own = _digest(support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]
-        return self.model.field(prepared, self.model.theta + self._updates[other])
+        return self.model.rendering_field(prepared, self.model.theta + self._updates[other])
 
 
 def _digest(support: Views) -> str:

@@ -78,6 +78,7 @@ def run(arguments: Arguments) -> int:
     assert isinstance(field, AdaptedField)
     adapted_model(model, field).save(arguments.out)
     more = "" if up == "y" else f" --up={up}"
+    more += " --all-views" if arguments.all_views else ""
     more += "" if arguments.downscale is None else f" --downscale {arguments.downscale}"
     console.say(f"{arguments.out}: the weights of {task.name}")
     console.say(

@@ -161,9 +161,13 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.evaluation.perceptual import LPIPS
     from hyperplanes.methods import WithSampler, at_steps, make_method
     from hyperplanes.presets import PROTOCOLS
+    from hyperplanes.utilities.plots import figure_kind
 
     if arguments.curve is not None and len(arguments.steps) < 2:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
+    for figure in (arguments.curve, arguments.boxes, arguments.grid):
+        if figure is not None:
+            figure_kind(figure)  # a wrong name is found before anything is evaluated
     if arguments.seeds < 1:
         raise ValueError(f"--seeds: expected at least 1, got {arguments.seeds}")
     console, device = Console(), choose_device(arguments.device)

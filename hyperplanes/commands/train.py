@@ -262,6 +262,10 @@ def _run(arguments: Arguments) -> int:
             f"{shown}: expected objects to train on, found none in its train split; "
             "a single scene can only be rendered or evaluated"
         )
+    if arguments.support is not None and chosen.training.views:
+        raise ValueError(
+            "--support: expected none, since training.views says how many views are shown; --training.views changes it"
+        )
     tasks = data if arguments.support is None else WithSupport(data, arguments.support)
     reference = None
     if arguments.checkpoint is not None:

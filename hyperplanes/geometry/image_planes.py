@@ -75,7 +75,7 @@ class ImagePlanes:
         Args:
             views: their indices.
         """
-        hidden = torch.zeros(len(self), dtype=torch.bool, device=self.images.device).index_fill_(0, views, True)
+        hidden = torch.zeros(len(self), dtype=torch.bool).index_fill_(0, views.cpu(), True).to(self.images.device)
         result = copy.copy(self)
         result.hidden = hidden if self.hidden is None else hidden | self.hidden
         return result

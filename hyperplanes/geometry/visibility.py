@@ -124,13 +124,14 @@ class VisibilityPlanes:
         return 2 / self.occupancy.occupied.shape[0]
 
     def hiding(self, views: Int[Tensor, " hidden"]) -> VisibilityPlanes:
-        """The same planes, of which some see nothing.
+        """The same planes, some more of which see nothing: no point is valid there, and its colour is the background.
 
         Args:
             views: their indices.
         """
         result = copy.copy(self)
-        result._hidden = torch.zeros_like(self._hidden).index_fill_(0, views, True)
+        result.colours = self.colours.hiding(views)
+        result._hidden = self._hidden.index_fill(0, views.to(self._hidden.device), True)
         return result
 
     def with_surface(

@@ -22,18 +22,19 @@ class Rendered:
         opacity: 1 - the transmittance of the whole ray.
         depth: expected distance along the ray in world units, sum of w t / opacity; 0 where the opacity is 0.
         samples: number of field evaluations, over all rays.
-        coarse: the colour of the coarse pass, where there was one; training has a loss on it too.
+        coarse: the pixels of the coarse pass, where there was one; training has a loss on their colour too.
     """
 
     colour: Float[Tensor, "ray 3"]
     opacity: Float[Tensor, " ray"]
     depth: Float[Tensor, " ray"]
     samples: int
-    coarse: Float[Tensor, "ray 3"] | None = None
+    coarse: Rendered | None = None
 
     def over(self, background: Float[Tensor, " 3"]) -> Rendered:
-        """The same pixels, rendered over white, over another colour; not those of the coarse pass."""
-        return replace(self, colour=self.colour + (1 - self.opacity)[:, None] * (background - 1))
+        """The same pixels, rendered over white, over another colour; those of the coarse pass too."""
+        colour = self.colour + (1 - self.opacity)[:, None] * (background - 1)
+        return replace(self, colour=colour, coarse=self.coarse and self.coarse.over(background))
 
 
 def composite(

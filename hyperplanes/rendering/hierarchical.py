@@ -6,7 +6,7 @@ interval; `weights` are the compositing weights of the intervals, (ray, interval
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -110,7 +110,7 @@ class Hierarchical:
             edges = torch.cat([edges, added], 1).sort(1).values
             places = stratified(edges, generator)
         fine, _ = composited(field, places, edges)
-        return Rendered(fine.colour, fine.opacity, fine.depth, coarse.samples + fine.samples, coarse.colour)
+        return replace(fine, samples=coarse.samples + fine.samples, coarse=coarse)
 
 
 def intervals(rays: Rays, count: int) -> Float[Tensor, "ray edge"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -167,7 +167,7 @@ def _all_at_once(
     even = (rank % 2 == 0).nonzero()[:, 0]
     alone = rank[even] + 1 == total[samples.ray[even]]
     coarse = composited(proposal, samples[even], torch.where(alone, 1, 2) * samples.step)
-    return Rendered(fine.colour, fine.opacity, fine.depth, fine.samples + coarse.samples, coarse.colour)
+    return replace(fine, samples=fine.samples + coarse.samples, coarse=coarse)
 
 
 def _ranks(ray: Tensor, count: int) -> tuple[Tensor, Tensor]:

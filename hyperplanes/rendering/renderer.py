@@ -137,14 +137,18 @@ def _render_rays(
         return part(rays)
     size = chunk or sampling.rays_per_chunk(rays.origins.device)
     with torch.no_grad(), allow_tf32(rays.origins.device):
-        parts = [part(rays[first : first + size]) for first in range(0, max(1, len(rays)), size)]
+        return _joined([part(rays[first : first + size]) for first in range(0, max(1, len(rays)), size)])
+
+
+def _joined(parts: list[Rendered]) -> Rendered:
+    """The pixels of all parts, one after the other."""
     coarse = [each.coarse for each in parts if each.coarse is not None]
     return Rendered(
         torch.cat([each.colour for each in parts]),
         torch.cat([each.opacity for each in parts]),
         torch.cat([each.depth for each in parts]),
         sum(each.samples for each in parts),
-        torch.cat(coarse) if coarse else None,
+        _joined(coarse) if coarse else None,
     )
 
 

@@ -48,7 +48,7 @@ class Episode:
 
     @property
     def nbytes(self) -> int:
-        """Memory of images, masks, hull and indices, and of the copy that lookups make of the planes."""
+        """Memory of images, masks, hull, volumes and indices, and of the copy that lookups make of the planes."""
         planes = self.prepared.views
         own = (
             planes.nbytes * (2 if isinstance(self.prepared.planes, VisibilityPlanes) else 1)
@@ -56,7 +56,8 @@ class Episode:
             + self.query.nbytes
             + self.prepared.occupancy.occupied.nbytes
         )
-        return own + (0 if self.live is None else self.live.nbytes)
+        further = (self.live, self.prepared.volume, self.whole)
+        return own + sum(each.nbytes for each in further if each is not None)
 
 
 def prepare_episode(model: HyperPlanes, task: Task, *, carved: bool = True) -> Episode:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.fine_tuning import Hiding, minimise, ray_loss
-from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.fine_tuning import minimise, ray_loss
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
 from hyperplanes.adaptation.initialisation import InitialisationConfig
 from hyperplanes.adaptation.meta_learning import maml_gradient, reptile_gradient
 from hyperplanes.data.support import SingleView
@@ -68,12 +68,17 @@ class ReptileTrainer(_InitialisationTrainer):
         for episode, generator in zip(episodes, generators, strict=True):
             free = Parameters((name, value.clone().requires_grad_(True)) for name, value in theta.items())
             field = self.model.field(episode.prepared, free)
+
+            def showing(
+                hidden: Tensor | None, shown: Prepared = episode.prepared, free: Parameters = free
+            ) -> AdaptedField:
+                return self.model.field(shown if hidden is None else shown.hiding(hidden), free)
+
             settings = replace(self.initialisation.descent(self.config.rays), seed=_seed(generator))
             views, steps = episode.prepared.views, self.initialisation.inner_steps
             live = episode.support_live
-            for _ in minimise(
-                lambda hidden, field=field: field, list(free.values()), views, steps, settings, pixels=live
-            ):
+            hiding = self.model.any_order
+            for _ in minimise(showing, list(free.values()), views, steps, settings, pixels=live, hiding=hiding):
                 pass
             adapted.append(free.detach())
             with torch.no_grad():
@@ -84,7 +89,16 @@ class ReptileTrainer(_InitialisationTrainer):
 
 
 class MAMLTrainer(_InitialisationTrainer):
-    """The loss of query rays after gradient steps on support rays, and its gradient through them (Finn et al. 2017)."""
+    """The loss of query rays after gradient steps on support rays, and its gradient through them (Finn et al. 2017).
+
+    Raises:
+        ValueError: a field of any order, which would learn to copy the views that support rays come from.
+    """
+
+    def __init__(self, model: HyperPlanes, data: Tasks, config: TrainingConfig, folder: Path | None = None) -> None:
+        if model.any_order:
+            raise ValueError(f"maml: expected a field that knows views by their places, got {model.config.target}")
+        super().__init__(model, data, config, folder)
 
     @property
     def rays_per_step(self) -> int:
@@ -195,11 +209,6 @@ def initialisation_trainer(
             raise ValueError("mv_matched: expected a checkpoint of mv_meta to match, got none; see --checkpoint")
         return MatchedTrainer(model, data, config, folder, reference)
     return (ReptileTrainer if method in ("mv_meta", "sv_meta") else MAMLTrainer)(model, data, config, folder)
-
-
-def _constant(field: AdaptedField) -> Hiding:
-    """The field, whatever is hidden."""
-    return lambda hidden: field
 
 
 def _seed(generator: torch.Generator) -> int:

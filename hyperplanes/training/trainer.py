@@ -82,8 +82,6 @@ class Trainer:
                 "training.views: expected numbers of at least 1, for the field any_order, which takes any of them, "
                 f"got {list(config.views)} for {model.config.target}"
             )
-        if config.random_background and model.config.coarse_network:
-            raise ValueError("training.random_background: expected a model without a coarse network, got one with")
         if config.completion and not (model.reads_volume and model.config.network.grid >= COMPLETED and config.views):
             raise ValueError(
                 f"training.completion: expected training.views, a hypernetwork with encoder 'volume' and a grid of at "
@@ -110,7 +108,7 @@ class Trainer:
         if folder is not None:
             check_model(folder, model.config)
         resumed = folder is not None and (folder / "training.json").exists()
-        if not resumed and self.processes.first:  # the others get it with the weights
+        if not (resumed or model.rig.any()) and self.processes.first:  # the others get it with the weights
             with prefix_errors(self.names[0]):
                 model.set_rig(data.task(self.names[0]).support)
         self.average = WeightAverage(model, config.average) if config.average else None
@@ -398,8 +396,8 @@ class Trainer:
 
     @property
     def _reads_hull(self) -> bool:
-        """Whether any sample depends on the hull; the paper's protocol samples without one."""
-        return self.model.config.sampling.needs_occupancy or self.config.empty_points > 0
+        """Whether a sample or the field depends on the hull; the paper's protocol samples without one."""
+        return self.model.any_order or self.model.config.sampling.needs_occupancy or self.config.empty_points > 0
 
     def _load(self, name: str) -> Episode:
         if not self.config.views:

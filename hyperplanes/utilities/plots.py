@@ -23,6 +23,7 @@ __all__ = [
     "draw_grid",
     "draw_lines",
     "encode_figure",
+    "figure_kind",
     "new_figure",
     "save_figure",
     "set_counts",
@@ -41,16 +42,21 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all; the ending of the name decides the format. The same figure, the same bytes.
+    """Write a figure, whole or not at all, as `figure_kind` says. The same figure, the same bytes."""
+    write_whole(path, encode_figure(figure, figure_kind(path)))
+
+
+def figure_kind(path: Path) -> str:
+    """The format that the ending of a figure's name stands for, such as "svg".
 
     Raises:
         ValueError: an ending that matplotlib does not know.
     """
     kind = path.suffix.removeprefix(".").lower()
-    known = sorted(figure.canvas.get_supported_filetypes())
+    known = sorted(new_figure(1, 1).canvas.get_supported_filetypes())
     if kind not in known:
         raise ValueError(f"{path}: expected a name that ends in one of {', '.join(known)}, got {path.name!r}")
-    write_whole(path, encode_figure(figure, kind))
+    return kind
 
 
 def encode_figure(figure: Figure, kind: str) -> bytes:

@@ -8,6 +8,7 @@ import torch
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.fine_tuning import FineTuning, minimise
+from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
@@ -135,6 +136,19 @@ def test_a_second_pass_takes_colours_by_the_surface_that_the_first_one_shows_eve
     for free in ("weights", "hypernetwork"):
         tuned = twice.fine_tune(support, 0, FineTuning(free=free))
         torch.testing.assert_close(tuned.render(ring(2, (10, 13), shift=1)).images, expected)
+
+
+def test_the_control_of_swapped_updates_takes_the_second_pass_too():
+    twice = model(**READERS["volume"], second_pass=True)
+    objects = [views(6, colour) for colour in ((0.8, 0.2, 0.1), (0.1, 0.9, 0.3))]
+    swapped = Swapped(twice, objects).adapt(objects[0])
+    with torch.no_grad():
+        prepared = twice.prepare(objects[0])
+        expected = twice.rendering_field(prepared, twice.theta + twice.update(twice.prepare(objects[1])))
+        once = twice.field(prepared, twice.theta + twice.update(twice.prepare(objects[1])))
+    cameras = ring(2, (10, 13), shift=1)
+    assert torch.equal(swapped.render(cameras).images, expected.render(cameras).images)
+    assert not torch.allclose(swapped.render(cameras).images, once.render(cameras).images, atol=1e-4)
 
 
 def test_a_second_pass_is_refused_where_the_field_does_not_judge_what_views_see():

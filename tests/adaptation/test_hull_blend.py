@@ -1,11 +1,14 @@
 """Source of truth: a ball of one colour, a ball whose sides differ, and its masks."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.nn.functional import max_pool2d
 
 from hyperplanes.adaptation import HullBlend
-from hyperplanes.geometry.cameras import concatenate
+from hyperplanes.geometry import Sphere
+from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
 from hyperplanes.metrics import psnr
 from hyperplanes.views import Views
 from tests.reference_rendering import ball_views, camera_at, ring
@@ -50,6 +53,18 @@ def test_a_view_from_behind_gives_no_colour():
     assert west[2].min() > 0.8
     assert east[2].max() < 0.02
     assert west[0].max() < 0.02
+
+
+def test_where_the_world_has_its_origin_does_not_matter():
+    red, green = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    eyes = [(3.0, 0.0, 0.0), (-3.0, 0.0, 0.0), (0.0, 0.2, 3.0), (0.0, 0.2, -3.0)]
+    here = painted(concatenate([camera_at(eye, (24, 24)) for eye in eyes]), [red, green, green, green])
+    moved = camera_from_world(here.cameras).clone()
+    place = torch.tensor([9.0, -1.0, 2.0])
+    moved[:, :3, 3] -= moved[:, :3, :3] @ place
+    there = replace(here, cameras=with_poses(here.cameras, moved), bounds=Sphere(tuple(place.tolist())))
+    one, other = (SMALL.adapt(views).render(views.cameras).images for views in (here, there))
+    torch.testing.assert_close(one, other, atol=2e-2, rtol=0)
 
 
 def test_the_order_of_the_views_does_not_matter():

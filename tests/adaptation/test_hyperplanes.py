@@ -184,7 +184,7 @@ def test_a_coarse_network_proposes_and_is_updated_too(support):
     prepared = both.prepare(support)
     assert {name.split(".")[0] for name in both.update(prepared)} == {"fine", "coarse"}
     seen = both.adapt(support).trace(support.rays(0, span="constant"))
-    assert (seen.coarse - seen.colour).abs().max() > 1e-3
+    assert (seen.coarse.colour - seen.colour).abs().max() > 1e-3
 
 
 def test_a_saved_model_is_the_same_model(model, support, tmp_path):

@@ -1,5 +1,7 @@
 """Source of truth: what must not matter (the order of views, views that see nothing), and the visual hull of a ball."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -80,6 +82,21 @@ def test_a_hidden_view_is_as_good_as_absent():
     found = target.bind(Parameters.of(target), hidden)(points, directions)
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_hidden_views_show_nothing_even_where_too_few_others_are_left():
+    target, views, (points, directions) = network(), coloured(3), queries()
+    occupancy, hidden = carve(views.masks, views.cameras, views.bounds, 32), torch.tensor([1])
+    images = views.images.clone()
+    images[1] = torch.rand(images[1].shape)
+
+    def seen(views):
+        planes = target.planes_of(views, occupancy).hiding(hidden).hiding(torch.tensor([2]))
+        return target.bind(Parameters.of(target), planes)(points, directions)
+
+    for one, other in zip(seen(views), seen(replace(views, images=images)), strict=True):
+        assert torch.equal(one, other)
 
 
 @torch.no_grad()

@@ -142,7 +142,7 @@ def test_placement_at_samples_is_nerfs():
         cumulative = np.concatenate([[0.0], np.cumsum(mass / mass.sum())])
         added = np.interp((np.arange(fine) + 0.5) / fine, cumulative, (t[1:] + t[:-1]) / 2)
         last, _ = pixel(ray, np.sort(np.concatenate([t, added])))
-        assert found.coarse[ray].numpy() == pytest.approx(first, abs=1e-9)
+        assert found.coarse.colour[ray].numpy() == pytest.approx(first, abs=1e-9)
         assert found.colour[ray].numpy() == pytest.approx(last, abs=1e-9)
     assert found.samples == 5 * (coarse + coarse + fine)
 

@@ -87,7 +87,22 @@ def test_fine_samples_bring_the_coarse_picture_nearer():
     rays = some_rays(60)
     truth = render(soft_ball, rays, Hierarchical(400, 0)).colour
     seen = render(soft_ball, rays, Hierarchical(12, 40))
-    assert (seen.colour - truth).abs().mean() < 0.3 * (seen.coarse - truth).abs().mean()
+    assert (seen.colour - truth).abs().mean() < 0.3 * (seen.coarse.colour - truth).abs().mean()
+
+
+@torch.no_grad()
+def test_pixels_over_a_colour_are_what_is_rendered_over_it_in_both_passes():
+    rays = some_rays(40)
+    for sampling in (Hierarchical(12, 40), Marched(64)):
+        proposal = None if isinstance(sampling, Hierarchical) else fog(0.4)
+        grey, white = (
+            render(soft_ball, rays, sampling, occupancy=GRID, proposal=proposal, background=background)
+            for background in (0.3, 1.0)
+        )
+        found = white.over(torch.full((3,), 0.3))
+        torch.testing.assert_close(found.colour, grey.colour)
+        torch.testing.assert_close(found.coarse.colour, grey.coarse.colour)
+        assert (found.coarse.colour - white.coarse.colour).abs().max() > 0.1
 
 
 @pytest.mark.parametrize("stop", [0.2, 1e-2, 1e-3])
@@ -183,7 +198,7 @@ def test_the_proposal_draws_the_coarse_picture_and_learns_from_it():
     own, _ = torch.autograd.grad(seen.colour.sum(), (fine, coarse), allow_unused=True, retain_graph=True)
     assert own > 0
     assert torch.autograd.grad(seen.colour.sum(), coarse, allow_unused=True, retain_graph=True)[0] is None
-    assert torch.autograd.grad(seen.coarse.sum(), coarse)[0] > 0
+    assert torch.autograd.grad(seen.coarse.colour.sum(), coarse)[0] > 0
 
 
 @pytest.mark.parametrize("background", [0.0, 0.4, 1.0])
@@ -295,7 +310,7 @@ def test_a_proposal_sees_each_ray_by_itself_and_its_whole_length():
     seen = render(fog(0.5), rays, Marched(20), occupancy=GRID, proposal=proposal, background=0.0)
     assert asked == [1 + 1 + 2 + 4]
     opacity = 1 - torch.exp(-0.9 * count * step)
-    torch.testing.assert_close(seen.coarse[:, 0], 0.2 * opacity.double())
+    torch.testing.assert_close(seen.coarse.colour[:, 0], 0.2 * opacity.double())
 
 
 @torch.no_grad()
@@ -311,7 +326,7 @@ def test_chunks_keep_the_coarse_picture_and_no_rays_make_no_chunks():
     rays = some_rays(11)
     whole = render(soft_ball, rays, Hierarchical(8, 4))
     parts = render(soft_ball, rays, Hierarchical(8, 4), differentiable=False, chunk=4)
-    torch.testing.assert_close(parts.coarse, whole.coarse)
+    torch.testing.assert_close(parts.coarse.colour, whole.coarse.colour)
     for sampling in PROTOCOLS:
         assert render(soft_ball, rays[:0], sampling, occupancy=GRID, differentiable=False).colour.shape == (0, 3)
 

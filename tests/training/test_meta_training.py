@@ -175,6 +175,11 @@ def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not
     trainer.save()
     resumed = start_training(given.config, FAST, Balls(), tmp_path / "out", reference=tmp_path / "given")
     assert resumed.step == 1  # an interrupted training goes on from where it was, not from there
+    small_model().save(tmp_path / "others")
+    with pytest.raises(
+        ValueError, match="checkpoint: expected what the training in .* began with, .*given, got .*others"
+    ):
+        start_training(given.config, FAST, Balls(), tmp_path / "out", reference=tmp_path / "others")
     for name, value in trainer.model.state_dict().items():
         assert torch.equal(resumed.model.state_dict()[name], value), name
 

@@ -102,7 +102,6 @@ def test_only_random_backgrounds_tell_a_white_surface_from_none(random):
     [
         (small_model, TRAINING, "any_order"),
         (lambda: HyperPlanes(MODEL), replace(TRAINING, views=(0, 3)), "at least 1"),
-        (lambda: small_model(coarse_network=True), replace(TRAINING, views=()), "coarse"),
     ],
 )
 def test_settings_that_do_not_fit_the_model_are_refused(model, training, message):
