@@ -11,6 +11,7 @@ another object of the data set, and with its own; and fine-tuned.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,8 @@ from hyperplanes.files import encode_png, write_whole
 from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.metrics import psnr
 from hyperplanes.parameters import Parameters
-from hyperplanes.views import Views
+from hyperplanes.training.augmentation import Augmentation
+from hyperplanes.views import Task, Tasks, Views
 
 __all__ = ["METHODS", "PARTS", "adapters", "main"]
 
@@ -57,6 +59,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--methods", nargs="*", choices=(*METHODS, *PARTS), default=list(METHODS), help="beside the model itself"
     )
+    parser.add_argument(
+        "--rotated", type=float, default=0.0, metavar="DEGREES", help="every scene, about its vertical axis"
+    )
     parser.add_argument("--second-pass", action="store_true", help="the model takes one, in all its rows")
     parser.add_argument("--pictures", type=Path, metavar="FILE", help="PNG: of each data set the best, the median and "
                         "the worst view by the most views shown; columns are the truth and the numbers of views, "
@@ -73,10 +78,11 @@ def main(arguments: list[str]) -> int:
         names = sorted(data.names("test"))[: chosen.objects]
         seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count: truth and prediction of every view
         for count in chosen.counts:
-            shown = Shown(data, count, chosen.query)
+            shown = _Rotated(Shown(data, count, chosen.query), chosen.rotated)
             for method, adapter in adapters(model, shown, names, chosen.methods, chosen.steps).items():
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
                 row |= {"second_pass": True} if chosen.second_pass else {}
+                row |= {"rotated": chosen.rotated} if chosen.rotated else {}
                 made = seen.setdefault(count, []) if method == "one_step" else []
                 score = evaluate(
                     method,
@@ -98,6 +104,28 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
+@dataclass(frozen=True)
+class _Rotated:
+    """Tasks whose scenes are rotated about their vertical axes.
+
+    Attributes:
+        data: the tasks.
+        degrees: of the rotation.
+    """
+
+    data: Tasks
+    degrees: float
+
+    def names(self, split: str) -> Sequence[str]:
+        """The objects of a split."""
+        return self.data.names(split)
+
+    def task(self, name: str) -> Task:
+        """One object."""
+        task, rotation = self.data.task(name), Augmentation(math.radians(self.degrees))
+        return Task(rotation.views(task.support), rotation.views(task.query), task.name)
+
+
 def _best_median_worst(seen: Mapping[int, Sequence[tuple[Tensor, Tensor]]]) -> list[Tensor]:
     """Three rows of pictures: the truth, and what was predicted from ever more views."""
     most = seen[max(seen)]
@@ -107,7 +135,7 @@ def _best_median_worst(seen: Mapping[int, Sequence[tuple[Tensor, Tensor]]]) -> l
 
 
 def adapters(
-    model: HyperPlanes, shown: Shown, names: list[str], wanted: list[str], steps: list[int]
+    model: HyperPlanes, shown: Tasks, names: list[str], wanted: list[str], steps: list[int]
 ) -> Mapping[str, Adapter]:
     """The rows by name."""
     found: dict[str, Adapter] = {}
@@ -148,7 +176,7 @@ class _Partly:
         return model.rendering_field(prepared, model.theta + update)
 
 
-def _swapped(model: HyperPlanes, shown: Shown, names: list[str]) -> Adapter:
+def _swapped(model: HyperPlanes, shown: Tasks, names: list[str]) -> Adapter:
     return Swapped(model, [shown.task(name).support for name in names])
 
 
