@@ -22,7 +22,7 @@ from small_demo import demo_folder, first_object
 from data_gen.rendering.renderers import RendererError
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.fine_tuning import FineTuning
-from hyperplanes.adaptation.pretrained import load_model
+from hyperplanes.adaptation.pretrained import find_checkpoints, load_model
 from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
 from hyperplanes.commands import find_verbs
@@ -92,6 +92,9 @@ def test_every_verb_has_help_with_an_example_and_no_torch(verb):
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout.splitlines()[-1] == "0 False"
     assert f"    hyperplanes {verb}" in done.stdout
+    if verb in ("render", "export", "bake", "adapt", "evaluate"):
+        text = " ".join(done.stdout.replace("│", " ").split())
+        assert "or a packaged model: small, cars-64" in text
 
 
 def test_an_unknown_verb_is_answered_with_the_nearest(capsys):
@@ -105,9 +108,27 @@ def test_an_unknown_flag_is_wrong_input(capsys):
     assert end.value.code == 2
 
 
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        (["train", "--data", "x", "--out", "x", "--field", "None"], "'nerf', 'multiplane', 'point_multiplane'"),
+        (["generate", "--out", "x", "--class", "None"], "'car', 'chair', 'plane', 'lamp'"),
+    ],
+)
+def test_the_names_of_an_option_that_may_be_left_out_are_listed_in_order_without_none(arguments, names, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+    assert f"Expected one of ({names})." in " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().err).split())
+
+
 def test_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("hyperplanes 0")
+
+
+RENDER = ["render", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", "--out", "OUT/run"]
+BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", "--out"]
 
 
 @pytest.mark.parametrize(
@@ -126,11 +147,26 @@ def test_version(capsys):
         (["evaluate", "--data", "DATA", "--method", "nearest_view", "--boxes", "OUT/a.gfi"], ["OUT/a.gfi", "png"]),
         (["evaluate", "--data", "DATA", "--method", "hyperplanes"], ["checkpoint", "hyperplanes train"]),
         (
+            ["evaluate", "--data", "DATA", "--checkpoint", "RUN", "cars-64", "--method", "nearest_view"],
+            ["RUN and ", "cars-64, which are both hyperplanes"],
+        ),
+        (
             ["render", "--checkpoint", "OUT/none", "--views", "DATA", "--out", "OUT"],
             ["OUT/none", "hyperplanes train"],
         ),
         (["export", "--checkpoint", "RUN", "--views", "OUT/none", "--out", "OUT/x"], ["OUT/none", "nothing"]),
         (["demo", "--held-out", "500", "--out", "OUT/demo"], ["--held-out", "500"]),
+        (["inspect", "smal"], ["smal: expected a data set, posed images, a checkpoint", "small, cars-64, example-car"]),
+        (
+            ["demo", "--first-only", "--meshes", "OUT/none", "--out", "OUT/demo"],
+            ["--meshes: expected a folder of mesh files, got OUT/none, which is nothing"],
+        ),
+        ([*RENDER, "--orbit", "0"], ["--orbit: expected at least 1 frame, got 0"]),
+        ([*RENDER, "--size", "32"], ["--size: expected --orbit, whose pictures it is for, got 32"]),
+        ([*RENDER, "--orbit", "2", "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
+        ([*BAKE, "OUT/bk"], ["--out: expected a name that ends in .safetensors, got OUT/bk"]),
+        ([*BAKE, "OUT/bk.safetensors", "--orbit", "0"], ["--orbit: expected at least 1 frame, got 0"]),
+        (["inspect", "OUT/none"], ["OUT/none: expected a data set, posed images, a checkpoint", "found nothing"]),
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, capsys):
@@ -146,6 +182,7 @@ def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, cap
     assert main([placed(argument) for argument in arguments]) == 2
     line = complaint(capsys)
     assert all(placed(part) in line for part in parts), line
+    assert not list(tmp_path.iterdir()), "what is refused leaves nothing behind"
 
 
 def test_a_traceback_is_shown_when_asked_for():
@@ -166,7 +203,11 @@ def test_a_full_disk_is_one_line(monkeypatch, capsys):
 
 def test_presets_and_inspect(capsys, tmp_path):
     assert main(["presets"]) == 0
-    assert "paper-128" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "paper-128" in shown
+    assert re.search(r"^small +128 .* volume +all views ", shown, re.MULTILINE)
+    assert main(["inspect", "small"]) == 0
+    assert "hypernetwork: volume reads all views, low_rank update" in capsys.readouterr().out
     demo = demo_folder()
     assert main(["inspect", str(demo / "hyperplanes")]) == 0
     assert "20 of 20 steps" in capsys.readouterr().out
@@ -232,6 +273,16 @@ def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
         assert f"{written[name]['psnr']:.2f} dB" in shown
 
 
+def test_checkpoints_of_one_method_in_one_folder_are_taken_by_name_and_a_folder_given_twice_is_one(tmp_path):
+    run = demo_folder() / "hyperplanes"
+    for name in ("b", "a"):
+        shutil.copytree(run, tmp_path / name)
+    assert find_checkpoints([tmp_path]) == {"hyperplanes": tmp_path / "a"}
+    assert find_checkpoints([tmp_path, tmp_path / "a"]) == {"hyperplanes": tmp_path / "a"}
+    with pytest.raises(ValueError, match="expected one of each method, got .*/a and .*/b, which are both hyperplanes"):
+        find_checkpoints([tmp_path / "a", tmp_path / "b"])
+
+
 def test_fields_are_optimised_on_one_posed_scene_without_a_checkpoint(tmp_path, monkeypatch):
     monkeypatch.setitem(PRESETS, "quick", tiny_preset())
     scene, table = first_object(demo_folder()), tmp_path / "table.json"
@@ -290,6 +341,11 @@ def test_steps_chosen_on_left_out_views_are_reported(tmp_path, monkeypatch, caps
     with pytest.raises(SystemExit) as end:
         main([*command, "--steps", "some"])
     assert end.value.code == 2
+    capsys.readouterr()
+    common = ["--checkpoint", str(demo), "--views", scene, "--steps", "auto", "--voxels", "32"]
+    assert main(["export", *common, "--what", "mesh", "--out", str(tmp_path / "export")]) == 0
+    assert main(["bake", *common, "--out", str(tmp_path / "voxels.safetensors")]) == 0
+    assert len(re.findall(r"adapted to 6 views of .* in .*, \d+ fine-tuning steps", capsys.readouterr().out)) == 2
 
 
 def test_psnr_over_fine_tuning_steps_is_a_table_and_a_chart(tmp_path, capsys):
@@ -421,10 +477,15 @@ def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tm
     assert "nerf " in capsys.readouterr().out
 
 
-def test_the_scene_that_comes_with_the_package_has_a_name(tmp_path, monkeypatch):
+def test_the_scene_that_comes_with_the_package_has_a_name(tmp_path, monkeypatch, capsys):
     task, up = read_scene(Path("example-car"), Console(silent=True))
     assert (len(task.support), len(task.query), task.name, up) == (25, 25, "example-car", "y")
     monkeypatch.chdir(tmp_path)
+    assert main(["evaluate", "--data", "example-car", "--method", "nearest_view"]) == 0
+    assert "1 objects of example-car" in capsys.readouterr().out
+    assert main(["inspect", "example-car"]) == 0
+    assert "views: 25 support, 25 query" in capsys.readouterr().out
+    assert (tmp_path / "runs" / "inspect" / "example-car" / "contact_sheet.png").exists()
     (tmp_path / "example-car").mkdir()  # a folder of that name goes first
     with pytest.raises(DataError, match="example-car"):
         read_scene(Path("example-car"), Console(silent=True))
@@ -446,21 +507,52 @@ def test_a_second_pass_is_taken_by_models_that_judge_what_views_see_and_refused_
     assert "expected a model of the field any_order, such as small" in complaint(capsys)
 
 
-def test_views_of_a_world_with_z_up_are_adapted_to_as_if_y_were(tmp_path):
-    """Source of truth: the same scene, its cameras turned by hand as Blender would have written them."""
-    demo = demo_folder()
-    scene, turned = first_object(demo), tmp_path / first_object(demo).name
-    shutil.copytree(scene, turned)
-    document = json.loads((turned / "transforms.json").read_text())
+def with_z_up(scene, folder):
+    """A copy of a scene, its cameras turned by hand as Blender would have written them."""
+    shutil.copytree(scene, folder)
+    document = json.loads((folder / "transforms.json").read_text())
     for frame in document["frames"]:
         x, y, z, last = frame["transform_matrix"]
         frame["transform_matrix"] = [x, [-value for value in z], y, last]
-    (turned / "transforms.json").write_text(json.dumps(document))
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+def test_views_of_a_world_with_z_up_are_adapted_to_as_if_y_were(tmp_path):
+    """Source of truth: the same scene."""
+    demo = demo_folder()
+    scene = first_object(demo)
+    turned = with_z_up(scene, tmp_path / scene.name)
     common = ["--checkpoint", str(demo), "--all-views"]
     assert main(["render", *common, "--views", str(scene), "--out", str(tmp_path / "y")]) == 0
     assert main(["render", *common, "--views", str(turned), "--out", str(tmp_path / "z"), "--up", "z"]) == 0
     for path in (tmp_path / "y").iterdir():
         assert abs(pixels(path) - pixels(tmp_path / "z" / path.name)).max() <= 1
+
+
+def test_a_single_scene_is_evaluated_with_the_way_up_that_its_cameras_tell(tmp_path, capsys):
+    """Source of truth: the same scene in a world with y up, and its object in the data set."""
+    demo = demo_folder()
+    scene = first_object(demo)
+    turned = with_z_up(scene, tmp_path / scene.name)
+
+    def quality(data, *more):
+        table = tmp_path / "table.json"
+        command = ["evaluate", "--data", str(data), "--checkpoint", str(demo), "--method", "hyperplanes"]
+        assert main([*command, *more, "--json", str(table)]) == 0
+        return json.loads(table.read_text())["hyperplanes"]["objects"][scene.name]["psnr"]
+
+    capsys.readouterr()
+    expected = quality(scene)
+    assert "up: y, as the cameras are held; --up says otherwise" in capsys.readouterr().out
+    assert quality(turned) == pytest.approx(expected, abs=1e-2)
+    assert "up: z, as the cameras are held; --up says otherwise" in capsys.readouterr().out
+    assert quality(turned, "--up", "0,0,2") == pytest.approx(expected, abs=1e-2)
+    assert abs(quality(turned, "--up", "y") - expected) > 0.1
+    assert quality(demo / "data") == pytest.approx(expected, abs=1e-2)
+    assert "up:" not in capsys.readouterr().out
+    assert main(["evaluate", "--data", str(turned), "--up", "w"]) == 2
+    assert "up: expected one of y, z, " in complaint(capsys)
 
 
 def test_photographs_with_a_background_are_warned_about_and_ways_up_are_said(tmp_path, capsys):
@@ -486,6 +578,14 @@ def test_the_demonstration_does_nothing_twice(capsys):
     assert main(["demo", "--quick-check", "--out", str(demo)]) == 0
     assert capsys.readouterr().out.count("done before") == 17
     assert {path: path.stat().st_mtime_ns for path in demo.rglob("*") if path.is_file()} == before
+
+
+def test_the_demonstration_reads_meshes_before_it_renders_classes(tmp_path):
+    meshes, out = tmp_path / "meshes", tmp_path / "out"
+    meshes.mkdir()
+    (meshes / "broken.glb").write_bytes(b"none")
+    assert main(["demo", "--quick-check", "--first-only", "--meshes", str(meshes), "--out", str(out)]) == 2
+    assert not (out / "first" / "car").exists()
 
 
 def test_the_demonstration_shows_the_packaged_model_before_anything_is_trained(tmp_path, capsys):

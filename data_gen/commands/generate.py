@@ -20,13 +20,15 @@ import tyro
 
 from data_gen import SUPERSAMPLE
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, optional
+from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, choices, optional
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     from data_gen.datasets.generate import GenerationReport, MeshFolder, Procedural
 
 __all__ = ["Arguments", "remarks", "run", "source_of", "summary"]
+
+Class = Literal["car", "chair", "plane", "lamp"]
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Arguments:
     """
 
     out: Path
-    class_name: Annotated[Literal["car", "chair", "plane", "lamp"] | None, optional("NAME", name="class")] = None
+    class_name: Annotated[Class | None, choices(Class), optional("NAME", name="class")] = None
     meshes: OptionalFolder = None
     meshes_class: Annotated[str | None, optional("NAME", name="class-name")] = None
     count: int = 70

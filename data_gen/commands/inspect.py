@@ -32,7 +32,8 @@ class Arguments:
     """What to look at.
 
     Attributes:
-        path: A data set in any layout, a folder of posed images, a checkpoint, or a baked file.
+        path: A data set in any layout, a folder of posed images, a checkpoint, a baked file, or what comes with the
+            package: small, cars-64, example-car.
         out: Where the pictures go; runs/inspect/NAME when not given.
         objects: How many objects to look at closely.
         checksums: Compare every file with its checksum in the manifest, too.
@@ -60,8 +61,9 @@ def checkpoint_lines(folder: Path) -> list[str]:
     ]
     if config.hypernetwork is not None and model.hypernetwork is not None:
         hyper = config.hypernetwork
+        views = "all views" if model.reads_volume else f"{hyper.views} views"
         lines.append(
-            f"hypernetwork: {hyper.encoder} reads {hyper.views} views, {hyper.update} update of "
+            f"hypernetwork: {hyper.encoder} reads {views}, {hyper.update} update of "
             f"{', '.join(hyper.layers)}, {sum(p.numel() for p in model.hypernetwork.parameters()):,} weights"
         )
         lines.append(f"diagnostics: {recorded_diagnostics(folder) or 'not recorded; `hyperplanes train` does'}")
@@ -102,6 +104,17 @@ def recorded_diagnostics(folder: Path) -> Diagnostics | None:
     return Diagnostics.of_json(read_json(folder / "diagnostics.json"), folder / "diagnostics.json")
 
 
+def _is_checkpoint(path: Path) -> bool:
+    """Whether a checkpoint lies there, or a packaged one has that name."""
+    from hyperplanes.adaptation.configuration import checkpoint_folder
+    from hyperplanes.checkpoints import CheckpointError
+
+    try:
+        return (checkpoint_folder(path) / "model.json").exists()
+    except CheckpointError:
+        return False
+
+
 def run(arguments: Arguments) -> int:
     """Describe it; 1 when a data set is not as it should be."""
     console = Console()
@@ -109,13 +122,22 @@ def run(arguments: Arguments) -> int:
         for line in baked_lines(arguments.path):
             console.say(line)
         return 0
-    packaged = len(arguments.path.parts) == 1 and not arguments.path.exists()
-    if packaged or (arguments.path / "model.json").exists():
+    if _is_checkpoint(arguments.path):
         for line in checkpoint_lines(arguments.path):
             console.say(line)
         return 0
     from data_gen.datasets.inspect import inspect
+    from hyperplanes.data.dataset import locate_scene
+    from hyperplanes.files import DataError
 
+    if not locate_scene(arguments.path).exists():
+        raise DataError(
+            arguments.path,
+            "a data set, posed images, a checkpoint or a baked file, or a model or scene of the package (small, "
+            "cars-64, example-car)",
+            "nothing",
+            "check the path",
+        )
     out = arguments.out or Path("runs/inspect") / arguments.path.resolve().name
     found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums)
     for line in found.lines():

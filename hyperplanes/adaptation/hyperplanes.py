@@ -139,10 +139,7 @@ class HyperPlanes(nn.Module):
             ValueError: fewer views than planes.
         """
         if len(support) < len(self.rig):
-            raise ValueError(
-                f"support: expected at least {len(self.rig)} views, got {len(support)}; `train --support "
-                f"{len(self.rig)}` takes query views too (support and query unified)"
-            )
+            raise ValueError(f"support: expected at least {len(self.rig)} views, one a plane, got {len(support)}")
         self.rig.copy_(standpoints(support)[: len(self.rig)])
 
     def arrange(self, support: Views) -> Views:

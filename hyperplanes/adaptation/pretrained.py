@@ -24,10 +24,10 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
         folders: each a checkpoint, a folder of checkpoints such as `runs/demo`, or the name of a packaged model.
 
     Returns:
-        Folders by the names of their methods, such as "hyperplanes"; the first of a name counts.
+        Folders by the names of their methods, such as "hyperplanes"; of those in one folder the first of a name counts.
 
     Raises:
-        CheckpointError: a folder that neither is nor holds a checkpoint.
+        CheckpointError: a folder that neither is nor holds a checkpoint, or two folders with the same method.
     """
     found: dict[str, Path] = {}
     for folder in map(checkpoint_folder, folders):
@@ -38,8 +38,16 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
                 f"{folder}: expected a checkpoint, found {what}; "
                 "`hyperplanes train` writes one, `hyperplanes demo` makes a small one in minutes"
             )
+        here: dict[str, Path] = {}
         for path in inside:
-            found.setdefault(ModelConfig.load(path).method, path)
+            here.setdefault(ModelConfig.load(path).method, path)
+        for method, path in here.items():
+            other = found.setdefault(method, path)
+            if other.resolve() != path.resolve():
+                raise CheckpointError(
+                    f"checkpoint: expected one of each method, got {other} and {path}, which are both {method}; "
+                    "give one of them at a time"
+                )
     return found
 
 

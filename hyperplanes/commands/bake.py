@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
-from hyperplanes.commands.options import OptionalInt, ViewsUp, optional
+from hyperplanes.commands.options import OptionalInt, Steps, ViewsUp, check_orbit, optional
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
@@ -34,11 +34,11 @@ class Arguments:
     """What to bake.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote.
+        checkpoint: What `train`, `adapt` or `demo` wrote, or a packaged model: small, cars-64.
         views: The posed images of the object; example-car comes with the package.
-        out: The file to write.
+        out: The file to write, with a name that ends in .safetensors.
         voxels: Along each side of the grid; two for every pixel that the object is wide lose little.
-        steps: Fine-tuning steps on the shown views.
+        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best.
         orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
         size: Pixels along the longer side of the turntable; as the images when not given.
         turntable: The format of the turntable.
@@ -56,7 +56,7 @@ class Arguments:
     views: Path
     out: Path
     voxels: int = 256
-    steps: int = 0
+    steps: Steps = 0
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"
@@ -86,6 +86,9 @@ def run(arguments: Arguments) -> int:
 
     if arguments.out.is_dir():
         raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")
+    if arguments.out.suffix != ".safetensors":
+        raise ValueError(f"--out: expected a name that ends in .safetensors, got {arguments.out}; add the ending")
+    check_orbit(arguments.orbit, arguments.size)
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "bake")
     model = load_adaptable(arguments.checkpoint, device, second_pass=arguments.second_pass)

@@ -70,10 +70,14 @@ def settings_of(arguments: Arguments) -> DemoSettings:
     """The settings of the demonstration.
 
     Raises:
-        ValueError: too few objects or pixels.
+        ValueError: too few objects or pixels, or no folder of meshes.
     """
     from hyperplanes.demo.pipeline import DemoSettings
 
+    if arguments.meshes is not None and not arguments.meshes.is_dir():
+        found = "a file" if arguments.meshes.exists() else "nothing"
+        what = f"got {arguments.meshes}, which is {found}"
+        raise ValueError(f"--meshes: expected a folder of mesh files, {what}; check the path")
     if arguments.quick_check:
         return replace(DemoSettings.quick_check(arguments.seed), meshes=arguments.meshes)
     if not 1 < arguments.held_out < arguments.objects:
@@ -169,7 +173,7 @@ def _show_first(settings: DemoSettings, out: Path, console: Console) -> None:
     folders = {out / "first" / name: {"class_name": name, "count": 1} for name in settings.first}
     if settings.meshes is not None:
         folders[out / "first" / "meshes"] = {"meshes": settings.meshes}
-    for folder, what in folders.items():
+    for folder, what in sorted(folders.items(), key=lambda item: "meshes" not in item[1]):  # they may be wrong input
         generate.run(generate.Arguments(folder, held_out=1, **what, **sizes))
     data = open_datasets(list(folders))
     page = write_first_look(

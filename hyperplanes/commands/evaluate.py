@@ -26,12 +26,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import Free, OptionalInt, Protocol, Up, optional
+from hyperplanes.commands.options import Free, OptionalInt, Protocol, ViewsUp, optional
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from hyperplanes.data import Dataset
     from hyperplanes.evaluation import Score
     from hyperplanes.evaluation.comparison import Comparison
 
@@ -46,13 +47,14 @@ class Arguments:
     """What to compare on what.
 
     Attributes:
-        data: A data set or one posed scene.
+        data: A data set or one posed scene; example-car comes with the package.
         method: nearest_view and hull_blend (nothing is learned); nerf, multiplane, point_multiplane, hyperplanes,
             hyperplanes_swapped (each object with the update of another), autoencoder; scratch_N (the field of a
             checkpoint from random weights), nerf_scratch_N, multiplane_scratch_N, point_multiplane_scratch_N (no
             checkpoint is needed); standard, mv_matched, mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but
             the first two and hyperplanes_swapped may be followed by _N or _auto for gradient steps.
-        checkpoint: Folders that `train` wrote, or folders of them such as runs/demo; {seed} stands for each seed.
+        checkpoint: Folders that `train` wrote, folders of them such as runs/demo, or a packaged model: small,
+            cars-64; {seed} stands for each seed.
         json: Write the table here too, with every object, every seed and every pair of methods.
         csv: Write every object's numbers here, a line each.
         markdown: Write the tables of methods and of their pairs here.
@@ -67,7 +69,8 @@ class Arguments:
         objects: Only the first so many.
         support: Support views an object; more than there are go on with the query views.
         preset: The shape of fields that need no checkpoint.
-        up: The axis that points up in the data's world: y as in training data, z as in Blender.
+        up: The direction that points up in the data's world: an axis such as y or -z, three numbers such as 0,0.1,1, or
+            auto: of a single scene as its cameras are held, of a data set y as in training data.
         protocol: How fields are sampled: as they were trained, 64 + 128 times a ray as in the paper, or fast.
         legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.
         device: auto, cpu or cuda.
@@ -90,7 +93,7 @@ class Arguments:
     objects: OptionalInt = None
     support: OptionalInt = None
     preset: str = "quick"
-    up: Up = "y"
+    up: ViewsUp = "auto"
     protocol: Protocol = "default"
     legacy: bool = False
     device: str = "auto"
@@ -176,7 +179,7 @@ def run(arguments: Arguments) -> int:
     for line in opened.skipped:
         console.warn(line)
     tasks = opened if arguments.support is None else WithSupport(opened, arguments.support)
-    data = TasksOnDevice(tasks, device, arguments.up)
+    data = TasksOnDevice(tasks, device, _up(arguments, opened, console))
     names = data.names(arguments.split)[: arguments.objects]
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
@@ -221,6 +224,21 @@ def run(arguments: Arguments) -> int:
         console.table(PAIR_HEADINGS, compared_rows(pairs[:LARGEST_TABLE]))
     console.say(f"{len(names)} objects of {arguments.data}{_of_seeds(arguments)}")
     return 0
+
+
+def _up(arguments: Arguments, data: Dataset, console: Console) -> str:
+    """The direction that is up in the world of the data."""
+    from hyperplanes.commands.scene import say_up
+    from hyperplanes.data.upright import y_up_from
+
+    if arguments.up == "auto":
+        names = data.names() if data.layout == "posed" else []
+        if len(names) != 1:
+            return "y"
+        scene = data.posed(names[0])
+        return say_up([scene.support, scene.query], console)
+    y_up_from(arguments.up)  # a wrong one is found before anything is evaluated
+    return arguments.up
 
 
 def _of_seeds(arguments: Arguments) -> str:

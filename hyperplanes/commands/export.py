@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
-from hyperplanes.commands.options import OptionalInt, ViewsUp, optional
+from hyperplanes.commands.options import OptionalInt, Steps, ViewsUp, optional
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.commands.writing import writes_to
 
@@ -28,11 +28,12 @@ class Arguments:
     """What to write.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote, or a file that `bake` wrote.
+        checkpoint: What `train`, `adapt` or `demo` wrote, a file that `bake` wrote, or a packaged model: small,
+            cars-64.
         views: The posed images of the object; example-car comes with the package.
         out: The folder to write to.
         what: Any of the three.
-        steps: Fine-tuning steps on the shown views.
+        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best.
         frames: Of the turntable.
         size: Pixels along the longer side of the turntable; as the images when not given.
         turntable: The format of the turntable.
@@ -54,7 +55,7 @@ class Arguments:
     views: Path
     out: Path
     what: tuple[Literal["images", "turntable", "mesh"], ...] = ("images", "turntable", "mesh")
-    steps: int = 0
+    steps: Steps = 0
     frames: int = 48
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
 __all__ = [
     "Free",
@@ -17,8 +18,9 @@ __all__ = [
     "Protocol",
     "Steps",
     "Trainable",
-    "Up",
     "ViewsUp",
+    "check_orbit",
+    "choices",
     "optional",
 ]
 
@@ -28,8 +30,26 @@ def optional(metavar: str, **options: Any) -> Any:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="", **options)
 
 
+def choices(literal: Any) -> PrimitiveConstructorSpec[str | None]:
+    """What tyro is told of one of some names that may be left out: an error lists them in their order, without None.
+
+    Args:
+        literal: of the names.
+    """
+    names = get_args(literal)
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{" + ",".join(names) + "}",
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: value is None or value in names,
+        str_from_instance=lambda value: [str(value)],
+        choices=names,
+    )
+
+
 OptionalFolder = Annotated[Path | None, optional("FOLDER")]
-OptionalField = Annotated[Literal["nerf", "multiplane", "point_multiplane"] | None, optional("FIELD")]
+Field = Literal["nerf", "multiplane", "point_multiplane"]
+OptionalField = Annotated[Field | None, choices(Field), optional("FIELD")]
 OptionalInt = Annotated[int | None, optional("INT")]
 OptionalName = Annotated[str | None, optional("NAME")]
 OptionalNumber = Annotated[int | float | None, optional("NUMBER")]
@@ -49,8 +69,23 @@ Trainable = Literal[
 Free = Literal["weights", "hypernetwork"]
 """What fine-tuning optimises."""
 
-Up = Literal["y", "z"]
-"""The axis that points up in the world of a data set."""
-
 ViewsUp = Annotated[str, tyro.conf.arg(metavar="{auto,y,z,x,-y,-z,-x}")]
 """The axis that points up in the world of photographs, three numbers, or auto: as the cameras are held."""
+
+
+def check_orbit(orbit: int | None, size: int | None) -> None:
+    """Nothing, where both can be done.
+
+    Args:
+        orbit: frames around the object, None for no orbit.
+        size: pixels along the longer side of its pictures, None for that of the images.
+
+    Raises:
+        ValueError: no frame, no pixel, or a size of no orbit.
+    """
+    if orbit is not None and orbit < 1:
+        raise ValueError(f"--orbit: expected at least 1 frame, got {orbit}")
+    if size is not None and orbit is None:
+        raise ValueError(f"--size: expected --orbit, whose pictures it is for, got {size} without; leave it out")
+    if size is not None and size < 1:
+        raise ValueError(f"--size: expected at least 1 pixel, got {size}")

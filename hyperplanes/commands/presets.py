@@ -42,13 +42,13 @@ def row(name: str, preset: Preset) -> tuple[str, ...]:
     model, training = preset.model, preset.training
     hyper, anyhow = model.hypernetwork, find_targets()[model.target].any_order
     planes = "any" if anyhow else model.network.planes
-    read = "all" if hyper and hyper.encoder == VOLUME else hyper.views if hyper else 0
+    read = f"{hyper.views if hyper else 0} of {planes}"
     return (
         name,
         str(preset.resolution),
         f"{model.network.depth} x {model.network.width}",
         hyper.encoder if hyper else "-",
-        f"{read} of {planes}",
+        "all views" if hyper and hyper.encoder == VOLUME else read,
         model.sampling.summary,
         f"{training.steps:,}",
         str(training.rays * training.tasks),

@@ -5,6 +5,7 @@ NSVF, or an object of any data set. The model is shown the support half of the v
 that the result can be compared with the truth; --orbit asks for a round about the object instead.
 
 Example:
+    hyperplanes render --checkpoint small --views example-car --out new-views
     hyperplanes render --checkpoint runs/demo --views photos/ --out new-views
     hyperplanes render --checkpoint runs/demo --views photos/ --out new-views --orbit 48 --all-views
 """
@@ -18,7 +19,7 @@ from typing import Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
-from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, ViewsUp, optional
+from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, ViewsUp, check_orbit, optional
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
@@ -31,7 +32,8 @@ class Arguments:
     """What to look at, and from where.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote, or a file that `bake` wrote.
+        checkpoint: What `train`, `adapt` or `demo` wrote, a file that `bake` wrote, or a packaged model: small,
+            cars-64.
         views: The posed images of the object; example-car comes with the package.
         out: The folder for the pictures.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
@@ -80,6 +82,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.metrics import psnr, ssim
     from hyperplanes.presets import PROTOCOLS
 
+    check_orbit(arguments.orbit, arguments.size)
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, _ = read_scene(

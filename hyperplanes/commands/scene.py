@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from hyperplanes.commands.console import Console
-    from hyperplanes.views import Task
+    from hyperplanes.data.pictures.posed import Posed
+    from hyperplanes.views import Task, Views
 
-__all__ = ["read_scene"]
+__all__ = ["read_scene", "say_up"]
 
 
 def read_scene(
@@ -31,8 +33,7 @@ def read_scene(
     """
     from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.formats.recognise import read_posed, read_posed_task
-    from hyperplanes.data.upright import guess_up, upright_task
-    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.data.upright import upright_task
     from hyperplanes.views import Task
 
     path = locate_scene(path)
@@ -46,12 +47,24 @@ def read_scene(
     for note in notes:
         console.warn(f"{path}: {note}")
     if up == "auto":
-        parts = [task.support.cameras] if all_views else [task.support.cameras, task.query.cameras]
-        guessed = guess_up(camera.concatenate(parts))
-        up = guessed or "y"
-        console.say(
-            f"up: {up}, as the cameras are held; --up says otherwise"
-            if guessed
-            else "up: y; the cameras do not tell, --up says otherwise"
-        )
+        up = say_up([task.support] if all_views else [task.support, task.query], console)
     return upright_task(task, up), up
+
+
+def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
+    """The direction that is up in the world of one scene, as its cameras are held, or y where they do not tell.
+
+    Args:
+        parts: of the scene.
+        console: where it is said.
+    """
+    from hyperplanes.data.upright import guess_up
+    from hyperplanes.geometry import cameras as camera
+
+    guessed = guess_up(camera.concatenate([part.cameras for part in parts]))
+    console.say(
+        f"up: {guessed}, as the cameras are held; --up says otherwise"
+        if guessed
+        else "up: y; the cameras do not tell, --up says otherwise"
+    )
+    return guessed or "y"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ def writes_to(
     folder: Callable[[Any], Path], when: Callable[[Any], bool] = lambda arguments: True
 ) -> Callable[[Callable[[Any], int]], Callable[[Any], int]]:
     """A decorator of a verb's `run`: it fails at once where another process writes into the same folder.
+
+    A folder that was not there before and that a failure leaves empty is removed again.
 
     Args:
         folder: from a verb's arguments the folder that it writes into, as in `files.one_writer`.
@@ -30,8 +33,16 @@ def writes_to(
 
             if not when(arguments):
                 return run(arguments)
-            with one_writer(folder(arguments)):
-                return run(arguments)
+            place = folder(arguments)
+            made = [each for each in (place, *place.parents) if not each.exists()]
+            try:
+                with one_writer(place):
+                    return run(arguments)
+            except BaseException:
+                with suppress(OSError):  # of a folder with something in it, and all above
+                    for each in made:
+                        each.rmdir()
+                raise
 
         return locked
 

@@ -12,7 +12,9 @@ from typing import Any
 from hyperplanes.data.formats.catalogue import SPLITS
 from hyperplanes.data.formats.recognise import find_catalogue, read_posed, read_posed_task
 from hyperplanes.data.pictures.posed import PosedTask
+from hyperplanes.data.upright import guess_up, upright, upright_task
 from hyperplanes.files import DataError, malformed
+from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
 
@@ -144,14 +146,14 @@ def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET, *, legacy: bool
     """A data set in any layout, or a single posed scene presented as one with one test task.
 
     Args:
-        path: a folder, or a transforms file.
+        path: a folder, or a transforms file. "example-car" comes with the package.
         budget: as in `Dataset`.
         legacy: as in `Dataset`.
 
     Returns:
         The data set; objects are read when asked for.
     """
-    return Dataset(path, budget, legacy=legacy)
+    return Dataset(locate_scene(path), budget, legacy=legacy)
 
 
 class Datasets:
@@ -216,7 +218,7 @@ def open_datasets(
     return Datasets({name: open_dataset(path, share, legacy=legacy) for name, path in zip(names, paths, strict=True)})
 
 
-def read_views(path: str | Path, downscale: int | None = None) -> Views:
+def read_views(path: str | Path, downscale: int | None = None, *, up: str | None = None) -> Views:
     """All posed images of one scene, over white.
 
     Args:
@@ -225,17 +227,21 @@ def read_views(path: str | Path, downscale: int | None = None) -> Views:
             files, all are read. "example-car" comes with the package.
         downscale: take the mean of so many by so many pixels; None: photographs of more than a megapixel get as many
             as leave one at most.
+        up: the direction that points up in the world of the files, which is turned so that it is y, as models expect:
+            an axis such as "z" or "-y", three numbers such as "0,0.1,1", or "auto": as the cameras are held, y where
+            they do not tell. None leaves the world as it is, which is right where y is up, as `generate` writes it.
 
     Returns:
         The views in the order of the files; masks where the files have alpha. Where pictures were left out, turned or
-        scaled, a UserWarning says which. As `recognise.read_posed`, it raises DataError.
+        scaled, a UserWarning says which. As `recognise.read_posed`, it raises DataError, and ValueError for another
+        `up`.
     """
     path = locate_scene(path)
     with malformed(path, "posed images of one scene"):
         scene = read_posed(path, downscale)
         views = scene.views()
     warn_of(scene.notes, path)
-    return views
+    return views if up is None else upright(views, _up_of(up, views))
 
 
 def locate_scene(path: str | Path) -> Path:
@@ -249,7 +255,7 @@ def locate_scene(path: str | Path) -> Path:
     return packaged if len(path.parts) == 1 and not path.exists() and packaged.is_dir() else path
 
 
-def read_task(path: str | Path, downscale: int | None = None) -> Task:
+def read_task(path: str | Path, downscale: int | None = None, *, up: str | None = None) -> Task:
     """The support and query views of one scene.
 
     Args:
@@ -257,16 +263,23 @@ def read_task(path: str | Path, downscale: int | None = None) -> Task:
             train_filenames and test_filenames decide, else views alternate), or another layout of one scene.
             "example-car" comes with the package.
         downscale: as in `read_views`.
+        up: as in `read_views`.
 
     Returns:
-        The task; its name is the folder's. It warns as `read_views`, and raises DataError.
+        The task; its name is the folder's. It warns and raises as `read_views`.
     """
     path = locate_scene(path)
     with malformed(path, "posed images of one scene"):
         task = read_posed_task(path, downscale)
         made = task.task()
     warn_of(task.notes, path)
-    return made
+    return made if up is None else upright_task(made, _up_of(up, made.support, made.query))
+
+
+def _up_of(up: str, *parts: Views) -> str:
+    if up != "auto":
+        return up
+    return guess_up(camera.concatenate([part.cameras for part in parts])) or "y"
 
 
 def warn_of(notes: Sequence[str], path: str | Path) -> None:

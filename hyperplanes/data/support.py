@@ -52,7 +52,9 @@ class WithSupport:
         task = self.data.task(name)
         total = len(task.support) + len(task.query)
         if self.count > total:
-            raise ValueError(f"{name}: expected {self.count} views for the support, got {total}")
+            raise ValueError(
+                f"{name}: expected {self.count} views for the support, got {total}; --support {total} takes all of them"
+            )
         more = self.count - len(task.support)
         support = task.support[: self.count] if more <= 0 else join_views(task.support, task.query[:more])
         return replace(task, support=support)

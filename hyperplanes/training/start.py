@@ -12,6 +12,7 @@ from hyperplanes.checkpoints import read_json
 from hyperplanes.devices import TasksOnDevice
 from hyperplanes.files import sha256, write_json
 from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.training.distributed import Processes
 from hyperplanes.training.meta_training import initialisation_trainer
 from hyperplanes.training.trainer import Trainer
 from hyperplanes.views import Tasks
@@ -20,6 +21,9 @@ __all__ = ["start_training"]
 
 INITIAL = "initial.json"
 """In the folder of a training: the checkpoint that it began with."""
+
+ARCHITECTURE = ("target", "network", "hypernetwork", "autoencoder", "coarse_network")
+MOST = 8  # entries of a configuration that a message names
 
 
 def start_training(
@@ -43,7 +47,8 @@ def start_training(
 
     Returns:
         A trainer; its `step` says how far it is. CheckpointError where the folder holds another model or training,
-        ValueError for a reference with other weights than `config` says, or another than the training began with.
+        ValueError for a reference with other weights than `config` says, or another than the training began with, and
+        for fewer support views than planes.
     """
     matching = config.initialisation is not None and config.initialisation.method == "mv_matched"
     model = HyperPlanes(config, training.seed + matching).to(device)  # not the weights that mv_meta began with
@@ -53,6 +58,8 @@ def start_training(
         return initialisation_trainer(model, tasks, training, folder, found)
     if reference is not None:
         _begin_with(model, reference, folder)
+    if Processes.current().first and not (model.rig.any() or (folder / "training.json").exists()):
+        _check_views(model, tasks)
     if config.initialisation is None:
         return Trainer(model, tasks, training, folder)
     return initialisation_trainer(model, tasks, training, folder)
@@ -74,14 +81,43 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
             raise ValueError(f"checkpoint: expected what the training in {folder} began with, {began}, got {reference}")
         return
     found = HyperPlanes.from_pretrained(reference)
-    differing = _differing_weights(model, found)
-    if differing:
-        raise ValueError(f"checkpoint: expected weights of the configured model, got others of {differing[0]}")
+    if _shapes(model) != _shapes(found):
+        config, names = found.config, model.config.differences(found.config)
+        parts = {name: name.partition(".")[0] for name in names}
+        differing = [
+            name for name, part in parts.items() if part in ARCHITECTURE and (part == name or part not in names)
+        ]
+        written = checkpoint_folder(reference) / "config.yaml"
+        known = f"--config {written}" if written.exists() else "the --preset or --config that it was trained by"
+        raise ValueError(
+            f"checkpoint: expected weights of the configured model, {model.config.method} of the field "
+            f"{model.config.target}, got {reference}, {config.method} of the field {config.target}, which differs in "
+            f"{', '.join(differing[:MOST])}{', ...' * (len(differing) > MOST)}; give {known}"
+        )
     model.load_state_dict(found.state_dict())
     write_json(note, {"checkpoint": str(reference), "sha256": sha256(weights.read_bytes())})
 
 
-def _differing_weights(model: HyperPlanes, other: HyperPlanes) -> list[str]:
-    """Names of the weights that one of two models lacks, or that are of another shape."""
-    mine, others = ({name: value.shape for name, value in each.state_dict().items()} for each in (model, other))
-    return sorted(name for name in mine | others if mine.get(name) != others.get(name))
+def _check_views(model: HyperPlanes, tasks: Tasks) -> None:
+    """Nothing, where the first object has a support view for every plane, or the model needs none.
+
+    Raises:
+        ValueError: fewer; the message says what `train --support` can do about it.
+    """
+    planes, names = len(model.rig), sorted(tasks.names("train"))
+    if not planes or not names:
+        return
+    task = tasks.task(names[0])
+    if len(task.support) >= planes:
+        return
+    count = min(planes, len(task.support) + len(task.query))
+    reader = model.config.hypernetwork or model.config.autoencoder
+    fewer = f" --model.hypernetwork.views {count}" if reader and reader.views > count else ""
+    raise ValueError(
+        f"{task.name}: expected a support view for each of {planes} planes, got {len(task.support)}; "
+        f"`train --support {count}{fewer}` takes query views too{', and as many planes' * (count < planes)}"
+    )
+
+
+def _shapes(model: HyperPlanes) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in model.state_dict().items()}

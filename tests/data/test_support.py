@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data.support import SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TargetConfig
@@ -27,7 +28,7 @@ def test_the_support_is_its_first_views_and_then_those_of_the_query(count):
 
 
 def test_more_views_than_there_are_and_none_are_refused():
-    with pytest.raises(ValueError, match="train0: expected 9 views for the support, got 8"):
+    with pytest.raises(ValueError, match="train0: expected 9 views for the support, got 8; --support 8 takes all"):
         WithSupport(Balls(), 9).task("train0")
     with pytest.raises(ValueError, match="support: expected at least 1 view, got 0"):
         WithSupport(Balls(), 0)
@@ -37,7 +38,7 @@ def test_fifty_planes_are_trained_and_evaluated_with_support_and_query_unified()
     data = WithSupport(Balls(train=1, views=25), 50)
     network = TargetConfig(depth=2, width=16, planes=50, point_octaves=2, direction_octaves=1)
     hypernetwork = HyperNetworkConfig(views=50, normalisation="group", code=2, depth=1, width=8)
-    model = small_model(network=network, hypernetwork=hypernetwork)
+    model = HyperPlanes(small_model(network=network, hypernetwork=hypernetwork).config)  # which has no rig yet
     trainer = train(model, data, TrainingConfig(steps=1, tasks=1, rays=16, held_out=0))
     assert trainer.model.rig.shape == (50, 3)
     task = data.task("test0")

@@ -1,12 +1,18 @@
 """Source of truth: geometry by hand, and that turning the world and its cameras together changes no picture."""
 
+import json
+
 import pytest
 import torch
+from PIL import Image
 
+from hyperplanes.data import read_task, read_views
 from hyperplanes.data.upright import _direction, guess_up, upright, upright_task, y_up_from
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, Views
+
+FLIP = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)  # OpenCV's camera axes to OpenGL's
 
 
 def z_up_views(count=5):
@@ -77,3 +83,26 @@ def test_up_is_not_guessed_where_cameras_do_not_tell():
     pose = torch.eye(4).repeat(20, 1, 1)
     pose[:, :3, :3] = rotation
     assert guess_up(camera.pinhole(camera.symmetric_intrinsics(4, 4, 0.7), pose, 4, 4)) is None
+
+
+def test_scenes_are_read_upright_when_asked_for(tmp_path):
+    """Level cameras in a world with z up: what `upright` makes of the views as they are read."""
+    eyes = torch.tensor([[3.0, 0.0, 1.0], [0.0, 3.0, 1.0], [-3.0, 0.0, 1.0], [0.0, -3.0, 1.0]])
+    pose = camera.look_at(eyes, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)).double()
+    frames = [
+        {"file_path": f"{view}.png", "transform_matrix": (torch.linalg.inv(one) * FLIP).tolist()}
+        for view, one in enumerate(pose)
+    ]
+    for frame in frames:
+        Image.new("RGBA", (8, 8), "red").save(tmp_path / frame["file_path"])
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    as_it_is = read_views(tmp_path)
+    expected = camera.camera_from_world(upright(as_it_is, "z").cameras)
+    assert torch.allclose(camera.camera_from_world(as_it_is.cameras), pose.float(), atol=1e-5)
+    for up in ("auto", "z", "0,0,3"):
+        assert torch.equal(camera.camera_from_world(read_views(tmp_path, up=up).cameras), expected)
+        task = read_task(tmp_path, up=up)
+        assert torch.equal(camera.camera_from_world(task.support.cameras), expected[::2])
+        assert torch.equal(camera.camera_from_world(task.query.cameras), expected[1::2])
+    with pytest.raises(ValueError, match="up: expected one of y, z, .* got 'w'"):
+        read_task(tmp_path, up="w")

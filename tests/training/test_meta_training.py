@@ -8,7 +8,7 @@ import torch
 from hyperplanes.adaptation import FineTuned, HyperPlanes, InitialisationConfig
 from hyperplanes.adaptation.fine_tuned import shuffled
 from hyperplanes.adaptation.fine_tuning import ray_loss
-from hyperplanes.data.support import SingleView
+from hyperplanes.data.support import SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Hierarchical
@@ -164,6 +164,30 @@ def test_what_is_learned_helps_on_an_object_that_was_not_trained_on(method, rate
     assert reached > quality(untrained) + 1
 
 
+def test_too_few_support_views_are_told_the_number_that_can_be_trained_with(tmp_path):
+    def model(planes, views=2):
+        return HyperPlanes(replace(config, network=replace(config.network, planes=planes), hypernetwork=reading(views)))
+
+    def reading(views):
+        return replace(config.hypernetwork, views=views)
+
+    def start(planes, views=2, data=None):
+        chosen = model(planes, views).config
+        return start_training(chosen, FAST, data or Balls(), tmp_path / f"{planes}-{views}")
+
+    config = small_model().config
+    both = "^train0: expected a support view for each of {} planes, got 4; `train --support {}` takes query views too{}"
+    with pytest.raises(ValueError, match=both.format(6, 6, "")):
+        start(6)
+    with pytest.raises(ValueError, match=both.format(25, 8, ", and as many planes")):
+        start(25)
+    with pytest.raises(ValueError, match=both.format(25, "8 --model.hypernetwork.views 8", ", and as many planes")):
+        start(25, 9)
+    with pytest.raises(ValueError, match="^train0: expected 25 views .*, got 8; --support 8 takes all of them$"):
+        start(25, data=WithSupport(Balls(), 25))
+    assert start(8, 8, WithSupport(Balls(), 8)).model.rig.shape == (8, 3)
+
+
 def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not_fit(tmp_path):
     given = small_model()
     torch.nn.init.normal_(given.networks.fine.colour.weight)
@@ -184,5 +208,12 @@ def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not
         assert torch.equal(resumed.model.state_dict()[name], value), name
 
     wider = replace(given.config, network=replace(given.config.network, width=32))
-    with pytest.raises(ValueError, match="checkpoint: expected weights of the configured model, got others of"):
+    wider = replace(wider, hull_side=32, sampling=Hierarchical(4, 4))  # neither decides on weights
+    expected = "expected weights of the configured model, .* got .*given, hyperplanes of .* differs in {}; give {}$"
+    remedy = "the --preset or --config that it was trained by"
+    with pytest.raises(ValueError, match=expected.format("network.width", remedy)):
         start_training(wider, FAST, Balls(), tmp_path / "other", reference=tmp_path / "given")
+    (tmp_path / "given" / "config.yaml").touch()
+    plain = replace(given.config, hypernetwork=None)
+    with pytest.raises(ValueError, match=expected.format("hypernetwork", "--config .*given/config.yaml")):
+        start_training(plain, FAST, Balls(), tmp_path / "other", reference=tmp_path / "given")
