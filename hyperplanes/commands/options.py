@@ -17,7 +17,6 @@ __all__ = [
     "OptionalNumber",
     "Protocol",
     "Steps",
-    "Trainable",
     "ViewsUp",
     "check_orbit",
     "choices",
@@ -59,12 +58,6 @@ Protocol = Literal["default", "paper", "fast"]
 
 Steps = int | Literal["auto"]
 """Fine-tuning steps, or as many as show left-out views best."""
-
-Trainable = Literal[
-    "hyperplanes", "point_multiplane", "multiplane", "nerf", "autoencoder", "mv_meta", "sv_meta", "maml",
-    "maml_first_order", "mv_matched",
-]  # fmt: skip
-"""A name in `hyperplanes.presets.TRAINABLE`."""
 
 Free = Literal["weights", "hypernetwork"]
 """What fine-tuning optimises."""

@@ -64,7 +64,7 @@ class Arguments:
         config: A YAML file of settings, such as the config.yaml of another run, whole or in part.
         preset: One of `hyperplanes presets`: what holds where nothing else is said; quick where no file says otherwise.
         method: hyperplanes; a target network alone with one set of weights for all objects: point_multiplane,
-            multiplane, nerf, or a field of another package; autoencoder; or a learned initialisation: mv_meta, sv_meta
+            multiplane, nerf, any_order, or a field of another package; autoencoder; or a learned initialisation: mv_meta, sv_meta
             (Reptile from many views or a single one), maml, maml_first_order, mv_matched (random weights matched to
             mv_meta).
         field: Which target network: the preset's, or for learned initialisations NeRF, when not given.
