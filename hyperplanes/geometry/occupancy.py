@@ -59,10 +59,24 @@ class Occupancy:
         unit = (cell + 0.5) * (2 / self.occupied.shape[0]) - 1
         return unit * self.bounds.radius + unit.new_tensor(self.bounds.centre)
 
+    def surface(self) -> Occupancy:
+        """The occupied voxels with a face at an empty one or at the border of the grid: what every ray enters by."""
+        padded = pad(self.occupied, (1, 1, 1, 1, 1, 1))
+        inner = self.occupied.clone()
+        for axis in range(3):
+            for start in (0, 2):
+                inner &= padded.narrow(axis, start, len(inner))[_middle(axis)]
+        return Occupancy(self.occupied & ~inner, self.bounds)
+
     def dilated(self, voxels: int = 1) -> Occupancy:
         """The grid grown by some voxels in every direction."""
         grown = max_pool3d(self.occupied[None, None].float(), 2 * voxels + 1, 1, voxels)[0, 0] > 0
         return Occupancy(grown, self.bounds)
+
+
+def _middle(axis: int) -> tuple[slice, ...]:
+    """The middle of a padded grid along the other axes."""
+    return tuple(slice(None) if each == axis else slice(1, -1) for each in range(3))
 
 
 def full(bounds: Sphere, side: int = 64, device: torch.device | str | None = None) -> Occupancy:

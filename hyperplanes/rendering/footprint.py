@@ -21,14 +21,15 @@ __all__ = ["footprint"]
 def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "view height width"]:
     """The pixels whose rays may cross an occupied voxel; every other pixel is background.
 
-    Voxel centres are projected and dilated by the largest extent of a voxel in that view, so that no pixel is missed.
+    The centres of the voxels at the surface are projected and dilated by the largest extent of a voxel in that view, so
+    that no pixel is missed.
     All pixels of a view count where a voxel lies beside or behind the camera, or where the camera has lens distortion.
     """
     height, width = camera.image_size(cameras)
     if isinstance(cameras, DistortedCamera) and occupancy.occupied.any():
         return torch.ones(cameras.batch_size, height, width, dtype=torch.bool, device=cameras.intrinsics.device)
     matrices, calibration = camera.projection_matrices(cameras), camera.intrinsics(cameras)
-    points = occupancy.centres().to(matrices)
+    points = occupancy.surface().centres().to(matrices)
     result = torch.zeros(len(matrices), height, width, dtype=torch.bool, device=points.device)
     if not len(points):
         return result

@@ -1,5 +1,6 @@
 """The visual hull against a loop (tests/reference.py) and against shapes whose pictures are known exactly."""
 
+import itertools
 import math
 
 import numpy as np
@@ -132,3 +133,12 @@ def test_contains_and_centres_agree():
     assert grid.contains(points).tolist() == [True, False, False, True]
     assert grid.dilated().occupied.all()
     np.testing.assert_array_equal(grid.dilated(0).occupied.numpy(), occupied.numpy())
+
+
+def test_the_surface_has_a_face_at_an_empty_voxel_or_at_the_border():
+    grid = torch.rand(7, 7, 7, generator=torch.Generator().manual_seed(0)) < 0.9
+    found = Occupancy(grid, Sphere()).surface().occupied
+    for x, y, z in itertools.product(range(7), repeat=3):
+        around = [(x + 1, y, z), (x - 1, y, z), (x, y + 1, z), (x, y - 1, z), (x, y, z + 1), (x, y, z - 1)]
+        bare = any(min(each) < 0 or max(each) > 6 or not grid[each] for each in around)
+        assert bool(found[x, y, z]) == (bool(grid[x, y, z]) and bare)

@@ -57,6 +57,14 @@ def test_no_pixel_that_meets_an_occupied_voxel_is_missed(which, bounds, side):
         assert not missed.any(), f"{int(missed.sum())} pixels"
 
 
+@pytest.mark.parametrize("which", CAMERAS)
+def test_no_pixel_that_meets_a_solid_is_missed(which):
+    ball = full(Sphere(), 20)
+    solid = Occupancy((ball.centres().norm(dim=1) < 0.6).reshape(20, 20, 20), Sphere())
+    for grid in (solid, ball):
+        assert not (pixels_with_samples(grid, CAMERAS[which]) & ~footprint(grid, CAMERAS[which])).any()
+
+
 def test_far_pixels_are_left_out():
     grid = torch.zeros(32, 32, 32, dtype=torch.bool)
     grid[15:17, 15:17, 15:17] = True  # a sixteenth of a unit about the centre, seen from 3: about 3 of 64 pixels
