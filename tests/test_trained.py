@@ -144,7 +144,7 @@ def test_a_lamp_with_the_update_of_a_car_is_worse(count):
 
 @pytest.mark.parametrize(("count", "most"), [(3, 4.5), (25, 1.0)])
 def test_a_car_that_faces_another_way_costs_little(count, most):
-    """Measured: 3.3 and 0.15 dB. Weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
+    """3.3 and 0.15 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
     model, found = HyperPlanes.from_pretrained("small"), {}
     for degrees in (0, 45, 100):
         rotation = Augmentation(math.radians(degrees))
