@@ -94,7 +94,7 @@ def test_every_verb_has_help_with_an_example_and_no_torch(verb):
     assert f"    hyperplanes {verb}" in done.stdout
     if verb in ("render", "export", "bake", "adapt", "evaluate"):
         text = " ".join(done.stdout.replace("│", " ").split())
-        assert "or a packaged model: small, cars-64" in text
+        assert "or a packaged model: small, small-paper, cars-64" in text
 
 
 def test_an_unknown_verb_is_answered_with_the_nearest(capsys):
@@ -156,7 +156,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ),
         (["export", "--checkpoint", "RUN", "--views", "OUT/none", "--out", "OUT/x"], ["OUT/none", "nothing"]),
         (["demo", "--held-out", "500", "--out", "OUT/demo"], ["--held-out", "500"]),
-        (["inspect", "smal"], ["smal: expected a data set, posed images, a checkpoint", "small, cars-64, example-car"]),
+        (["inspect", "smal"], ["smal: expected a data set, posed images, a checkpoint", "small-paper, cars-64, example"]),
         (
             ["demo", "--first-only", "--meshes", "OUT/none", "--out", "OUT/demo"],
             ["--meshes: expected a folder of mesh files, got OUT/none, which is nothing"],

@@ -33,7 +33,7 @@ class Arguments:
 
     Attributes:
         path: A data set in any layout, a folder of posed images, a checkpoint, a baked file, or what comes with the
-            package: small, cars-64, example-car.
+            package: small, small-paper, cars-64, example-car.
         out: Where the pictures go; runs/inspect/NAME when not given.
         objects: How many objects to look at closely.
         checksums: Compare every file with its checksum in the manifest, too.
@@ -134,7 +134,7 @@ def run(arguments: Arguments) -> int:
         raise DataError(
             arguments.path,
             "a data set, posed images, a checkpoint or a baked file, or a model or scene of the package (small, "
-            "cars-64, example-car)",
+            "small-paper, cars-64, example-car)",
             "nothing",
             "check the path",
         )

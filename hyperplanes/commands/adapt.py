@@ -27,7 +27,7 @@ class Arguments:
     """What to adapt to.
 
     Attributes:
-        checkpoint: What `train` or `demo` wrote, or a packaged model: small, cars-64.
+        checkpoint: What `train` or `demo` wrote, or a packaged model: small, small-paper, cars-64.
         views: The posed images of the object; example-car comes with the package.
         out: The folder for the weights.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's

@@ -34,7 +34,7 @@ class Arguments:
     """What to bake.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote, or a packaged model: small, cars-64.
+        checkpoint: What `train`, `adapt` or `demo` wrote, or a packaged model: small, small-paper, cars-64.
         views: The posed images of the object; example-car comes with the package.
         out: The file to write, with a name that ends in .safetensors.
         voxels: Along each side of the grid; two for every pixel that the object is wide lose little.

@@ -54,7 +54,7 @@ class Arguments:
             checkpoint is needed); standard, mv_matched, mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but
             the first two and hyperplanes_swapped may be followed by _N or _auto for gradient steps.
         checkpoint: Folders that `train` wrote, folders of them such as runs/demo, or a packaged model: small,
-            cars-64; {seed} stands for each seed.
+            small-paper, cars-64; {seed} stands for each seed.
         json: Write the table here too, with every object, every seed and every pair of methods.
         csv: Write every object's numbers here, a line each.
         markdown: Write the tables of methods and of their pairs here.

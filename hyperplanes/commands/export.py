@@ -29,7 +29,7 @@ class Arguments:
 
     Attributes:
         checkpoint: What `train`, `adapt` or `demo` wrote, a file that `bake` wrote, or a packaged model: small,
-            cars-64.
+            small-paper, cars-64.
         views: The posed images of the object; example-car comes with the package.
         out: The folder to write to.
         what: Any of the three.

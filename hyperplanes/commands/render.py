@@ -33,7 +33,7 @@ class Arguments:
 
     Attributes:
         checkpoint: What `train`, `adapt` or `demo` wrote, a file that `bake` wrote, or a packaged model: small,
-            cars-64.
+            small-paper, cars-64.
         views: The posed images of the object; example-car comes with the package.
         out: The folder for the pictures.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
