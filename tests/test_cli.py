@@ -156,7 +156,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ),
         (["export", "--checkpoint", "RUN", "--views", "OUT/none", "--out", "OUT/x"], ["OUT/none", "nothing"]),
         (["demo", "--held-out", "500", "--out", "OUT/demo"], ["--held-out", "500"]),
-        (["inspect", "smal"], ["smal: expected a data set, posed images, a checkpoint", "small-paper, cars-64, example"]),
+        (["inspect", "smal"], ["smal: expected a data set, posed images", "small-paper, cars-64, example"]),
         (
             ["demo", "--first-only", "--meshes", "OUT/none", "--out", "OUT/demo"],
             ["--meshes: expected a folder of mesh files, got OUT/none, which is nothing"],
