@@ -159,7 +159,7 @@ def test_planes_in_the_order_of_their_file_are_the_first_views(count, expected):
 def test_no_view_at_all_is_refused(model, support):
     with pytest.raises(ValueError, match="support: expected at least one view, got none"):
         model.adapt(support[:0])
-    with pytest.raises(ValueError, match="support: expected at least 4 views, got 3"):
+    with pytest.raises(ValueError, match="support: expected at least 4 views, one a plane, got 3"):
         model.set_rig(support[:3])
 
 
