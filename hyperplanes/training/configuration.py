@@ -100,8 +100,6 @@ class TrainingConfig:
             share = getattr(self, name)
             if not 0 <= share <= 1:
                 raise ValueError(f"{name}: expected a share from 0 to 1, got {share}")
-            if share and not self.views:
-                raise ValueError(f"{name}: expected 0 without training.views, got {share}")
 
     def steps_for(self, objects: int) -> int:
         """How many steps are taken with so many training objects.

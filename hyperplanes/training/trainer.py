@@ -82,6 +82,9 @@ class Trainer:
                 "training.views: expected numbers of at least 1, for the field any_order, which takes any of them, "
                 f"got {list(config.views)} for {model.config.target}"
             )
+        for name in ("rotations", "recolouring"):
+            if getattr(config, name) and not config.views:
+                raise ValueError(f"training.{name}: expected 0 without training.views, got {getattr(config, name)}")
         if config.completion and not (model.reads_volume and model.config.network.grid >= COMPLETED and config.views):
             raise ValueError(
                 f"training.completion: expected training.views, a hypernetwork with encoder 'volume' and a grid of at "

@@ -101,5 +101,6 @@ def test_a_training_shows_changed_objects_with_their_volumes_and_goes_on_where_i
 def test_shares_that_are_none_and_trainings_without_episodes_are_refused(name, share):
     with pytest.raises(ValueError, match=f"{name}: expected a share from 0 to 1"):
         replace(TRAINING, **{name: share})
-    with pytest.raises(ValueError, match=f"{name}: expected 0 without training.views"):
-        replace(TRAINING, views=(), completion=0.0, **{name: 0.5})
+    config = replace(TRAINING, views=(), completion=0.0, **{name: 0.5})
+    with pytest.raises(ValueError, match=f"training.{name}: expected 0 without training.views, got 0.5"):
+        Trainer(HyperPlanes(MODEL), Balls(), config)
