@@ -12,10 +12,14 @@ import pytest
 from PIL import Image
 from small_demo import demo_folder
 
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
 from hyperplanes.demo.charts import line_chart
+from hyperplanes.demo.first_look import write_first_look
 from hyperplanes.demo.pictures import ERROR_SCALE, colour_scale, error_map
 from hyperplanes.utilities.environment import find_commit
+from tests.reference_rendering import Balls
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 
@@ -158,3 +162,14 @@ def test_the_page_of_a_demonstration():
         assert f"<small>{name}</small>" in page
     assert "arXiv 2402.01524" in page
     assert find_commit() in page
+
+
+def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small").mkdir()
+    with pytest.raises(CheckpointError, match="small"):
+        HyperPlanes.from_pretrained("small")  # a folder of that name goes first, where a name is given
+    data, shown = Balls(train=0, test=1, views=6, size=(24, 24)), {}
+    page = write_first_look(tmp_path / "first.html", data, data.names("test"), 2, shown.__setitem__, counts=(2, 3))
+    assert page.exists()
+    assert len(shown) == 3

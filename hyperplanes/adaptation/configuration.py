@@ -14,7 +14,7 @@ from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.utilities.settings import SettingsError, choose_by_tag, structure
 
-__all__ = ["ORDERS", "ModelConfig", "checkpoint_folder"]
+__all__ = ["ORDERS", "ModelConfig", "checkpoint_folder", "packaged_folder"]
 
 ORDERS = ("matched", "file")
 
@@ -124,6 +124,11 @@ class ModelConfig:
         return sorted(name for name in mine | others if mine.get(name, ...) != others.get(name, ...))
 
 
+def packaged_folder(name: str) -> Path:
+    """The folder of a model that comes with the package, whatever lies in the current folder."""
+    return PACKAGED / name
+
+
 def checkpoint_folder(name: Path | str) -> Path:
     """The folder of a checkpoint, or of a packaged one by its name.
 
@@ -140,7 +145,7 @@ def checkpoint_folder(name: Path | str) -> Path:
             f"{name}: expected a checkpoint's folder or the name of a packaged model ({known}), found neither; "
             "`hyperplanes train` writes a checkpoint"
         )
-    return PACKAGED / folder.name
+    return packaged_folder(folder.name)
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hyperplanes.adaptation import HyperPlanes, NearestView
 from hyperplanes.adaptation.base import Adapter, Pictures
+from hyperplanes.adaptation.configuration import packaged_folder
 from hyperplanes.data.support import Shown
 from hyperplanes.demo.content import Exhibit, Look, Report, Row
 from hyperplanes.demo.page import render_page
@@ -46,7 +47,7 @@ def write_first_look(
     Returns:
         The page.
     """
-    model, most = HyperPlanes.from_pretrained(PACKAGED), counts[-1]
+    model, most = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)), counts[-1]
     rows: dict[str, tuple[str, int, Adapter]] = {
         "nearest_view": (f"nearest of {most} views, copied", most, NearestView()),
         **{f"views_{count}": (f"{count} views", count, model) for count in counts},
