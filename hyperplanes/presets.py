@@ -100,7 +100,7 @@ class Preset:
     def for_known_places(self) -> Preset:
         """Without what only a field of any number of views has: the grid of features, episodes of some of the views."""
         network = replace(self.model.network, grid=0)
-        training = replace(self.training, views=(), rotations=0.0, recolouring=0.0, completion=0.0)
+        training = replace(_of_all_views(self.training), completion=0.0)
         return replace(self, model=replace(self.model, network=network), training=training)
 
     def without_hypernetwork(self) -> Preset:
@@ -123,12 +123,9 @@ class Preset:
         initialisation = replace(self.initialisation, method=method, **changes)
         plain = self.without_hypernetwork()
         training = replace(
-            plain.training,
+            _of_all_views(plain.training),
             optimiser="adam",
             learning_rate=self.outer_rate,
-            views=(),
-            rotations=0.0,
-            recolouring=0.0,
             random_background=False,
             empty_points=0,
         )
@@ -137,6 +134,11 @@ class Preset:
         else:
             training = replace(training, tasks=1, rays=128, warmup=0, final=1.0)
         return replace(plain, model=replace(plain.model, initialisation=initialisation), training=training)
+
+
+def _of_all_views(training: TrainingConfig) -> TrainingConfig:
+    """The same on the objects as they are and all their support views, not on episodes of some."""
+    return replace(training, views=(), rotations=0.0, recolouring=0.0)
 
 
 MAML_STEPS = 4

@@ -42,6 +42,15 @@ def test_pooling_reads_the_views_of_a_point_in_no_order():
     torch.testing.assert_close(field.joined(slots), field.joined(changed))
 
 
+def test_parts_of_an_update_are_rendered_with_the_passes_that_the_whole_has():
+    model, task = HyperPlanes(replace(MODEL, second_pass=True)), Balls(views=6, size=(24, 24)).task("train0")
+    found = views.PARTS["grid_alone"](model).adapt(task.support)  # outputs start at zero: nothing to leave out
+    expected = model.adapt(task.support)
+    cameras = task.query.cameras
+    assert torch.equal(found.render(cameras).images, expected.render(cameras).images)
+    assert found.field.planes._surface is not None
+
+
 def test_the_second_pass_of_the_benchmark_of_views_is_that_of_the_model(tmp_path):
     data = demo_folder() / "data"
     model = HyperPlanes(MODEL)

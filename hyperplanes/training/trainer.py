@@ -27,8 +27,10 @@ from hyperplanes.training.completion import completion_loss
 from hyperplanes.training.configuration import Progress, TrainingConfig
 from hyperplanes.training.distributed import ProcessEnded, Processes, check_shares, other_processes
 from hyperplanes.training.drawing import draw, draw_balanced, episode_generator, episode_object, object_generator
-from hyperplanes.training.episodes import COMPLETED, Episode, prepare_episode, prepare_subset, whole_of
+from hyperplanes.training.emptiness import emptiness_loss
+from hyperplanes.training.episodes import Episode, prepare_episode, prepare_subset, whole_of
 from hyperplanes.training.prefetching import Prefetcher
+from hyperplanes.training.requirements import check_requirements
 from hyperplanes.training.state import Curve, check_model, load_state, save_state
 from hyperplanes.training.watching import Samples, write_curve
 from hyperplanes.utilities.errors import prefix_errors
@@ -38,7 +40,6 @@ from hyperplanes.views import Task, Tasks, class_of
 __all__ = ["Trainer", "train"]
 
 
-EMPTINESS = 0.01  # weight of the opacity of empty space beside the squared error of pixels
 FREE = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every", "keep_last", "memory", "prefetch")
 """What may differ in a training that is resumed."""
 
@@ -77,19 +78,7 @@ class Trainer:
         self.names = sorted(data.names("train"))
         if not self.names:
             raise ValueError("data: expected at least one training object, got none")
-        if config.views and (not model.any_order or min(config.views) < 1):
-            raise ValueError(
-                "training.views: expected numbers of at least 1, for the field any_order, which takes any of them, "
-                f"got {list(config.views)} for {model.config.target}"
-            )
-        for name in ("rotations", "recolouring"):
-            if getattr(config, name) and not config.views:
-                raise ValueError(f"training.{name}: expected 0 without training.views, got {getattr(config, name)}")
-        if config.completion and not (model.reads_volume and model.config.network.grid >= COMPLETED and config.views):
-            raise ValueError(
-                f"training.completion: expected training.views, a hypernetwork with encoder 'volume' and a grid of at "
-                f"least {COMPLETED} features, got another model or training"
-            )
+        check_requirements(config, model)
         self.config = config = replace(config, steps=config.steps_for(len(self.names)))
         check_shares(config.tasks, self._reference_objects, self.processes.count)
         self.classes: dict[str, list[str]] = {}
@@ -253,7 +242,7 @@ class Trainer:
                 seen, truth = seen.over(colour), truth + (1 - opacity) * (colour - 1)
             if config.empty_points:
                 with record_function("step:emptiness"):
-                    total = total + self._emptiness(field, generator)
+                    total = total + emptiness_loss(field, config.empty_points, generator)
             total = total + ray_loss(seen, truth)
             if config.completion:
                 total = total + config.completion * completion_loss(weights, episode)
@@ -379,16 +368,6 @@ class Trainer:
                 write_json(self.folder / "diagnostics.json", self.diagnostics.as_json())
             config = asdict(self.config)
             save_state(self.folder, self.model, self.optimisers, self.step, self.curve, config, self.average)
-
-    def _emptiness(self, field: AdaptedField, generator: torch.Generator) -> Tensor:
-        """Mean opacity, a tenth of a radius thick, of random points of the sphere that the hull rules out."""
-        bounds, device = field.occupancy.bounds, field.occupancy.occupied.device
-        unit = torch.randn(self.config.empty_points, 3, generator=generator)
-        unit = unit / unit.norm(dim=1, keepdim=True) * torch.rand(len(unit), 1, generator=generator) ** (1 / 3)
-        points = (unit * bounds.radius + torch.tensor(bounds.centre)).to(device)
-        points = points[~field.occupancy.contains(points)]
-        opacity = [1 - torch.exp(-density(points) * bounds.radius / 10) for density in field.densities]
-        return EMPTINESS * sum((each.sum() for each in opacity), torch.zeros((), device=device)) / len(unit)
 
     def _schedule(self) -> float:
         config = self.config

@@ -195,6 +195,10 @@ def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not
     trainer = start_training(given.config, FAST, Balls(), tmp_path / "out", reference=tmp_path / "given")
     for name, value in given.networks.state_dict().items():
         assert torch.equal(trainer.model.networks.state_dict()[name], value), name
+    elsewhere = Balls(views=5)  # whose first views stand elsewhere; the weights know each plane by its place
+    kept = start_training(given.config, FAST, elsewhere, tmp_path / "kept", reference=tmp_path / "given")
+    assert torch.equal(kept.model.rig, given.rig)
+    assert not torch.equal(start_training(given.config, FAST, elsewhere, tmp_path / "new").model.rig, given.rig)
     trainer.take_step()
     trainer.save()
     resumed = start_training(given.config, FAST, Balls(), tmp_path / "out", reference=tmp_path / "given")

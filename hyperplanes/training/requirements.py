@@ -1,0 +1,31 @@
+"""What the parts of a training need of the model, and of each other."""
+
+from __future__ import annotations
+
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.training.episodes import COMPLETED
+
+__all__ = ["check_requirements"]
+
+
+def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
+    """Nothing, where the model can be trained so.
+
+    Raises:
+        ValueError: numbers of views for a field that knows them by their places, augmentation without such numbers, or
+            completion for a model without a volume or a grid.
+    """
+    if config.views and (not model.any_order or min(config.views) < 1):
+        raise ValueError(
+            "training.views: expected numbers of at least 1, for the field any_order, which takes any of them, "
+            f"got {list(config.views)} for {model.config.target}"
+        )
+    for name in ("rotations", "recolouring"):
+        if getattr(config, name) and not config.views:
+            raise ValueError(f"training.{name}: expected 0 without training.views, got {getattr(config, name)}")
+    if config.completion and not (model.reads_volume and model.config.network.grid >= COMPLETED and config.views):
+        raise ValueError(
+            f"training.completion: expected training.views, a hypernetwork with encoder 'volume' and a grid of at "
+            f"least {COMPLETED} features, got another model or training"
+        )
