@@ -202,7 +202,6 @@ PRESETS: dict[str, Preset] = {
             hypernetwork_learning_rate=1e-3,
             warmup=300,
             final=0.02,
-            average=0.999,
         ),
         128,
         "any number of views of any rig, 128x128, hours on a few cores",
