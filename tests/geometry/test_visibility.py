@@ -162,3 +162,23 @@ def test_the_nearest_views_are_judged_by_the_surface_that_is_given_and_the_best_
     for distances, opacity in ((surface, 0.0), (0 * surface, 1.0)):  # nothing found, or before the hull's
         same = loose.with_surface(distances, opacity * everywhere).hiding(hidden)
         assert torch.equal(same.choose(points, directions, best=3, nearest=2).nearest.behind, by_hull.nearest.behind)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_points_that_are_not_finite_are_seen_by_no_view_and_leave_the_others_as_they_are(monkeypatch, compiled, value):
+    if not compiled:
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    shown, (points, directions) = planes(), queries(600)
+    expected = shown.choose(points, directions, best=3, nearest=2)
+    spoiled, other = points.clone(), torch.arange(600) % 5 > 0
+    spoiled[~other, 1] = value
+    torch.full((600, 20), 2**40).sum()  # memory that is written to and left: what nothing fills holds no index
+    for given in ((spoiled, directions), (points, directions + spoiled - points)):
+        found = shown.choose(*given, best=3, nearest=2)
+        for part, clean in ((found.best, expected.best), (found.nearest, expected.nearest)):
+            assert part.views.min() >= 0
+            assert part.views.max() < len(shown)
+            for name in ("views", "behind", "coverage", "penalty"):
+                torch.testing.assert_close(getattr(part, name)[other], getattr(clean, name)[other], rtol=0, atol=0)
+    assert not shown.choose(spoiled, directions, best=3).number[~other].any()

@@ -113,9 +113,12 @@ def _judge(s, pitch, total, along_x, along_y, along_z, guides, shape, limits):
 @inner
 @no_type_check
 def _keep(s, pitch, total, row, count, views, values, scores, start):
-    """Writes the `count` views of the least numbers in a row of the scratch, best first, and their results."""
+    """Writes the `count` views of the least numbers in a row of the scratch, best first, and their results.
+
+    Where all numbers are NaN, as those of a point that is not finite, these are the first views.
+    """
     for place in range(count):
-        scores[place] = np.inf
+        scores[place], views[start + place] = np.inf, place
     for view in range(total):
         score = load(s, row * pitch + view)
         if score < scores[count - 1]:
