@@ -251,12 +251,10 @@ class HyperPlanes(nn.Module):
             return hypernetwork(torch.stack(volumes), theta)
         read = [each.views[self.hyperplanes(each.views)] for each in prepared]
         directions = [camera.viewing_directions(each.cameras) for each in read]
-        if not self.any_order:
-            images = torch.stack([each.images for each in read])
-            return cast("list[Parameters]", hypernetwork(images, torch.stack(directions), theta))
-        assert isinstance(hypernetwork, HyperNetwork)
-        side = hypernetwork.config.resolution
+        side = hypernetwork.config.resolution if isinstance(hypernetwork, HyperNetwork) else 0
         images = [_resized(each.images, (side, side) if side else read[0].size) for each in read]
+        if not self.any_order:
+            return cast("list[Parameters]", hypernetwork(torch.stack(images), torch.stack(directions), theta))
         present = [torch.ones(len(each), device=each.device) for each in directions]
         batch = [pad_sequence(part, batch_first=True) for part in (images, directions, present)]
         return cast("list[Parameters]", hypernetwork(batch[0], batch[1], theta, batch[2] > 0))

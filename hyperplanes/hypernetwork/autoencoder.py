@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import silu
 
 from hyperplanes.hypernetwork.choices import check_choices
-from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
+from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS, encode_objects
 from hyperplanes.parameters import Parameters
 
 __all__ = ["Autoencoder", "AutoencoderConfig"]
@@ -99,5 +99,7 @@ class Autoencoder(nn.Module):
         self, images: Float[Tensor, "object view 3 height width"], directions: Float[Tensor, "object view 3"]
     ) -> Float[Tensor, "object latent"]:
         """The code z of each object."""
-        codes = self.encoder(images.flatten(0, 1)).unflatten(0, images.shape[:2])
+        present = torch.ones(images.shape[:2], device=images.device) > 0
+        apart = self.config.normalisation == "batch_statistics" and not self.training
+        codes = encode_objects(self.encoder, images, present, apart=apart)
         return silu(self.latent(torch.cat([codes, directions], -1).flatten(1)))

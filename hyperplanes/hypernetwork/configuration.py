@@ -30,7 +30,7 @@ class HyperNetworkConfig:
         views: k, the number of HyperPlanes it reads; the most it reads with a field that takes any number of views.
         choice: which k of the n planes they are: the "farthest" apart, or the "first".
         resolution: pixels a side that HyperPlanes are resized to before they are encoded, so that pictures of every
-            size are read alike; 0 leaves them as they are.
+            size are read alike; 0 leaves them as they are, and resizes those of a step to the size of its first object.
         encoder: "convnet" (ShapeNet 128) or "resnet101" (ShapeNet 200) read images; "volume" reads what all views show
             on a grid over the scene, `VolumeHyperNetwork`, and ignores `views`, `choice`, `resolution`,
             `normalisation`, `join` and `see_directions`.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
 from hyperplanes.hypernetwork.synchronisation import BatchNorm2d
 
-__all__ = ["CHOICES", "ENCODERS", "NORMALISATIONS", "ConvNet", "ResNet101"]
+__all__ = ["CHOICES", "ENCODERS", "NORMALISATIONS", "ConvNet", "ResNet101", "encode_objects"]
 
 CHOICES = ("farthest", "first")
 """Which k of n planes an encoder reads."""
@@ -101,3 +102,27 @@ class ResNet101(nn.Module):
 
 
 ENCODERS: dict[str, type[nn.Module]] = {"convnet": ConvNet, "resnet101": ResNet101}
+
+
+def encode_objects(
+    encoder: nn.Module,
+    images: Float[Tensor, "object view 3 height width"],
+    present: Bool[Tensor, "object view"],
+    *,
+    apart: bool,
+) -> Float[Tensor, "object view code"]:
+    """The codes of the images of several objects.
+
+    Args:
+        encoder: one of ENCODERS.
+        images: in [0, 1].
+        present: which of the images there are; the others are not encoded and count in no statistics of a batch.
+        apart: every object is a batch of its own. Otherwise the images of all of them are one.
+
+    Returns:
+        Codes, zero where there is no image.
+    """
+    batches = [each[there] for each, there in zip(images, present, strict=True)]
+    codes = [encoder(batch) for batch in (batches if apart else [torch.cat(batches)])]
+    found = torch.cat(codes)
+    return found.new_zeros(*present.shape, found.shape[1]).masked_scatter(present[..., None], found)

@@ -1,5 +1,6 @@
 """Source of truth: what must not matter (order, what else is in a batch), and views that a step may not be shown."""
 
+import copy
 from dataclasses import replace
 
 import pytest
@@ -60,9 +61,10 @@ def test_larger_pictures_carve_a_finer_hull():
     assert model().prepare(replace(task, masks=None)).occupancy.occupied.shape[0] == 16
 
 
-def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch():
+@pytest.mark.parametrize("normalisation", ["group", "batch", "batch_statistics"])
+def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch(normalisation):
     """Objects of 1, 2 and 5 views, of which the hypernetwork reads at most 3, and of two picture sizes."""
-    adapter = model(hypernetwork=replace(SHAPE, resolution=16))
+    adapter = model(hypernetwork=replace(SHAPE, resolution=32, normalisation=normalisation))
     supports = [views(1), views(2, (0.1, 0.9, 0.3)), ball_views(ring(5, (20, 24)), colour=(0.2, 0.3, 0.9))]
     with torch.no_grad():
         prepared = [adapter.prepare(each) for each in supports]
@@ -71,6 +73,31 @@ def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch():
             for name, value in adapter.update(each).items():
                 torch.testing.assert_close(one[name], value, atol=1e-5, rtol=1e-4)
     assert not torch.allclose(together[0]["fine.density.weight"], together[1]["fine.density.weight"])
+
+
+@pytest.mark.parametrize("normalisation", ["group", "batch", "batch_statistics"])
+@pytest.mark.parametrize("training", [False, True])
+@torch.no_grad()
+def test_images_that_are_not_there_count_in_no_statistics(normalisation, training):
+    network = model(hypernetwork=replace(SHAPE, normalisation=normalisation)).hypernetwork.train(training)
+    generator = torch.Generator().manual_seed(0)
+    images, directions = torch.rand(2, 3, 3, 32, 32, generator=generator), torch.rand(2, 3, 3, generator=generator)
+    present = torch.tensor([[True, False, False], [True, True, True]])
+    before = copy.deepcopy(network)
+    codes = network.encode(images, directions, present)
+    images[0, 1:] = 0.7
+    assert torch.equal(before.encode(images, directions, present), codes)
+    for name, value in network.state_dict().items():
+        assert torch.equal(before.state_dict()[name], value)
+
+
+def test_a_model_of_planes_reads_objects_of_several_picture_sizes():
+    shape = replace(SHAPE, join="concatenate", choice="first", views=2, resolution=16)
+    adapter = model(target="point_multiplane", hypernetwork=shape, order="file")
+    with torch.no_grad():
+        prepared = [adapter.prepare(ball_views(ring(4, size))) for size in ((16, 16), (20, 24))]
+        for one, each in zip(adapter.updates(prepared), prepared, strict=True):
+            torch.testing.assert_close(one["fine.density.weight"], adapter.update(each)["fine.density.weight"])
 
 
 def test_the_hypernetwork_reads_the_views_that_stand_farthest_apart():
