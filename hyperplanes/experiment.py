@@ -124,7 +124,7 @@ def _merged(base: Mapping[str, Any], changes: Any) -> Any:
         before = result.get(name)
         if isinstance(value, Mapping):
             result[name] = _merged(before if isinstance(before, Mapping) else {}, value)
-        elif isinstance(before, list | tuple) and isinstance(value, str):
+        elif isinstance(before, list | tuple) and isinstance(value, str | int | float):
             result[name] = [value]
         else:
             result[name] = value

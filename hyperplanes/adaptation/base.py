@@ -60,6 +60,11 @@ class AdaptedField:
     proposal: FieldFunction | None = None
     densities: tuple[Callable[[Tensor], Tensor], ...] = ()
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision in which the field expects points; single for functions that do not say."""
+        return getattr(self.field, "dtype", torch.float32)
+
     @cached_property
     def refined_occupancy(self) -> Occupancy:
         """The voxels of `occupancy` in which the field has density; computed when the first view is rendered."""
@@ -67,6 +72,7 @@ class AdaptedField:
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without colour where the field can do that."""
+        points = points.to(self.dtype)
         if self.densities:
             return self.densities[0](points)
         return self.field(points, torch.nn.functional.normalize(points, dim=-1))[1]
@@ -85,7 +91,7 @@ class AdaptedField:
 
     @torch.no_grad()
     def render(self, cameras: PinholeCamera, sampling: Sampler | None = None) -> Pictures:
-        """The pictures of cameras, without gradients.
+        """The pictures of cameras, without gradients; rays and pixels in single precision, whatever the field's.
 
         Args:
             cameras: any number, one image size, on any device and in any precision.
@@ -96,13 +102,24 @@ class AdaptedField:
         """
         sampling = sampling or self.sampling.for_rendering
         return render(
-            self.field,
+            self._in_single_precision(self.field),
             camera.to(cameras, self.occupancy.occupied.device),
             sampling,
             bounds=self.occupancy.bounds,
             occupancy=self.refined_occupancy if sampling.needs_occupancy else None,
-            proposal=self.proposal,
+            proposal=self.proposal and self._in_single_precision(self.proposal),
         )
+
+    def _in_single_precision(self, field: FieldFunction) -> FieldFunction:
+        """The function of single-precision points that a field of another precision is."""
+        if self.dtype == torch.float32:
+            return field
+
+        def single(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+            colour, density = field(points.to(self.dtype), directions.to(self.dtype))
+            return colour.float(), density.float()
+
+        return single
 
 
 def hull(support: Views, side: int) -> Occupancy:

@@ -12,6 +12,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.optimisers import make_optimisers
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
@@ -55,6 +56,9 @@ class FineTuning:
         hide: a field that takes any number of views is not shown those that the rays of a step come from, a share
             `1 / left_out` of them, as it could copy their colours; of fewer than three views none is hidden.
         seed: of rays and samples.
+
+    Raises:
+        ValueError: an unknown name, no ray, a rate that is negative or not finite, or every view left out.
     """
 
     free: Literal["weights", "hypernetwork"] = "weights"
@@ -67,6 +71,16 @@ class FineTuning:
     left_out: int = 6
     hide: bool = True
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_choices(self, {"free": RATES, "optimiser": (None, "adam", "muon", "sgd")})
+        for name, least in (("rays", 1), ("longest", 1), ("left_out", 2)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+        for name in ("learning_rate", "muon_learning_rate", "final"):
+            rate = getattr(self, name)
+            if rate is not None and not 0 <= rate < math.inf:
+                raise ValueError(f"{name}: expected a finite number of 0 or more, got {rate}")
 
     def with_rates(self, rates: Mapping[str, float]) -> FineTuning:
         """The settings with these rates where they state none; `rates` are fields of the settings by name."""

@@ -311,7 +311,8 @@ class HyperPlanes(nn.Module):
             on_step: called with the number of steps done, before the first and after each.
 
         Returns:
-            The field.
+            The field. A model that takes a second pass takes it twice: the steps keep the surface of the weights that
+            they begin with, and the field has that of its own.
 
         Raises:
             ValueError: the hypernetwork of a model that has none, a negative number of steps, or "auto" with fewer
@@ -327,15 +328,15 @@ class HyperPlanes(nn.Module):
         given, support = support, support.views if isinstance(support, Prepared) else self._to_own(support)
         schedule, stop = (settings.longest, self._best_stop(support, settings)) if steps == "auto" else (steps, steps)
         prepared = given if isinstance(given, Prepared) else self.prepare(support)
-        field, variables = self._tunable(prepared, settings)
-        pixels = self._live_pixels(prepared, support)
+        weights, variables = self._tunable(prepared, settings)
+        field, pixels = self._hiding(prepared, weights), self._live_pixels(prepared, support)
         for done in minimise(field, variables, support, schedule, settings, pixels=pixels, hiding=self.any_order):
             if on_step is not None:
                 on_step(done)
             if done == stop:
                 break
         with torch.no_grad():
-            return field(None)
+            return self.rendering_field(prepared, weights())
 
     def _best_stop(self, support: Views, settings: FineTuning) -> int:
         """How many steps of fine-tuning show left-out views best; they are neither planes nor give rays meanwhile."""
@@ -345,9 +346,9 @@ class HyperPlanes(nn.Module):
         left_out = torch.arange(len(support)) % every == every // 2
         shown, judged = support[(~left_out).nonzero()[:, 0]], support[left_out.nonzero()[:, 0]]
         prepared = self.prepare(shown)
-        field, variables = self._tunable(prepared, settings)
+        weights, variables = self._tunable(prepared, settings)
         return best_stop(
-            field,
+            self._hiding(prepared, weights),
             variables,
             shown,
             judged,
@@ -357,28 +358,26 @@ class HyperPlanes(nn.Module):
             hiding=self.any_order,
         )
 
-    def _tunable(self, prepared: Prepared, settings: FineTuning) -> tuple[Hiding, Sequence[Tensor]]:
-        """The field as a function of what fine-tuning optimises, and the tensors that it optimises."""
+    def _tunable(
+        self, prepared: Prepared, settings: FineTuning
+    ) -> tuple[Callable[[], Parameters], Sequence[Tensor]]:
+        """The weights of the field as a function of what fine-tuning optimises, and the tensors that it optimises."""
         if settings.free == "hypernetwork":
             tuned = copy.deepcopy(self.hypernetwork)
             assert tuned is not None
             tuned = tuned.eval().requires_grad_(True)
-            with torch.no_grad():
-                prepared = self._second_pass(prepared, self.theta + self.update(prepared, tuned))
-            theta, variables = self.theta.detach(), [*tuned.parameters()]
-        else:
-            with torch.no_grad(), _in_use(self):
-                start = self.theta + self.update(prepared)
-                prepared = self._second_pass(prepared, start)
-            free = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
-            tuned, theta, variables = None, free, list(free.values())
+            theta = self.theta.detach()
+            return lambda: theta + self.update(prepared, tuned), [*tuned.parameters()]
+        with torch.no_grad(), _in_use(self):
+            start = self.theta + self.update(prepared)
+        free = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
+        return lambda: free if torch.is_grad_enabled() else free.detach(), list(free.values())
 
-        def field(hidden: Tensor | None) -> AdaptedField:
-            weights = theta if torch.is_grad_enabled() else theta.detach()
-            weights = weights if tuned is None else weights + self.update(prepared, tuned)
-            return self.field(prepared if hidden is None else prepared.hiding(hidden), weights)
-
-        return field, variables
+    def _hiding(self, prepared: Prepared, weights: Callable[[], Parameters]) -> Hiding:
+        """The field of these weights; of a second pass, the surface is that of the weights as they are now."""
+        with torch.no_grad():
+            judged = self._second_pass(prepared, weights())
+        return lambda hidden: self.field(judged if hidden is None else judged.hiding(hidden), weights())
 
     def _live_pixels(self, prepared: Prepared, views: Views) -> Int[Tensor, " pixel"] | None:
         """Flat indices of the pixels of views that look into the hull; None where all are drawn from."""

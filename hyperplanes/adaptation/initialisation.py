@@ -47,19 +47,20 @@ class InitialisationConfig:
             raise ValueError(f"method: expected one of {', '.join(LEARNED)}, got {self.method!r}")
 
     def descent(self, rays: int | None = None, given: FineTuning | None = None) -> FineTuning:
-        """Plain gradient descent at a constant rate.
+        """Plain gradient descent at a constant rate, `inner_rate`, where nothing else is stated.
 
         Args:
             rays: a step; those of a new object where absent.
-            given: settings whose optimiser and rates, where they state any, and whose seed are kept.
+            given: settings whose optimiser and rates, where they state any, and whose seed are kept. The rates of
+                another optimiser than "sgd" fall to `given.final`.
         """
         given = given or FineTuning()
-        stated = given.optimiser is not None or given.learning_rate is not None
+        optimiser = given.optimiser or "sgd"
+        plain = optimiser == "sgd"
         return replace(
-            given,
+            given.with_rates({"learning_rate": self.inner_rate} if plain else {}),
             free="weights",
             rays=rays or self.test_rays,
-            optimiser=given.optimiser if stated else "sgd",
-            learning_rate=given.learning_rate if stated else self.inner_rate,
-            final=given.final if stated else 1.0,
+            optimiser=optimiser,
+            final=1.0 if plain else given.final,
         )

@@ -37,7 +37,7 @@ class ObjectScore:
         adapt_seconds: from support views to a field.
         render_seconds: of one query view.
         psnr_pooled: dB, of the squared error of all its query views together.
-        psnr_foreground: dB, inside the true masks, mean over its query views; None without masks.
+        psnr_foreground: dB, inside the true masks, mean over its query views; None where no mask has a pixel.
         lpips: mean over its query views; None where its weights were not given.
     """
 
@@ -75,14 +75,18 @@ class Score:
     seeds: tuple[Score, ...] = ()
 
     def mean(self, quantity: str) -> float:
-        """Mean over objects of one of `ObjectScore`'s numbers; NaN where an object has none."""
-        found = [getattr(each, quantity) for each in self.objects]
-        return math.nan if None in found else fmean(found)
+        """Mean of one of `ObjectScore`'s numbers over the objects that have it; NaN where none has."""
+        found = self._numbers(quantity)
+        return fmean(found) if found else math.nan
 
     def spread(self, quantity: str) -> float:
-        """Standard deviation over objects."""
-        found = [getattr(each, quantity) for each in self.objects]
-        return pstdev(found) if None not in found and all(map(math.isfinite, found)) else math.nan
+        """Standard deviation over the objects that have it."""
+        found = self._numbers(quantity)
+        return pstdev(found) if found and all(map(math.isfinite, found)) else math.nan
+
+    def _numbers(self, quantity: str) -> list[float]:
+        """One of the numbers, of every object that has it."""
+        return [value for each in self.objects if (value := getattr(each, quantity)) is not None]
 
     def deviation(self, quantity: str) -> float | None:
         """Standard deviation over seeds of the mean over objects; None of fewer than two seeds."""
@@ -90,8 +94,8 @@ class Score:
 
     @property
     def quantities(self) -> list[str]:
-        """The numbers that every object has."""
-        return [name for name in QUANTITIES if all(getattr(each, name) is not None for each in self.objects)]
+        """The numbers that any object has."""
+        return [name for name in QUANTITIES if self._numbers(name)]
 
     def as_json(self) -> dict[str, Any]:
         """The row as it stands in metrics.json."""
@@ -185,7 +189,7 @@ def evaluate(
             adapted_at - start,
             (rendered_at - adapted_at) / len(task.query),
             float(pooled_psnr(images, truth)),
-            None if masks is None else float(foreground_psnr(images, truth, masks).nanmean()),
+            None if masks is None else _number(float(foreground_psnr(images, truth, masks).nanmean())),
             None if lpips is None else float(lpips(images, truth).mean()),
         )
         scores.append(score)
@@ -234,3 +238,8 @@ def evaluate_all(
             runs.append(evaluate(method, make(seed), data, names, look, lpips))
         scores.append(merge_seeds(runs))
     return scores
+
+
+def _number(value: float) -> float | None:
+    """None for NaN, which says that there was nothing to measure."""
+    return None if math.isnan(value) else value

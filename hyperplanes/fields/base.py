@@ -130,6 +130,11 @@ class Field:
     planes: Any
     bounds: Sphere
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision of the weights, in which points are expected."""
+        return next(iter(self.parameters.values())).dtype
+
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:

@@ -135,7 +135,9 @@ def cast(
     if span != "sphere":
         raise ValueError(f"span: expected 'sphere' or 'constant', got {span!r}")
     middle = (to_centre * directions).sum(-1)
-    square = bounds.radius**2 - to_centre.square().sum(-1) + middle.square()
+    # the squared distance of the ray from the centre, of the vector between them: the difference of the squares of
+    # `to_centre` and `middle` is nothing but rounding where the camera is far away
+    square = bounds.radius**2 - (to_centre - middle[:, None] * directions).square().sum(-1)
     hit = square > 0 if shown is None else (square > 0) & shown
     half = torch.where(hit, torch.where(hit, square, 1.0).sqrt(), 0.0)  # no sqrt at 0: its gradient is infinite
     return Rays(origins, directions, (middle - half).clamp_min(0), (middle + half).clamp_min(0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -94,8 +95,12 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.average < 1:
             raise ValueError(f"average: expected a decay from 0 to below 1, got {self.average}")
-        if not self.clip >= 0:
-            raise ValueError(f"clip: expected a norm of 0 or more, got {self.clip}")
+        for name in (
+            *("learning_rate", "muon_learning_rate", "hypernetwork_learning_rate"),
+            *("final", "completion", "clip"),
+        ):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite number of 0 or more, got {getattr(self, name)}")
         for name in ("rotations", "recolouring"):
             share = getattr(self, name)
             if not 0 <= share <= 1:

@@ -24,6 +24,6 @@ def emptiness_loss(field: AdaptedField, count: int, generator: torch.Generator) 
     unit = torch.randn(count, 3, generator=generator)
     unit = unit / unit.norm(dim=1, keepdim=True) * torch.rand(len(unit), 1, generator=generator) ** (1 / 3)
     points = (unit * bounds.radius + torch.tensor(bounds.centre)).to(device)
-    points = points[~field.occupancy.contains(points)]
+    points = points[~field.occupancy.contains(points)].to(field.dtype)
     opacity = [1 - torch.exp(-density(points) * bounds.radius / 10) for density in field.densities]
     return EMPTINESS * sum((each.sum() for each in opacity), torch.zeros((), device=device)) / len(unit)

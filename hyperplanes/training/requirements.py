@@ -21,6 +21,12 @@ def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
             "training.views: expected numbers of at least 1, for the field any_order, which takes any of them, "
             f"got {list(config.views)} for {model.config.target}"
         )
+    for name in ("random_background", "empty_points"):
+        if getattr(config, name) and model.config.initialisation is not None:
+            raise ValueError(
+                f"training.{name}: expected {type(getattr(config, name))()} for {model.config.method}, whose steps on "
+                f"an object are plain fine-tuning, got {getattr(config, name)}"
+            )
     for name in ("rotations", "recolouring"):
         if getattr(config, name) and not config.views:
             raise ValueError(f"training.{name}: expected 0 without training.views, got {getattr(config, name)}")

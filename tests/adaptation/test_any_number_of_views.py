@@ -9,6 +9,7 @@ import torch
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.fine_tuning import FineTuning, minimise
+from hyperplanes.adaptation.pretrained import adapted_model
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
@@ -230,3 +231,23 @@ def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is(reader, fr
 
     assert quality(adapter.fine_tune(support, 30, FineTuning(free))) > quality(adapter.adapt(support)) + gain
     assert all(torch.equal(value, before[name]) for name, value in adapter.state_dict().items())
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("second_pass", [False, True])
+def test_a_model_in_double_precision_makes_the_same_pictures(reader, second_pass):
+    single, support = model(**READERS[reader], second_pass=second_pass), views(4)
+    found = picture(copy.deepcopy(single).double(), support)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, picture(single, support), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("free", ["weights", "hypernetwork"])
+def test_the_weights_of_one_object_make_its_field_again_after_a_second_pass(free):
+    twice, support = model(**READERS["volume"], second_pass=True), views(6)
+    tuned = twice.fine_tune(support, 10, FineTuning(free))
+    cameras = ring(2, (10, 13), shift=1)
+    again = adapted_model(twice, tuned).adapt(support).render(cameras).images
+    torch.testing.assert_close(again, tuned.render(cameras).images, atol=1e-6, rtol=0)
+    before = twice.adapt(support).field.planes
+    assert not torch.equal(before._surface, tuned.field.planes._surface)  # that of the tuned weights
