@@ -307,14 +307,14 @@ def look_at_origin(centres: npt.ArrayLike) -> Array:
 
     Returns:
         `world_from_camera` `(view, 4, 4)`, OpenCV axes. Right above or below the origin, where no direction is up,
-        the world's -z axis is up in the picture.
+        the world's z axis is up in the picture.
 
     >>> look_at_origin([[0.0, 0.0, 3.0]])[0].round().astype(int).tolist()
     [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]]
     """
     positions = np.asarray(centres, dtype=np.float64)
     forward = -positions / np.linalg.norm(positions, axis=-1, keepdims=True)
-    up = np.where(np.abs(forward[:, 1:2]) < 1.0 - 1e-9, [[0.0, 1.0, 0.0]], [[0.0, 0.0, -1.0]])
+    up = np.where(np.linalg.norm(forward[:, ::2], axis=-1, keepdims=True) >= 1e-6, [[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]])
     right = np.cross(forward, up)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
     poses = np.zeros((len(positions), 4, 4))

@@ -92,6 +92,22 @@ def test_a_baked_field_survives_the_disk(baked, tmp_path):
     assert again.bounds == baked.bounds
 
 
+@pytest.mark.parametrize("unit", [1e-10, 1e-4, 1e10])
+def test_the_file_holds_the_same_object_in_every_unit_of_the_world(baked, tmp_path, unit):
+    values = torch.cat([baked.values[:, :1] / unit, baked.values[:, 1:]], 1)
+    BakedField(baked.index, values, Sphere(radius=unit)).save(tmp_path / "ball.safetensors")
+    again = BakedField.load(tmp_path / "ball.safetensors")
+    cameras = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), CAMERAS.extrinsics.clone(), 48, 48)
+    cameras.extrinsics[:, :3, 3] *= unit
+    expected, found = BakedScene(baked).render(CAMERAS), BakedScene(again).render(cameras)
+    assert float(expected.opacity.max()) > 0.9
+    torch.testing.assert_close(found.opacity, expected.opacity, atol=5e-3, rtol=0)
+    assert float((found.images - expected.images).abs().mean()) < 2e-3
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) - 0.5
+    directions = torch.nn.functional.normalize(points, dim=-1)
+    torch.testing.assert_close(again(points * unit, directions)[0], baked(points, directions)[0], atol=5e-3, rtol=0)
+
+
 def test_a_file_that_is_no_baked_field_is_named(tmp_path):
     from hyperplanes.checkpoints import save_tensors
 

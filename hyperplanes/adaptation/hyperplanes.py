@@ -358,9 +358,7 @@ class HyperPlanes(nn.Module):
             hiding=self.any_order,
         )
 
-    def _tunable(
-        self, prepared: Prepared, settings: FineTuning
-    ) -> tuple[Callable[[], Parameters], Sequence[Tensor]]:
+    def _tunable(self, prepared: Prepared, settings: FineTuning) -> tuple[Callable[[], Parameters], Sequence[Tensor]]:
         """The weights of the field as a function of what fine-tuning optimises, and the tensors that it optimises."""
         if settings.free == "hypernetwork":
             tuned = copy.deepcopy(self.hypernetwork)

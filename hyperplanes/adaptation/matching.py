@@ -19,8 +19,7 @@ def standpoints(views: Views) -> Float[Tensor, "view 3"]:
     Args:
         views: of one scene.
     """
-    standing = camera.centres(views.cameras)
-    return torch.nn.functional.normalize(standing - standing.new_tensor(views.bounds.centre), dim=-1).float()
+    return camera.standpoints(views.cameras, views.bounds.centre).float()
 
 
 def match(rig: Float[Tensor, "plane 3"], standing: Float[Tensor, "view 3"]) -> Int[Tensor, " plane"]:

@@ -23,9 +23,10 @@ class _Copies:
 
         Its mask is the opacity; without masks all that is in a picture counts as there. Depth is not known: 0.
         """
-        centre = self.support.images.new_tensor(self.support.bounds.centre)
-        known = torch.nn.functional.normalize(camera.centres(self.support.cameras).to(centre) - centre, dim=-1)
-        asked = torch.nn.functional.normalize(camera.centres(cameras).to(centre) - centre, dim=-1)
+        known, asked = (
+            camera.standpoints(each, self.support.bounds.centre).to(self.support.images)
+            for each in (self.support.cameras, cameras)
+        )
         nearest = (asked @ known.T).argmax(1)
         masks = self.support.masks
         opacity = torch.ones_like(self.support.images[nearest, :1]) if masks is None else masks[nearest]

@@ -10,7 +10,6 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 __all__ = [
     "Free",
-    "OptionalField",
     "OptionalFolder",
     "OptionalInt",
     "OptionalName",
@@ -47,8 +46,6 @@ def choices(literal: Any) -> PrimitiveConstructorSpec[str | None]:
 
 
 OptionalFolder = Annotated[Path | None, optional("FOLDER")]
-Field = Literal["nerf", "multiplane", "point_multiplane"]
-OptionalField = Annotated[Field | None, choices(Field), optional("FIELD")]
 OptionalInt = Annotated[int | None, optional("INT")]
 OptionalName = Annotated[str | None, optional("NAME")]
 OptionalNumber = Annotated[int | float | None, optional("NUMBER")]

@@ -104,8 +104,7 @@ def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
     with torch.no_grad():
         prepared = model.prepare(shown, carved=False)
         views = prepared.views
-        centre = model.rig.new_tensor(views.bounds.centre)
-        standing = torch.nn.functional.normalize(camera.centres(views.cameras).to(centre) - centre, dim=-1)
+        standing = camera.standpoints(views.cameras, views.bounds.centre).to(model.rig)
         angle = 0.0
         if not model.any_order:
             angle = float(torch.rad2deg(torch.acos((standing * model.rig).sum(-1).clamp(-1, 1))).mean())

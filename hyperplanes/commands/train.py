@@ -33,7 +33,6 @@ import tyro
 
 from hyperplanes.commands.console import Bar, Console
 from hyperplanes.commands.options import (
-    OptionalField,
     OptionalFolder,
     OptionalInt,
     OptionalName,
@@ -67,7 +66,8 @@ class Arguments:
             multiplane, nerf, any_order, or a field of another package; autoencoder; or a learned initialisation:
             mv_meta, sv_meta (Reptile from many views or a single one), maml, maml_first_order, mv_matched (random
             weights matched to mv_meta).
-        field: Which target network: the preset's, or for learned initialisations NeRF, when not given.
+        field: Which target network: nerf, multiplane, point_multiplane, any_order, or that of another package; when not
+            given the preset's, or for learned initialisations NeRF.
         support: Support views and ImagePlanes an object; more than there are go on with the query views.
         checkpoint: Weights to begin with instead of random ones: a checkpoint, or a packaged model such as small; for
             mv_matched the checkpoint of mv_meta that it is to match.
@@ -90,7 +90,7 @@ class Arguments:
     config: Annotated[Path | None, optional("FILE")] = None
     preset: OptionalName = None
     method: OptionalName = None
-    field: OptionalField = None
+    field: OptionalName = None
     support: OptionalInt = None
     checkpoint: OptionalFolder = None
     protocol: Protocol = "default"

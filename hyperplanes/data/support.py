@@ -101,7 +101,6 @@ class Shown:
         asked = torch.linspace(0, len(task.query) - 1, min(self.query, len(task.query))).round().long()
         rest = [index for index in range(len(task.query)) if index not in asked.tolist()]
         views = join_views(task.support, task.query[rest])
-        centre = torch.tensor(views.bounds.centre)
-        standing = torch.nn.functional.normalize(camera.centres(views.cameras) - centre, dim=-1)
+        standing = camera.standpoints(views.cameras, views.bounds.centre)
         chosen = farthest_first(standing, 0, min(self.count, len(views)))
         return replace(task, support=views[torch.tensor(chosen)], query=task.query[asked])

@@ -19,7 +19,7 @@ HARMONICS = 9
 LARGEST_SIDE = 512
 STORED = {  # what a file holds
     "occupied": torch.uint8,
-    "density": torch.float16,
+    "scaled_density": torch.float16,  # times the radius: half precision whatever the unit of the world
     "coefficients": torch.uint8,
     "range": torch.float32,
     "sphere": torch.float32,
@@ -100,7 +100,7 @@ class BakedField:
             weighted = weight * found[:, 0]
             density = density + weighted
             coefficients = coefficients + weighted[:, None] * found[:, 1:]
-        coefficients = (coefficients / density.clamp_min(1e-8)[:, None]).reshape(-1, 3, HARMONICS)
+        coefficients = (coefficients / density.clamp_min(1e-8 / self.bounds.radius)[:, None]).reshape(-1, 3, HARMONICS)
         colour = (coefficients * spherical_harmonics(directions)[:, None]).sum(-1)
         return colour.clamp(0, 1), density
 
@@ -115,8 +115,8 @@ class BakedField:
         rows = self.values[order[order >= 0].long()]
         low, high = rows[:, 1:].aminmax(dim=0) if len(rows) else 2 * (rows.new_zeros(3 * HARMONICS),)
         coefficients = (rows[:, 1:] - low) / (high - low).clamp_min(1e-12) * 255
-        density = rows[:, 0].clamp_max(torch.finfo(torch.float16).max).half()
-        content = {"occupied": packed, "density": density, "coefficients": coefficients.round().byte()}
+        density = (rows[:, 0] * self.bounds.radius).clamp_max(torch.finfo(torch.float16).max).half()
+        content = {"occupied": packed, "scaled_density": density, "coefficients": coefficients.round().byte()}
         content |= {"range": torch.stack([low, high])}
         content |= {"sphere": torch.tensor([*self.bounds.centre, self.bounds.radius])}
         save_tensors(Path(path), content)
@@ -134,7 +134,7 @@ class BakedField:
             raise CheckpointError(f"{path}: expected a baked field, found tensors {sorted(found)}; `hyperplanes bake`")
         bits = found["occupied"].reshape(-1, 1).bitwise_and((2 ** torch.arange(8)).to(torch.uint8)).bool().flatten()
         side, rows, numbers = round(len(bits) ** (1 / 3)), int(bits.sum()), 3 * HARMONICS
-        shapes = {"density": (rows,), "coefficients": (rows, numbers), "range": (2, numbers), "sphere": (4,)}
+        shapes = {"scaled_density": (rows,), "coefficients": (rows, numbers), "range": (2, numbers), "sphere": (4,)}
         if side**3 != len(bits) or side > LARGEST_SIDE or any(found[n].shape != shape for n, shape in shapes.items()):
             raise CheckpointError(
                 f"{path}: expected a cube of voxels and {rows} rows of 1 + {numbers} numbers, found {len(bits)} voxels "
@@ -142,10 +142,10 @@ class BakedField:
             )
         low, high = found["range"]
         coefficients = low + (high - low) / 255 * found["coefficients"].float()
-        values = torch.cat([found["density"].float()[:, None], coefficients], 1)
         index = torch.full((len(bits),), -1, dtype=torch.int32)
         index[bits] = torch.arange(rows, dtype=torch.int32)
         x, y, z, radius = found["sphere"].tolist()
         if not radius > 0:
             raise CheckpointError(f"{path}: expected a sphere of positive radius, found {radius:g}; bake again")
+        values = torch.cat([found["scaled_density"].float()[:, None] / radius, coefficients], 1)
         return cls(index.reshape(side, side, side), values, Sphere((x, y, z), radius))

@@ -36,6 +36,7 @@ __all__ = [
     "resized",
     "scale",
     "select",
+    "standpoints",
     "symmetric_intrinsics",
     "to",
     "viewing_directions",
@@ -170,6 +171,16 @@ def centres(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
     """Optical centres in the world: -R^T t."""
     pose = camera_from_world(cameras)
     return -(pose[:, :3, :3].mT @ pose[:, :3, 3:]).squeeze(-1)
+
+
+def standpoints(cameras: PinholeCamera, centre: tuple[float, float, float]) -> Float[Tensor, "view 3"]:
+    """Unit vectors from a point, such as the centre of a scene, to the cameras; zero for a camera that is there.
+
+    >>> standpoints(pinhole(torch.eye(3), look_at(torch.tensor([[0.0, 0.0, 3.0]])), 1, 1), (0.0, 0.0, 1.0)).tolist()
+    [[0.0, 0.0, 1.0]]
+    """
+    standing = centres(cameras)
+    return torch.nn.functional.normalize(standing - standing.new_tensor(centre), dim=-1)
 
 
 def scale(cameras: PinholeCamera) -> float:

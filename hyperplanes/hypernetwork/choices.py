@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 __all__ = ["check_choices"]
 
 
-def check_choices(settings: object, known: Mapping[str, Collection[str]]) -> None:
+def check_choices(settings: object, known: Mapping[str, Collection[str | None]]) -> None:
     """Hold settings against what there is to choose from.
 
     Args:

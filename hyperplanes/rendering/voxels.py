@@ -158,7 +158,7 @@ def _render(index, values, empty, origins, directions, near, far, basis, step, l
                 density += at_corner
                 for number in range(mixed.shape[0]):
                     mixed[number] += at_corner * values[row, number]
-            if density <= np.float32(1e-8):
+            if density <= zero:
                 continue
             total += 1
             # Colour: the spherical harmonics of the ray's direction.

@@ -6,8 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-__all__ = ["draw", "draw_balanced", "episode_generator", "episode_object", "object_generator"]
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["draw", "draw_balanced", "episode_generator", "episode_object", "object_generator", "points_in"]
 
 EPISODES, ORDERS = 1, 2  # set the streams of these apart from those of rays
 
@@ -76,6 +80,19 @@ def episode_object(classes: Mapping[str, Sequence[str]], number: int, seed: int)
     epoch, index = divmod(turn, len(classes[chosen]))
     order = torch.randperm(len(classes[chosen]), generator=_generator(seed, epoch, place, ORDERS))
     return classes[chosen][int(order[index])]
+
+
+def points_in(bounds: Sphere, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
+    """Random points, evenly in the volume of a sphere, on the CPU.
+
+    Args:
+        bounds: the sphere.
+        count: how many.
+        generator: of the points.
+    """
+    unit = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    unit = unit * torch.rand(count, 1, generator=generator) ** (1 / 3)
+    return unit * bounds.radius + torch.tensor(bounds.centre)
 
 
 def _generator(*numbers: int) -> torch.Generator:

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.training.drawing import points_in
 
-__all__ = ["emptiness_loss"]
+__all__ = ["emptiness_loss", "thin_opacity"]
 
 EMPTINESS = 0.01  # weight beside the squared error of pixels
 
 
+def thin_opacity(density: Float[Tensor, " point"], bounds: Sphere) -> Float[Tensor, " point"]:
+    """The opacity of a layer a tenth of a radius thick, which does not depend on the unit of the world.
+
+    Args:
+        density: per world unit.
+        bounds: of the scene.
+    """
+    return 1 - torch.exp(-density * bounds.radius / 10)
+
+
 def emptiness_loss(field: AdaptedField, count: int, generator: torch.Generator) -> Tensor:
-    """Mean opacity, a tenth of a radius thick, of random points of the sphere that the hull rules out.
+    """EMPTINESS times the mean `thin_opacity` of random points of the sphere, which counts where the hull rules it out.
 
     Args:
         field: whose densities, all of them, are asked.
@@ -21,9 +34,7 @@ def emptiness_loss(field: AdaptedField, count: int, generator: torch.Generator) 
         generator: of the points.
     """
     bounds, device = field.occupancy.bounds, field.occupancy.occupied.device
-    unit = torch.randn(count, 3, generator=generator)
-    unit = unit / unit.norm(dim=1, keepdim=True) * torch.rand(len(unit), 1, generator=generator) ** (1 / 3)
-    points = (unit * bounds.radius + torch.tensor(bounds.centre)).to(device)
+    points = points_in(bounds, count, generator).to(device)
     points = points[~field.occupancy.contains(points)].to(field.dtype)
-    opacity = [1 - torch.exp(-density(points) * bounds.radius / 10) for density in field.densities]
-    return EMPTINESS * sum((each.sum() for each in opacity), torch.zeros((), device=device)) / len(unit)
+    opacity = [thin_opacity(density(points), bounds) for density in field.densities]
+    return EMPTINESS * sum((each.sum() for each in opacity), torch.zeros((), device=device)) / count

@@ -18,6 +18,8 @@ from hyperplanes.data.support import SingleView
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.training.drawing import points_in
+from hyperplanes.training.emptiness import thin_opacity
 from hyperplanes.training.episodes import Episode
 from hyperplanes.training.trainer import Trainer
 from hyperplanes.views import Tasks
@@ -173,15 +175,15 @@ class MatchedTrainer(_InitialisationTrainer):
         total = torch.zeros((), device=self.model.rig.device)
         for episode, generator in zip(episodes, generators, strict=True):
             bounds = episode.prepared.occupancy.bounds
-            points, directions = (_in_sphere(self.config.rays, generator, unit) for unit in (False, True))
-            points = (points * bounds.radius + torch.tensor(bounds.centre)).to(total)
-            directions = directions.to(total)
+            points = points_in(bounds, self.config.rays, generator).to(total)
+            directions = torch.randn(self.config.rays, 3, generator=generator).to(total)
+            directions = torch.nn.functional.normalize(directions, dim=1)
             made = [model.field(episode.prepared, model.theta) for model in (self.model, self.reference)]
             for mine, wanted in zip(*([each.field, each.proposal] for each in made), strict=True):
                 if mine is None or wanted is None:
                     continue
                 (colour, density), (true_colour, true_density) = mine(points, directions), wanted(points, directions)
-                opacity, true_opacity = (1 - torch.exp(-s * bounds.radius / 10) for s in (density, true_density))
+                opacity, true_opacity = (thin_opacity(each, bounds) for each in (density, true_density))
                 total = total + (colour - true_colour).square().mean() + (opacity - true_opacity).square().mean()
         (total / len(episodes)).backward()
         return float(total.detach()) / len(episodes)
@@ -221,9 +223,3 @@ def _draw(
     """Rays of the query views or of the planes of an object, and their colours."""
     views, live = (episode.prepared.views, episode.support_live) if of_support else (episode.query, episode.live)
     return views.sample_rays(count, generator=generator, among=live, span=field.sampling.span)
-
-
-def _in_sphere(count: int, generator: torch.Generator, surface: bool) -> Tensor:
-    """Random points of the unit ball, or of its surface."""
-    unit = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    return unit if surface else unit * torch.rand(count, 1, generator=generator) ** (1 / 3)

@@ -167,3 +167,20 @@ def test_from_scratch_nothing_that_was_trained_is_used(support):
     assert torch.equal(*pictures)
     other = FromScratch(small_model(), 2, replace(WEIGHTS, seed=1)).adapt(support).render(cameras).images
     assert not torch.equal(pictures[0], other)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"free": "theta"}, "free: expected one of 'weights', 'hypernetwork', got 'theta'"),
+        ({"optimiser": "lion"}, "optimiser: expected one of .*, got 'lion'"),
+        ({"rays": 0}, "rays: expected at least 1, got 0"),
+        ({"left_out": 1}, "left_out: expected at least 2, got 1"),
+        ({"longest": 0}, "longest: expected at least 1, got 0"),
+        ({"learning_rate": -1.0}, "learning_rate: expected a finite number of 0 or more, got -1.0"),
+        ({"muon_learning_rate": float("nan")}, "muon_learning_rate: expected a finite number"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        FineTuning(**settings)

@@ -118,6 +118,12 @@ def test_poses_are_those_of_the_cameras_of_hyperplanes():
     assert np.allclose(camera.centres(part).numpy(), rig.camera_centres[[4, 0]], atol=1e-12)
 
 
+def test_straight_above_and_below_the_origin_the_image_top_is_the_same_axis():
+    centres = np.array([[0.0, 3.0, 0.0], [0.0, -2.0, 0.0], [1e-7, 3.0, 0.0], [1e-5, 3.0, 0.0], [0.0, 1.0, 2.0]])
+    expected = torch.linalg.inv(look_at(torch.from_numpy(centres)))
+    np.testing.assert_allclose(rigs.look_at_origin(centres), expected, atol=1e-9)
+
+
 def test_one_intrinsic_matrix_serves_all_views():
     rig = rigs.fixed(4, 16)
     same = Rig(rig.world_from_camera, rig.intrinsics[0], 16, 16, 2.0, 4.0)

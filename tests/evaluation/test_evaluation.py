@@ -56,6 +56,25 @@ def test_scores_are_means_over_the_query_views():
     assert score.objects[0].image_seconds == score.objects[0].adapt_seconds + score.objects[0].render_seconds
 
 
+class Glass(Balls):
+    """Objects of which the second has masks that never count as foreground."""
+
+    def task(self, name):
+        task = super().task(name)
+        masks = task.query.masks * (0.4 if name == "test1" else 1.0)
+        return replace(task, query=replace(task.query, masks=masks))
+
+
+def test_an_object_without_foreground_has_no_quality_there_and_the_others_keep_theirs():
+    data = Glass(test=2)
+    score = evaluate("nearest_view", NearestView(), data, ["test0", "test1"])
+    assert score.objects[1].psnr_foreground is None
+    assert score.mean("psnr_foreground") == score.objects[0].psnr_foreground
+    assert "psnr_foreground" in score.quantities
+    again = Score.of_json("nearest_view", json.loads(json.dumps(score.as_json())))
+    assert again.objects == score.objects
+
+
 def test_pictures_are_clamped_before_they_are_compared():
     data = Balls(test=1)
 

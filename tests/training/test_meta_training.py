@@ -7,7 +7,7 @@ import torch
 
 from hyperplanes.adaptation import FineTuned, HyperPlanes, InitialisationConfig
 from hyperplanes.adaptation.fine_tuned import shuffled
-from hyperplanes.adaptation.fine_tuning import ray_loss
+from hyperplanes.adaptation.fine_tuning import FineTuning, ray_loss
 from hyperplanes.data.support import SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.parameters import Parameters
@@ -131,6 +131,20 @@ def test_a_reference_that_does_not_fit_is_refused(tmp_path):
     other = small_model(hypernetwork=None, initialisation=InitialisationConfig())
     with pytest.raises(ValueError, match="reference: expected mv_meta .*, got other target"):
         initialisation_trainer(model, Balls(), FAST, None, other)
+
+
+@pytest.mark.parametrize(("name", "value"), [("random_background", True), ("empty_points", 64)])
+def test_what_inner_steps_do_not_do_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"training.{name}: expected .* for mv_meta"):
+        initialisation_trainer(model_of("mv_meta"), Balls(), replace(FAST, **{name: value}), None)
+
+
+def test_gradient_steps_from_an_initialisation_are_plain_descent_unless_an_optimiser_is_stated():
+    config, given = InitialisationConfig(inner_rate=0.3), FineTuning(learning_rate=0.1, final=0.2, seed=4)
+    for rate, settings in ((0.3, config.descent()), (0.1, config.descent(given=given))):
+        assert (settings.optimiser, settings.learning_rate, settings.final) == ("sgd", rate, 1.0)
+    adam = config.descent(given=replace(given, optimiser="adam"))
+    assert (adam.optimiser, adam.learning_rate, adam.final, adam.seed) == ("adam", 0.1, 0.2, 4)
 
 
 def test_objects_in_another_order_have_the_same_results_and_the_initialisation_stays_as_it_is():

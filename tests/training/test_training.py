@@ -172,16 +172,6 @@ def test_a_rate_of_zero_freezes_its_part_alone(frozen):
     assert moved == ({"hypernetwork"} if frozen == "theta" else {"networks"})
 
 
-def test_theta_and_the_hypernetwork_move_in_turns_when_asked_to():
-    model = small_model()
-    trainer = Trainer(model, Balls(), with_(alternating=True))
-    for moving in ("networks", "hypernetwork", "networks"):
-        before = {name: value.clone() for name, value in model.named_parameters()}
-        trainer.take_step()
-        moved = {name.split(".")[0] for name, value in model.named_parameters() if not torch.equal(value, before[name])}
-        assert moved == {moving}
-
-
 def test_muon_moves_the_hidden_matrices_by_its_own_rate():
     model = small_model()
     before = state_of(model)
@@ -216,7 +206,11 @@ def test_the_paper_keeps_its_rate():
 
 
 def test_several_objects_a_step_are_averaged():
-    assert all(0 < loss < 1 for loss in losses(small_model(), with_(tasks=3), 2))
+    found = []
+    for tasks in (1, 3):  # one object: three draws of it differ in their rays alone
+        trainer = Trainer(small_model(hypernetwork=None), Balls(train=1), with_(tasks=tasks, rays=4096))
+        found.append((trainer.take_step(), trainer.norms()["gradient_theta"]))
+    assert found[1] == pytest.approx(found[0], rel=0.1)
 
 
 def test_objects_that_fall_out_of_memory_change_nothing():

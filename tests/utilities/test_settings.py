@@ -85,6 +85,11 @@ def test_every_field_of_every_configuration_can_be_set_by_an_option(base):
         assert {name for name in entries if now[name] != entries[name]} == {path}
 
 
+def test_one_number_is_a_list_of_one_where_a_list_is_expected():
+    made = changed(preset("small"), parse_options(["--training.views", "5"]))
+    assert made.training.views == (5,)
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_configuration_written_is_the_one_read(name, tmp_path):
     chosen = configure(name, "multiplane", seed=4)
