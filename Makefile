@@ -23,8 +23,8 @@ lint: $(DEVELOP)  ## style and docstrings
 types: $(DEVELOP)  ## static types
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-bench: $(DEVELOP)  ## every benchmark, the short way
-	for name in lookup rendering training generation; do \
+bench: $(DEVELOP)  ## the benchmarks that need no data of yours, the short way
+	for name in lookup visibility rendering training generation; do \
 		if [ -f benchmarks/$$name.py ]; then $(BIN)/python -m benchmarks $$name --quick || exit 1; fi; \
 	done
 

@@ -3,6 +3,9 @@
 import sys
 from importlib import import_module
 
+from hyperplanes.checkpoints import CheckpointError
+from hyperplanes.files import DataError
+
 NAMES = ("any_order", "generation", "hypernetwork", "lookup", "rendering", "training", "views", "visibility")
 
 
@@ -17,7 +20,11 @@ def main(arguments: list[str]) -> int:
         wanted = not arguments or arguments[0] not in ("-h", "--help")
         print(f"benchmarks: expected one of {', '.join(NAMES)}, {asked}", file=sys.stderr if wanted else sys.stdout)
         return 2 if wanted else 0
-    return int(import_module(f"benchmarks.{arguments[0]}").main(arguments[1:]) or 0)
+    try:
+        return int(import_module(f"benchmarks.{arguments[0]}").main(arguments[1:]) or 0)
+    except (DataError, CheckpointError) as error:
+        print(f"benchmarks {arguments[0]}: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from hyperplanes.rendering.renderer import Marched
 from hyperplanes.rendering.transmittance import compiled_transmittance, transmittance
 from hyperplanes.rendering.voxels import compiled_caster, distance_to_filled, render_voxels
 
-__all__ = ["BakedScene", "bake"]
+__all__ = ["BakedScene", "bake", "coarsening"]
 
 CHUNK = 1 << 12
 SIDE = 128  # voxels an axis of the grid of transmittances; half of that where they are not computed by numba
@@ -92,9 +92,7 @@ def bake(adapted: AdaptedField, *, side: int = 256, directions: int = 24) -> Bak
     """
     if directions < HARMONICS:
         raise ValueError(f"directions: expected at least {HARMONICS}, one a harmonic, got {directions}")
-    coarser = max(2, side // (SIDE if compiled_transmittance() else SIDE // 2))
-    if side % coarser or not 8 <= side <= LARGEST_SIDE:
-        raise ValueError(f"side: expected a multiple of {coarser} from 8 to {LARGEST_SIDE}, got {side}")
+    coarser = coarsening(side)
     view = camera.fibonacci_sphere(directions, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
     coarse = _resampled(adapted.refined_occupancy, side // coarser)
     optical_depth = torch.zeros_like(coarse.occupied, dtype=view.dtype)
@@ -117,6 +115,21 @@ def bake(adapted: AdaptedField, *, side: int = 256, directions: int = 24) -> Bak
     index = torch.full((side**3,), -1, dtype=torch.int32, device=view.device)
     index[filled] = torch.arange(len(filled), dtype=torch.int32, device=view.device)
     return BakedField(index.reshape(side, side, side).cpu(), values.cpu(), fine.bounds)
+
+
+def coarsening(side: int) -> int:
+    """How many voxels along an axis share the transmittance of one, in a field of so many an axis.
+
+    Args:
+        side: voxels an axis.
+
+    Raises:
+        ValueError: too few, too many, or no multiple of that number.
+    """
+    coarser = max(2, side // (SIDE if compiled_transmittance() else SIDE // 2))
+    if side % coarser or not 8 <= side <= LARGEST_SIDE:
+        raise ValueError(f"side: expected a multiple of {coarser} from 8 to {LARGEST_SIDE}, got {side}")
+    return coarser
 
 
 def _voxels(

@@ -265,16 +265,17 @@ def extract_mesh(
         The surface, closed at the border of the cube too.
 
     Raises:
-        ValueError: a density that never reaches the level; fewer than 8 voxels.
+        ValueError: a level that is not positive or that the density never reaches; fewer than 8 voxels.
     """
     from skimage.measure import marching_cubes
 
     bounds, device = field.occupancy.bounds, field.occupancy.occupied.device
     density = density_grid(field, voxels) if density is None else density
     level = level if level is not None else 32 * math.log(2) / bounds.radius
-    if not float(density.max()) > level:
+    if not 0 < level < float(density.max()):
         raise ValueError(
-            f"level: expected less than the highest density, {float(density.max()):.3g}, got {level:.3g}; "
+            f"level: expected more than 0 and less than the highest density, {float(density.max()):.3g}, "
+            f"got {level:.3g}; "
             "give a lower one, or a model that was trained longer"
         )
     volume = np.pad(density.cpu().numpy(), 1)

@@ -29,6 +29,7 @@ from hyperplanes.commands import find_verbs
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.data import DataError, read_task
+from hyperplanes.data.dataset import locate_scene
 from hyperplanes.demo.pipeline import DemoSettings, configurations
 from hyperplanes.export import to_pixels
 from hyperplanes.fields.baked import BakedField
@@ -165,6 +166,27 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ([*RENDER, "--size", "32"], ["--size: expected --orbit, whose pictures it is for, got 32"]),
         ([*RENDER, "--orbit", "2", "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
         ([*BAKE, "OUT/bk"], ["--out: expected a name that ends in .safetensors, got OUT/bk"]),
+        (
+            ["train", "--data", "DATA", "--out", "DATA"],
+            ["--out: expected a folder of its own, got DATA, which is --data"],
+        ),
+        (
+            ["train", "--data", "DATA", "--steps", "3", "--epochs", "1", "--out", "OUT/run"],
+            ["--steps, --epochs: expected one of the two, got 3 and 1"],
+        ),
+        (
+            ["evaluate", "--data", "DATA", "--method", "nearest_view", "--objects", "0"],
+            ["--objects: expected at least 1"],
+        ),
+        (
+            ["export", "--checkpoint", "RUN", "--views", "DATA", "--out", "OUT/x", "--level", "-3"],
+            ["--level: expected a density above 0, got -3"],
+        ),
+        ([*BAKE, "OUT/bk.safetensors", "--voxels", "0"], ["--voxels: side: expected a multiple of 2 from 8 to 512"]),
+        (
+            ["render", "--checkpoint", "RUN", "--views", "pyproject.toml", "--out", "OUT/x"],
+            ["pyproject.toml", "found a file of another kind"],
+        ),
         ([*BAKE, "OUT/bk.safetensors", "--orbit", "0"], ["--orbit: expected at least 1 frame, got 0"]),
         (["inspect", "OUT/none"], ["OUT/none: expected a data set, posed images, a checkpoint", "found nothing"]),
     ],
@@ -183,6 +205,20 @@ def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, cap
     line = complaint(capsys)
     assert all(placed(part) in line for part in parts), line
     assert not list(tmp_path.iterdir()), "what is refused leaves nothing behind"
+
+
+@pytest.mark.parametrize(
+    ("verb", "out", "more"),
+    [("render", "photos/images", []), ("export", "photos", ["--what", "images"])],
+)
+def test_pictures_are_not_written_over_those_that_are_read(verb, out, more, tmp_path, monkeypatch, capsys):
+    shutil.copytree(locate_scene("example-car"), tmp_path / "photos")
+    monkeypatch.chdir(tmp_path)
+    before = {path: path.read_bytes() for path in (tmp_path / "photos").rglob("*") if path.is_file()}
+    arguments = [verb, "--checkpoint", str(demo_folder() / "hyperplanes"), "--views", "photos", "--out", out, *more]
+    assert main(arguments) == 2
+    assert "--out: expected a folder without the pictures that are read, got photos/images" in complaint(capsys)
+    assert {path: path.read_bytes() for path in (tmp_path / "photos").rglob("*") if path.is_file()} == before
 
 
 def test_a_traceback_is_shown_when_asked_for():
@@ -568,7 +604,7 @@ def test_photographs_with_a_background_are_warned_about_and_ways_up_are_said(tmp
     assert "up: y, as the cameras are held; --up says otherwise" in shown.out
     assert "rendering 6/6" in shown.out
     assert "the views have no alpha and no masks" in shown.err
-    assert re.search("worse than copying the nearest view: .*; --steps 100 adapts", shown.err)
+    assert re.search("worse than copying the nearest view: .*; cut the object out first", shown.err)
 
 
 def test_the_demonstration_does_nothing_twice(capsys):

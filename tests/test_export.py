@@ -98,7 +98,7 @@ def test_the_level_is_the_one_with_the_rendered_silhouettes():
     assert agreement(surface, adapted, cameras).overlap > 0.9
     hazy = extract_mesh(adapted, level=0.1, density=density)
     assert agreement(hazy, adapted, cameras).overlap == pytest.approx((0.5 / RADIUS) ** 2, abs=0.07)
-    with pytest.raises(ValueError, match="level: expected less than the highest density, 8, got 11.1"):
+    with pytest.raises(ValueError, match="level: expected more than 0 and less than the highest density, 8, got 11.1"):
         extract_mesh(adapted, density=density)
 
 

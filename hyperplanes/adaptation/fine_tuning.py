@@ -186,6 +186,7 @@ def best_stop(
     pixels: Int[Tensor, " pixel"] | None = None,
     judged: Int[Tensor, " judged"] | None = None,
     hiding: bool = False,
+    on_step: Callable[[int], None] | None = None,
 ) -> int:
     """After how many steps of a schedule of `settings.longest` the field shows left-out views best; 0 for none.
 
@@ -201,6 +202,7 @@ def best_stop(
         pixels: as in `minimise`.
         judged: flat indices of the pixels of `left_out` that count.
         hiding: as in `minimise`.
+        on_step: called with the number of steps done, before the first and after each.
 
     Returns:
         A number of steps.
@@ -214,6 +216,8 @@ def best_stop(
 
     best = 0
     for step in minimise(field, variables, support, settings.longest, settings, pixels=pixels, hiding=hiding):
+        if on_step is not None:
+            on_step(step)
         if step not in (0, every // 3, settings.longest) and step % every:
             continue
         with torch.no_grad():

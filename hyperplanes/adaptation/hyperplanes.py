@@ -297,6 +297,7 @@ class HyperPlanes(nn.Module):
         settings: FineTuning | None = None,
         *,
         on_step: Callable[[int], None] | None = None,
+        on_trial: Callable[[int], None] | None = None,
     ) -> AdaptedField:
         """The field of one object after gradient steps on its support views; the model itself stays as it is.
 
@@ -309,6 +310,7 @@ class HyperPlanes(nn.Module):
                 support views best that were left out for the purpose; 0 where every step made those worse.
             settings: what is optimised, rates, rays and seed.
             on_step: called with the number of steps done, before the first and after each.
+            on_trial: likewise, while "auto" finds how many they are to be; there are up to `settings.longest`.
 
         Returns:
             The field. A model that takes a second pass takes it twice: the steps keep the surface of the weights that
@@ -326,7 +328,9 @@ class HyperPlanes(nn.Module):
         if steps != "auto" and steps < 0:
             raise ValueError(f"steps: expected 0 or more, or 'auto', got {steps}")
         given, support = support, support.views if isinstance(support, Prepared) else self._to_own(support)
-        schedule, stop = (settings.longest, self._best_stop(support, settings)) if steps == "auto" else (steps, steps)
+        schedule = stop = settings.longest if steps == "auto" else steps
+        if steps == "auto":
+            stop = self._best_stop(support, settings, on_trial)
         prepared = given if isinstance(given, Prepared) else self.prepare(support)
         weights, variables = self._tunable(prepared, settings)
         field, pixels = self._hiding(prepared, weights), self._live_pixels(prepared, support)
@@ -338,7 +342,7 @@ class HyperPlanes(nn.Module):
         with torch.no_grad():
             return self.rendering_field(prepared, weights())
 
-    def _best_stop(self, support: Views, settings: FineTuning) -> int:
+    def _best_stop(self, support: Views, settings: FineTuning, on_step: Callable[[int], None] | None) -> int:
         """How many steps of fine-tuning show left-out views best; they are neither planes nor give rays meanwhile."""
         if len(support) < 3:
             raise ValueError(f"steps: expected at least 3 support views to choose their number by, got {len(support)}")
@@ -356,6 +360,7 @@ class HyperPlanes(nn.Module):
             pixels=self._live_pixels(prepared, shown),
             judged=self._live_pixels(prepared, judged),
             hiding=self.any_order,
+            on_step=on_step,
         )
 
     def _tunable(self, prepared: Prepared, settings: FineTuning) -> tuple[Callable[[], Parameters], Sequence[Tensor]]:

@@ -77,18 +77,21 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
 def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
     from hyperplanes.adaptation.base import AdaptedField
-    from hyperplanes.baking import BakedScene, bake
+    from hyperplanes.baking import BakedScene, bake, coarsening
     from hyperplanes.devices import choose_device
     from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
     from hyperplanes.files import write_whole
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.metrics import psnr
+    from hyperplanes.utilities.errors import prefix_errors
 
     if arguments.out.is_dir():
         raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")
     if arguments.out.suffix != ".safetensors":
         raise ValueError(f"--out: expected a name that ends in .safetensors, got {arguments.out}; add the ending")
     check_orbit(arguments.orbit, arguments.size)
+    with prefix_errors("--voxels"):
+        coarsening(arguments.voxels)
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "bake")
     model = load_adaptable(arguments.checkpoint, device, second_pass=arguments.second_pass)

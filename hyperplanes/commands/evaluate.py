@@ -48,9 +48,9 @@ class Arguments:
 
     Attributes:
         data: A data set or one posed scene; example-car comes with the package.
-        method: nearest_view and hull_blend (nothing is learned); nerf, multiplane, point_multiplane, hyperplanes,
-            hyperplanes_swapped (each object with the update of another), autoencoder; scratch_N (the field of a
-            checkpoint from random weights), nerf_scratch_N, multiplane_scratch_N, point_multiplane_scratch_N (no
+        method: nearest_view and hull_blend (nothing is learned); nerf, multiplane, point_multiplane, any_order,
+            hyperplanes, hyperplanes_swapped (each object with the update of another), autoencoder; scratch_N (the field
+            of a checkpoint from random weights), nerf_scratch_N, multiplane_scratch_N, point_multiplane_scratch_N (no
             checkpoint is needed); standard, mv_matched, mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but
             the first two and hyperplanes_swapped may be followed by _N or _auto for gradient steps.
         checkpoint: Folders that `train` wrote, folders of them such as runs/demo, or a packaged model: small,
@@ -181,6 +181,8 @@ def run(arguments: Arguments) -> int:
     tasks = opened if arguments.support is None else WithSupport(opened, arguments.support)
     data = TasksOnDevice(tasks, device, _up(arguments, opened, console))
     names = data.names(arguments.split)[: arguments.objects]
+    if arguments.objects is not None and arguments.objects < 1:
+        raise ValueError(f"--objects: expected at least 1, got {arguments.objects}")
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
     sampling = PROTOCOLS[arguments.protocol]

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
 from hyperplanes.commands.options import OptionalInt, Steps, ViewsUp, optional
-from hyperplanes.commands.scene import read_scene
+from hyperplanes.commands.scene import read_scene, refuse_sources
 from hyperplanes.commands.writing import writes_to
 
 __all__ = ["Arguments", "run"]
@@ -81,6 +81,8 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export import save_images, save_turntable
     from hyperplanes.surface import agreement, choose_level, density_grid, extract_mesh, fill_hidden, save_mesh
 
+    if arguments.level is not None and not arguments.level > 0:
+        raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, _ = read_scene(
@@ -90,6 +92,7 @@ def run(arguments: Arguments) -> int:
         up=arguments.up,
         downscale=arguments.downscale,
     )
+    refuse_sources(out / "images", arguments.views, task.query.names)
     shown, query = task.support.to(device), task.query.to(device)
     field, _ = adapt_to(source, shown, task.name, console, steps=arguments.steps)
     if "images" in arguments.what:

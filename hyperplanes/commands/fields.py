@@ -103,6 +103,7 @@ def adapt_to(
     Raises:
         ValueError: fine-tuning steps of a baked scene.
     """
+    from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.baking import BakedScene
     from hyperplanes.commands.suitability import misgivings
 
@@ -113,19 +114,23 @@ def adapt_to(
             )
         console.say(f"{len(source.field.values):,} baked voxels, shown from the poses of {name}")
         return source, []
-    warned = misgivings(source, shown)
+    warned = misgivings(source, shown, steps)
     for line in warned:
         console.warn(f"{name}: {line}")
-    started, taken = time.perf_counter(), []
-    total = None if steps == "auto" else steps
+    started, taken, settings = time.perf_counter(), [], settings or FineTuning()
     with console.bar("fine-tuning") as bar:
 
         def count(done: int) -> None:
             taken.append(done)
-            if total:
-                bar.show(done, total, "steps")
+            if steps == "auto":
+                bar.show(done, settings.longest, "steps at most")
+            elif steps:
+                bar.show(done, steps, "steps")
 
-        field = source.fine_tune(shown, steps, settings, on_step=count)
+        def count_trials(done: int) -> None:
+            bar.show(done, settings.longest, "steps at most, to find how many")
+
+        field = source.fine_tune(shown, steps, settings, on_step=count, on_trial=count_trials)
     how = f", {taken[-1]} fine-tuning steps" if any(taken) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")

@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, ViewsUp, check_orbit, optional
-from hyperplanes.commands.scene import read_scene
+from hyperplanes.commands.scene import read_scene, refuse_sources
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
 
@@ -92,6 +92,7 @@ def run(arguments: Arguments) -> int:
         up=arguments.up,
         downscale=arguments.downscale,
     )
+    refuse_sources(arguments.out, arguments.views, task.query.names)
     shown, asked = task.support.to(device), task.query.to(device)
     settings = FineTuning(free=arguments.fine_tune)
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
@@ -127,7 +128,7 @@ def run(arguments: Arguments) -> int:
                 f"copying the nearest view {scores[1]:.2f} dB"
             )
             scores = scores if arguments.steps == 0 else None
-    for line in worse_than_copying(*scores, arguments.steps) if scores else []:
+    for line in worse_than_copying(shown, *scores, arguments.steps) if scores else []:
         console.warn(f"{task.name}: {line}")
     console.say(f"{arguments.out}: {len(paths)} pictures, {format_duration(seconds)} each")
     return 0

@@ -68,3 +68,21 @@ def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
         else "up: y; the cameras do not tell, --up says otherwise"
     )
     return guessed or "y"
+
+
+def refuse_sources(folder: Path, path: Path, names: Sequence[str]) -> None:
+    """One line where pictures would be written over those that were read.
+
+    Args:
+        folder: to write into.
+        path: of the posed images that were read.
+        names: of their pictures, relative to it or to its folder images/.
+
+    Raises:
+        ValueError: a folder that holds one of them.
+    """
+    root = path if path.is_dir() else path.parent
+    if folder.resolve() in {(root / name).parent.resolve() for name in (*names, "images/any")}:
+        raise ValueError(
+            f"--out: expected a folder without the pictures that are read, got {folder}, where they are; name another"
+        )

@@ -18,16 +18,22 @@ JUDGED = 4  # left-out views, and pixels along their longer side
 JUDGED_SIZE = 64
 
 
-def misgivings(model: HyperPlanes, shown: Views) -> list[str]:
+def misgivings(model: HyperPlanes, shown: Views, steps: object = 0) -> list[str]:
     """What speaks against good pictures, a sentence each, before anything has been adapted.
 
     Args:
         model: what will adapt.
         shown: the views it will be shown.
+        steps: fine-tuning steps that are asked for.
     """
     found = []
-    covered = 1.0 if shown.masks is None else float(shown.masks.mean())
-    if covered > COVERED:
+    if steps and model.any_order and len(shown) < 3:
+        found.append(
+            f"{len(shown)} views are shown, too few to hide any from itself: fine-tuning learns to copy them, and new "
+            "views become worse; leave --steps out"
+        )
+    if _covered(shown) > COVERED:
+        covered = _covered(shown)
         what = "no alpha and no masks" if shown.masks is None else f"masks that cover {covered:.0%}"
         found.append(
             f"the views have {what}, and the model was trained on objects over white: it takes the background for the "
@@ -39,18 +45,24 @@ def misgivings(model: HyperPlanes, shown: Views) -> list[str]:
     unlike, angle = _unlikeness(model, shown)
     if unlike is not None and unlike > UNLIKE:
         found.append(
-            f"the views are unlike those of the training: their codes deviate {unlike:.1f} times as much as those did; "
-            "--steps 100 adapts to them"
+            f"the views are unlike those of the training: their codes deviate {unlike:.1f} times as much as those did"
+            + ("" if steps else "; --steps 100 adapts to them")
         )
     if angle > ELSEWHERE and len(shown) >= planes:
         found.append(f"the cameras stand {angle:.0f} degrees from where those of the training stood, on average")
     return found
 
 
-def worse_than_copying(rendered: float, copied: float, steps: object) -> list[str]:
+def _covered(shown: Views) -> float:
+    """Mean opacity of the masks; 1 where there are none."""
+    return 1.0 if shown.masks is None else float(shown.masks.mean())
+
+
+def worse_than_copying(shown: Views, rendered: float, copied: float, steps: object) -> list[str]:
     """A sentence where the pictures of a field are worse than the nearest view, copied.
 
     Args:
+        shown: the views that it was shown.
         rendered: PSNR of the field in decibels.
         copied: PSNR of the nearest view.
         steps: fine-tuning steps that were asked for.
@@ -58,6 +70,7 @@ def worse_than_copying(rendered: float, copied: float, steps: object) -> list[st
     if rendered >= copied:
         return []
     advice = "--steps 100 adapts the model to the views" if steps == 0 else "check masks, poses and --up"
+    advice = "cut the object out first" if _covered(shown) > COVERED else advice
     return [f"worse than copying the nearest view: {rendered:.2f} dB against {copied:.2f} dB; {advice}"]
 
 

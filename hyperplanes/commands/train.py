@@ -203,7 +203,11 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
         chosen = chosen.by_method(arguments.method or chosen.model.method, arguments.field)
     options = {"steps": arguments.steps, "epochs": arguments.epochs, "seed": arguments.seed}
     if arguments.steps is not None:
-        options["epochs"] = arguments.epochs or 0
+        if arguments.epochs:
+            raise ValueError(
+                f"--steps, --epochs: expected one of the two, got {arguments.steps} and {arguments.epochs}"
+            )
+        options["epochs"] = 0
     if arguments.cache_size is not None:
         options["memory"] = int(arguments.cache_size * 2**30)
     for name, value in options.items():
@@ -250,6 +254,8 @@ def _run(arguments: Arguments) -> int:
     from hyperplanes.training.launching import count_processes, launched
     from hyperplanes.training.watching import TensorBoard
 
+    if arguments.out.resolve() in {path.resolve() for path in arguments.data}:
+        raise ValueError(f"--out: expected a folder of its own, got {arguments.out}, which is --data; name another one")
     first = _is_first(arguments)
     console = Console(silent=not first)
     method, chosen = resolve(arguments)

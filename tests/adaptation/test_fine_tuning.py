@@ -124,8 +124,12 @@ def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, s
 
 
 def test_auto_goes_on_where_steps_show_left_out_views_better():
-    model, support, taken = awaken(small_model()), ball_views(ring(9)), []
-    field = model.fine_tune(support, "auto", replace(WEIGHTS, longest=40, left_out=3), on_step=taken.append)
+    model, support, taken, tried = awaken(small_model()), ball_views(ring(9)), [], []
+    field = model.fine_tune(
+        support, "auto", replace(WEIGHTS, longest=40, left_out=3), on_step=taken.append, on_trial=tried.append
+    )
+    assert tried == list(range(max(tried) + 1))
+    assert max(taken) <= max(tried) <= 40
     assert taken[-1] >= 12
     query = ball_views(ring(4, shift=1))
     quality = [psnr(each.render(query.cameras).images, query.images).mean() for each in (model.adapt(support), field)]

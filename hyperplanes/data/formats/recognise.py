@@ -164,6 +164,7 @@ def _format(folder: Path) -> _Format:
         return found
     refuse_unposed(folder)
     if not folder.is_dir():
-        raise DataError(folder, "a transforms*.json or a folder that holds one", "nothing", "check the path")
+        found = "a file of another kind" if folder.exists() else "nothing"
+        raise DataError(folder, "a transforms*.json or a folder that holds one", found, "check the path")
     names = ", ".join(sorted(child.name for child in folder.iterdir())[:5]) or "an empty folder"
     raise DataError(folder, "transforms.json or another layout of one scene", names, "give one object's folder")

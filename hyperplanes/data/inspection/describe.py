@@ -96,6 +96,8 @@ class Description:
             if first.extent is not None and first.coverage is not None:
                 box = " x ".join(f"{side:.3g}" for side in first.extent)
                 lines.append(f"visual hull: {box}, {first.coverage:.0%} of the pixels covered")
+            else:
+                lines.append("masks: none; the packaged models need them (RGBA images, or a folder masks/)")
             wrong = [one for one in self.objects if not one.consistent]
             shown = (wrong or self.objects)[0]
             lines += [shown.conventions.line(), *shown.problems, *shown.checks]
