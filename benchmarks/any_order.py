@@ -256,7 +256,7 @@ def _judged(model: HyperPlanes, data: Dataset, count: int, objects: int) -> floa
 def configured(name: str, steps: int, seed: int) -> Preset:
     """The preset "small" with a network of 3 x 96, a hull of 64 voxels an axis, 128 rays an object, and one change.
 
-    Objects are neither rotated nor recoloured.
+    Objects are not rotated.
 
     Args:
         name: of VARIANTS, "white" or HYPERNETWORKS; only the last have a hypernetwork.
@@ -273,7 +273,6 @@ def configured(name: str, steps: int, seed: int) -> Preset:
         warmup=min(60, steps // 4),
         held_out=0,
         rotations=0.0,
-        recolouring=0.0,
         random_background=name != "white",
         completion=made.training.completion if wanted and wanted.completed else 0.0,
     )

@@ -34,7 +34,7 @@ from hyperplanes.files import encode_png, write_whole
 from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.metrics import psnr
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.augmentation import Augmentation
+from hyperplanes.training.rotation import Rotation
 from hyperplanes.views import Task, Tasks, Views
 
 __all__ = ["METHODS", "PARTS", "adapters", "main"]
@@ -122,7 +122,7 @@ class _Rotated:
 
     def task(self, name: str) -> Task:
         """One object."""
-        task, rotation = self.data.task(name), Augmentation(math.radians(self.degrees))
+        task, rotation = self.data.task(name), Rotation(math.radians(self.degrees))
         return Task(rotation.views(task.support), rotation.views(task.query), task.name)
 
 

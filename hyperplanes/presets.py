@@ -138,7 +138,7 @@ class Preset:
 
 def _of_all_views(training: TrainingConfig) -> TrainingConfig:
     """The same on the objects as they are and all their support views, not on episodes of some."""
-    return replace(training, views=(), rotations=0.0, recolouring=0.0)
+    return replace(training, views=(), rotations=0.0)
 
 
 MAML_STEPS = 4
@@ -194,7 +194,6 @@ PRESETS: dict[str, Preset] = {
             rays=256,
             views=(1, 2, 3, 4, 5, 7, 10, 15, 25, 40),
             rotations=0.5,
-            recolouring=0.3,
             random_background=True,
             completion=0.1,
             optimiser="muon",

@@ -17,7 +17,7 @@ from hyperplanes.fields import TargetConfig
 from hyperplanes.hypernetwork import HyperNetworkConfig
 from hyperplanes.metrics import psnr
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.training.augmentation import Augmentation
+from hyperplanes.training.rotation import Rotation
 from tests.reference_rendering import Balls, small_model
 
 SMALL = {"views": 1, "normalisation": "group", "code": 16, "depth": 2, "width": 32}
@@ -151,7 +151,7 @@ def test_a_car_that_faces_another_way_costs_little(count, most):
     """3.8 and 0.2 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
     model, found = HyperPlanes.from_pretrained("small"), {}
     for degrees in (0, 45):
-        rotation = Augmentation(math.radians(degrees))
+        rotation = Rotation(math.radians(degrees))
         values = []
         for task in cars():
             shown, query = (rotation.views(part) for part in (task.support[:: 25 // count][:count], task.query[::12]))

@@ -1,10 +1,10 @@
 """Run a table or a figure of the HyperPlanes paper and print it beside the paper's numbers.
 
-The scale `smoke` takes seconds and shows that everything runs; `small` is sized for two cores, about an hour each, on
-procedural objects that `hyperplanes generate` makes; `paper` is the paper's setting on data sets as they were
-published, one folder a class, and says first how many hours it will take by what it has measured here. All tables share
---out: a data set, a training or an evaluation that lies there is not made again, so Ctrl-C and the same command go on.
-The table goes to --out/NAME as Markdown, CSV and JSON with its figure.
+The scale `smoke` takes seconds and shows that everything runs; `small` is sized for two cores, one to a few hours each,
+as --estimate says, on procedural objects that `hyperplanes generate` makes; `paper` is the paper's setting on data sets
+as they were published, one folder a class, and says first how long it will take by what it has measured here. All
+tables share --out: a data set, a training or an evaluation that lies there is not made again, so Ctrl-C and the same
+command go on. The table goes to --out/NAME as Markdown, CSV and JSON with its figure.
 
 Example:
     hyperplanes reproduce target --scale smoke
@@ -127,7 +127,7 @@ def run(arguments: Arguments) -> int:
     if arguments.estimate or scale.name == "paper":
         found = estimate(runner, experiment, seeds)
         console.table(found.headings, found.rows)
-        console.say(f"all of it: {format_duration(found.seconds)} on this machine, {found.seconds / 3600:.1f} hours")
+        console.say(f"all of it: {format_duration(found.seconds)} on this machine")
         if arguments.estimate:
             return 0
     outcome = runner.run(experiment, seeds)

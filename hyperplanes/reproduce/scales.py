@@ -119,7 +119,7 @@ SCALES: dict[str, Scale] = {
         ),
         Scale(
             "small",
-            "about an hour on two cores: 64x64, procedural objects",
+            "one to a few hours on two cores: 64x64, procedural objects",
             {128: "quick", 200: "quick"},
             "default",
             64,

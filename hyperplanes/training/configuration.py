@@ -32,7 +32,6 @@ class TrainingConfig:
         rotations: share of the episodes of `views` whose object is rotated about the vertical axis by a random angle. A
             grid of features and what reads it know objects as they stand in the training; photographs come with any
             heading.
-        recolouring: share of those episodes whose colour channels are permuted and darkened at random.
         random_background: prediction and truth are composited over a random colour for every object and step, as far
             as masks say what is background: over white alone, a white surface cannot be told from none.
         empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
@@ -70,7 +69,6 @@ class TrainingConfig:
     views: tuple[int, ...] = ()
     episodes: Annotated[int, range(1, 4097)] = 16
     rotations: float = 0.0
-    recolouring: float = 0.0
     random_background: bool = False
     empty_points: Annotated[int, range(2**24)] = 0
     completion: float = 0.0
@@ -101,10 +99,8 @@ class TrainingConfig:
         ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a finite number of 0 or more, got {getattr(self, name)}")
-        for name in ("rotations", "recolouring"):
-            share = getattr(self, name)
-            if not 0 <= share <= 1:
-                raise ValueError(f"{name}: expected a share from 0 to 1, got {share}")
+        if not 0 <= self.rotations <= 1:
+            raise ValueError(f"rotations: expected a share from 0 to 1, got {self.rotations}")
 
     def steps_for(self, objects: int) -> int:
         """How many steps are taken with so many training objects.

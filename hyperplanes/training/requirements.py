@@ -13,7 +13,7 @@ def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
     """Nothing, where the model can be trained so.
 
     Raises:
-        ValueError: numbers of views for a field that knows them by their places, augmentation without such numbers, or
+        ValueError: numbers of views for a field that knows them by their places, rotations without such numbers, or
             completion for a model without a volume or a grid.
     """
     if config.views and (not model.any_order or min(config.views) < 1):
@@ -27,9 +27,8 @@ def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
                 f"training.{name}: expected {type(getattr(config, name))()} for {model.config.method}, whose steps on "
                 f"an object are plain fine-tuning, got {getattr(config, name)}"
             )
-    for name in ("rotations", "recolouring"):
-        if getattr(config, name) and not config.views:
-            raise ValueError(f"training.{name}: expected 0 without training.views, got {getattr(config, name)}")
+    if config.rotations and not config.views:
+        raise ValueError(f"training.rotations: expected 0 without training.views, got {config.rotations}")
     if config.completion and not (model.reads_volume and model.config.network.grid >= COMPLETED and config.views):
         raise ValueError(
             f"training.completion: expected training.views, a hypernetwork with encoder 'volume' and a grid of at "

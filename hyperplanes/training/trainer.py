@@ -21,7 +21,6 @@ from hyperplanes.files import encode_png, write_json, write_whole
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.augmentation import draw_augmentation
 from hyperplanes.training.averaging import WeightAverage
 from hyperplanes.training.completion import completion_loss
 from hyperplanes.training.configuration import Progress, TrainingConfig
@@ -31,6 +30,7 @@ from hyperplanes.training.emptiness import emptiness_loss
 from hyperplanes.training.episodes import Episode, prepare_episode, prepare_subset, whole_of
 from hyperplanes.training.prefetching import Prefetcher
 from hyperplanes.training.requirements import check_requirements
+from hyperplanes.training.rotation import draw_rotation
 from hyperplanes.training.state import Curve, check_model, load_state, save_state
 from hyperplanes.training.watching import Samples, write_curve
 from hyperplanes.utilities.errors import prefix_errors
@@ -388,8 +388,8 @@ class Trainer:
         generator = episode_generator(self.config.seed, int(number))
         task, config = self.data.task(name), self.config
         whole = self._whole(task)
-        if config.rotations or config.recolouring:
-            drawn = draw_augmentation(config.rotations, config.recolouring, generator)
+        if config.rotations:
+            drawn = draw_rotation(config.rotations, generator)
             task = Task(drawn.views(task.support), drawn.views(task.query), task.name)
             whole = None if whole is None else drawn.volume(whole)
         return prepare_subset(self.model, task, config.views, generator, whole)

@@ -116,7 +116,7 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
     assert (chosen.model.target, chosen.model.hypernetwork) == ("nerf", None)
     assert chosen.model.network == replace(small.model.network, depth=3, grid=0)
     assert chosen.model.sampling == Hierarchical(8, 5)
-    of_any_order = {"views": (), "rotations": 0.0, "recolouring": 0.0, "completion": 0.0}
+    of_any_order = {"views": (), "rotations": 0.0, "completion": 0.0}
     assert chosen.training == replace(small.training, learning_rate=1e-3, steps=11, rays=13, **of_any_order)
     assert resolve(replace(given, method="multiplane", protocol="fast", settings=()))[1].model.sampling == Marched()
     assert resolve(replace(given, cache_size=0.5))[1].training.memory == 2**29

@@ -1,0 +1,78 @@
+"""Rotation of training objects about the vertical axis."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+from torch.nn.functional import affine_grid, grid_sample
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.views import Views
+
+__all__ = ["Rotation", "draw_rotation"]
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """A rotation of an object, the same for all of its views.
+
+    Attributes:
+        angle: in radians, about the vertical axis through the middle of the scene.
+    """
+
+    angle: float = 0.0
+
+    def views(self, views: Views) -> Views:
+        """The views of the rotated object: the same pictures, whose cameras are rotated with it."""
+        return replace(views, cameras=_rotated(views, self.angle)) if self.angle else views
+
+    def volume(self, volume: Float[Tensor, "4 x y z"]) -> Float[Tensor, "4 x y z"]:
+        """The first channels of a volume (`geometry.volume.volume_of`) of the rotated object.
+
+        Args:
+            volume: the share of every cell that is occupied, and its mean colour in [-1, 1]. It is resampled, so that
+                the result is smoother than the volume of the rotated views.
+        """
+        return _resampled(volume, self.angle) if self.angle else volume
+
+
+def draw_rotation(share: float, generator: torch.Generator) -> Rotation:
+    """A random rotation.
+
+    Args:
+        share: probability that there is one, by any angle.
+        generator: of the draws, which are as many whatever they decide.
+    """
+    chance, angle = torch.rand(2, generator=generator).tolist()
+    return Rotation(2 * math.pi * angle) if chance < share else Rotation()
+
+
+def _rotated(views: Views, angle: float) -> PinholeCamera:
+    """The cameras of the views, rotated with the object."""
+    pose = camera.camera_from_world(views.cameras)
+    return camera.with_poses(views.cameras, pose @ torch.linalg.inv(_rotation(angle, views.bounds)).to(pose))
+
+
+def _rotation(angle: float, bounds: Sphere) -> Float[Tensor, "4 4"]:
+    """The rigid motion about the vertical axis through the centre of a sphere, in float64."""
+    x, y, z = bounds.centre
+    cos, sin = math.cos(angle), math.sin(angle)
+    rows = [[cos, 0, sin, x - cos * x - sin * z], [0, 1, 0, 0], [-sin, 0, cos, z + sin * x - cos * z], [0, 0, 0, 1]]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def _resampled(volume: Float[Tensor, "4 x y z"], angle: float) -> Float[Tensor, "4 x y z"]:
+    """A volume rotated, its colours weighted by how much of each cell is occupied."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    inverse = volume.new_tensor([[cos, 0, sin, 0], [0, 1, 0, 0], [-sin, 0, cos, 0]], dtype=torch.float32)
+    share, colours = volume.float().split([1, 3])
+    weighted = torch.cat([share, colours * share])[None]
+    grid = affine_grid(inverse[None], list(weighted.shape), align_corners=False)
+    share, colours = grid_sample(weighted, grid, align_corners=False)[0].split([1, 3])
+    return torch.cat([share, colours / share.clamp_min(1e-6)]).to(volume)
