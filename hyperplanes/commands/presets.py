@@ -8,12 +8,12 @@ Example:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalName
+from hyperplanes.commands.options import optional
 
 if TYPE_CHECKING:
     from hyperplanes.presets import Preset
@@ -31,7 +31,7 @@ class Arguments:
         name: Print all settings of this one.
     """
 
-    name: tyro.conf.Positional[OptionalName] = None
+    name: tyro.conf.Positional[Annotated[str | None, optional("[NAME]")]] = None
 
 
 def row(name: str, preset: Preset) -> tuple[str, ...]:
