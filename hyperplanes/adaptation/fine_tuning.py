@@ -54,7 +54,7 @@ class FineTuning:
         longest: the most steps that "auto" may choose.
         left_out: every so many-th support view is left out of the planes and of the rays while "auto" chooses.
         hide: a field that takes any number of views is not shown those that the rays of a step come from, a share
-            `1 / left_out` of them, as it could copy their colours; of fewer than three views none is hidden.
+            `1 / left_out` of them, as it could copy their colours; a single view cannot be hidden.
         seed: of rays and samples.
 
     Raises:
@@ -135,7 +135,7 @@ def minimise(
     optimisers = settings.optimisers(variables)
     rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
     generator = torch.Generator().manual_seed(settings.seed)
-    hiding = hiding and settings.hide and len(support) > 2
+    hiding = hiding and settings.hide and len(support) > 1
     yield 0
     for step in range(steps):
         with torch.enable_grad():

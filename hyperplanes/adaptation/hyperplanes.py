@@ -317,8 +317,8 @@ class HyperPlanes(nn.Module):
             they begin with, and the field has that of its own.
 
         Raises:
-            ValueError: the hypernetwork of a model that has none, a negative number of steps, or "auto" with fewer
-                than 3 views.
+            ValueError: the hypernetwork of a model that has none, a negative number of steps, "auto" with fewer than 3
+                views, or a single view of a field that takes any number of them, unless `settings.hide` is off.
         """
         settings = settings or FineTuning()
         if self.config.network.grid and settings.free == "weights":
@@ -328,6 +328,11 @@ class HyperPlanes(nn.Module):
         if steps != "auto" and steps < 0:
             raise ValueError(f"steps: expected 0 or more, or 'auto', got {steps}")
         given, support = support, support.views if isinstance(support, Prepared) else self._to_own(support)
+        if steps and len(support) == 1 and self.any_order and settings.hide:
+            raise ValueError(
+                f"steps: expected 0 with a single view, whose colours {self.config.target} would learn to copy, got "
+                f"{steps}; give 2 views or more"
+            )
         schedule = stop = settings.longest if steps == "auto" else steps
         if steps == "auto":
             stop = self._best_stop(support, settings, on_trial)

@@ -27,11 +27,6 @@ def misgivings(model: HyperPlanes, shown: Views, steps: object = 0) -> list[str]
         steps: fine-tuning steps that are asked for.
     """
     found = []
-    if steps and model.any_order and len(shown) < 3:
-        found.append(
-            f"{len(shown)} views are shown, too few to hide any from itself: fine-tuning learns to copy them, and new "
-            "views become worse; leave --steps out"
-        )
     if _covered(shown) > COVERED:
         covered = _covered(shown)
         what = "no alpha and no masks" if shown.masks is None else f"masks that cover {covered:.0%}"

@@ -202,6 +202,21 @@ class Recorder:
         return field
 
 
+def test_of_two_views_one_is_hidden_from_the_rays_of_the_other():
+    recorder = Recorder(views(2))
+    list(minimise(recorder, [recorder.value], views(2), 8, FineTuning(rays=16), hiding=True))
+    assert all(hidden == sources and len(hidden) == 1 for hidden, sources in recorder.notes)
+
+
+def test_a_single_view_is_not_fine_tuned_on_unless_it_may_be_copied():
+    adapter = model(**READERS["volume"])
+    for steps in (3, "auto"):
+        with pytest.raises(ValueError, match="steps: expected 0 with a single view"):
+            adapter.fine_tune(views(1), steps)
+    adapter.fine_tune(views(1), 0)
+    adapter.fine_tune(views(1), 1, FineTuning(hide=False))
+
+
 @pytest.mark.parametrize("among", [False, True])
 def test_rays_come_from_hidden_views_only(among):
     support = views(12)
@@ -213,8 +228,8 @@ def test_rays_come_from_hidden_views_only(among):
     assert len(set.union(*(hidden for hidden, _ in recorder.notes))) > 6  # others in every step
 
 
-@pytest.mark.parametrize(("count", "settings"), [(2, FineTuning()), (12, FineTuning(hide=False))])
-def test_too_few_views_and_who_does_not_want_it_hide_none(count, settings):
+@pytest.mark.parametrize(("count", "settings"), [(1, FineTuning()), (12, FineTuning(hide=False))])
+def test_a_single_view_and_who_does_not_want_it_hide_none(count, settings):
     recorder = Recorder(views(count))
     list(minimise(recorder, [recorder.value], views(count), 3, settings, hiding=True))
     assert [hidden for hidden, _ in recorder.notes] == [None] * 3
