@@ -27,10 +27,11 @@ def render_page(report: Report) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters |= {"png": inline_png, "inline": inline, "error": error_map}
     folder = files("hyperplanes.demo")
+    methods = [row for row in report.table if row.method in report.exhibits[0].looks[0].predictions]
     return environment.from_string(folder.joinpath("report.html").read_text(encoding="utf-8")).render(
         report=report,
-        methods=[row for row in report.table if row.method in report.exhibits[0].looks[0].predictions],
-        best=max(row.psnr for row in report.table),
+        methods=methods,
+        best=max(row.psnr for row in methods),  # not of the rows on other objects
         charts=_charts(report),
         style=folder.joinpath("style.css").read_text(encoding="utf-8"),
         gradient=gradient(),
