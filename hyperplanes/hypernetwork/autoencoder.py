@@ -99,7 +99,6 @@ class Autoencoder(nn.Module):
         self, images: Float[Tensor, "object view 3 height width"], directions: Float[Tensor, "object view 3"]
     ) -> Float[Tensor, "object latent"]:
         """The code z of each object."""
-        present = torch.ones(images.shape[:2], device=images.device) > 0
         apart = self.config.normalisation == "batch_statistics" and not self.training
-        codes = encode_objects(self.encoder, images, present, apart=apart)
+        codes = encode_objects(self.encoder, images, apart=apart)
         return silu(self.latent(torch.cat([codes, directions], -1).flatten(1)))

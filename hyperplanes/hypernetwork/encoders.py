@@ -107,7 +107,7 @@ ENCODERS: dict[str, type[nn.Module]] = {"convnet": ConvNet, "resnet101": ResNet1
 def encode_objects(
     encoder: nn.Module,
     images: Float[Tensor, "object view 3 height width"],
-    present: Bool[Tensor, "object view"],
+    present: Bool[Tensor, "object view"] | None = None,
     *,
     apart: bool,
 ) -> Float[Tensor, "object view code"]:
@@ -116,12 +116,15 @@ def encode_objects(
     Args:
         encoder: one of ENCODERS.
         images: in [0, 1].
-        present: which of the images there are; the others are not encoded and count in no statistics of a batch.
+        present: which of the images there are, all where absent; the others are not encoded and count in no statistics
+            of a batch.
         apart: every object is a batch of its own. Otherwise the images of all of them are one.
 
     Returns:
         Codes, zero where there is no image.
     """
+    if present is None:
+        present = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
     batches = [each[there] for each, there in zip(images, present, strict=True)]
     codes = [encoder(batch) for batch in (batches if apart else [torch.cat(batches)])]
     found = torch.cat(codes)

@@ -81,14 +81,13 @@ class HyperNetwork(UpdateWriter):
         read = images.flatten(0, 1)
         if self.config.resolution and read.shape[2:] != (self.config.resolution,) * 2:
             read = interpolate(read, (self.config.resolution,) * 2, mode="area")
-        present = torch.ones(images.shape[:2], device=read.device) > 0 if present is None else present
         apart = self.config.normalisation == "batch_statistics" and not self.training
         codes = encode_objects(self.encoder, read.unflatten(0, images.shape[:2]), present, apart=apart)
         if self.config.join == "mean":
             if not self.config.see_directions:
                 directions = torch.zeros_like(directions)
             codes = silu(self.place(torch.cat([codes, directions], -1)))
-            weights = present.to(codes)
+            weights = codes.new_ones(codes.shape[:2]) if present is None else present.to(codes)
             codes = (weights[..., None] * codes).sum(1) / weights.sum(1, keepdim=True)
         return self.code_normalisation(codes)
 
