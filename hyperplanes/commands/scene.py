@@ -81,6 +81,9 @@ def refuse_sources(folder: Path, path: Path, names: Sequence[str]) -> None:
     Raises:
         ValueError: a folder that holds one of them.
     """
+    from hyperplanes.data.dataset import locate_scene
+
+    path = locate_scene(path)
     root = path if path.is_dir() else path.parent
     if folder.resolve() in {(root / name).parent.resolve() for name in (*names, "images/any")}:
         raise ValueError(

@@ -27,8 +27,8 @@ def misgivings(model: HyperPlanes, shown: Views, steps: object = 0) -> list[str]
         steps: fine-tuning steps that are asked for.
     """
     found = []
-    if _covered(shown) > COVERED:
-        covered = _covered(shown)
+    covered = _covered(shown)
+    if covered > COVERED:
         what = "no alpha and no masks" if shown.masks is None else f"masks that cover {covered:.0%}"
         found.append(
             f"the views have {what}, and the model was trained on objects over white: it takes the background for the "
