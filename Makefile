@@ -1,5 +1,6 @@
 # Everything runs from a virtual environment that is made on the first call; later calls find it made.
 VENV ?= .venv
+WORKERS ?= 2
 BIN := $(VENV)/bin
 USE := $(VENV)/.ready
 DEVELOP := $(VENV)/.ready-dev
@@ -10,8 +11,8 @@ WHAT_DECIDES := pyproject.toml setup.cfg constraints.txt scripts/setup
 demo: $(USE)  ## meshes, training, new views and a page about them: runs/demo/report.html
 	$(BIN)/hyperplanes demo $(DEMO)
 
-test: $(DEVELOP)  ## all tests, on the CPU
-	$(BIN)/python -m pytest $(TESTS)
+test: $(DEVELOP)  ## all tests, on the CPU, by two processes (WORKERS=8: more)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadscope $(TESTS)
 
 fuzz: $(DEVELOP)  ## 10,000 damaged files are read or refused in one line
 	$(BIN)/python -m tests.fuzz --files 10000 $(FUZZ)
