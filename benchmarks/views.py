@@ -79,7 +79,8 @@ def main(arguments: list[str]) -> int:
         seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count: truth and prediction of every view
         for count in chosen.counts:
             shown = _Rotated(Shown(data, count, chosen.query), chosen.rotated)
-            for method, adapter in adapters(model, shown, names, chosen.methods, chosen.steps).items():
+            steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
+            for method, adapter in adapters(model, shown, names, chosen.methods, steps).items():
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
                 row |= {"second_pass": True} if chosen.second_pass else {}
                 row |= {"rotated": chosen.rotated} if chosen.rotated else {}
