@@ -70,7 +70,7 @@ def test_the_second_pass_of_the_benchmark_of_views_is_that_of_the_model(tmp_path
 def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     HyperPlanes(MODEL).save(tmp_path / "model")
     options = ["--checkpoint", str(tmp_path / "model"), "--data", str(demo_folder() / "data"), "--objects", "1"]
-    options += ["--query", "1", "--methods", "--counts", "1", "2", "--steps", "1", "--json", str(tmp_path / "rows.json")]
-    assert views.main(options) == 0
+    options += ["--query", "1", "--methods", "--counts", "1", "2", "--steps", "1"]
+    assert views.main([*options, "--json", str(tmp_path / "rows.json")]) == 0
     rows = [(row["views"], row["name"]) for row in json.loads((tmp_path / "rows.json").read_text())["rows"]]
     assert rows == [(1, "one_step"), (2, "one_step"), (2, "1_steps"), (2, "scratch_1")]
