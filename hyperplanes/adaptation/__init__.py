@@ -5,9 +5,10 @@ from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
 from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.hull_blend import HullBlend
-from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig, Prepared
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.initialisation import InitialisationConfig
 from hyperplanes.adaptation.nearest_view import NearestView
+from hyperplanes.adaptation.prepared import Prepared
 from hyperplanes.adaptation.swapped import Swapped
 
 __all__ = [

@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.prepared import Prepared
 from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.hypernetwork import Autoencoder, Reader
 from hyperplanes.metrics import psnr

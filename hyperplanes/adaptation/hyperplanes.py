@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -18,12 +18,12 @@ from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
 from hyperplanes.adaptation.fine_tuning import GRID_RATES, FineTuning, Hiding, Steps, best_stop, minimise
 from hyperplanes.adaptation.matching import match, standpoints, superfluous
+from hyperplanes.adaptation.prepared import Prepared
 from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.fields import Target, find_targets
 from hyperplanes.files import write_json
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, volume_of
@@ -32,35 +32,10 @@ from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views
 
-__all__ = ["HyperPlanes", "ModelConfig", "Prepared"]
+__all__ = ["HyperPlanes", "ModelConfig"]
 
 VOXELS_PER_PIXEL = 3 / 4  # of a side of the pictures: 96 voxels for 128 pixels, as the preset "small" is trained
 FINEST_HULL = 192
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """The support side of one object, computed once.
-
-    Attributes:
-        views: the support views in the order of the model's rig, one a plane; as given where any order will do.
-        planes: the same as the field reads them.
-        occupancy: the visual hull of all support masks.
-        volume: what the planes show on a grid over the scene, for a hypernetwork that reads it.
-    """
-
-    views: Views
-    planes: ImagePlanes | VisibilityPlanes
-    occupancy: Occupancy
-    volume: Float[Tensor, "channel x y z"] | None = None
-
-    def hiding(self, views: Int[Tensor, " hidden"]) -> Prepared:
-        """The same object, of which some views show the field nothing.
-
-        Args:
-            views: their indices.
-        """
-        return replace(self, planes=self.planes.hiding(views))
 
 
 class HyperPlanes(nn.Module):

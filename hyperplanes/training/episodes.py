@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.prepared import Prepared
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.errors import prefix_errors

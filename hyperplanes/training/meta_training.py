@@ -11,9 +11,10 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.fine_tuning import minimise, ray_loss
-from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.initialisation import InitialisationConfig
 from hyperplanes.adaptation.meta_learning import maml_gradient, reptile_gradient
+from hyperplanes.adaptation.prepared import Prepared
 from hyperplanes.data.support import SingleView
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters

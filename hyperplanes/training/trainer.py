@@ -16,7 +16,8 @@ from torch.profiler import record_function
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
 from hyperplanes.adaptation.fine_tuning import ray_loss
-from hyperplanes.adaptation.hyperplanes import HyperPlanes, Prepared
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.prepared import Prepared
 from hyperplanes.files import encode_png, write_json, write_whole
 from hyperplanes.metrics import psnr
 from hyperplanes.optimisers import make_optimisers
