@@ -3,8 +3,8 @@
 import sys
 from importlib import import_module
 
-from hyperplanes.checkpoints import CheckpointError
-from hyperplanes.files import DataError
+from hyperplanes.utilities.checkpoints import CheckpointError
+from hyperplanes.utilities.files import DataError
 
 NAMES = ("any_order", "generation", "hypernetwork", "lookup", "rendering", "training", "views", "visibility")
 

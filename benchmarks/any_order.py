@@ -23,6 +23,7 @@ from torch.nn.functional import conv2d, relu
 
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.configuration.presets import Preset, preset
 from hyperplanes.data.dataset import Dataset, open_dataset, open_datasets
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
@@ -31,7 +32,6 @@ from hyperplanes.fields.any_order import READ, AnyOrderField
 from hyperplanes.geometry import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.visibility import ChosenViews, Visibility, VisibilityPlanes
-from hyperplanes.presets import Preset, preset
 from hyperplanes.training import Trainer
 from hyperplanes.views import Views
 

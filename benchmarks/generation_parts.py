@@ -36,7 +36,7 @@ def obvious_loop(objects: int, out: Path) -> dict[str, float]:
     from data_gen.meshes.mesh import prepare_scene
     from data_gen.rigs import fixed
     from data_gen.shapes import make
-    from hyperplanes.axes import flip_camera_axes
+    from hyperplanes.utilities.axes import flip_camera_axes
 
     rig = fixed(VIEWS, RESOLUTION)
     ends: list[float] = []
@@ -82,7 +82,7 @@ def stages(objects: int, out: Path) -> dict[str, float]:
     from data_gen.rendering.renderers import find_renderer
     from data_gen.rigs import fixed
     from data_gen.shapes import make
-    from hyperplanes.files import sha256, write_folder
+    from hyperplanes.utilities.files import sha256, write_folder
 
     rig = fixed(VIEWS, RESOLUTION)
     spent = dict.fromkeys(("mesh", "one sample a pixel drawn", "nine samples a pixel drawn", "png", "written"), 0.0)

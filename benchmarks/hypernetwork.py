@@ -21,11 +21,11 @@ import torch
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.diagnostics import diagnose
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.presets import Preset, preset
 from hyperplanes.data.dataset import open_datasets
-from hyperplanes.metrics import psnr
-from hyperplanes.presets import Preset, preset
 from hyperplanes.training import Trainer
 from hyperplanes.training.episodes import prepare_episode
+from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Tasks
 
 __all__ = ["VARIANTS", "main", "measure", "variant"]

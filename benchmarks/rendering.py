@@ -22,15 +22,15 @@ from benchmarks.rendering_growth import growth, plot_growth
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.baking import BakedScene, bake
+from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
-from hyperplanes.metrics import psnr
 from hyperplanes.rendering.compositing import composite_packed, packed_weights
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.marching import march
 from hyperplanes.rendering.renderer import Hierarchical, Marched, render
+from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task, Views
 
 __all__ = ["main"]

@@ -19,10 +19,10 @@ from benchmarks._timing import interleaved, peak_bytes, ratio, timed
 from benchmarks.objects import held_out
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.metrics import psnr
-from hyperplanes.presets import Preset, preset
+from hyperplanes.configuration.presets import Preset, preset
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import Trainer
+from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task
 
 __all__ = ["main"]

@@ -29,12 +29,12 @@ from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
-from hyperplanes.export import to_pixels
-from hyperplanes.files import encode_png, write_whole
+from hyperplanes.export.images import to_pixels
 from hyperplanes.geometry.volume import CHANNELS
-from hyperplanes.metrics import psnr
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.rotation import Rotation
+from hyperplanes.utilities.files import encode_png, write_whole
+from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task, Tasks, Views
 
 __all__ = ["METHODS", "PARTS", "adapters", "main"]

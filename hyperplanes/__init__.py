@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
     from hyperplanes.adaptation.nearest_view import NearestView
+    from hyperplanes.configuration.presets import preset
     from hyperplanes.data import DataError, Dataset, open_dataset, read_task, read_views
     from hyperplanes.evaluation import evaluate
-    from hyperplanes.export import save_images, save_turntable
+    from hyperplanes.export.images import save_images, save_turntable
+    from hyperplanes.export.mesh import extract_mesh, save_mesh
     from hyperplanes.geometry import ImagePlanes, Lookup
-    from hyperplanes.metrics import psnr, ssim
-    from hyperplanes.presets import preset
     from hyperplanes.rendering.renderer import render
-    from hyperplanes.surface import extract_mesh, save_mesh
     from hyperplanes.training import Trainer
+    from hyperplanes.utilities.metrics import psnr, ssim
     from hyperplanes.views import Task, Views
 
 _HOMES = {
@@ -46,17 +46,17 @@ _HOMES = {
     "Trainer": "training",
     "Views": "views",
     "evaluate": "evaluation",
-    "extract_mesh": "surface",
+    "extract_mesh": "export.mesh",
     "open_dataset": "data",
-    "preset": "presets",
-    "psnr": "metrics",
+    "preset": "configuration.presets",
+    "psnr": "utilities.metrics",
     "read_task": "data",
     "read_views": "data",
     "render": "rendering.renderer",
-    "save_images": "export",
-    "save_mesh": "surface",
-    "save_turntable": "export",
-    "ssim": "metrics",
+    "save_images": "export.images",
+    "save_mesh": "export.mesh",
+    "save_turntable": "export.images",
+    "ssim": "utilities.metrics",
 }
 
 __all__ = [

@@ -17,8 +17,8 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.initialisation import LEARNED
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.configuration.presets import configure
 from hyperplanes.fields import find_targets
-from hyperplanes.presets import configure
 from hyperplanes.rendering.samplers import Sampler
 from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.views import Views

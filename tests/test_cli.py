@@ -23,20 +23,20 @@ from data_gen.rendering.renderers import RendererError
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.pretrained import find_checkpoints, load_model
-from hyperplanes.baking import BakedScene
 from hyperplanes.cli import main
 from hyperplanes.commands import find_verbs
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.scene import read_scene
+from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.data import DataError, read_task
 from hyperplanes.data.dataset import locate_scene
 from hyperplanes.demo.pipeline import DemoSettings, configurations
-from hyperplanes.export import to_pixels
+from hyperplanes.export.baking import BakedScene
+from hyperplanes.export.images import to_pixels
 from hyperplanes.fields.baked import BakedField
-from hyperplanes.metrics import psnr
-from hyperplanes.presets import PRESETS
 from hyperplanes.rendering.renderer import Hierarchical
 from hyperplanes.training import Trainer
+from hyperplanes.utilities.metrics import psnr
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"

@@ -17,10 +17,10 @@ from hyperplanes.adaptation import (
 )
 from hyperplanes.adaptation.initialisation import LEARNED
 from hyperplanes.adaptation.pretrained import find_checkpoints
+from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.evaluation import evaluate
 from hyperplanes.hypernetwork import AutoencoderConfig
 from hyperplanes.methods import METHODS, at_steps, describe_method, make_method
-from hyperplanes.presets import PRESETS
 from tests.reference_rendering import Balls, awaken, small_model
 
 

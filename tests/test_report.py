@@ -13,11 +13,11 @@ from PIL import Image
 from small_demo import demo_folder
 
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
 from hyperplanes.demo.charts import line_chart
 from hyperplanes.demo.first_look import write_first_look
 from hyperplanes.demo.pictures import ERROR_SCALE, colour_scale, error_map
+from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.environment import find_commit
 from tests.reference_rendering import Balls
 

@@ -15,9 +15,9 @@ from benchmarks.objects import held_out
 from hyperplanes.adaptation import HyperPlanes, diagnose, swap_gap
 from hyperplanes.fields import TargetConfig
 from hyperplanes.hypernetwork import HyperNetworkConfig
-from hyperplanes.metrics import psnr
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.rotation import Rotation
+from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, small_model
 
 SMALL = {"views": 1, "normalisation": "group", "code": 16, "depth": 2, "width": 32}

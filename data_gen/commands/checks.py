@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hyperplanes.doctor import Check
+from hyperplanes.commands.checks import Check
 
 __all__ = ["examine_renderers"]
 

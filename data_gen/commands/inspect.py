@@ -49,7 +49,7 @@ def checkpoint_lines(folder: Path) -> list[str]:
     """What a checkpoint holds, a line a fact."""
     from hyperplanes.adaptation.configuration import checkpoint_folder
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
-    from hyperplanes.checkpoints import read_json
+    from hyperplanes.utilities.checkpoints import read_json
 
     folder = checkpoint_folder(folder)
     model = HyperPlanes.from_pretrained(folder)
@@ -97,7 +97,7 @@ def baked_lines(path: Path) -> list[str]:
 def recorded_diagnostics(folder: Path) -> Diagnostics | None:
     """The diagnostics that the training of a checkpoint recorded last, beside its weights."""
     from hyperplanes.adaptation.diagnostics import Diagnostics
-    from hyperplanes.checkpoints import read_json
+    from hyperplanes.utilities.checkpoints import read_json
 
     if not (folder / "diagnostics.json").exists():
         return None
@@ -107,7 +107,7 @@ def recorded_diagnostics(folder: Path) -> Diagnostics | None:
 def _is_checkpoint(path: Path) -> bool:
     """Whether a checkpoint lies there, or a packaged one has that name."""
     from hyperplanes.adaptation.configuration import checkpoint_folder
-    from hyperplanes.checkpoints import CheckpointError
+    from hyperplanes.utilities.checkpoints import CheckpointError
 
     try:
         return (checkpoint_folder(path) / "model.json").exists()
@@ -128,7 +128,7 @@ def run(arguments: Arguments) -> int:
         return 0
     from data_gen.datasets.inspect import inspect
     from hyperplanes.data.dataset import locate_scene
-    from hyperplanes.files import DataError
+    from hyperplanes.utilities.files import DataError
 
     if not locate_scene(arguments.path).exists():
         raise DataError(

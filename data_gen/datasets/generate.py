@@ -17,7 +17,7 @@ from data_gen.datasets.manifest import GenerationState, build_manifest
 from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
 from data_gen.rigs import OBJECT_RADIUS
-from hyperplanes.files import DataError, sha256
+from hyperplanes.utilities.files import DataError, sha256
 
 __all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
 

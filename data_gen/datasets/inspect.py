@@ -10,7 +10,7 @@ import numpy as np
 
 from data_gen.datasets.contact_sheet import contact_sheet
 from data_gen.datasets.manifest import Verification, verify
-from hyperplanes.files import encode_png, write_whole
+from hyperplanes.utilities.files import encode_png, write_whole
 
 __all__ = ["Inspection", "inspect"]
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.datasets.sources import Item
-from hyperplanes.files import (
+from hyperplanes.utilities.files import (
     DataError,
     encode_json,
     inside,

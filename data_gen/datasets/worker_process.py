@@ -14,7 +14,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from hyperplanes.files import DataError
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["main", "process_item"]
 

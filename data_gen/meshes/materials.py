@@ -16,7 +16,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 
 from data_gen.meshes.files import IMAGE_FORMATS
-from hyperplanes.colour import convert_8bit, linear_from_srgb, srgb_from_linear
+from hyperplanes.utilities.colour import convert_8bit, linear_from_srgb, srgb_from_linear
 
 __all__ = [
     "DEFAULT_COLOUR",

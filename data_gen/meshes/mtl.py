@@ -22,7 +22,7 @@ import PIL.Image
 from data_gen.meshes.files import MAX_TEXT_BYTES
 from data_gen.meshes.materials import LinearMaterial, convert_image, roughness_of_exponent
 from data_gen.meshes.model_folder import ModelFolder
-from hyperplanes.colour import linear_from_srgb
+from hyperplanes.utilities.colour import linear_from_srgb
 
 __all__ = ["decode_text", "read_materials"]
 

@@ -20,7 +20,7 @@ from data_gen.rendering.shading import facing, shade
 from data_gen.rendering.surfaces import COINCIDENT, ShadedSurface
 from data_gen.rendering.textures import MipmappedTexture
 from data_gen.rigs import Rig
-from hyperplanes.colour import linear_from_srgb
+from hyperplanes.utilities.colour import linear_from_srgb
 
 __all__ = ["EmbreeRenderer", "Geometry", "cast_geometry"]
 

@@ -16,7 +16,7 @@ from data_gen.rendering.lighting import Lighting
 from data_gen.rendering.renderers import RendererError
 from data_gen.rendering.surfaces import ShadedSurface
 from data_gen.rigs import Rig
-from hyperplanes.axes import flip_camera_axes
+from hyperplanes.utilities.axes import flip_camera_axes
 
 __all__ = ["PyrenderRenderer"]
 

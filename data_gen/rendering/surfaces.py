@@ -23,7 +23,7 @@ from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from data_gen.meshes.materials import linear_factor, pbr_of_mtl, texture_of, visual_of
-from hyperplanes.colour import linear_from_srgb
+from hyperplanes.utilities.colour import linear_from_srgb
 
 __all__ = [
     "COINCIDENT",

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hyperplanes.adaptation.initialisation import InitialisationConfig
-from hyperplanes.checkpoints import CheckpointError, read_json
 from hyperplanes.fields import TargetConfig
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.settings import SettingsError, choose_by_tag, structure
 
 __all__ = ["ORDERS", "ModelConfig", "checkpoint_folder", "packaged_folder"]

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.prepared import Prepared
-from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.hypernetwork import Autoencoder, Reader
-from hyperplanes.metrics import psnr
+from hyperplanes.utilities.checkpoints import CheckpointError
+from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 
 __all__ = ["SMALLEST_SPREAD", "Diagnostics", "diagnose", "swap_gap"]

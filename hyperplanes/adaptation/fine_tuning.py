@@ -12,8 +12,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.optimisers import make_optimisers
 from hyperplanes.hypernetwork.choices import check_choices
-from hyperplanes.optimisers import make_optimisers
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
 

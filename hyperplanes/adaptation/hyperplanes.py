@@ -19,9 +19,7 @@ from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
 from hyperplanes.adaptation.fine_tuning import GRID_RATES, FineTuning, Hiding, Steps, best_stop, minimise
 from hyperplanes.adaptation.matching import match, standpoints, superfluous
 from hyperplanes.adaptation.prepared import Prepared
-from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.fields import Target, find_targets
-from hyperplanes.files import write_json
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.poses import farthest_first
@@ -30,6 +28,8 @@ from hyperplanes.geometry.volume import CHANNELS, SIDE, volume_of
 from hyperplanes.hypernetwork import VOLUME, Autoencoder, HyperNetwork, Reader, VolumeHyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.footprint import footprint
+from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
+from hyperplanes.utilities.files import write_json
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanes", "ModelConfig"]

@@ -11,8 +11,8 @@ import torch
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.fields.base import Field
+from hyperplanes.utilities.checkpoints import CheckpointError
 
 __all__ = ["adapted_model", "find_checkpoints", "load_model"]
 

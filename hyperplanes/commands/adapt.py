@@ -61,7 +61,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.pretrained import adapted_model
-    from hyperplanes.devices import choose_device
+    from hyperplanes.data.devices import choose_device
 
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "adapt")

@@ -77,13 +77,13 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
 def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
     from hyperplanes.adaptation.base import AdaptedField
-    from hyperplanes.baking import BakedScene, bake, coarsening
-    from hyperplanes.devices import choose_device
-    from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
-    from hyperplanes.files import write_whole
+    from hyperplanes.data.devices import choose_device
+    from hyperplanes.export.baking import BakedScene, bake, coarsening
+    from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
     from hyperplanes.geometry import cameras as camera
-    from hyperplanes.metrics import psnr
     from hyperplanes.utilities.errors import prefix_errors
+    from hyperplanes.utilities.files import write_whole
+    from hyperplanes.utilities.metrics import psnr
 
     if arguments.out.is_dir():
         raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")

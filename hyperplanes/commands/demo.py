@@ -205,7 +205,7 @@ def _generate(settings: DemoSettings, out: Path) -> None:
 def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:
     from hyperplanes.commands.train import follow
     from hyperplanes.data import open_dataset
-    from hyperplanes.devices import choose_device
+    from hyperplanes.data.devices import choose_device
     from hyperplanes.training import start_training
 
     data = open_dataset(arguments.out / "data")
@@ -217,8 +217,8 @@ def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:
 
 
 def _finish(out: Path, console: Console) -> None:
-    from hyperplanes.checkpoints import read_json
     from hyperplanes.demo.pipeline import describe_row
+    from hyperplanes.utilities.checkpoints import read_json
 
     metrics = read_json(out / "metrics.json")
     rows = [

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from hyperplanes.commands.console import Console
 
 if TYPE_CHECKING:
-    from hyperplanes.doctor import Check
+    from hyperplanes.commands.checks import Check
 
 __all__ = ["Arguments", "line", "run"]
 
@@ -33,7 +33,7 @@ def line(check: Check) -> str:
 
 def run(arguments: Arguments) -> int:
     """Examine everything and print a line for each."""
-    from hyperplanes.doctor import examine, healthy
+    from hyperplanes.commands.checks import examine, healthy
 
     console, checks = Console(), examine()
     for check in checks:

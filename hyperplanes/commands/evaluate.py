@@ -156,14 +156,14 @@ def run(arguments: Arguments) -> int:
     """Evaluate all methods, print the table and write what was asked for."""
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.pretrained import find_checkpoints
+    from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data import open_dataset
+    from hyperplanes.data.devices import TasksOnDevice, choose_device
     from hyperplanes.data.support import WithSupport
-    from hyperplanes.devices import TasksOnDevice, choose_device
     from hyperplanes.evaluation import evaluate_all
     from hyperplanes.evaluation.comparison import compare_all
     from hyperplanes.evaluation.perceptual import LPIPS
     from hyperplanes.methods import WithSampler, at_steps, make_method
-    from hyperplanes.presets import PROTOCOLS
     from hyperplanes.utilities.plots import figure_kind
 
     if arguments.curve is not None and len(arguments.steps) < 2:
@@ -256,7 +256,7 @@ def _of_seeds(arguments: Arguments) -> str:
 def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Comparison]) -> None:
     """Every file but the grid of pictures."""
     from hyperplanes.evaluation import QUANTITIES
-    from hyperplanes.files import write_json, write_whole
+    from hyperplanes.utilities.files import write_json, write_whole
     from hyperplanes.utilities.tables import csv_table, markdown_table
 
     if arguments.json is not None:
@@ -328,7 +328,7 @@ class _Pictures:
         self.seen: dict[str, dict[str, np.ndarray]] = {}
 
     def keep(self, method: str, seed: int, task, pictures) -> None:
-        from hyperplanes.export import to_pixels
+        from hyperplanes.export.images import to_pixels
 
         if seed or (task.name not in self.seen and len(self.seen) >= self.rows):
             return

@@ -77,9 +77,9 @@ GOOD_DEPTH = 0.9
 def run(arguments: Arguments) -> int:
     """Adapt and write what was asked for."""
     from hyperplanes.adaptation.base import AdaptedField
-    from hyperplanes.devices import choose_device
-    from hyperplanes.export import save_images, save_turntable
-    from hyperplanes.surface import agreement, choose_level, density_grid, extract_mesh, fill_hidden, save_mesh
+    from hyperplanes.data.devices import choose_device
+    from hyperplanes.export.images import save_images, save_turntable
+    from hyperplanes.export.mesh import agreement, choose_level, density_grid, extract_mesh, fill_hidden, save_mesh
 
     if arguments.level is not None and not arguments.level > 0:
         raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")

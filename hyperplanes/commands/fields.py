@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
-    from hyperplanes.baking import BakedScene
     from hyperplanes.commands.console import Console
+    from hyperplanes.export.baking import BakedScene
     from hyperplanes.rendering.renderer import Sampler
     from hyperplanes.views import Views
 
@@ -36,7 +36,7 @@ def load_source(path: Path, device: torch.device, *, second_pass: bool = False) 
     if path.is_file():
         if second_pass:
             refuse_baked(path, "take a second pass")
-        from hyperplanes.baking import BakedScene
+        from hyperplanes.export.baking import BakedScene
         from hyperplanes.fields.baked import BakedField
 
         return BakedScene(BakedField.load(path))
@@ -104,8 +104,8 @@ def adapt_to(
         ValueError: fine-tuning steps of a baked scene.
     """
     from hyperplanes.adaptation.fine_tuning import FineTuning
-    from hyperplanes.baking import BakedScene
     from hyperplanes.commands.suitability import misgivings
+    from hyperplanes.export.baking import BakedScene
 
     if isinstance(source, BakedScene):
         if steps != 0:

@@ -51,7 +51,7 @@ OptionalName = Annotated[str | None, optional("NAME")]
 OptionalNumber = Annotated[int | float | None, optional("NUMBER")]
 
 Protocol = Literal["default", "paper", "fast"]
-"""A name in `hyperplanes.presets.PROTOCOLS`."""
+"""A name in `hyperplanes.configuration.presets.PROTOCOLS`."""
 
 Steps = int | Literal["auto"]
 """Fine-tuning steps, or as many as show left-out views best."""

@@ -16,7 +16,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import optional
 
 if TYPE_CHECKING:
-    from hyperplanes.presets import Preset
+    from hyperplanes.configuration.presets import Preset
 
 __all__ = ["HEADINGS", "Arguments", "row", "run"]
 
@@ -57,8 +57,8 @@ def row(name: str, preset: Preset) -> tuple[str, ...]:
 
 def run(arguments: Arguments) -> int:
     """Print the table, or one of its rows in full."""
-    from hyperplanes.experiment import document
-    from hyperplanes.presets import PRESETS, configure
+    from hyperplanes.configuration.presets import PRESETS, configure
+    from hyperplanes.configuration.settings_file import document
 
     console = Console()
     if arguments.name is not None:

@@ -74,13 +74,13 @@ def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
     from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.nearest_view import NearestView
-    from hyperplanes.baking import BakedScene
     from hyperplanes.commands.suitability import left_out_check, worse_than_copying
-    from hyperplanes.devices import choose_device
-    from hyperplanes.export import encode_animation, orbit_cameras, save_images, to_pixels
-    from hyperplanes.files import write_whole
-    from hyperplanes.metrics import psnr, ssim
-    from hyperplanes.presets import PROTOCOLS
+    from hyperplanes.configuration.presets import PROTOCOLS
+    from hyperplanes.data.devices import choose_device
+    from hyperplanes.export.baking import BakedScene
+    from hyperplanes.export.images import encode_animation, orbit_cameras, save_images, to_pixels
+    from hyperplanes.utilities.files import write_whole
+    from hyperplanes.utilities.metrics import psnr, ssim
 
     check_orbit(arguments.orbit, arguments.size)
     console, device = Console(), choose_device(arguments.device)

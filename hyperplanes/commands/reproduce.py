@@ -27,7 +27,7 @@ from hyperplanes.commands.options import OptionalInt
 from hyperplanes.commands.writing import writes_to
 
 if TYPE_CHECKING:
-    from hyperplanes.presets import Preset
+    from hyperplanes.configuration.presets import Preset
     from hyperplanes.reproduce.scales import Scale
     from hyperplanes.views import Tasks
 
@@ -93,13 +93,13 @@ def data_sets(given: Sequence[str]) -> dict[str, Path]:
 def run(arguments: Arguments) -> int:
     """Run what is not done yet and print the table."""
     from hyperplanes.commands.train import follow
-    from hyperplanes.devices import choose_device
-    from hyperplanes.files import write_json, write_whole
+    from hyperplanes.data.devices import choose_device
     from hyperplanes.reproduce import EXPERIMENTS, SCALES, report
     from hyperplanes.reproduce.engine import Runner
     from hyperplanes.reproduce.estimate import estimate
     from hyperplanes.reproduce.figures import figure_of
     from hyperplanes.training import start_training
+    from hyperplanes.utilities.files import write_json, write_whole
     from hyperplanes.utilities.formatting import format_duration
     from hyperplanes.utilities.plots import save_figure
 

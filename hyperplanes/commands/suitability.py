@@ -85,7 +85,7 @@ def left_out_check(model: HyperPlanes, shown: Views) -> tuple[float, float] | No
 
     from hyperplanes.adaptation.nearest_view import NearestView
     from hyperplanes.geometry import cameras as camera
-    from hyperplanes.metrics import psnr
+    from hyperplanes.utilities.metrics import psnr
 
     if len(shown) < 4:
         return None

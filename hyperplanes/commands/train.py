@@ -46,7 +46,7 @@ from hyperplanes.utilities.interrupts import Terminated
 from hyperplanes.utilities.processes import is_first_process
 
 if TYPE_CHECKING:
-    from hyperplanes.presets import Preset
+    from hyperplanes.configuration.presets import Preset
     from hyperplanes.training import Progress, Trainer
     from hyperplanes.training.watching import TensorBoard
 
@@ -186,8 +186,8 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
     Raises:
         ValueError: an unknown name, or a value that does not fit; the message names the file or the option.
     """
-    from hyperplanes.experiment import changed, parse_options, read_experiment
-    from hyperplanes.presets import preset
+    from hyperplanes.configuration.presets import preset
+    from hyperplanes.configuration.settings_file import changed, parse_options, read_experiment
     from hyperplanes.utilities.settings import SettingsError
 
     given = read_experiment(arguments.config) if arguments.config else {}
@@ -245,10 +245,10 @@ def run(arguments: Arguments) -> int:
 
 def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.pretrained import find_checkpoints
+    from hyperplanes.configuration.settings_file import write_experiment
     from hyperplanes.data.dataset import open_datasets
+    from hyperplanes.data.devices import choose_device
     from hyperplanes.data.support import WithSupport
-    from hyperplanes.devices import choose_device
-    from hyperplanes.experiment import write_experiment
     from hyperplanes.training import start_training
     from hyperplanes.training.distributed import check_shares
     from hyperplanes.training.launching import count_processes, launched

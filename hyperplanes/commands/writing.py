@@ -29,7 +29,7 @@ def writes_to(
     def decorate(run: Callable[[Any], int]) -> Callable[[Any], int]:
         @wraps(run)
         def locked(arguments: Any) -> int:
-            from hyperplanes.files import one_writer
+            from hyperplanes.utilities.files import one_writer
 
             if not when(arguments):
                 return run(arguments)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.data.formats.npz import read_arrays
-from hyperplanes.files import DataError
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["CHANNELS", "mesh_path", "read_channel"]
 

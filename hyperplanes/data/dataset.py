@@ -13,8 +13,8 @@ from hyperplanes.data.formats.catalogue import SPLITS
 from hyperplanes.data.formats.recognise import find_catalogue, read_posed, read_posed_task
 from hyperplanes.data.pictures.posed import PosedTask
 from hyperplanes.data.upright import guess_up, upright, upright_task
-from hyperplanes.files import DataError, malformed
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.files import DataError, malformed
 from hyperplanes.utilities.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
 

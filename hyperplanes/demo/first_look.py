@@ -12,8 +12,8 @@ from hyperplanes.data.support import Shown
 from hyperplanes.demo.content import Exhibit, Look, Report, Row
 from hyperplanes.demo.page import render_page
 from hyperplanes.evaluation import ObjectScore, Score, evaluate
-from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
-from hyperplanes.files import write_whole
+from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
+from hyperplanes.utilities.files import write_whole
 from hyperplanes.utilities.formatting import format_duration
 from hyperplanes.views import Task, Tasks
 

@@ -11,16 +11,16 @@ from typing import Any
 import torch
 
 from hyperplanes.adaptation.base import Adapter, Pictures
-from hyperplanes.checkpoints import read_json
+from hyperplanes.configuration.presets import Preset, configure
+from hyperplanes.data.devices import TasksOnDevice, choose_device
 from hyperplanes.demo.first_look import COUNTS
 from hyperplanes.demo.stages import Stage
-from hyperplanes.devices import TasksOnDevice, choose_device
 from hyperplanes.evaluation import ObjectScore, evaluate
-from hyperplanes.export import save_images
-from hyperplanes.files import write_json
+from hyperplanes.export.images import save_images
 from hyperplanes.methods import at_steps, describe_method, make_method
-from hyperplanes.presets import Preset, configure
 from hyperplanes.rendering.renderer import Marched
+from hyperplanes.utilities.checkpoints import read_json
+from hyperplanes.utilities.files import write_json
 from hyperplanes.views import Task, Tasks
 
 __all__ = [

@@ -12,14 +12,14 @@ from PIL import Image
 
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.pretrained import load_model
-from hyperplanes.checkpoints import read_json
 from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
 from hyperplanes.demo.content import Pixels
 from hyperplanes.demo.pipeline import MODELS, DemoSettings, describe_row
 from hyperplanes.demo.stages import Stages
-from hyperplanes.export import encode_animation, orbit_cameras, to_pixels
-from hyperplanes.files import encode_png, write_whole
+from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
+from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.environment import environment
+from hyperplanes.utilities.files import encode_png, write_whole
 from hyperplanes.utilities.formatting import format_duration
 from hyperplanes.views import Tasks
 

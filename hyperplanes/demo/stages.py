@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hyperplanes.checkpoints import CheckpointError, read_json
-from hyperplanes.files import write_json
+from hyperplanes.utilities.checkpoints import CheckpointError, read_json
+from hyperplanes.utilities.files import write_json
 
 __all__ = ["Stage", "Stages"]
 

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import Adapter, Pictures
-from hyperplanes.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 from hyperplanes.utilities.errors import prefix_errors
+from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 from hyperplanes.views import Task, Tasks
 
 __all__ = ["QUANTITIES", "ObjectScore", "Perceptual", "Score", "evaluate", "evaluate_all", "merge_seeds"]

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hyperplanes.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
 
 __all__ = ["HARMONICS", "LARGEST_SIDE", "BakedField", "spherical_harmonics"]
 

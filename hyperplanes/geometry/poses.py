@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hyperplanes.axes import flip_camera_axes
+from hyperplanes.utilities.axes import flip_camera_axes
 
 __all__ = ["farthest_first", "fibonacci_sphere", "look_at", "opencv_from_opengl", "opengl_from_opencv", "orbit"]
 

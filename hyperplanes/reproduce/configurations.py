@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from hyperplanes.presets import Preset, configure
+from hyperplanes.configuration.presets import Preset, configure
 from hyperplanes.reproduce.experiments import Experiment, Trained
 from hyperplanes.reproduce.scales import Scale
 

@@ -13,17 +13,17 @@ import torch
 
 from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.pretrained import find_checkpoints
-from hyperplanes.checkpoints import read_json
+from hyperplanes.configuration.presets import PROTOCOLS, Preset
 from hyperplanes.data import open_dataset
+from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.data.support import WithSupport
-from hyperplanes.devices import TasksOnDevice
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
-from hyperplanes.files import encode_json, write_json
 from hyperplanes.methods import WithSampler, make_method
-from hyperplanes.presets import PROTOCOLS, Preset
 from hyperplanes.reproduce.configurations import configuration
 from hyperplanes.reproduce.experiments import Cell, Experiment, Trained
 from hyperplanes.reproduce.scales import Scale
+from hyperplanes.utilities.checkpoints import read_json
+from hyperplanes.utilities.files import encode_json, write_json
 from hyperplanes.views import Tasks
 
 __all__ = ["Outcome", "Runner"]

@@ -8,13 +8,13 @@ import torch
 
 from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.checkpoints import read_json
-from hyperplanes.devices import TasksOnDevice
-from hyperplanes.files import sha256, write_json
+from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.distributed import Processes
 from hyperplanes.training.meta_training import initialisation_trainer
 from hyperplanes.training.trainer import Trainer
+from hyperplanes.utilities.checkpoints import read_json
+from hyperplanes.utilities.files import sha256, write_json
 from hyperplanes.views import Tasks
 
 __all__ = ["start_training"]

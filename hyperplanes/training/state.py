@@ -20,10 +20,10 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
-from hyperplanes.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
-from hyperplanes.files import DataError, encode_json, malformed, write_json
-from hyperplanes.optimisers import Muon
+from hyperplanes.adaptation.optimisers import Muon
 from hyperplanes.training.averaging import WeightAverage
+from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
+from hyperplanes.utilities.files import DataError, encode_json, malformed, write_json
 
 __all__ = ["Curve", "check_model", "load_state", "save_state"]
 

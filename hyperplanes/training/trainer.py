@@ -17,10 +17,8 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
 from hyperplanes.adaptation.fine_tuning import ray_loss
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.optimisers import make_optimisers
 from hyperplanes.adaptation.prepared import Prepared
-from hyperplanes.files import encode_png, write_json, write_whole
-from hyperplanes.metrics import psnr
-from hyperplanes.optimisers import make_optimisers
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.averaging import WeightAverage
 from hyperplanes.training.completion import completion_loss
@@ -35,7 +33,9 @@ from hyperplanes.training.rotation import draw_rotation
 from hyperplanes.training.state import Curve, check_model, load_state, save_state
 from hyperplanes.training.watching import Samples, write_curve
 from hyperplanes.utilities.errors import prefix_errors
+from hyperplanes.utilities.files import encode_png, write_json, write_whole
 from hyperplanes.utilities.lru_cache import LRUCache
+from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task, Tasks, class_of
 
 __all__ = ["Trainer", "train"]

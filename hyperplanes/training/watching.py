@@ -13,9 +13,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from hyperplanes.export import to_pixels
-from hyperplanes.files import write_whole
-from hyperplanes.metrics import ssim
+from hyperplanes.export.images import to_pixels
+from hyperplanes.utilities.files import write_whole
+from hyperplanes.utilities.metrics import ssim
 
 __all__ = ["Samples", "TensorBoard", "write_curve"]
 

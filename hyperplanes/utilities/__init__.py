@@ -1,1 +1,1 @@
-"""What needs no tensors: configuration records, entry points, error messages, formatting, tables, charts, a cache."""
+"""What every room uses: files, settings, entry points, error messages, formatting, metrics, a cache."""

@@ -14,9 +14,9 @@ from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
-from hyperplanes.metrics import psnr
 from hyperplanes.rendering import Marched
 from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring
 
 SHAPE = HyperNetworkConfig(

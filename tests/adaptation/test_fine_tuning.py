@@ -6,8 +6,8 @@ import torch
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.metrics import psnr
 from hyperplanes.rendering import Hierarchical
+from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring, small_model
 
 PAPER = FineTuning(free="hypernetwork", rays=64, learning_rate=1e-2)

@@ -9,7 +9,7 @@ from torch.nn.functional import max_pool2d
 from hyperplanes.adaptation import HullBlend
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
-from hyperplanes.metrics import psnr
+from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 from tests.reference_rendering import ball_views, camera_at, ring
 

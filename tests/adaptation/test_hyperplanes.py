@@ -6,13 +6,13 @@ import torch
 
 from hyperplanes.adaptation import HyperPlanes, InitialisationConfig, ModelConfig, configuration
 from hyperplanes.adaptation.fine_tuning import FineTuning
-from hyperplanes.checkpoints import CheckpointError
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import camera_from_world, centres, look_at, pinhole, viewing_directions
 from hyperplanes.geometry.cameras import intrinsics as calibration
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering import Hierarchical
+from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.views import Views
 from tests.reference_rendering import awaken, ball_views, ring, small_model
 

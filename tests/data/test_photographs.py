@@ -11,7 +11,7 @@ from PIL import Image
 from hyperplanes.adaptation.base import hull
 from hyperplanes.data import DataError, read_task, read_views
 from hyperplanes.data.pictures.posed import Posed
-from hyperplanes.export import orbit_cameras
+from hyperplanes.export.images import orbit_cameras
 from hyperplanes.geometry import cameras as camera
 
 

@@ -6,7 +6,7 @@ import torch
 
 from hyperplanes.adaptation import NearestView, Pictures
 from hyperplanes.evaluation import ObjectScore, Score, evaluate
-from hyperplanes.metrics import foreground_psnr, pooled_psnr, psnr, ssim
+from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 from tests.reference_rendering import Balls, small_model
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import nn
 
-from hyperplanes.checkpoints import CheckpointError, save_tensors
 from hyperplanes.evaluation.perceptual import LPIPS
+from hyperplanes.utilities.checkpoints import CheckpointError, save_tensors
 
 
 def alexnet():

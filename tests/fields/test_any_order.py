@@ -9,9 +9,9 @@ from hyperplanes.fields import AnyOrderNeRF, TargetConfig
 from hyperplanes.geometry import carve
 from hyperplanes.geometry.cameras import camera_from_world
 from hyperplanes.geometry.visibility import VisibilityPlanes
-from hyperplanes.metrics import psnr
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Marched, render
+from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views, join_views
 from tests.reference_rendering import ball_views, camera_at, ring
 

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hyperplanes.checkpoints import CheckpointError
-from hyperplanes.files import DataError
+from hyperplanes.utilities.checkpoints import CheckpointError
+from hyperplanes.utilities.files import DataError
 from tests.fuzz.corpus import CORPUS
 from tests.fuzz.mutations import mutate
 

@@ -12,12 +12,12 @@ from data_gen.datasets.manifest import verify
 from data_gen.meshes.mesh import load_mesh, mesh_parts
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.pretrained import load_model
+from hyperplanes.configuration.presets import configure
 from hyperplanes.data import open_dataset, read_channel, read_task, read_views
 from hyperplanes.fields.baked import BakedField
-from hyperplanes.files import encode_json, sha256
 from hyperplanes.geometry import Sphere, cameras
-from hyperplanes.presets import configure
 from hyperplanes.training.state import load_state, save_state
+from hyperplanes.utilities.files import encode_json, sha256
 
 VIEWS, HEIGHT, WIDTH = 4, 10, 12
 CONFIG = {"steps": 3, "seed": 0}

@@ -9,7 +9,7 @@ from hyperplanes.data.inspection.conventions import check_conventions
 from hyperplanes.data.pictures.bounds import estimate_bounds
 from hyperplanes.data.pictures.undistort import distort
 from hyperplanes.data.upright import upright, y_up_from
-from hyperplanes.export import orbit_cameras
+from hyperplanes.export.images import orbit_cameras
 from hyperplanes.geometry import ImagePlanes, Sphere, cameras, carve, cast
 from hyperplanes.geometry.distortion import (
     DistortedCamera,

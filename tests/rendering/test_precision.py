@@ -6,8 +6,8 @@ from torch.nn.functional import linear
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.fields import base
 from hyperplanes.geometry.cameras import resized, select
-from hyperplanes.metrics import psnr
 from hyperplanes.rendering.renderer import allow_tf32
+from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 from tests.reference_rendering import ring
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from hyperplanes.configuration.presets import TRAINABLE, preset
 from hyperplanes.methods import METHODS
-from hyperplanes.presets import TRAINABLE, preset
 from hyperplanes.reproduce import EXPERIMENTS, SCALES
 from hyperplanes.reproduce.configurations import change, configuration, deviations
 from hyperplanes.reproduce.published import CROSS, SHAPENET, SINGLE, TARGET, TIME

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.checkpoints import load_tensors
-from hyperplanes.metrics import psnr
 from hyperplanes.training import Trainer, TrainingConfig
+from hyperplanes.utilities.checkpoints import load_tensors
+from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, awaken, small_model
 
 CONFIG = TrainingConfig(steps=6, tasks=2, rays=16, evaluate_every=2, checkpoint_every=100, learning_rate=1e-2)

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.checkpoints import load_tensors, read_json
 from hyperplanes.commands.train import Arguments, resolve
 from hyperplanes.training import start_training
 from hyperplanes.training.distributed import Processes, check_shares
 from hyperplanes.training.launching import count_processes
+from hyperplanes.utilities.checkpoints import load_tensors, read_json
 from hyperplanes.utilities.processes import is_first_process
 from tests.training.two_processes import KINDS, OPTIONS, Data, normalised, weights_of
 

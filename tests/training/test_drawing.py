@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from hyperplanes.data.dataset import Datasets, open_dataset
+from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.data.support import WithSupport
-from hyperplanes.devices import TasksOnDevice
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.drawing import draw, draw_balanced, object_generator
 from hyperplanes.views import class_of

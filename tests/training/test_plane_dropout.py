@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
-from hyperplanes.metrics import psnr
 from hyperplanes.training import Trainer, TrainingConfig
+from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, small_model
 
 CONFIG = TrainingConfig(steps=200, tasks=4, rays=48, learning_rate=3e-3, held_out=0)

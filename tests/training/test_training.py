@@ -9,18 +9,18 @@ import pytest
 import torch
 from PIL import Image
 
-from hyperplanes import checkpoints, files
 from hyperplanes.adaptation import Diagnostics, HyperPlanes, base, diagnose
-from hyperplanes.checkpoints import CheckpointError, read_json
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.train import follow
 from hyperplanes.geometry import occupancy
 from hyperplanes.hypernetwork import HyperNetworkConfig
-from hyperplanes.metrics import psnr
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer, TrainingConfig, train
 from hyperplanes.training.watching import TensorBoard
+from hyperplanes.utilities import checkpoints, files
+from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.interrupts import Terminated
+from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, awaken, small_model
 
 FAST = TrainingConfig(steps=6, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)

@@ -16,13 +16,13 @@ import hyperplanes.data.dataset
 import hyperplanes.training
 from hyperplanes import cli
 from hyperplanes.adaptation import InitialisationConfig
-from hyperplanes.checkpoints import save_tensors
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.train import follow
-from hyperplanes.files import write_json
 from hyperplanes.hypernetwork import HyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.meta_training import initialisation_trainer
+from hyperplanes.utilities.checkpoints import save_tensors
+from hyperplanes.utilities.files import write_json
 from tests.reference_rendering import Balls, awaken, small_model
 
 CONFIG = TrainingConfig(

@@ -15,13 +15,13 @@ from hyperplanes.adaptation.fine_tuned import FineTuned
 from hyperplanes.adaptation.pretrained import find_checkpoints
 from hyperplanes.cli import main
 from hyperplanes.commands.train import Arguments, resolve
-from hyperplanes.experiment import changed, document, parse_options, read_experiment, write_experiment
+from hyperplanes.configuration.presets import PRESETS, configure, preset
+from hyperplanes.configuration.settings_file import changed, document, parse_options, read_experiment, write_experiment
 from hyperplanes.fields import NeRF, find_targets
-from hyperplanes.files import DataError
 from hyperplanes.methods import Method, describe_method, make_method
-from hyperplanes.presets import PRESETS, configure, preset
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.utilities import entry_points
+from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.settings import SettingsError, structure
 
 ROOT = Path(__file__).resolve().parents[2]

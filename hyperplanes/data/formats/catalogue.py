@@ -9,7 +9,7 @@ from typing import Any
 
 from hyperplanes.data.formats.transforms_json import read_transforms_task
 from hyperplanes.data.pictures.posed import PosedTask
-from hyperplanes.files import DataError
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["FORMAT", "SPLITS", "Catalogue", "is_plain", "native"]
 

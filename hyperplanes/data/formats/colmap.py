@@ -14,8 +14,8 @@ import numpy.typing as npt
 from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, check_pose
-from hyperplanes.files import DataError, inside, read_bytes, read_text
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError, inside, read_bytes, read_text
 
 __all__ = ["find_model", "read_colmap"]
 

@@ -13,8 +13,8 @@ from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES, image_size
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed
-from hyperplanes.files import DataError
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["camera_file", "read_idr"]
 

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.posed import Posed, check_pose
-from hyperplanes.files import DataError
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["FILE", "is_llff", "read_llff"]
 

@@ -15,8 +15,8 @@ from hyperplanes.data.formats.transforms_document import opencv_from_opengl
 from hyperplanes.data.formats.transforms_json import read_transforms, read_transforms_task
 from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
-from hyperplanes.files import MALFORMED, DataError, check_regular, read_json
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import MALFORMED, DataError, check_regular, read_json
 
 __all__ = ["AUTHORS_FOCAL", "catalogue", "read_arrays", "read_npz"]
 

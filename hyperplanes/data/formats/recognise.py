@@ -11,7 +11,7 @@ from hyperplanes.data.formats.catalogue import FORMAT, Catalogue, native
 from hyperplanes.data.formats.transforms_json import find_transforms, read_transforms, read_transforms_task
 from hyperplanes.data.formats.unposed import refuse_unposed
 from hyperplanes.data.pictures.posed import Posed, PosedTask
-from hyperplanes.files import DataError, read_json
+from hyperplanes.utilities.files import DataError, read_json
 
 __all__ = ["find_catalogue", "read_posed", "read_posed_task"]
 

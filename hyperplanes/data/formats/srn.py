@@ -12,8 +12,8 @@ from hyperplanes.data.formats.catalogue import Catalogue
 from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.images import image_size, read_image
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
-from hyperplanes.files import DataError, read_text
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError, read_text
 
 __all__ = ["catalogue", "is_srn", "read_srn"]
 

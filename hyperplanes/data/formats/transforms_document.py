@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.axes import flip_camera_axes
-from hyperplanes.files import DataError
+from hyperplanes.utilities.axes import flip_camera_axes
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["calibration", "opencv_from_opengl", "stated_size", "transforms_document"]
 

@@ -13,8 +13,8 @@ from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
 from hyperplanes.data.pictures.undistort import distortion
-from hyperplanes.files import DataError, inside, read_json
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError, inside, read_json
 
 __all__ = ["find_transforms", "read_transforms", "read_transforms_task"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
-from hyperplanes.files import DataError
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["refuse_unposed"]
 

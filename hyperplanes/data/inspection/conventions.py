@@ -11,10 +11,10 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.axes import flip_camera_axes
 from hyperplanes.data.inspection.matches import Matches, match_pictures
 from hyperplanes.data.inspection.silhouettes import coarse_hull, masks_tell, small_masks
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.axes import flip_camera_axes
 from hyperplanes.views import Views
 
 __all__ = [

@@ -11,9 +11,9 @@ import torch
 from hyperplanes.data.dataset import Dataset
 from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_splits
 from hyperplanes.data.inspection.conventions import Conventions, check_conventions
-from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
+from hyperplanes.utilities.files import DataError
 from hyperplanes.views import Task
 
 __all__ = ["Description", "ObjectDescription", "describe"]

@@ -11,11 +11,11 @@ from jaxtyping import Float, UInt8
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["estimate_bounds", "nearest_point", "stated_bounds"]
 

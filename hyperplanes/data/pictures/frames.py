@@ -23,8 +23,8 @@ from hyperplanes.data.pictures.images import (
 )
 from hyperplanes.data.pictures.posed import Posed, posed
 from hyperplanes.data.pictures.undistort import check_lens, undistort
-from hyperplanes.files import DataError
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["MEGAPIXEL", "Frame", "assemble", "listed"]
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from hyperplanes.files import DataError, check_regular
+from hyperplanes.utilities.files import DataError, check_regular
 
 __all__ = [
     "LARGEST_IMAGE",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
-from hyperplanes.files import DataError
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["find_masks"]
 

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from hyperplanes.data.pictures.bounds import estimate_bounds
 from hyperplanes.data.pictures.images import composite_over_white, reduced
-from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError
 from hyperplanes.views import Task, Views
 
 __all__ = ["Posed", "PosedTask", "check_pose", "posed"]

@@ -10,8 +10,8 @@ import numpy.typing as npt
 import torch
 from torch.nn.functional import grid_sample
 
-from hyperplanes.files import DataError
 from hyperplanes.geometry.distortion import inverse_distortion, turning_radius
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["COEFFICIENTS", "check_lens", "distort", "distortion", "undistort"]
 

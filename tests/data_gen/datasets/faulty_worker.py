@@ -6,7 +6,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-from hyperplanes.files import DataError
+from hyperplanes.utilities.files import DataError
 
 
 @contextmanager

@@ -17,9 +17,9 @@ from hyperplanes.cli import main
 from hyperplanes.data import mesh_path, open_dataset, read_channel, read_task, read_views
 from hyperplanes.data.dataset import open_datasets
 from hyperplanes.data.formats.npz import catalogue
-from hyperplanes.files import DataError
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError
 
 VIEWS = 6
 ITEMS = [

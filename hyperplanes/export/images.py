@@ -15,8 +15,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.adaptation.base import Renderable
-from hyperplanes.files import encode_png, write_whole
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.files import encode_png, write_whole
 from hyperplanes.views import Views
 
 __all__ = [

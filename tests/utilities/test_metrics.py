@@ -6,7 +6,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from hyperplanes.metrics import foreground_psnr, pooled_psnr, psnr, ssim
+from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 
 
 def pairs(size=(24, 31), noise=0.1):

@@ -17,9 +17,9 @@ from typing import Any
 import yaml
 
 from hyperplanes.adaptation.configuration import ModelConfig
-from hyperplanes.files import DataError, write_whole
-from hyperplanes.presets import Preset
+from hyperplanes.configuration.presets import Preset
 from hyperplanes.training import TrainingConfig
+from hyperplanes.utilities.files import DataError, write_whole
 from hyperplanes.utilities.settings import SettingsError, nearest, structure
 
 __all__ = ["changed", "document", "parse_options", "read_experiment", "write_experiment"]

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from data_gen.datasets.generate import Procedural, generate
-from hyperplanes.checkpoints import CheckpointError, load_tensors
 from hyperplanes.cli import main
 from hyperplanes.data import open_dataset
 from hyperplanes.data.formats.npz import read_npz
 from hyperplanes.data.pictures.images import read_image
-from hyperplanes.files import DataError, inside, malformed, one_writer, read_bytes, read_json
+from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors
+from hyperplanes.utilities.files import DataError, inside, malformed, one_writer, read_bytes, read_json
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -111,7 +111,9 @@ def test_every_verb_that_writes_locks_its_folder_and_names_a_file_in_its_place(t
 
 
 def test_a_lock_ends_with_its_process(tmp_path):
-    code = f"import os; from hyperplanes.files import one_writer\nwith one_writer({str(tmp_path)!r}): os.abort()"
+    code = (
+        f"import os; from hyperplanes.utilities.files import one_writer\nwith one_writer({str(tmp_path)!r}): os.abort()"
+    )
     assert (
         subprocess.run([sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL).returncode == -signal.SIGABRT
     )

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from hyperplanes.optimisers import Muon, make_optimisers, orthogonalise
+from hyperplanes.adaptation.optimisers import Muon, make_optimisers, orthogonalise
 
 
 @pytest.mark.parametrize("shape", [(40, 40), (60, 20), (20, 60)])

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from hyperplanes.checkpoints import (
+from hyperplanes.utilities.checkpoints import (
     CheckpointError,
     load_tensors,
     read_json,
     save_tensors,
 )
-from hyperplanes.files import write_json, write_whole
+from hyperplanes.utilities.files import write_json, write_whole
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "count": torch.tensor(7), "b": torch.ones(3, 2).T}
 

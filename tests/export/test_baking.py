@@ -6,18 +6,18 @@ import pytest
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.baking import BakedScene, bake
-from hyperplanes.checkpoints import CheckpointError
+from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.metrics import psnr
 from hyperplanes.rendering import transmittance as module
 from hyperplanes.rendering.renderer import Marched
 from hyperplanes.rendering.transmittance import compiled_transmittance, transmittance
 from hyperplanes.rendering.voxels import compiled_caster, distance_to_filled, render_voxels
+from hyperplanes.utilities.checkpoints import CheckpointError
+from hyperplanes.utilities.metrics import psnr
 
 CAMERAS = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(6, 3.0), 48, 48)
 
@@ -109,7 +109,7 @@ def test_the_file_holds_the_same_object_in_every_unit_of_the_world(baked, tmp_pa
 
 
 def test_a_file_that_is_no_baked_field_is_named(tmp_path):
-    from hyperplanes.checkpoints import save_tensors
+    from hyperplanes.utilities.checkpoints import save_tensors
 
     save_tensors(tmp_path / "other.safetensors", {"weights": torch.zeros(3)})
     with pytest.raises(CheckpointError, match=r"other\.safetensors: expected a baked field"):

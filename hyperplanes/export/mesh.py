@@ -22,10 +22,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.colour import linear_from_srgb
-from hyperplanes.files import write_whole
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
+from hyperplanes.utilities.colour import linear_from_srgb
+from hyperplanes.utilities.files import write_whole
 
 if TYPE_CHECKING:
     import trimesh

@@ -9,12 +9,8 @@ import trimesh
 from PIL import Image
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.export import encode_animation, orbit_cameras, save_images, save_turntable, to_pixels, upward
-from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.occupancy import full
-from hyperplanes.geometry.rays import Sphere
-from hyperplanes.rendering.renderer import Marched
-from hyperplanes.surface import (
+from hyperplanes.export.images import encode_animation, orbit_cameras, save_images, save_turntable, to_pixels, upward
+from hyperplanes.export.mesh import (
     Agreement,
     Surface,
     agreement,
@@ -24,6 +20,10 @@ from hyperplanes.surface import (
     fill_hidden,
     save_mesh,
 )
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering.renderer import Marched
 from hyperplanes.views import Views
 
 CENTRE, RADIUS = (0.3, -0.2, 0.1), 0.8

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hyperplanes import files
+from hyperplanes.utilities import files
 
 __all__ = [
     "CheckpointError",

@@ -5,8 +5,8 @@ import torch
 from torch import nn
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.configuration.presets import PRESETS, preset
 from hyperplanes.hypernetwork import ConvNet, ResNet101
-from hyperplanes.presets import PRESETS, preset
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer
 from tests.reference_rendering import Balls, ring

@@ -6,9 +6,9 @@ import pytest
 
 from data_gen.rendering import renderers
 from data_gen.rendering.renderers import ProbeResult
-from hyperplanes import doctor
 from hyperplanes.cli import main
-from hyperplanes.doctor import Check, examine, healthy
+from hyperplanes.commands import checks as doctor
+from hyperplanes.commands.checks import Check, examine, healthy
 
 WORKING = [
     ProbeResult("pyrender-egl", False, 1.0, "no libEGL", "apt-get install -y libegl1 libgl1"),

@@ -1,0 +1,1 @@
+"""Settings: named presets, and files of settings."""

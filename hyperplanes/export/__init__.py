@@ -1,0 +1,1 @@
+"""A field made into files: pictures, turntables, meshes and baked voxels."""
