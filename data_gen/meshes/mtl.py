@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import PIL.Image
 
-from data_gen.meshes.files import MAX_TEXT_BYTES
+from data_gen.meshes.files import IMAGE_FORMATS, MAX_TEXT_BYTES
 from data_gen.meshes.materials import LinearMaterial, convert_image, roughness_of_exponent
 from data_gen.meshes.model_folder import ModelFolder
 from hyperplanes.utilities.colour import linear_from_srgb
@@ -137,7 +137,7 @@ def _image(name: str | None, what: str, folder: ModelFolder, warnings: list[str]
     if not name:
         return None
     try:
-        image = PIL.Image.open(io.BytesIO(folder.get_image(name)))
+        image = PIL.Image.open(io.BytesIO(folder.get_image(name)), formats=IMAGE_FORMATS)
         image.load()
     except FileNotFoundError:
         warnings.append(f"{what} {name} ({folder.lost.get(name, 'not found')})")

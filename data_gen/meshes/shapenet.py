@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from data_gen.meshes.files import MeshError
+from hyperplanes.utilities.files import DataError, read_bytes
 
 __all__ = [
     "SYNSETS",
@@ -36,6 +38,7 @@ SYNSETS: dict[str, str] = dict(zip(_TABLE.split()[::2], _TABLE.split()[1::2], st
 """The 55 classes of ShapeNetCore: synset number to a name without spaces."""
 
 _V1, _V2 = Path("model.obj"), Path("models/model_normalized.obj")
+_LARGEST_SPLIT = 64 * 2**20  # bytes; the official file has 3.5 million
 _SPLITS = {"train": "train", "val": "val", "validation": "val", "test": "test"}
 _TRAIN_SHARE = 0.8
 
@@ -119,7 +122,7 @@ def read_split_file(path: Path) -> dict[tuple[str, str], str]:
     """
     split = {}
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with io.StringIO(read_bytes(path, _LARGEST_SPLIT).decode("utf-8-sig"), newline="") as file:
             rows = csv.DictReader(file)
             missing = {"synsetId", "modelId", "split"} - set(rows.fieldnames or [])
             if missing:
@@ -134,6 +137,8 @@ def read_split_file(path: Path) -> dict[tuple[str, str], str]:
                         f"{path}: line {rows.line_num}: expected train, val or test, found {name!r}; correct the line"
                     )
                 split[row["synsetId"].strip().zfill(8), (row["modelId"] or "").strip()] = _SPLITS[name]
+    except DataError as error:
+        raise MeshError(str(error)) from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise MeshError(f"{path}: expected a readable split file, found {error}") from error
     return split

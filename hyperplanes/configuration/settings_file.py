@@ -19,7 +19,7 @@ import yaml
 from hyperplanes.adaptation.configuration import ModelConfig
 from hyperplanes.configuration.presets import Preset
 from hyperplanes.training import TrainingConfig
-from hyperplanes.utilities.files import DataError, write_whole
+from hyperplanes.utilities.files import DataError, read_bytes, write_whole
 from hyperplanes.utilities.settings import SettingsError, nearest, structure
 
 __all__ = ["changed", "document", "parse_options", "read_experiment", "write_experiment"]
@@ -56,11 +56,11 @@ def read_experiment(path: Path) -> dict[str, Any]:
     """
     remedy = "`hyperplanes presets quick` prints a whole one"
     try:
-        text = path.read_bytes()
+        text = read_bytes(path, LARGEST)
+    except DataError:
+        raise
     except OSError as error:
         raise DataError(path, "a YAML file of settings", error.strerror or str(error), "check the path") from None
-    if len(text) > LARGEST:
-        raise DataError(path, f"at most {LARGEST} bytes", str(len(text)), remedy)
     try:
         value = yaml.load(text, _Loader)  # noqa: S506 - a subclass of SafeLoader
     except (yaml.YAMLError, RecursionError, ValueError) as error:

@@ -76,7 +76,7 @@ def _predictions(folder: Path, settings: DemoSettings, name: str, view: str) -> 
 
 
 def _read(path: Path) -> Pixels:
-    with Image.open(path) as image:
+    with Image.open(path, formats=["PNG"]) as image:
         return np.asarray(image.convert("RGB"))
 
 

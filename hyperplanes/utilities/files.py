@@ -15,7 +15,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Generator, Mapping
+from collections.abc import Collection, Generator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,13 @@ import numpy.typing as npt
 __all__ = [
     "DataError",
     "WriteError",
+    "check_link",
     "check_regular",
     "encode_json",
     "encode_npz",
     "encode_png",
     "inside",
+    "list_files",
     "malformed",
     "one_writer",
     "read_bytes",
@@ -116,7 +118,7 @@ def malformed(path: str | Path, expected: str) -> Generator[None]:
         raise DataError(path, expected, f"something else: {found[:200]}", "write or download it again") from error
 
 
-def check_regular(path: str | Path, largest: int = LARGEST_FILE) -> int:
+def check_regular(path: str | Path, largest: int = LARGEST_FILE, root: str | Path | None = None) -> int:
     """The size in bytes of a regular file, or of what a link to one leads to; FileNotFoundError where there is none.
 
     Opening a pipe waits for a writer for ever, and reading a device may never end.
@@ -124,10 +126,13 @@ def check_regular(path: str | Path, largest: int = LARGEST_FILE) -> int:
     Args:
         path: the file.
         largest: bytes above which it is refused.
+        root: a folder that it may not lie outside of, symbolic links followed; anywhere when None.
 
     Raises:
-        DataError: a folder, pipe, socket or device, or too large a file.
+        DataError: a folder, pipe, socket or device, too large a file, or a link that leads out of the root.
     """
+    if root is not None:
+        check_link(path, root)
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
         kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
@@ -138,19 +143,57 @@ def check_regular(path: str | Path, largest: int = LARGEST_FILE) -> int:
     return found.st_size
 
 
-def read_bytes(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
+def check_link(path: str | Path, root: str | Path) -> None:
+    """Nothing, where a path lies inside a folder, symbolic links followed.
+
+    Args:
+        path: of a file or a folder, which need not be there.
+        root: the folder.
+
+    Raises:
+        DataError: a link that leads out of it.
+    """
+    target = Path(path).resolve()
+    if not target.is_relative_to(Path(root).resolve()):
+        remedy = "copy what it leads to into the folder, or give a folder that holds both"
+        raise DataError(path, f"a file inside {root}", f"a symbolic link to {target}", remedy)
+
+
+def list_files(folder: str | Path, suffixes: Collection[str], root: str | Path | None = None) -> list[Path]:
+    """The files of a folder with certain endings, sorted by name.
+
+    Args:
+        folder: to look into, not into the folders in it.
+        suffixes: the endings, in small letters.
+        root: as in `check_regular`, for each of the files; the folder itself when None.
+
+    Returns:
+        Their paths. A link that leads out of the root is a DataError.
+    """
+    found = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in suffixes)
+    for path in found:
+        if path.is_symlink() or root is not None:
+            check_link(path, root or folder)
+    return found
+
+
+def read_bytes(path: str | Path, largest: int = LARGEST_FILE, root: str | Path | None = None) -> bytes:
     """The content of a regular file; as `check_regular`."""
-    check_regular(path, largest)
+    check_regular(path, largest, root)
     return Path(path).read_bytes()
 
 
-def read_text(path: str | Path, largest: int = LARGEST_JSON) -> str:
+def read_text(path: str | Path, largest: int = LARGEST_JSON, root: str | Path | None = None) -> str:
     """The content of a regular file of UTF-8; as `check_regular`, and UnicodeDecodeError where it is no text."""
-    return read_bytes(path, largest).decode("utf-8")
+    return read_bytes(path, largest, root).decode("utf-8")
 
 
-def read_json(path: str | Path) -> dict[str, Any]:
+def read_json(path: str | Path, root: str | Path | None = None) -> dict[str, Any]:
     """The JSON object in a file.
+
+    Args:
+        path: the file.
+        root: as in `check_regular`.
 
     Raises:
         DataError: no such file, not a regular one, too large, not JSON, not an object, or a whole number beyond 64
@@ -158,7 +201,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        value = json.loads(read_bytes(path, LARGEST_JSON), parse_int=_whole_number)
+        value = json.loads(read_bytes(path, LARGEST_JSON, root), parse_int=_whole_number)
     except DataError:
         raise
     except FileNotFoundError as error:
@@ -197,11 +240,15 @@ def inside(folder: str | Path, relative: str, source: str | Path) -> Path:
     """
     root = Path(folder).resolve()
     text = relative.replace("\\", "/") if isinstance(relative, str) else ""
-    if not text or "\0" in text or not (root / text).resolve().is_relative_to(root) or Path(text).is_absolute():
+    if not text or "\0" in text or Path(text).is_absolute() or os.path.normpath(text).split("/")[0] == "..":
         raise DataError(source, f"file names inside {folder}", repr(relative), "move the file into the folder")
     if any(len(os.fsencode(part)) > LONGEST_NAME for part in text.split("/")):
         found = f"{text[:40]}..., {len(text)} characters"
         raise DataError(source, f"file names of at most {LONGEST_NAME} bytes", found, "export the file again")
+    if not (target := (root / text).resolve()).is_relative_to(root):
+        found = f"{relative!r}, a symbolic link to {target}"
+        remedy = "copy the files to where the link is, or give a folder that holds both"
+        raise DataError(source, f"file names inside {folder}", found, remedy)
     return Path(folder) / text
 
 

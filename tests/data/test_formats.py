@@ -70,6 +70,21 @@ def test_llff(tmp_path):
         read_views(tmp_path)
 
 
+def test_masks_beside_the_pictures_of_llff(tmp_path):
+    """Source of truth: the masks as they are written; the program's own advice is to add the folder."""
+    llff(tmp_path)
+    names = [f"IMG_{index}.png" for index in range(VIEWS)]
+    for index, name in enumerate(names):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        Image.new("L", (WIDTH, HEIGHT), 40 * index).save(tmp_path / "masks" / name)
+    masks = read_views(tmp_path).masks
+    assert masks is not None
+    assert (masks.amax((1, 2, 3)) * 255).round().tolist() == [40 * index for index in range(VIEWS)]
+    (tmp_path / "masks/IMG_3.png").unlink()
+    with pytest.raises(DataError, match=r"masks: expected a mask for each of the 6 pictures, found 5, none for IMG_3"):
+        read_views(tmp_path)
+
+
 def test_forward_facing_cameras_have_their_bounds_ahead(tmp_path):
     """By hand: cameras on a plane, all looking along -z; halfway between 2 and 6 in disparity is a depth of 3."""
     rows = []
@@ -106,7 +121,15 @@ def test_idr(tmp_path, name):
     assert (
         camera.centres(views.cameras) - torch.from_numpy(np.stack([each[0] for each in eyes_and_axes()]))
     ).abs().max() < 1e-4
-    (tmp_path / "image/005.png").unlink()
+    for index in range(VIEWS):  # as NeuS publishes DTU: six digits for the pictures, three for their masks
+        Image.new("L", (WIDTH, HEIGHT), 40 * index).save(tmp_path / f"mask/{index:03d}.png")
+        (tmp_path / f"image/{index:03d}.png").rename(tmp_path / f"image/{index:06d}.png")
+    renamed = read_views(tmp_path).masks
+    assert (renamed.amax((1, 2, 3)) * 255).round().tolist() == [40 * index for index in range(VIEWS)]
+    (tmp_path / "mask/005.png").rename(tmp_path / "mask/five.png")
+    with pytest.raises(DataError, match="mask: expected masks named as the pictures, found none of them for 000000"):
+        read_views(tmp_path)
+    (tmp_path / "image/000005.png").unlink()
     with pytest.raises(DataError, match=rf"{name}: expected 6 or more pictures, one a world_mat, found 5"):
         read_views(tmp_path)
 

@@ -51,8 +51,8 @@ def test_splits_are_the_folders_names(scene, tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "match"),
     [
-        ("pose/000003.txt", "1 2 3", r"000003\.txt: expected 16 numbers, found 3"),
-        ("pose/000003.txt", "a b", "expected 16 numbers, found could not convert"),
+        ("pose/000003.txt", "1 2 3", r"000003\.txt: expected 16 finite numbers, found 3"),
+        ("pose/000003.txt", "a b", "expected 16 finite numbers, found could not convert"),
         ("pose/000003.txt", " ".join(["2"] * 16), "expected a rotation"),
         ("intrinsics.txt", "", "intrinsics.txt: expected f cx cy first"),
         ("intrinsics.txt", "-1 2 3\n4 5", "expected finite and positive numbers"),
@@ -66,5 +66,5 @@ def test_wrong_files_are_named(scene, tmp_path, name, text, match):
 
 def test_a_missing_pose_is_named(scene, tmp_path):
     (write(scene, tmp_path) / "pose/000002.txt").unlink()
-    with pytest.raises(DataError, match=r"000002\.txt: expected 16 numbers, found nothing"):
+    with pytest.raises(DataError, match=r"000002\.txt: expected 16 finite numbers, found nothing"):
         read_views(tmp_path)

@@ -87,6 +87,41 @@ def srn(folder):
         (folder / f"pose/{index:06d}.txt").write_text(" ".join(map(str, np.linalg.inv(pose).ravel())))
 
 
+def nsvf(folder):
+    srn(folder)
+    for index in range(VIEWS):
+        for name in (f"rgb/{index:06d}.png", f"pose/{index:06d}.txt"):
+            path = folder / name
+            path.rename(path.with_name(f"{index % 3}_{path.name}"))
+    (folder / "intrinsics.txt").write_text("16 0 6 0\n0 16 5 0\n0 0 1 0\n0 0 0 1\n")
+    (folder / "bbox.txt").write_text("-1 -1 -1 1 1 1 0.4\n")
+
+
+def save_pictures(folder, names, channels=slice(0, 3)):
+    folder.mkdir(parents=True)
+    for name, picture in zip(names, pictures(), strict=True):
+        Image.fromarray(picture[..., channels].squeeze()).save(folder / name)
+
+
+def llff(folder):
+    save_pictures(folder / "images", [f"{index}.png" for index in range(VIEWS)])
+    save_pictures(folder / "masks", [f"{index}.png" for index in range(VIEWS)], 3)
+    rows = []
+    for pose in np.linalg.inv(poses()):
+        right, down, forward, eye = pose[:3].T
+        rows.append([*np.stack([down, right, -forward, eye, [HEIGHT, WIDTH, 16]], 1).ravel(), 1, 6])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+
+
+def neus(folder):
+    save_pictures(folder / "image", [f"{index:06d}.png" for index in range(VIEWS)])
+    save_pictures(folder / "mask", [f"{index:03d}.png" for index in range(VIEWS)], 3)
+    matrix = np.diag([16.0, 16.0, 1.0, 1.0])
+    matrix[:2, 2] = 6, 5
+    arrays = {f"world_mat_{index}": matrix @ pose for index, pose in enumerate(poses())}
+    np.savez(folder / "cameras_sphere.npz", **arrays, **{f"scale_mat_{index}": np.eye(4) for index in range(VIEWS)})
+
+
 def archive(folder):
     folder.mkdir(parents=True)
     opengl = np.stack([np.linalg.inv(pose) * [1, -1, -1, 1] for pose in poses()])
@@ -161,6 +196,9 @@ CORPUS = {  # how each is made, which of its files are damaged, and what reads i
     "COLMAP text": (lambda folder: colmap(folder, False), "sparse/*", read_views),
     "COLMAP binary": (lambda folder: colmap(folder, True), "sparse/*", read_views),
     "SRN": (srn, "**/*.*", read_views),
+    "NSVF": (nsvf, "**/*.*", read_views),
+    "LLFF": (llff, "**/*.*", read_views),
+    "NeuS": (neus, "**/*.*", read_views),
     "archive": (archive, "4_a.npz", lambda folder: read_views(folder / "4_a.npz")),
     "channel": (archive, "depth.npz", lambda folder: read_channel(folder, "depth")),
     "model": (training, "model.*", load_model),

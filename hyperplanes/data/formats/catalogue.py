@@ -55,7 +55,11 @@ def native(folder: Path, manifest: dict[str, Any]) -> Catalogue:
     if manifest.get("version") != 1:
         raise DataError(source, "version 1", repr(manifest.get("version")), "read it with the release that wrote it")
     splits = manifest_splits(source, manifest)
-    return Catalogue("native", splits, lambda name: read_transforms_task(folder / name, name, complete=True), manifest)
+
+    def read(name: str) -> PosedTask:
+        return read_transforms_task(folder / name, name, complete=True, root=folder)
+
+    return Catalogue("native", splits, read, manifest)
 
 
 def manifest_splits(source: Path, manifest: dict[str, Any]) -> dict[str, tuple[str, ...]]:

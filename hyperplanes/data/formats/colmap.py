@@ -15,7 +15,7 @@ from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, check_pose
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError, inside, read_bytes, read_text
+from hyperplanes.utilities.files import DataError, check_link, inside, read_bytes, read_text
 
 __all__ = ["find_model", "read_colmap"]
 
@@ -69,7 +69,9 @@ def find_model(folder: str | Path) -> Path | None:
     return None
 
 
-def read_colmap(folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None) -> Posed:
+def read_colmap(
+    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
+) -> Posed:
     """The posed pictures of a COLMAP reconstruction.
 
     COLMAP's world and its OpenCV axes are kept; its principal point counts from the pictures' borders. Pictures lie in
@@ -81,6 +83,8 @@ def read_colmap(folder: str | Path, *, bounds: Sphere | None = None, downscale: 
         folder: the project, or the model itself.
         bounds: of the scene; estimated when None.
         downscale: as in `assemble`.
+        root: the model may not lie outside of it, symbolic links followed, nor a picture outside of it and of the
+            folder of pictures; the folder when None.
 
     Returns:
         The pictures, sorted by name.
@@ -95,6 +99,8 @@ def read_colmap(folder: str | Path, *, bounds: Sphere | None = None, downscale: 
     binary = (model / "images.bin").is_file() and (model / "cameras.bin").is_file()
     suffix = ".bin" if binary else ".txt"
     paths = model / f"cameras{suffix}", model / f"images{suffix}"
+    for path in paths:
+        check_link(path, root or folder)
     try:
         if binary:
             cameras, images = _cameras_binary(paths[0]), _images_binary(paths[1])
@@ -110,13 +116,13 @@ def read_colmap(folder: str | Path, *, bounds: Sphere | None = None, downscale: 
     absent = [image.name for image in images if image.camera not in cameras]
     if absent:
         raise DataError(paths[0], f"the camera of {absent[0]}", "none", _REMEDY)
-    home = _pictures_folder(folder, model, images, paths[1])
+    home = _pictures_folder(folder, model, images, paths[1], root or folder)
     frames = []
     for image in images:
         seen = cameras[image.camera]
         frames.append(
             Frame(
-                inside(home, image.name, paths[1]),
+                _picture(home, image.name, paths[1], root or folder),
                 image.name,
                 check_pose(image.camera_from_world, paths[1], image.name),
                 partial(_scaled, seen),
@@ -124,10 +130,16 @@ def read_colmap(folder: str | Path, *, bounds: Sphere | None = None, downscale: 
                 seen.coefficients,
             )
         )
-    masks = find_masks(home.parent / "masks", [frame.path for frame in frames])
-    if masks:
-        frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
+    masks = find_masks([home.parent / "masks"], [frame.path for frame in frames], root or home.parent)
+    frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
     return assemble(frames, paths[1], bounds=bounds, downscale=downscale)[0]
+
+
+def _picture(home: Path, name: str, source: Path, root: Path) -> Path:
+    """Where a picture lies: inside its folder, or, through a link, elsewhere inside the root."""
+    if ".." not in Path(name).parts and home.resolve().is_relative_to(root.resolve()):
+        return inside(root.resolve(), str(home.resolve().relative_to(root.resolve()) / name), source)
+    return inside(home, name, source)
 
 
 def _is_model(folder: Path) -> bool:
@@ -141,7 +153,7 @@ def _count(model: Path) -> int:
     return max((model / name).stat().st_size for name in ("images.bin", "images.txt") if (model / name).is_file())
 
 
-def _pictures_folder(folder: Path, model: Path, images: list[_Image], source: Path) -> Path:
+def _pictures_folder(folder: Path, model: Path, images: list[_Image], source: Path, root: Path) -> Path:
     """The folder that holds most of the pictures: images or input, beside the model or up to four folders above."""
     roots = [folder, model, *list(model.absolute().parents)[:4]]
     homes = [root / name for root in roots for name in ("images", "input")] + [folder, model]
@@ -149,7 +161,7 @@ def _pictures_folder(folder: Path, model: Path, images: list[_Image], source: Pa
     chosen = [image.name for image in images[:: max(1, len(images) // 20)]]
 
     def present(home: Path) -> int:
-        return sum((home / inside(home, name, source).relative_to(home)).is_file() for name in chosen)
+        return sum(_picture(home, name, source, root).is_file() for name in chosen)
 
     return max(homes, key=present)
 

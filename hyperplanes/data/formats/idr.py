@@ -14,7 +14,7 @@ from hyperplanes.data.pictures.images import PICTURE_SUFFIXES, image_size
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files import DataError, list_files
 
 __all__ = ["camera_file", "read_idr"]
 
@@ -28,17 +28,20 @@ def camera_file(folder: Path) -> Path | None:
     return next((folder / name for name in _FILES if (folder / name).is_file()), None)
 
 
-def read_idr(folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None) -> Posed:
+def read_idr(
+    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
+) -> Posed:
     """The posed pictures of a scene in IDR's layout.
 
     `world_mat_i` projects homogeneous points of the world to pixels (integer pixel centres), `scale_mat_i` takes the
     unit sphere, in which the object lies, to that world. Cameras are brought into the world of the unit sphere. Picture
-    i is the i-th of image/ by name; mask/ holds masks of the same names.
+    i is the i-th of image/ by name; mask/ holds masks of the same names, or numbered in the same order, as published.
 
     Args:
         folder: with cameras.npz or cameras_sphere.npz.
         bounds: of the scene; the unit sphere when None.
         downscale: as in `assemble`.
+        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures in the order of their names.
@@ -51,16 +54,17 @@ def read_idr(folder: str | Path, *, bounds: Sphere | None = None, downscale: int
     if source is None:
         raise DataError(folder, "cameras.npz", "nothing", "check the path")
     home = next((folder / name for name in _HOMES if (folder / name).is_dir()), folder)
-    pictures = sorted(path for path in home.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+    root = root or folder
+    pictures = list_files(home, PICTURE_SUFFIXES, root)
     wanted = {f"{kind}_{index}" for kind in ("world_mat", "scale_mat") for index in range(len(pictures) + 1)}
-    arrays = read_arrays(source, wanted)
+    arrays = read_arrays(source, wanted, root)
     count = sum(name.startswith("world_mat") for name in arrays)
     if not pictures or count != len(pictures):
         more = " or more" if count > len(pictures) else ""
         raise DataError(
             source, f"{count}{more} pictures, one a world_mat", f"{len(pictures)} in {home}", "copy all pictures"
         )
-    masks = find_masks(folder / "mask", pictures) or find_masks(folder / "masks", pictures) or [None] * count
+    masks = find_masks([folder / "mask", folder / "masks"], pictures, root)
     frames = []
     for index, (path, mask) in enumerate(zip(pictures, masks, strict=True)):
         matrix, pose = _decomposed(arrays, index, source)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 
@@ -10,9 +11,10 @@ import numpy.typing as npt
 
 from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
+from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, check_pose
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files import MALFORMED, DataError, list_files, read_bytes
 
 __all__ = ["FILE", "is_llff", "read_llff"]
 
@@ -25,18 +27,21 @@ def is_llff(folder: Path) -> bool:
     return (folder / FILE).is_file()
 
 
-def read_llff(folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None) -> Posed:
+def read_llff(
+    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
+) -> Posed:
     """The posed pictures of a scene in LLFF's layout.
 
     A row of poses_bounds.npy is a 3 x 5 matrix, row by row, and two depths: the axes of the camera in the world (down,
     right, backwards), its centre, and (height, width, focal length); the nearest and the farthest depth that it shows.
     The principal point is the middle of the picture. Rows are in the order of the sorted names of the pictures, which
-    lie in images/, or scaled down by N in images_N/, of which the largest are read.
+    lie in images/, or scaled down by N in images_N/, of which the largest are read; masks may lie in masks/ or mask/.
 
     Args:
         folder: with poses_bounds.npy.
         bounds: of the scene; estimated when None.
         downscale: as in `assemble`.
+        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures in the order of their names.
@@ -46,10 +51,12 @@ def read_llff(folder: str | Path, *, bounds: Sphere | None = None, downscale: in
     """
     folder = Path(folder)
     source = folder / FILE
-    rows = _rows(source)
-    pictures = _pictures(folder, len(rows))
+    root = root or folder
+    rows = _rows(source, root)
+    pictures = _pictures(folder, len(rows), root)
+    masks = find_masks([folder / "masks", folder / "mask"], pictures, root)
     frames = []
-    for path, row in zip(pictures, rows, strict=True):
+    for path, row, mask in zip(pictures, rows, masks, strict=True):
         matrix = row[:15].reshape(3, 5)
         height, width, focal = matrix[:, 4]
         if not (np.isfinite(matrix).all() and min(height, width, focal) > 0):
@@ -68,6 +75,7 @@ def read_llff(folder: str | Path, *, bounds: Sphere | None = None, downscale: in
                 pose,
                 _Calibration(width, focal),
                 (round(height), round(width)),
+                mask=mask,
                 depths=(float(near), float(far)) if 0 < near < far < np.inf else None,
             )
         )
@@ -86,12 +94,12 @@ class _Calibration:
         return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
 
 
-def _rows(source: Path) -> npt.NDArray[np.float64]:
-    if source.stat().st_size > LARGEST_FILE:
-        raise DataError(source, f"at most {LARGEST_FILE} bytes", f"{source.stat().st_size}", "is it LLFF's file?")
+def _rows(source: Path, root: Path) -> npt.NDArray[np.float64]:
     try:
-        rows = np.load(source, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+        rows = np.load(io.BytesIO(read_bytes(source, LARGEST_FILE, root)), allow_pickle=False)
+    except DataError:
+        raise
+    except MALFORMED + (OSError,) as error:
         raise DataError(source, "an array of numbers", str(error), "write or download it again") from error
     if (
         not isinstance(rows, np.ndarray)
@@ -104,13 +112,13 @@ def _rows(source: Path) -> npt.NDArray[np.float64]:
     return rows.astype(np.float64)
 
 
-def _pictures(folder: Path, count: int) -> list[Path]:
+def _pictures(folder: Path, count: int, root: Path) -> list[Path]:
     """The largest pictures of which there is one a row, by name."""
     scaled = [path for path in folder.iterdir() if path.is_dir() and re.fullmatch(r"images(_\d+)?", path.name)]
     homes = sorted(scaled, key=lambda path: int(path.name.partition("_")[2] or 1))
     found = {}
     for home in homes:
-        files = sorted(path for path in home.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+        files = list_files(home, PICTURE_SUFFIXES, root)
         if len(files) == count:
             return files
         found[home.name] = len(files)

@@ -26,7 +26,9 @@ AUTHORS_FOCAL = 277.77
 LARGEST_ARRAY = 2 * 2**30
 
 
-def read_npz(path: str | Path, *, legacy: bool = False, bounds: Sphere | None = None) -> Posed:
+def read_npz(
+    path: str | Path, *, legacy: bool = False, bounds: Sphere | None = None, root: Path | None = None
+) -> Posed:
     """The posed pictures of one object of the 200x200 data (HyperPlanes, MultiPlaneNeRF, points2nerf).
 
     `images` (view, height, width, 3 or 4), 8 bits or floats in [0, 1]; `cam_poses` or `poses` (view, 4, 4), OpenGL
@@ -38,6 +40,7 @@ def read_npz(path: str | Path, *, legacy: bool = False, bounds: Sphere | None = 
         legacy: put the principal point at W / 2 at integer pixel centres, as the authors' code does, instead of at
             the middle of the picture, (W - 1) / 2.
         bounds: of the scene; estimated when None.
+        root: as in `read_arrays`.
 
     Returns:
         The pictures in the order of the file.
@@ -46,7 +49,7 @@ def read_npz(path: str | Path, *, legacy: bool = False, bounds: Sphere | None = 
         DataError: not such a file, too large, or with other content.
     """
     path = Path(path)
-    arrays = read_arrays(path, {"images", "rgba", "cam_poses", "poses", "focal"})
+    arrays = read_arrays(path, {"images", "rgba", "cam_poses", "poses", "focal"}, root)
     poses = arrays.get("cam_poses", arrays.get("poses"))
     images = arrays.get("rgba", arrays.get("images"))
     if images is None or poses is None:
@@ -74,12 +77,13 @@ def read_npz(path: str | Path, *, legacy: bool = False, bounds: Sphere | None = 
     )
 
 
-def read_arrays(path: str | Path, names: set[str]) -> dict[str, npt.NDArray[Any]]:
+def read_arrays(path: str | Path, names: set[str], root: Path | None = None) -> dict[str, npt.NDArray[Any]]:
     """Some arrays of an .npz file; sizes are looked at before anything is unpacked, pickles are refused.
 
     Args:
         path: the file.
         names: which arrays to read, those that there are.
+        root: as in `files.check_regular`.
 
     Returns:
         The arrays by name.
@@ -89,7 +93,7 @@ def read_arrays(path: str | Path, names: set[str]) -> dict[str, npt.NDArray[Any]
     """
     path = Path(path)
     try:
-        check_regular(path)
+        check_regular(path, root=root)
         with zipfile.ZipFile(path) as archive:
             wanted = [entry for entry in archive.infolist() if entry.filename[:-4] in names]
             total = sum(max(entry.file_size, _claimed_size(archive, entry)) for entry in wanted)
@@ -136,12 +140,14 @@ def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -
     bounds = stated_bounds(manifest, folder / "manifest.json")
     archives = sorted(folder.glob("*/sampled/*.npz")) or sorted(folder.glob("sampled/*.npz"))
     if archives:
-        return _authors(archives, manifest, bounds, legacy)
+        return _authors(folder, archives, manifest, bounds, legacy)
     splits = sorted(folder.glob("*_splits.json"))
     return _learnit(folder, splits, manifest, bounds, legacy) if splits else None
 
 
-def _authors(archives: list[Path], manifest: dict[str, Any], bounds: Sphere | None, legacy: bool) -> Catalogue:
+def _authors(
+    folder: Path, archives: list[Path], manifest: dict[str, Any], bounds: Sphere | None, legacy: bool
+) -> Catalogue:
     paths = {path.stem.rpartition("_")[2]: path for path in archives}
     splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
     if isinstance(manifest.get("splits"), dict):
@@ -157,7 +163,7 @@ def _authors(archives: list[Path], manifest: dict[str, Any], bounds: Sphere | No
     split = PosedTask.alternating if manifest else PosedTask.halves
 
     def read(name: str) -> PosedTask:
-        return split(read_npz(paths[name], legacy=legacy, bounds=bounds), name)
+        return split(read_npz(paths[name], legacy=legacy, bounds=bounds, root=folder), name)
 
     return Catalogue("hyperplanes-200", splits, read, manifest)
 

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from hyperplanes.data.formats.text_numbers import read_numbers, read_rows
 from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files import DataError, list_files
 
 __all__ = ["is_nsvf", "read_nsvf", "read_nsvf_task"]
 
@@ -21,13 +22,15 @@ _REMEDY = "download the scene again"
 
 def is_nsvf(folder: Path) -> bool:
     """Whether a folder holds one scene in NSVF's layout: SRN's folders, and names that begin with the split."""
-    if not all((folder / name).exists() for name in ("intrinsics.txt", "rgb", "pose")):
+    if not ((folder / "intrinsics.txt").is_file() and (folder / "rgb").is_dir() and (folder / "pose").is_dir()):
         return False
     names = [path.name for path in (folder / "rgb").iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
     return bool(names) and all(re.match(r"[012]_", name) for name in names)
 
 
-def read_nsvf(folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None) -> Posed:
+def read_nsvf(
+    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
+) -> Posed:
     """The posed pictures of a scene in NSVF's layout.
 
     pose/*.txt are OpenCV camera-to-world; intrinsics.txt is a 3 x 3 or 4 x 4 calibration, or begins with
@@ -38,6 +41,7 @@ def read_nsvf(folder: str | Path, *, bounds: Sphere | None = None, downscale: in
         folder: of the scene.
         bounds: of the scene; the sphere around the box when None.
         downscale: as in `assemble`.
+        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures, sorted by name: those to train on, to validate with, and to test on.
@@ -46,33 +50,37 @@ def read_nsvf(folder: str | Path, *, bounds: Sphere | None = None, downscale: in
         DataError: anything wrong with a file.
     """
     folder = Path(folder)
-    pictures = sorted(path for path in (folder / "rgb").iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+    root = root or folder
+    pictures = list_files(folder / "rgb", PICTURE_SUFFIXES, root)
     if not pictures:
         raise DataError(folder / "rgb", "pictures", "none", _REMEDY)
-    matrix, size = _intrinsics(folder / "intrinsics.txt")
+    matrix, size = _intrinsics(folder / "intrinsics.txt", root)
     frames = []
     for path in pictures:
         pose_file = folder / "pose" / f"{path.stem}.txt"
-        world_from_camera = check_pose(_numbers(pose_file, (16,)).reshape(4, 4), pose_file, path.stem)
+        world_from_camera = check_pose(read_numbers(pose_file, [16], root).reshape(4, 4), pose_file, path.stem)
         pose = np.eye(4)
         pose[:3, :3] = world_from_camera[:3, :3].T
         pose[:3, 3] = -pose[:3, :3] @ world_from_camera[:3, 3]
         frames.append(Frame(path, f"rgb/{path.name}", pose, _Calibration(matrix, size), size))
-    return assemble(frames, folder, bounds=bounds or _box(folder / "bbox.txt"), downscale=downscale)[0]
+    return assemble(frames, folder, bounds=bounds or _box(folder / "bbox.txt", root), downscale=downscale)[0]
 
 
-def read_nsvf_task(folder: str | Path, name: str, *, downscale: int | None = None) -> PosedTask:
+def read_nsvf_task(
+    folder: str | Path, name: str, *, downscale: int | None = None, root: Path | None = None
+) -> PosedTask:
     """Support and query of a scene: the pictures 0_* to train on and 2_* to test on, or 1_* where there are none.
 
     Args:
         folder: of the scene.
         name: of the object.
         downscale: as in `assemble`.
+        root: as in `read_nsvf`.
 
     Returns:
         The two halves; views alternate where the names leave one of them empty.
     """
-    scene = read_nsvf(folder, downscale=downscale)
+    scene = read_nsvf(folder, downscale=downscale, root=root)
     splits = [[at for at, each in enumerate(scene.names) if Path(each).name[0] == digit] for digit in "012"]
     query = splits[2] or splits[1]
     if not splits[0] or not query:
@@ -94,12 +102,9 @@ class _Calibration:
         return result
 
 
-def _intrinsics(path: Path) -> tuple[npt.NDArray[np.float64], tuple[int, int] | None]:
+def _intrinsics(path: Path, root: Path) -> tuple[npt.NDArray[np.float64], tuple[int, int] | None]:
     """The calibration, the principal point from the borders, and (height, width) where the file states it."""
-    try:
-        lines = [[float(word) for word in line.split()] for line in path.read_text().splitlines() if line.strip()]
-    except (OSError, ValueError, UnicodeDecodeError) as error:
-        raise DataError(path, "a calibration in numbers", str(error), _REMEDY) from error
+    lines = read_rows(path, "a calibration in numbers", root)
     size = None
     values = np.array([value for line in lines for value in line])
     if len(lines) in (3, 4) and all(len(line) == len(lines) for line in lines):
@@ -119,26 +124,13 @@ def _intrinsics(path: Path) -> tuple[npt.NDArray[np.float64], tuple[int, int] | 
     return matrix, size
 
 
-def _box(path: Path) -> Sphere | None:
+def _box(path: Path, root: Path) -> Sphere | None:
     """The sphere around the box, None where there is no file."""
-    if not path.is_file():
+    if not path.exists():
         return None
-    values = _numbers(path, (6, 7))  # the seventh is the side of a voxel
+    values = read_numbers(path, [6, 7], root)  # the seventh is the side of a voxel
     low, high = values[:3], values[3:6]
     if not (high > low).all():
         raise DataError(path, "a box: lowest corner, then the highest", f"{values.tolist()}", _REMEDY)
     x, y, z = ((low + high) / 2).tolist()
     return Sphere((x, y, z), float(np.linalg.norm(high - low) / 2))
-
-
-def _numbers(path: Path, counts: tuple[int, ...]) -> npt.NDArray[np.float64]:
-    expected = f"{' or '.join(map(str, counts))} finite numbers"
-    try:
-        values = np.array(path.read_text().split(), dtype=np.float64)
-    except FileNotFoundError as error:
-        raise DataError(path, expected, "nothing", _REMEDY) from error
-    except (ValueError, UnicodeDecodeError) as error:
-        raise DataError(path, expected, str(error), _REMEDY) from error
-    if len(values) not in counts or not np.isfinite(values).all():
-        raise DataError(path, expected, f"{len(values)}", _REMEDY)
-    return values

@@ -22,40 +22,40 @@ class _Format:
 
     Attributes:
         found: whether a folder is in it.
-        read: all of its pictures; a folder and a factor to scale down by.
+        read: all of its pictures; a folder, a factor to scale down by, and the root that no file may lie outside of.
         read_task: support and query, where the layout has splits of its own; views alternate else.
     """
 
     found: Callable[[Path], bool]
-    read: Callable[[Path, int | None], Posed]
-    read_task: Callable[[Path, str, int | None], PosedTask] | None = None
+    read: Callable[[Path, int | None, Path], Posed]
+    read_task: Callable[[Path, str, int | None, Path], PosedTask] | None = None
 
-    def task(self, folder: Path, name: str, downscale: int | None) -> PosedTask:
+    def task(self, folder: Path, name: str, downscale: int | None, root: Path) -> PosedTask:
         if self.read_task is not None:
-            return self.read_task(folder, name, downscale)
-        return PosedTask.alternating(self.read(folder, downscale), name)
+            return self.read_task(folder, name, downscale, root)
+        return PosedTask.alternating(self.read(folder, downscale, root), name)
 
 
 _FORMATS = (
     _Format(
         lambda folder: bool(find_transforms(folder)),
-        lambda folder, downscale: read_transforms(find_transforms(folder), downscale=downscale),
-        lambda folder, name, downscale: read_transforms_task(folder, name, downscale=downscale),
+        lambda folder, downscale, root: read_transforms(find_transforms(folder), downscale=downscale, root=root),
+        lambda folder, name, downscale, root: read_transforms_task(folder, name, downscale=downscale, root=root),
     ),
     _Format(
         nsvf.is_nsvf,
-        lambda folder, downscale: nsvf.read_nsvf(folder, downscale=downscale),
-        lambda folder, name, downscale: nsvf.read_nsvf_task(folder, name, downscale=downscale),
+        lambda folder, downscale, root: nsvf.read_nsvf(folder, downscale=downscale, root=root),
+        lambda folder, name, downscale, root: nsvf.read_nsvf_task(folder, name, downscale=downscale, root=root),
     ),
-    _Format(srn.is_srn, lambda folder, downscale: srn.read_srn(folder).downscaled(downscale)),
+    _Format(srn.is_srn, lambda folder, downscale, root: srn.read_srn(folder, root=root).downscaled(downscale)),
     _Format(
         lambda folder: colmap.find_model(folder) is not None,
-        lambda folder, downscale: colmap.read_colmap(folder, downscale=downscale),
+        lambda folder, downscale, root: colmap.read_colmap(folder, downscale=downscale, root=root),
     ),
-    _Format(llff.is_llff, lambda folder, downscale: llff.read_llff(folder, downscale=downscale)),
+    _Format(llff.is_llff, lambda folder, downscale, root: llff.read_llff(folder, downscale=downscale, root=root)),
     _Format(
         lambda folder: idr.camera_file(folder) is not None,
-        lambda folder, downscale: idr.read_idr(folder, downscale=downscale),
+        lambda folder, downscale, root: idr.read_idr(folder, downscale=downscale, root=root),
     ),
 )
 
@@ -117,7 +117,7 @@ def read_posed(path: str | Path, downscale: int | None = None) -> Posed:
         return npz.read_npz(path).downscaled(downscale)
     if path.is_file() and path.suffix == ".json":
         return read_transforms(path, downscale=downscale)
-    return _format(path).read(path, downscale)
+    return _format(path).read(path, downscale, path)
 
 
 def read_posed_task(path: str | Path, downscale: int | None = None) -> PosedTask:
@@ -134,7 +134,7 @@ def read_posed_task(path: str | Path, downscale: int | None = None) -> PosedTask
     if path.is_file() and path.suffix == ".npz":
         return PosedTask.alternating(npz.read_npz(path), path.stem).downscaled(downscale)
     folder = path.parent if path.is_file() and path.suffix == ".json" else path
-    return _format(folder).task(folder, folder.resolve().name, downscale)
+    return _format(folder).task(folder, folder.resolve().name, downscale, folder)
 
 
 def _one_scene(path: Path, name: str) -> Catalogue:
@@ -144,9 +144,7 @@ def _one_scene(path: Path, name: str) -> Catalogue:
 
 def _read_child(root: Path, name: str) -> PosedTask:
     """A scene of a folder of scenes; its links may lead to other places in that folder."""
-    if find_transforms(root / name):
-        return read_transforms_task(root / name, name, root=root)
-    return read_posed_task(root / name)
+    return _format(root / name).task(root / name, name, None, root)
 
 
 def _find_format(folder: Path) -> _Format | None:

@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from hyperplanes.data.formats.catalogue import Catalogue
+from hyperplanes.data.formats.text_numbers import read_numbers, read_rows
 from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.images import image_size, read_image
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError, read_text
+from hyperplanes.utilities.files import DataError, list_files
 
 __all__ = ["catalogue", "is_srn", "read_srn"]
 
@@ -22,10 +23,10 @@ _SUFFIXES = {".png", ".jpg", ".jpeg"}
 
 def is_srn(folder: Path) -> bool:
     """Whether a folder holds one object in SRN's layout."""
-    return all((folder / name).exists() for name in ("intrinsics.txt", "rgb", "pose"))
+    return (folder / "intrinsics.txt").is_file() and (folder / "rgb").is_dir() and (folder / "pose").is_dir()
 
 
-def read_srn(folder: str | Path, *, bounds: Sphere | None = None) -> Posed:
+def read_srn(folder: str | Path, *, bounds: Sphere | None = None, root: Path | None = None) -> Posed:
     """The posed pictures of one object.
 
     Poses are OpenCV camera-to-world. The pictures have no alpha: where every pixel of their border is white, masks are
@@ -36,6 +37,7 @@ def read_srn(folder: str | Path, *, bounds: Sphere | None = None) -> Posed:
     Args:
         folder: with intrinsics.txt, rgb and pose.
         bounds: of the scene; estimated when None.
+        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures in the order of their names.
@@ -44,7 +46,8 @@ def read_srn(folder: str | Path, *, bounds: Sphere | None = None) -> Posed:
         DataError: anything wrong with a file.
     """
     folder = Path(folder)
-    pictures = sorted(path for path in (folder / "rgb").iterdir() if path.suffix.lower() in _SUFFIXES)
+    root = root or folder
+    pictures = list_files(folder / "rgb", _SUFFIXES, root)
     if not pictures:
         raise DataError(folder / "rgb", "pictures", "none", "download the object again")
     poses = [folder / "pose" / f"{path.stem}.txt" for path in pictures]
@@ -56,12 +59,14 @@ def read_srn(folder: str | Path, *, bounds: Sphere | None = None) -> Posed:
         alpha = True
         for picture in rgba:
             picture[..., 3] = np.where((picture[..., :3] == 255).all(-1), 0, 255)
-    world_from_camera = np.stack([check_pose(_numbers(path, 16).reshape(4, 4), path, path.stem) for path in poses])
+    world_from_camera = np.stack(
+        [check_pose(read_numbers(path, [16], root).reshape(4, 4), path, path.stem) for path in poses]
+    )
     rotation = world_from_camera[:, :3, :3].transpose(0, 2, 1)
     camera_from_world = np.tile(np.eye(4), (len(poses), 1, 1))
     camera_from_world[:, :3, :3] = rotation
     camera_from_world[:, :3, 3:] = -rotation @ world_from_camera[:, :3, 3:]
-    matrix = _intrinsics(folder / "intrinsics.txt", size)
+    matrix = _intrinsics(folder / "intrinsics.txt", size, root)
     return posed(
         rgba,
         camera_from_world,
@@ -99,9 +104,11 @@ def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
     paths = {path.name: path for found in homes.values() for path in found}
     splits = {split: tuple(path.name for path in homes.get(split, [])) for split in ("train", "val", "test")}
     bounds = stated_bounds(manifest, folder / "manifest.json")
-    return Catalogue(
-        "srn", splits, lambda name: PosedTask.alternating(read_srn(paths[name], bounds=bounds), name), manifest
-    )
+
+    def read(name: str) -> PosedTask:
+        return PosedTask.alternating(read_srn(paths[name], bounds=bounds, root=folder), name)
+
+    return Catalogue("srn", splits, read, manifest)
 
 
 def _objects(folder: Path) -> list[Path]:
@@ -116,25 +123,14 @@ def _white_border(picture: npt.NDArray[np.uint8]) -> bool:
     return bool((rows == 255).all() and (columns == 255).all())
 
 
-def _numbers(path: Path, count: int) -> npt.NDArray[np.float64]:
+def _intrinsics(path: Path, size: tuple[int, int], root: Path) -> npt.NDArray[np.float64]:
+    expected = "f cx cy first and height width last"
+    lines = read_rows(path, expected, root)
     try:
-        values = np.array(read_text(path).split(), dtype=np.float64)
-    except FileNotFoundError as error:
-        raise DataError(path, f"{count} numbers", "nothing", "download the object again") from error
-    except ValueError as error:
-        raise DataError(path, f"{count} numbers", str(error), "download the object again") from error
-    if len(values) != count:
-        raise DataError(path, f"{count} numbers", f"{len(values)}", "download the object again")
-    return values
-
-
-def _intrinsics(path: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:
-    try:
-        lines = [[float(word) for word in line.split()] for line in read_text(path).splitlines() if line.strip()]
         focal, centre_x, centre_y = lines[0][:3]
         height, width = (lines[4] if len(lines) > 4 else lines[-1])[:2]
-    except (ValueError, IndexError, UnicodeDecodeError) as error:
-        raise DataError(path, "f cx cy first and height width last", str(error), "download it again") from error
+    except (ValueError, IndexError) as error:
+        raise DataError(path, expected, str(error), "download it again") from error
     if not np.isfinite([focal, centre_x, centre_y, height, width]).all() or min(focal, height, width) <= 0:
         raise DataError(path, "finite and positive numbers", f"{lines}", "download it again")
     scale = np.array([size[1] / width, size[0] / height])

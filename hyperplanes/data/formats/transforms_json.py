@@ -142,7 +142,7 @@ def _listed_frames(
     paths: list[Path], legacy: bool, flat: bool, root: Path | None
 ) -> tuple[dict[str, Any], list[Frame], list[int]]:
     """The first document, the frames of all, and how many each has."""
-    documents = [read_json(one) for one in paths]
+    documents = [read_json(one, root or one.parent) for one in paths]
     parts = [_frames(path, document, legacy, flat, root) for path, document in zip(paths, documents, strict=True)]
     return documents[0], [frame for part in parts for frame in part], [len(part) for part in parts]
 
@@ -156,8 +156,8 @@ def _frames(path: Path, document: dict[str, Any], legacy: bool, flat: bool, root
     frames = [_frame(path, common | frame, legacy, flat, root or path.parent) for frame in listed]
     if any(frame.mask is not None for frame in frames):
         return frames
-    masks = find_masks(path.parent / "masks", [frame.path for frame in frames])
-    return [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)] if masks else frames
+    masks = find_masks([path.parent / "masks"], [frame.path for frame in frames], root or path.parent)
+    return [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
 
 
 def _frame(path: Path, fields: dict[str, Any], legacy: bool, flat: bool, root: Path) -> Frame:

@@ -158,8 +158,8 @@ def listed(names: Sequence[str], most: int = 20) -> str:
 
 def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tuple[list[int], list[str]]:
     """Which frames have a picture, and what to say of the others."""
-    kept = [index for index, frame in enumerate(frames) if frame.path.is_file()]
-    missing = [frame for frame in frames if not frame.path.is_file()]
+    kept = [index for index, frame in enumerate(frames) if frame.path.exists()]
+    missing = [frame for frame in frames if not frame.path.exists()]
     if not missing:
         return kept, []
     if complete:

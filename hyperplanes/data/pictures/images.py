@@ -16,6 +16,7 @@ from torch import Tensor
 from hyperplanes.utilities.files import DataError, check_regular
 
 __all__ = [
+    "FORMATS",
     "LARGEST_IMAGE",
     "PICTURE_SUFFIXES",
     "Header",
@@ -31,6 +32,9 @@ __all__ = [
 
 LARGEST_IMAGE = 64 * 10**6
 """Pixels above which an image is refused before it is decoded."""
+
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM", "JPEG2000")
+"""What Pillow may take a picture for, whatever it is called: for some other formats it starts other programs."""
 
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """Endings, in small letters, of the files that are taken for pictures."""
@@ -115,7 +119,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     """The pixels of an image.
 
     Args:
-        path: PNG, JPEG or what else Pillow reads; more than 8 bits a channel are scaled down to 8.
+        path: one of FORMATS; more than 8 bits a channel are scaled down to 8.
         size: the (height, width) that it must have, checked before decoding.
 
     Returns:
@@ -165,7 +169,7 @@ def _open(path: Path) -> Image.Image:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             check_regular(path)
-            image = Image.open(path)
+            image = Image.open(path, formats=FORMATS)
     except FileNotFoundError as error:
         raise DataError(path, "an image", "nothing", "check the name, or take the frame out") from error
     except Image.DecompressionBombError as error:

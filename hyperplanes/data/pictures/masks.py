@@ -6,41 +6,57 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files import DataError, check_link
 
 __all__ = ["find_masks"]
 
 
-def find_masks(folder: Path, pictures: Sequence[Path]) -> list[Path | None] | None:
-    """The mask of each picture, found by its name.
+def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path | None = None) -> list[Path | None]:
+    """The mask of each picture, found by its name or by its number.
 
     A mask is called as its picture with any ending, or as COLMAP has it, as its picture with .png after it; white is
-    what is kept.
+    what is kept. Where no name fits, there are as many masks as pictures and all names are numbers, as NeuS publishes
+    image/000000.png beside mask/000.png, both are taken in the order of their numbers.
 
     Args:
-        folder: what may hold masks.
+        folders: what may hold masks; the first one that exists counts.
         pictures: their files, some of which may be missing.
+        root: as in `files.check_regular`; the folder of the masks when None.
 
     Returns:
-        A file a picture, None for a picture that is missing; None where there is no such folder.
+        A file a picture, None for a picture that is missing, and for all where there is no such folder.
 
     Raises:
-        DataError: some pictures have a mask and others have none.
+        DataError: some pictures have a mask and others have none, or a link leads out of the root.
     """
-    if not folder.is_dir():
-        return None
-    root = folder.resolve()
+    folder = next((folder for folder in folders if folder.is_dir()), None)
+    if folder is None:
+        return [None] * len(pictures)
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES)
-    files = [path for path in files if path.resolve().is_relative_to(root)]
+    for path in files:
+        check_link(path, root or folder)
     by_name = {path.name: path for path in files} | {path.stem: path for path in files}
     masks = [by_name.get(picture.name) or by_name.get(picture.stem) for picture in pictures]
-    present = [mask for mask, picture in zip(masks, pictures, strict=True) if picture.is_file()]
+    if not any(masks):
+        masks = _by_number(files, pictures) or masks
+    present = [mask for mask, picture in zip(masks, pictures, strict=True) if picture.exists()]
     if present and not any(present):
-        raise DataError(folder, "masks named as the pictures", f"none of them for {pictures[0].name}", "rename them")
+        remedy = "rename them as the pictures, or number as many as there are pictures"
+        raise DataError(folder, "masks named as the pictures", f"none of them for {pictures[0].name}", remedy)
     if not all(present):
-        bare = [p.name for m, p in zip(masks, pictures, strict=True) if m is None and p.is_file()]
+        bare = [p.name for m, p in zip(masks, pictures, strict=True) if m is None and p.exists()]
         found = f"{len(present) - len(bare)}, none for {bare[0]}"
         raise DataError(
             folder, f"a mask for each of the {len(present)} pictures", found, "add them, or rename the folder"
         )
-    return [mask if picture.is_file() else None for mask, picture in zip(masks, pictures, strict=True)]
+    return [mask if picture.exists() else None for mask, picture in zip(masks, pictures, strict=True)]
+
+
+def _by_number(masks: Sequence[Path], pictures: Sequence[Path]) -> list[Path] | None:
+    """The masks of pictures in the order of their numbers; None where a name is none, or their counts differ."""
+    names = [path.stem for path in (*masks, *pictures)]
+    if len(masks) != len(pictures) or not all(name.isdecimal() and len(name) < 20 for name in names):
+        return None
+    order = sorted(range(len(pictures)), key=lambda index: int(pictures[index].stem))
+    chosen = dict(zip(order, sorted(masks, key=lambda path: int(path.stem)), strict=True))
+    return [chosen[index] for index in range(len(pictures))]

@@ -1,0 +1,53 @@
+"""Numbers in text files: poses, calibrations and boxes as SRN, NSVF and their like write them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.utilities.files import DataError, read_text
+
+__all__ = ["LARGEST_TEXT", "read_numbers", "read_rows"]
+
+LARGEST_TEXT = 2**20
+"""Bytes above which a file of a few numbers is refused unread."""
+
+_REMEDY = "download it again"
+
+
+def read_rows(path: Path, expected: str, root: Path | None = None) -> list[list[float]]:
+    """The numbers of each line that is not empty.
+
+    Args:
+        path: the file.
+        expected: what it should hold, for the message.
+        root: as in `files.check_regular`.
+
+    Returns:
+        Any numbers, those that are not finite too.
+
+    Raises:
+        DataError: no such file, not a regular one, too large, or something else than numbers.
+    """
+    try:
+        lines = read_text(path, LARGEST_TEXT, root).splitlines()
+        return [[float(word) for word in line.split()] for line in lines if line.strip()]
+    except DataError:
+        raise
+    except FileNotFoundError as error:
+        raise DataError(path, expected, "nothing", _REMEDY) from error
+    except (OSError, ValueError) as error:
+        raise DataError(path, expected, str(error), _REMEDY) from error
+
+
+def read_numbers(path: Path, counts: Sequence[int], root: Path | None = None) -> npt.NDArray[np.float64]:
+    """All numbers of a file, as many as one of `counts` and finite; as `read_rows`."""
+    expected = f"{' or '.join(map(str, counts))} finite numbers"
+    values = np.array([value for row in read_rows(path, expected, root) for value in row], dtype=np.float64)
+    if len(values) not in counts or not np.isfinite(values).all():
+        found = f"{len(values)}" if np.isfinite(values).all() else "NaN or infinity"
+        raise DataError(path, expected, found, _REMEDY)
+    return values
