@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Arguments", "remarks", "run", "source_of", "summary"]
 
-Class = Literal["car", "chair", "plane", "lamp"]
+Class = Literal["car", "chair", "plane", "lamp", "random"]
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,8 @@ class Arguments:
 
     Attributes:
         out: The folder to write: new, empty, or one in which the same command was interrupted.
-        class_name: Procedural objects of this class: car, chair, plane or lamp.
+        class_name: Procedural objects of this class: car, chair, plane, lamp, or random, which composes
+            primitives that mean nothing.
         meshes: A folder of mesh files, instead of --class.
         meshes_class: What the meshes are, where their tree does not say it: layouts of other projects name folders so.
         count: How many procedural objects, the held-out ones included.

@@ -22,7 +22,7 @@ class Procedural:
     """Objects of a class of `data_gen.shapes`.
 
     Attributes:
-        class_name: car, chair, plane or lamp.
+        class_name: car, chair, plane, lamp or random.
         count: how many, the held-out ones included.
         seed: the training objects are the first ones of one endless sequence, the held-out ones of another; both depend
             on the seed alone, so data sets of different sizes and one seed share objects, and never mix the two.

@@ -1,7 +1,7 @@
 """An endless supply of procedural, ShapeNet-like objects: `make(class_name, seed)` is always the same scene.
 
-Frame: y up, front along +z (so +x is the object's left). Units are metres and the origin lies wherever the object
-stands or balances; whoever renders them normalises.
+Frame: y up, front along +z (so +x is the object's left); a `random` composition has neither. Units are metres and the
+origin lies wherever the object stands or balances; whoever renders them normalises.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from data_gen.shapes.chair import chair
 from data_gen.shapes.lamp import lamp
 from data_gen.shapes.parts import Part, build_scene
 from data_gen.shapes.plane import plane
+from data_gen.shapes.random import composition
 
 __all__ = ["CLASSES", "assemble", "make"]
 
-CLASSES: tuple[str, ...] = ("car", "chair", "plane", "lamp")
+CLASSES: tuple[str, ...] = ("car", "chair", "plane", "lamp", "random")
 """Names of the classes; the position of a name is part of its objects' seed, so the order is fixed."""
 
 _MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
@@ -27,6 +28,7 @@ _MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
     "chair": chair,
     "plane": plane,
     "lamp": lamp,
+    "random": composition,
 }
 
 

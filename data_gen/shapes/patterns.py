@@ -9,7 +9,7 @@ import numpy as np
 
 from data_gen.shapes.materials import Colour, Material, brighten
 
-__all__ = ["PRINTS", "checks", "dots", "lines", "print_of", "stripes", "weave", "wheel_face", "wood"]
+__all__ = ["PRINTS", "checks", "dots", "lines", "noise", "print_of", "stripes", "weave", "wheel_face", "wood"]
 
 SIZE = 112
 """Width and height of a texture in pixels."""
@@ -27,7 +27,7 @@ def _mix(first: Colour, second: Colour, share: np.ndarray) -> np.ndarray:
     return np.round((1 - share) * np.array(first) + share * np.array(second)).astype(np.uint8)
 
 
-def _noise(rng: np.random.Generator, cells: tuple[int, int], size: int = SIZE) -> np.ndarray:
+def noise(rng: np.random.Generator, cells: tuple[int, int], size: int = SIZE) -> np.ndarray:
     """Smooth noise (size, size) in [0, 1]: random values on a (v, u) lattice of that many cells, interpolated."""
     lattice = rng.random((cells[0] + 1, cells[1] + 1))
     rows, columns = np.linspace(0, cells[0], size), np.linspace(0, cells[1], size)
@@ -43,10 +43,10 @@ def wood(rng: np.random.Generator, colour: Colour, boards: int = 1) -> Material:
     """Grain along v, in one or several boards side by side along u with dark joints."""
     v, u = _grid()
     board = np.floor(u * boards)
-    warp = _noise(rng, (3, 6)) + 0.35 * _noise(rng, (5, 24))
+    warp = noise(rng, (3, 6)) + 0.35 * noise(rng, (5, 24))
     phase = rng.uniform(0, 6, boards)[board.astype(int)]
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * (rng.uniform(5, 8) * u + 2.2 * warp + phase + 0.4 * v))
-    fine = _noise(rng, (4, 70))
+    fine = noise(rng, (4, 70))
     level = 0.6 * rings + 0.4 * fine
     level = level * rng.uniform(0.75, 1, boards)[board.astype(int)]
     if boards > 1:
@@ -60,7 +60,7 @@ def weave(rng: np.random.Generator, colour: Colour) -> Material:
     count = int(rng.integers(9, 16))
     across, along = np.sin(np.pi * count * u) ** 2, np.sin(np.pi * count * v) ** 2
     odd = (np.floor(u * count) + np.floor(v * count)) % 2 == 0
-    level = np.where(odd, across, along) * 0.7 + 0.3 * _noise(rng, (8, 8))
+    level = np.where(odd, across, along) * 0.7 + 0.3 * noise(rng, (8, 8))
     return Material("weave", _mix(brighten(colour, 0.7), brighten(colour, 1.15), level))
 
 

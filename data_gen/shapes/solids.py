@@ -15,7 +15,7 @@ import trimesh
 
 from data_gen.shapes.profiles import polygon_area, triangulate
 
-__all__ = ["Solid", "lathe", "loft", "rotation", "sweep"]
+__all__ = ["Solid", "lathe", "loft", "rotation", "skin", "sweep"]
 
 _AXES = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
 """World axis of the (first, second) coordinate of an outline and of the direction it is drawn along; cyclic, so that
@@ -119,8 +119,12 @@ def rotation(axis: str, degrees: float) -> np.ndarray:
     return matrix
 
 
-def _skin(rings: np.ndarray, wrap: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles between successive rings (k, n, 3); each quadrilateral is cut along its shorter diagonal.
+def skin(rings: np.ndarray, wrap: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles between successive rings; each quadrilateral is cut along its shorter diagonal.
+
+    Args:
+        rings: points (k, n, 3).
+        wrap: whether the last ring is joined with the first.
 
     Returns:
         Faces (F, 3) into the flattened rings, uv (F, 3, 2), cells (F, 2), and which quadrilaterals (k or k - 1, n)
@@ -156,7 +160,7 @@ def _closed(
     rings: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Skin and both caps of an open row of rings: faces, uv, cells, and the cuts of the quadrilaterals."""
-    faces, uv, cells, forward = _skin(rings, wrap=False)
+    faces, uv, cells, forward = skin(rings, wrap=False)
     start = (len(rings) - 1) * rings.shape[1]
     bottom, top = _cap(first, 0, last=False), _cap(last, start, last=True)
     return (
@@ -234,7 +238,7 @@ def lathe(profile: Sequence[tuple[float, float]] | np.ndarray, segments: int = 1
     rings[..., 2], rings[..., 0] = np.moveaxis(points[:, None, :1] * circle, -1, 0)
     rings[..., 1] = points[:, None, 1]
     if ring:
-        faces, uv, cells, _ = _skin(rings, wrap=True)
+        faces, uv, cells, _ = skin(rings, wrap=True)
         return Solid(rings.reshape(-1, 3), faces, uv, cells, volume)
     faces, uv, cells, _ = _closed(rings, circle, circle)
     vertices = rings.reshape(-1, 3)

@@ -1,0 +1,176 @@
+"""Compositions of random primitives: objects that mean nothing, to learn from that views are to be trusted.
+
+How many primitives, and how long their axes are, follows LRM-Zero (Xie et al. 2024, arXiv 2406.09371).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data_gen.shapes.materials import Material
+from data_gen.shapes.parts import Part, pick
+from data_gen.shapes.random.primitives import primitive
+from data_gen.shapes.random.textures import random_material
+from data_gen.shapes.random.tubes import merged, moved
+from data_gen.shapes.solids import Solid, rotation
+
+__all__ = ["COUNTS", "Paint", "composition", "random_rotation"]
+
+COUNTS = (5, 5, 5, 4, 4, 3, 2, 1, 1)
+"""How often an object has 1, 2, ... 9 primitives."""
+
+RELIEF = 0.5
+"""Share of the primitives with a height field."""
+
+MOST_FACES = 3000
+"""Faces of a primitive and its copies together."""
+
+_PROPORTIONS = {"any": 0.62, "plate": 0.14, "rod": 0.12, "cube": 0.12}
+_TURNS = {"none": 0.4, "quarter": 0.25, "upright": 0.15, "any": 0.2}
+_ARRANGEMENTS = {"single": 0.66, "mirrored": 0.14, "row": 0.1, "ring": 0.1}
+
+
+class Paint:
+    """Draws the materials of one object: one for all of it, a few that come again, or new ones all the time."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        count = int(rng.choice([1, 2, 3, 4, 0], p=[0.08, 0.14, 0.18, 0.1, 0.5]))
+        self._materials = [random_material(rng) for _ in range(count)]
+
+    def draw(self) -> Material:
+        """A material for the next surface."""
+        if self._materials:
+            return self._materials[int(self._rng.integers(len(self._materials)))]
+        return random_material(self._rng)
+
+    def part(self, name: str, solid: Solid) -> Part:
+        """A painted solid, some with other materials on their flat ends."""
+        part = Part.of(name, solid, self.draw())
+        if self._rng.random() < 0.25 and (solid.cells[:, 0] == -1).any():
+            part = part.capped(self.draw(), *((True, False), (False, True), (True, True))[int(self._rng.integers(3))])
+        return part
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """A rotation matrix (3, 3), uniform over all rotations (Shoemake 1992)."""
+    w, x, y, z = (quaternion := rng.normal(size=4)) / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _half_axes(rng: np.random.Generator, thin: bool) -> np.ndarray:
+    """Half extents (3,) of a primitive: axes of 0.25 to 2, some of them plates or rods where it may be thin."""
+    axes = rng.uniform(0.25, 2.0, 3)
+    kind = pick(rng, _PROPORTIONS) if thin else "any"
+    if kind == "cube":
+        axes[:] = axes[0]
+    elif kind == "plate":
+        axes[int(rng.integers(3))] = rng.uniform(0.03, 0.12)
+    elif kind == "rod":
+        long = int(rng.integers(3))
+        axes[np.arange(3) != long] = rng.uniform(0.04, 0.2)
+        axes[long] = rng.uniform(1.0, 2.2)
+    return axes / 2
+
+
+def _turn(rng: np.random.Generator) -> np.ndarray:
+    """A rotation matrix (3, 3): none, quarter turns, about the y axis, or any."""
+    kind = pick(rng, _TURNS)
+    if kind == "none":
+        return np.eye(3)
+    if kind == "quarter":
+        return rotation("xyz"[int(rng.integers(3))], 90.0 * int(rng.integers(1, 4)))
+    if kind == "upright":
+        return rotation("y", rng.uniform(0, 360))
+    return random_rotation(rng)
+
+
+def _piece(rng: np.random.Generator, thin: bool) -> Solid:
+    """A primitive with its height field, its proportions and its rotation, about the origin."""
+    solid = moved(primitive(rng, RELIEF), np.diag(_half_axes(rng, thin)))
+    return moved(solid, _turn(rng))
+
+
+def _arranged(rng: np.random.Generator, solid: Solid) -> Solid:
+    """The solid alone, beside its mirror image, in a row of copies, or in a ring of them."""
+    kind = pick(rng, _ARRANGEMENTS)
+    most = max(2, MOST_FACES // len(solid.faces))
+    extents = np.ptp(solid.vertices, axis=0)
+    if kind == "mirrored":
+        axis = int(rng.choice([0, 0, 2, 1]))
+        mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
+        shift = np.zeros(3)
+        shift[axis] = extents[axis] * rng.uniform(0.3, 1.2)
+        return merged([moved(solid, np.eye(3), shift), moved(solid, mirror, -shift)])
+    if kind == "row":
+        count, axis = min(most, int(rng.integers(2, 6))), int(rng.integers(3))
+        step = np.zeros(3)
+        step[axis] = extents[axis] * rng.uniform(0.7, 1.8)
+        size = rng.uniform(0.5, 0.9)
+        places = (np.arange(count) - (count - 1) / 2)[:, None] * step
+        return merged([moved(solid, size * np.eye(3), place) for place in places])
+    if kind == "ring":
+        count = min(most, int(rng.integers(3, 9)))
+        small = moved(solid, rng.uniform(0.3, 0.6) * np.eye(3))
+        outwards = np.array([0.0, 0.0, rng.uniform(0.3, 1.2)])
+        turns = [rotation("y", 360.0 * k / count) for k in range(count)]
+        return merged([moved(moved(small, np.eye(3), outwards), turn) for turn in turns])
+    return solid
+
+
+def _attached(rng: np.random.Generator, solid: Solid, others: list[Solid]) -> Solid:
+    """The solid moved to the outside of one of the others, most often into it a little, some apart."""
+    other = others[int(rng.integers(len(others)))]
+    direction = rng.normal(size=3)
+    if rng.random() < 0.5:
+        direction = np.where(np.arange(3) == int(rng.integers(3)), rng.choice([-1.0, 1.0]), 0.1 * direction)
+    direction /= np.linalg.norm(direction)
+    middle = (other.vertices.min(axis=0) + other.vertices.max(axis=0)) / 2
+    reach = ((other.vertices - middle) @ direction).max() + (solid.vertices @ -direction).max()
+    share = rng.uniform(1.05, 1.5) if rng.random() < 0.08 else rng.uniform(0.45, 0.95)
+    return moved(solid, np.eye(3), middle + share * reach * direction)
+
+
+def _base(rng: np.random.Generator, solids: list[Solid]) -> Solid:
+    """A plate under all of them."""
+    from data_gen.shapes.primitives import box, cylinder
+
+    points = np.concatenate([solid.vertices for solid in solids])
+    low, high = points.min(axis=0), points.max(axis=0)
+    width, _, depth = (high - low) * rng.uniform(0.7, 1.4, 3) + 0.1
+    thick = rng.uniform(0.03, 0.3)
+    plate = box(width, thick, depth) if rng.random() < 0.6 else cylinder(0.5, thick, 24).scaled(width, 1.0, depth)
+    middle = (low + high) / 2
+    return moved(plate, np.eye(3), np.array([middle[0], low[1] - 0.3 * thick, middle[2]]))
+
+
+def composition(rng: np.random.Generator) -> list[Part]:
+    """An object of one to nine random primitives and what is repeated of them.
+
+    Args:
+        rng: source of every choice.
+
+    Returns:
+        Its parts about the origin; any side may be up.
+    """
+    count = 1 + int(rng.choice(len(COUNTS), p=np.array(COUNTS) / sum(COUNTS)))
+    solids: list[Solid] = []
+    for _ in range(count):
+        solid = _arranged(rng, _piece(rng, thin=bool(solids)))
+        solids.append(_attached(rng, solid, solids) if solids else solid)
+    if rng.random() < 0.12:
+        mirror = np.diag([-1.0, 1.0, 1.0])
+        edge = np.concatenate([solid.vertices for solid in solids])[:, 0]
+        shift = np.array([-edge.min() - rng.uniform(0.1, 0.5) * np.ptp(edge), 0.0, 0.0])
+        solids = [merged([shifted := moved(solid, np.eye(3), shift), moved(shifted, mirror)]) for solid in solids]
+    if rng.random() < 0.15:
+        solids.append(_base(rng, solids))
+    turn = random_rotation(rng) if rng.random() < 0.25 else rotation("y", rng.uniform(0, 360))
+    paint = Paint(rng)
+    return [paint.part(f"piece_{index}", moved(solid, turn)) for index, solid in enumerate(solids)]

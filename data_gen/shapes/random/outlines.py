@@ -1,0 +1,96 @@
+"""Random cross-sections: closed outlines of one number of corners, so that any two of them can be joined."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data_gen.shapes.parts import pick
+from data_gen.shapes.profiles import ellipse, polygon_area, rectangle, rounded_rectangle, superellipse
+from data_gen.shapes.random.tubes import subdivided
+
+__all__ = ["AROUND", "blob", "cross", "outline", "star"]
+
+AROUND = 24
+"""Corners of an outline."""
+
+_SHARES = {
+    "circle": 3.0,
+    "rectangle": 3.0,
+    "rounded": 1.5,
+    "polygon": 1.5,
+    "blob": 1.0,
+    "superellipse": 0.7,
+    "star": 0.5,
+    "cross": 0.5,
+    "half": 0.4,
+}
+
+
+def blob(rng: np.random.Generator, count: int = AROUND) -> np.ndarray:
+    """A smooth outline (count, 2) in polar coordinates, whose radius varies by four cosines."""
+    angles = np.arange(count) * (2 * np.pi / count)
+    radius = np.ones(count)
+    for frequency in range(1, 5):
+        radius += rng.uniform(0, 0.28 / frequency) * np.cos(frequency * angles + rng.uniform(0, 2 * np.pi))
+    return radius[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def star(points: int, depth: float, count: int = AROUND) -> np.ndarray:
+    """A star (count, 2) of some points, whose inner corners lie at `depth` of the outer ones' radius."""
+    corners = ellipse(1.0, 1.0, 2 * points)
+    corners[1::2] *= depth
+    return subdivided(corners, count)
+
+
+def cross(arm: float, count: int = AROUND) -> np.ndarray:
+    """A plus sign (count, 2) in the square of side 2, its arms of half-width `arm`."""
+    a = arm
+    corners = [
+        (1, -a),
+        (1, a),
+        (a, a),
+        (a, 1),
+        (-a, 1),
+        (-a, a),
+        (-1, a),
+        (-1, -a),
+        (-a, -a),
+        (-a, -1),
+        (a, -1),
+        (a, -a),
+    ]
+    return subdivided(np.array(corners, dtype=float), count)
+
+
+def outline(rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """An outline about the origin that fills the square of side 2, and the crease angle in degrees that suits it.
+
+    Args:
+        rng: source of every choice.
+
+    Returns:
+        Corners (AROUND, 2), counter-clockwise, star-shaped about their mean, and the angle.
+    """
+    kind, crease, count = pick(rng, _SHARES), 40.0, AROUND
+    if kind == "circle":
+        corners = ellipse(1.0, 1.0, count)
+    elif kind == "rectangle":
+        corners = subdivided(rectangle(2.0, 2.0), count)
+    elif kind == "rounded":
+        corners, crease = subdivided(rounded_rectangle(2.0, 2.0, rng.uniform(0.15, 0.8), 3), count), 50.0
+    elif kind == "polygon":
+        corners = subdivided(ellipse(1.0, 1.0, int(rng.choice([3, 5, 6, 8]))), count)
+    elif kind == "blob":
+        corners, crease = blob(rng, count), 60.0
+    elif kind == "superellipse":
+        corners, crease = superellipse(2.0, 2.0, rng.uniform(0.7, 5.0), count), 50.0
+    elif kind == "star":
+        corners = star(int(rng.integers(4, 9)), rng.uniform(0.45, 0.8), count)
+    elif kind == "cross":
+        corners = cross(rng.uniform(0.25, 0.6), count)
+    else:
+        angles = np.linspace(0, np.pi, 9)
+        corners = subdivided(np.stack([np.cos(angles), np.sin(angles) - 0.4], axis=1), count)
+    corners = corners - corners.mean(axis=0)
+    assert polygon_area(corners) > 0
+    return corners / np.abs(corners).max(axis=0), crease
