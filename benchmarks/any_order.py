@@ -274,7 +274,7 @@ def configured(name: str, steps: int, seed: int) -> Preset:
         held_out=0,
         rotations=0.0,
         random_background=name != "white",
-        completion=made.training.completion if wanted and wanted.completed else 0.0,
+        volume_loss=made.training.volume_loss if wanted and wanted.completed else 0.0,
     )
     network = replace(
         made.model.network, depth=3, width=96, grid=made.model.network.grid if wanted and wanted.grid else 0

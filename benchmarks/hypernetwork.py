@@ -53,7 +53,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 }  # fmt: skip
 """Names, what they change, and the entries of HyperNetworkConfig that differ from the preset's."""
 
-PAPER_RATES = {"learning_rate": 1e-4, "hypernetwork_learning_rate": 1e-4, "warmup": 0, "final": 1.0}
+PAPER_RATES = {"learning_rate": 1e-4, "hypernetwork_learning_rate": 1e-4, "warmup": 0, "final_rate_factor": 1.0}
 TRAINING: dict[str, dict[str, Any]] = {"no_warmup": {"warmup": 0}, "paper_rates": {"optimiser": "adam", **PAPER_RATES}}
 """The entries of TrainingConfig that a variant changes."""
 

@@ -80,7 +80,9 @@ def both(chosen: Preset, objects: Objects) -> dict[str, Trainer]:
     device, trainers = objects.task(objects.names("test")[0]).support.images.device, {}
     for path, sampling in (("packed", chosen.model.sampling), ("dense", DENSE)):
         model = HyperPlanes(replace(chosen.model, sampling=sampling)).to(device)
-        trainers[path] = Trainer(model, objects, replace(chosen.training, rays=RAYS, tasks=1, warmup=10, final=1.0))
+        trainers[path] = Trainer(
+            model, objects, replace(chosen.training, rays=RAYS, tasks=1, warmup=10, final_rate_factor=1.0)
+        )
         for name in objects.names("train"):
             trainers[path].warm(name)
     return trainers

@@ -100,12 +100,12 @@ class Preset:
     def for_known_places(self) -> Preset:
         """Without what only a field of any number of views has: the grid of features, episodes of some of the views."""
         network = replace(self.model.network, grid=0)
-        training = replace(_of_all_views(self.training), completion=0.0)
+        training = replace(_of_all_views(self.training), volume_loss=0.0)
         return replace(self, model=replace(self.model, network=network), training=training)
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
-        training = replace(self.training, completion=0.0)  # of what a hypernetwork reads
+        training = replace(self.training, volume_loss=0.0)  # of what a hypernetwork reads
         return replace(self, model=replace(self.model, hypernetwork=None), training=training)
 
     def with_autoencoder(self) -> Preset:
@@ -132,7 +132,7 @@ class Preset:
         if method == "mv_matched":
             training = replace(training, learning_rate=MATCHING_RATE)
         else:
-            training = replace(training, tasks=1, rays=128, warmup=0, final=1.0)
+            training = replace(training, tasks=1, rays=128, warmup=0, final_rate_factor=1.0)
         return replace(plain, model=replace(plain.model, initialisation=initialisation), training=training)
 
 
@@ -173,7 +173,7 @@ PRESETS: dict[str, Preset] = {
             learning_rate=3e-3,
             hypernetwork_learning_rate=1.5e-3,
             warmup=100,
-            final=0.03,
+            final_rate_factor=0.03,
         ),
         64,
         "64x64, minutes on two cores: what `make demo` trains",
@@ -195,12 +195,12 @@ PRESETS: dict[str, Preset] = {
             views=(1, 2, 3, 4, 5, 7, 10, 15, 25, 40),
             rotations=0.5,
             random_background=True,
-            completion=0.1,
+            volume_loss=0.1,
             optimiser="muon",
             learning_rate=2e-3,
             hypernetwork_learning_rate=1e-3,
             warmup=300,
-            final=0.02,
+            final_rate_factor=0.02,
         ),
         128,
         "any number of views of any rig, 128x128, hours on a few cores",
@@ -220,7 +220,7 @@ PRESETS: dict[str, Preset] = {
             learning_rate=2e-3,
             hypernetwork_learning_rate=1e-3,
             warmup=500,
-            final=0.02,
+            final_rate_factor=0.02,
         ),
         128,
         "the paper's field of 25 planes with a low-rank update of all layers, 128x128, hours on a few cores",
@@ -241,7 +241,7 @@ PRESETS: dict[str, Preset] = {
             learning_rate=5e-4,
             hypernetwork_learning_rate=3e-4,
             warmup=100,
-            final=0.02,
+            final_rate_factor=0.02,
             empty_points=64,
             evaluate_every=200,
         ),

@@ -19,6 +19,7 @@ import yaml
 from hyperplanes.adaptation.configuration import ModelConfig
 from hyperplanes.configuration.presets import Preset
 from hyperplanes.training import TrainingConfig
+from hyperplanes.training.configuration import upgraded
 from hyperplanes.utilities.files import DataError, read_bytes, write_whole
 from hyperplanes.utilities.settings import SettingsError, nearest, structure
 
@@ -109,7 +110,7 @@ def changed(chosen: Preset, changes: Mapping[str, Any]) -> Preset:
         path = "model"
         made = ModelConfig.structured(_merged(model, wanted))
         path = "training"
-        trained = structure(TrainingConfig, _merged(training, changes.get("training", {})))
+        trained = structure(TrainingConfig, _merged(training, upgraded(changes.get("training", {}))))
     except SettingsError as error:
         raise SettingsError(f"{path}.{error.path}" if error.path else path, error.problem) from None
     return replace(chosen, model=made, training=trained)

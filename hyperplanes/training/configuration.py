@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 from hyperplanes.adaptation.diagnostics import Diagnostics
+from hyperplanes.utilities.settings import SettingsError
 
-__all__ = ["Progress", "TrainingConfig"]
+__all__ = ["Progress", "TrainingConfig", "upgraded"]
+
+RENAMED = {"final": "final_rate_factor", "completion": "volume_loss"}
+REMOVED: dict[str, object] = {"alternating": False, "average": 0.0}
+"""Settings of earlier versions: what they are called now; those that are gone, with the value that left them off."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,7 @@ class TrainingConfig:
             as masks say what is background: over white alone, a white surface cannot be told from none.
         empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
             training sees nothing there, but a field that is rendered without masks must know.
-        completion: weight of a loss beside that of rays, for a hypernetwork that reads a volume: the first features of
+        volume_loss: weight of a loss beside that of rays, for a hypernetwork that reads a volume: the first features of
             the target's grid are to be the hull and the colours of all views of the object, so that every cell teaches
             what is behind what few views show, and not only those that a ray meets; 0 is none.
         optimiser: of theta: "adam" as in the paper, or "muon" for the matrices of its hidden layers.
@@ -44,12 +50,8 @@ class TrainingConfig:
         muon_learning_rate: of the matrices of theta that Muon optimises.
         hypernetwork_learning_rate: of the hypernetwork.
         warmup: steps in which the learning rates rise from zero.
-        final: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
-        alternating: theta and the hypernetwork move in turns, theta first, instead of both in every step. The paper
-            speaks of separate gradient steps; its code moves both.
+        final_rate_factor: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
         clip: the norm to which the gradient of all weights that a step moves is cut where it is longer; 0 leaves it.
-        average: decay of a moving average of weights and running statistics, which is evaluated and saved as the model,
-            while the training goes on from the weights themselves; 0 is none.
         balanced: classes are drawn equally often, however many objects each has. Where a data set does not state them,
             each data set is one.
         evaluate_every: steps between looks at held-out objects.
@@ -71,16 +73,14 @@ class TrainingConfig:
     rotations: float = 0.0
     random_background: bool = False
     empty_points: Annotated[int, range(2**24)] = 0
-    completion: float = 0.0
+    volume_loss: float = 0.0
     optimiser: str = "adam"
     learning_rate: float = 1e-4
     muon_learning_rate: float = 0.02
     hypernetwork_learning_rate: float = 1e-4
     warmup: Annotated[int, range(10**10)] = 0
-    final: float = 1.0
-    alternating: bool = False
+    final_rate_factor: float = 1.0
     clip: float = 0.0
-    average: float = 0.0
     balanced: bool = False
     evaluate_every: Annotated[int, range(1, 10**10)] = 250
     held_out: Annotated[int, range(10**6)] = 4
@@ -91,11 +91,9 @@ class TrainingConfig:
     seed: Annotated[int, range(2**40)] = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.average < 1:
-            raise ValueError(f"average: expected a decay from 0 to below 1, got {self.average}")
         for name in (
             *("learning_rate", "muon_learning_rate", "hypernetwork_learning_rate"),
-            *("final", "completion", "clip"),
+            *("final_rate_factor", "volume_loss", "clip"),
         ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a finite number of 0 or more, got {getattr(self, name)}")
@@ -121,7 +119,7 @@ class Progress:
     Attributes:
         step: steps done.
         steps: steps to do.
-        loss: mean squared error of the last step's rays, plus what `completion` and `empty_points` add.
+        loss: mean squared error of the last step's rays, plus what `volume_loss` and `empty_points` add.
         rays_per_second: since the last report.
         psnr: in dB, of some views of held-out objects, where this step looked at them.
         seconds_left: by the speed so far.
@@ -137,3 +135,23 @@ class Progress:
     seconds_left: float
     diagnostics: Diagnostics | None = None
     ssim: float | None = None
+
+
+def upgraded(entries: Any) -> Any:
+    """The entries of a training's settings as an earlier version wrote them, by the names of this one.
+
+    >>> upgraded({"final": 0.1, "average": 0.0})
+    {'final_rate_factor': 0.1}
+
+    Args:
+        entries: what a file or an option says; anything but a mapping is returned as it is.
+
+    Raises:
+        SettingsError: a setting that is gone, at another value than the one that left it off.
+    """
+    if not isinstance(entries, Mapping):
+        return entries
+    for name, off in REMOVED.items():
+        if entries.get(name, off) != off:
+            raise SettingsError(name, f"expected {off}, since this setting was removed, got {entries[name]}")
+    return {RENAMED.get(name, name): value for name, value in entries.items() if name not in REMOVED}

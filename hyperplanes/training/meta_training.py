@@ -39,7 +39,7 @@ class _InitialisationTrainer(Trainer):
 
     def _adapted(self, episode: Episode) -> AdaptedField:
         settings = replace(self.initialisation.descent(self.config.rays), seed=self.config.seed)
-        return self.evaluated.fine_tune(episode.prepared, self.initialisation.inner_steps, settings)
+        return self.model.fine_tune(episode.prepared, self.initialisation.inner_steps, settings)
 
     def _set_gradients(self, gradient: Parameters) -> None:
         for name, value in self.model.networks.named_parameters():

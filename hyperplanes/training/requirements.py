@@ -14,7 +14,7 @@ def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
 
     Raises:
         ValueError: numbers of views for a field that knows them by their places, rotations without such numbers, or
-            completion for a model without a volume or a grid.
+            the volume loss for a model without a volume or a grid.
     """
     if config.views and (not model.any_order or min(config.views) < 1):
         raise ValueError(
@@ -29,8 +29,8 @@ def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
             )
     if config.rotations and not config.views:
         raise ValueError(f"training.rotations: expected 0 without training.views, got {config.rotations}")
-    if config.completion and not (model.reads_volume and model.config.network.grid >= COMPLETED and config.views):
+    if config.volume_loss and not (model.reads_volume and model.config.network.grid >= COMPLETED and config.views):
         raise ValueError(
-            f"training.completion: expected training.views, a hypernetwork with encoder 'volume' and a grid of at "
+            f"training.volume_loss: expected training.views, a hypernetwork with encoder 'volume' and a grid of at "
             f"least {COMPLETED} features, got another model or training"
         )

@@ -1,10 +1,10 @@
 """A training on disk: one consistent state at any moment, whenever the power goes.
 
 training.json                   step, curve, configuration, and the name of the file of that step; written last
-training-00000500.safetensors   weights, their average where there is one, and optimisers of step 500
+training-00000500.safetensors   weights and optimisers of step 500
 training-00000500.json          what training.json was at step 500, where earlier steps are kept: copied over
                                 training.json, the training goes on from there
-model.json, model.safetensors   the model alone, for everybody else: of the averaged weights where there are some
+model.json, model.safetensors   the model alone, for everybody else
 best/                           the model of the look at held-out objects with the highest PSNR
 """
 
@@ -21,9 +21,10 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.optimisers import Muon
-from hyperplanes.training.averaging import WeightAverage
+from hyperplanes.training.configuration import upgraded
 from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
 from hyperplanes.utilities.files import DataError, encode_json, malformed, write_json
+from hyperplanes.utilities.settings import SettingsError
 
 __all__ = ["Curve", "check_model", "load_state", "save_state"]
 
@@ -41,7 +42,6 @@ def save_state(
     step: int,
     curve: Curve,
     config: Mapping[str, Any],
-    average: WeightAverage | None = None,
 ) -> None:
     """Put a new state in the place of the last one, or beside the last ones where the configuration keeps several.
 
@@ -52,17 +52,14 @@ def save_state(
         step: steps done.
         curve: what was reported so far.
         config: of the training; its `keep_last` says how many states stay.
-        average: of the weights; the model of others is made of it.
     """
     name = f"training-{step:08d}.safetensors"
     tensors = {f"model.{key}": value for key, value in model.state_dict().items()}
     for index, optimiser in enumerate(optimisers):
         for place, entries in optimiser.state_dict()["state"].items():
             tensors |= {f"{index}.{place}.{key}": torch.as_tensor(value) for key, value in entries.items()}
-    if average is not None:
-        tensors |= {f"average.{key}": value for key, value in average.state_dict().items()}
     save_tensors(folder / name, tensors)
-    (model if average is None else average.model).save(folder)
+    model.save(folder)
     document = {"step": step, "curve": curve, "config": dict(config), "state": name}
     kept = config.get("keep_last", 1)
     beside = (folder / name).with_suffix(".json")
@@ -98,7 +95,6 @@ def load_state(
     config: Mapping[str, Any],
     free: Sequence[str],
     defaults: Mapping[str, Any],
-    average: WeightAverage | None = None,
 ) -> tuple[int, Curve]:
     """Continue where `save_state` stopped: weights and moments are set.
 
@@ -109,7 +105,6 @@ def load_state(
         config: of the training that is to go on.
         free: entries of it that may differ.
         defaults: what entries are that a training of an earlier version has not.
-        average: of the weights, which is set too.
 
     Returns:
         The steps done, and the curve.
@@ -121,7 +116,7 @@ def load_state(
     saved = read_json(path)
     try:
         with malformed(path, "the state of a training"):
-            return _load(path, saved, model, optimisers, config, free, defaults, average)
+            return _load(path, saved, model, optimisers, config, free, defaults)
     except DataError as error:
         raise CheckpointError(str(error)) from error
 
@@ -134,7 +129,6 @@ def _load(
     config: Mapping[str, Any],
     free: Sequence[str],
     defaults: Mapping[str, Any],
-    average: WeightAverage | None,
 ) -> tuple[int, Curve]:
     folder = path.parent
     for name, kind in ENTRIES.items():
@@ -143,7 +137,9 @@ def _load(
             raise CheckpointError(f"{path}: expected an entry {name!r} ({kind.__name__}), found {found}; {REMEDY}")
     if saved["step"] < 0:
         raise CheckpointError(f"{path}: expected a number of steps, found {saved['step']}; {REMEDY}")
-    wanted, before = (json.loads(encode_json(dict(each))) for each in (config, {**defaults, **saved["config"]}))
+    wanted, before = (
+        json.loads(encode_json(dict(each))) for each in (config, {**defaults, **_upgraded(path, saved["config"])})
+    )
     differing = [name for name in wanted if name not in free and before[name] != wanted[name]]
     if differing:
         raise CheckpointError(
@@ -160,11 +156,8 @@ def _load(
             if f"{index}.{place}.{names[0]}" in found:  # absent where no gradient has reached the parameter yet
                 moments |= {f"{index}.{place}.{name}": parameter for name in names if name != "step"}
                 moments |= {f"{index}.{place}.{name}": torch.zeros(()) for name in names if name == "step"}
-    averaged = {} if average is None else {f"average.{name}": value for name, value in average.state_dict().items()}
-    check_tensors(folder / saved["state"], found, {**weights, **moments, **averaged})
+    check_tensors(folder / saved["state"], found, {**weights, **moments})
     model.load_state_dict({name: found[f"model.{name}"] for name in model.state_dict()})
-    if average is not None:
-        average.load_state_dict({name: found[f"average.{name}"] for name in average.state_dict()})
     for index, optimiser in enumerate(optimisers):
         state: dict[int, dict[str, Tensor]] = {}
         for key in moments:
@@ -173,6 +166,14 @@ def _load(
                 state.setdefault(int(place), {})[name] = found[key]
         optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
     return saved["step"], saved["curve"]
+
+
+def _upgraded(path: Path, config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The settings of the training, by the names of this version; CheckpointError where one of them is gone."""
+    try:
+        return upgraded(config)
+    except SettingsError as error:
+        raise CheckpointError(f"{path}: {error}; {REMEDY}") from None
 
 
 def check_model(folder: Path, config: ModelConfig) -> None:

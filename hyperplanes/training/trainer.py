@@ -20,7 +20,6 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.optimisers import make_optimisers
 from hyperplanes.adaptation.prepared import Prepared
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.averaging import WeightAverage
 from hyperplanes.training.completion import completion_loss
 from hyperplanes.training.configuration import Progress, TrainingConfig
 from hyperplanes.training.distributed import ProcessEnded, Processes, check_shares, other_processes
@@ -93,7 +92,6 @@ class Trainer:
         self._updates: list[Parameters] = []
         theta = list(model.networks.parameters())
         self.optimisers = make_optimisers(theta, config.optimiser, config.learning_rate, config.muon_learning_rate)
-        self._of_theta = len(self.optimisers)
         if model.hypernetwork is not None:
             rate = config.hypernetwork_learning_rate
             self.optimisers += make_optimisers(list(model.hypernetwork.parameters()), "adam", rate, 0.0)
@@ -104,10 +102,9 @@ class Trainer:
         if not (resumed or model.rig.any()) and self.processes.first:  # the others get it with the weights
             with prefix_errors(self.names[0]):
                 model.set_rig(data.task(self.names[0]).support)
-        self.average = WeightAverage(model, config.average) if config.average else None
         if folder is not None and resumed:
             defaults = asdict(TrainingConfig())
-            loaded = load_state(folder, model, self.optimisers, asdict(config), FREE, defaults, self.average)
+            loaded = load_state(folder, model, self.optimisers, asdict(config), FREE, defaults)
             self.step, self.curve = loaded
         with other_processes():
             self.processes.agree(model, self.step)
@@ -144,7 +141,7 @@ class Trainer:
             self.diagnostics = diagnostics or self.diagnostics
             seen = self.samples if look else None
             if quality is not None and self.folder is not None and quality > self._best:
-                self.evaluated.save(self.folder / "best")
+                self.model.save(self.folder / "best")
             if report:
                 row = {"step": step, "loss": loss, **self.norms()}
                 row |= {} if quality is None else {"psnr": quality}
@@ -193,14 +190,11 @@ class Trainer:
         for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
             optimiser.param_groups[0]["lr"] = rate * self._schedule()
         with record_function("step:optimisers"):
-            due = self._due()
             if self.config.clip:
-                moved = [value for each in due for group in each.param_groups for value in group["params"]]
+                moved = [value for each in self.optimisers for group in each.param_groups for value in group["params"]]
                 torch.nn.utils.clip_grad_norm_(moved, self.config.clip)
-            for optimiser in due:
+            for optimiser in self.optimisers:
                 optimiser.step()
-            if self.average is not None:
-                self.average.update_parameters(self.model)
         self.step += 1
         return loss
 
@@ -245,8 +239,8 @@ class Trainer:
                 with record_function("step:emptiness"):
                     total = total + emptiness_loss(field, config.empty_points, generator)
             total = total + ray_loss(seen, truth)
-            if config.completion:
-                total = total + config.completion * completion_loss(weights, episode)
+            if config.volume_loss:
+                total = total + config.volume_loss * completion_loss(weights, episode)
         with record_function("step:gradients"):
             (total / tasks).backward()
         self._updates = [update.detach() for update in updates]
@@ -259,13 +253,6 @@ class Trainer:
             return prepared
         hidden = torch.rand(len(prepared.views), generator=generator) < chance
         return prepared.hiding(hidden.nonzero()[:, 0])
-
-    def _due(self) -> list[torch.optim.Optimizer]:
-        """The optimisers of this step: all, or in turns those of theta and that of the hypernetwork."""
-        theta, hypernetwork = self.optimisers[: self._of_theta], self.optimisers[self._of_theta :]
-        if not self.config.alternating or not hypernetwork:
-            return self.optimisers
-        return hypernetwork if self.step % 2 else theta
 
     @torch.no_grad()
     def norms(self) -> dict[str, float]:
@@ -316,11 +303,6 @@ class Trainer:
         """The highest quality of the looks so far."""
         return max((row["psnr"] for row in self.curve if row.get("psnr") is not None), default=-math.inf)
 
-    @property
-    def evaluated(self) -> HyperPlanes:
-        """What is evaluated and saved: the model, or that of the averaged weights."""
-        return self.model if self.average is None else self.average.model
-
     def warm(self, name: str) -> None:
         """Have the planes and the hull of an object ready, as its first step otherwise makes them."""
         self._prefetcher.get(name)
@@ -343,7 +325,7 @@ class Trainer:
         if not episodes:
             return None, None
         prepared, queries = [each.prepared for each in episodes], [each.query for each in episodes]
-        model = self.evaluated
+        model = self.model
         training = model.training
         model.eval()
         try:
@@ -360,7 +342,7 @@ class Trainer:
 
     def _adapted(self, episode: Episode) -> AdaptedField:
         """The field of a held-out object."""
-        return self.evaluated.adapt(episode.prepared)
+        return self.model.adapt(episode.prepared)
 
     def save(self) -> None:
         """Write model and training state to the folder, where there is one; whole or not at all."""
@@ -368,14 +350,14 @@ class Trainer:
             if self.diagnostics is not None:
                 write_json(self.folder / "diagnostics.json", self.diagnostics.as_json())
             config = asdict(self.config)
-            save_state(self.folder, self.model, self.optimisers, self.step, self.curve, config, self.average)
+            save_state(self.folder, self.model, self.optimisers, self.step, self.curve, config)
 
     def _schedule(self) -> float:
         config = self.config
         if self.step < config.warmup:
             return (self.step + 1) / config.warmup
         done = (self.step - config.warmup) / max(1, config.steps - config.warmup)
-        return config.final + (1 - config.final) * (1 + math.cos(math.pi * done)) / 2
+        return config.final_rate_factor + (1 - config.final_rate_factor) * (1 + math.cos(math.pi * done)) / 2
 
     @property
     def _reads_hull(self) -> bool:
@@ -397,7 +379,7 @@ class Trainer:
 
     def _whole(self, task: Task) -> Tensor | None:
         """What all views of an object show, where the training completes volumes; made once while there is room."""
-        if not self.config.completion:
+        if not self.config.volume_loss:
             return None
         with self._lock:
             kept = self._wholes.get(task.name)

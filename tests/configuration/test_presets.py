@@ -58,7 +58,7 @@ def test_the_papers_protocol_and_training(name):
     training = chosen.training
     assert (training.tasks, training.rays, training.learning_rate) == (1, 512, 1e-4)
     assert training.hypernetwork_learning_rate == 1e-4
-    assert (training.warmup, training.final) == (0, 1.0)
+    assert (training.warmup, training.final_rate_factor) == (0, 1.0)
     assert str(chosen.resolution) in name
 
 
@@ -68,7 +68,7 @@ def test_every_preset_survives_json_and_fits_its_own_parts(name):
     assert ModelConfig.of_json(chosen.model.as_json()) == chosen.model
     assert chosen.model.hypernetwork.views <= chosen.model.network.planes
     assert chosen.without_hypernetwork().model == replace(chosen.model, hypernetwork=None)
-    assert chosen.without_hypernetwork().training == replace(chosen.training, completion=0.0)
+    assert chosen.without_hypernetwork().training == replace(chosen.training, volume_loss=0.0)
     assert "\n" not in chosen.about
 
 

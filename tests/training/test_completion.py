@@ -23,7 +23,7 @@ MODEL = ModelConfig(
     hull_side=32,
 )
 TRAINING = TrainingConfig(
-    steps=4, tasks=2, rays=32, views=(1, 3), episodes=4, completion=0.1, hypernetwork_learning_rate=3e-3, held_out=0
+    steps=4, tasks=2, rays=32, views=(1, 3), episodes=4, volume_loss=0.1, hypernetwork_learning_rate=3e-3, held_out=0
 )
 
 
@@ -61,7 +61,7 @@ def test_only_cells_of_the_hull_that_is_shown_count_and_only_the_first_features(
 
 def test_a_training_learns_what_is_behind_the_views_that_are_shown():
     model = HyperPlanes(MODEL)
-    trainer = Trainer(model, Balls(views=8, size=(24, 24)), replace(TRAINING, steps=40, completion=1.0))
+    trainer = Trainer(model, Balls(views=8, size=(24, 24)), replace(TRAINING, steps=40, volume_loss=1.0))
     shown = episode(model)
 
     def loss():
@@ -96,5 +96,5 @@ def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):
     ],
 )
 def test_models_and_trainings_without_what_it_needs_are_refused(changes, training):
-    with pytest.raises(ValueError, match=r"training\.completion: expected"):
+    with pytest.raises(ValueError, match=r"training\.volume_loss: expected"):
         Trainer(HyperPlanes(replace(MODEL, **changes)), Balls(), training)

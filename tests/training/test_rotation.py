@@ -87,6 +87,6 @@ def test_a_training_shows_rotated_objects_with_their_volumes_and_goes_on_where_i
 def test_shares_that_are_none_and_trainings_without_episodes_are_refused(share):
     with pytest.raises(ValueError, match="rotations: expected a share from 0 to 1"):
         replace(TRAINING, rotations=share)
-    config = replace(TRAINING, views=(), completion=0.0, rotations=0.5)
+    config = replace(TRAINING, views=(), volume_loss=0.0, rotations=0.5)
     with pytest.raises(ValueError, match=r"training.rotations: expected 0 without training.views, got 0.5"):
         Trainer(HyperPlanes(MODEL), Balls(), config)

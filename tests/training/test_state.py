@@ -4,9 +4,11 @@ import json
 import shutil
 from dataclasses import replace
 
+import pytest
+
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.training import Trainer, TrainingConfig, train
-from hyperplanes.utilities.checkpoints import load_tensors
+from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors
 from tests.reference_rendering import Balls, awaken, small_model
 
 CONFIG = TrainingConfig(steps=5, tasks=1, rays=8, evaluate_every=100, checkpoint_every=1, held_out=0)
@@ -54,11 +56,11 @@ def test_the_best_model_is_that_of_the_look_with_the_highest_quality(tmp_path):
 
     class Judged(Trainer):
         def look(self):
-            weights.append(weights_of(self.evaluated))
+            weights.append(weights_of(self.model))
             return qualities[self.step - 1], None
 
     def judged(steps, folder):
-        config = replace(CONFIG, evaluate_every=1, steps=steps, average=0.5)
+        config = replace(CONFIG, evaluate_every=1, steps=steps)
         trainer = Judged(awaken(small_model()), Balls(), config, folder)
         list(trainer.run())
 
@@ -72,10 +74,17 @@ def test_the_best_model_is_that_of_the_look_with_the_highest_quality(tmp_path):
     assert same(HyperPlanes.from_pretrained(tmp_path / "parts" / "best").state_dict(), best)
 
 
-def test_a_training_of_a_version_without_some_settings_goes_on_with_their_defaults(tmp_path):
+def test_a_training_of_an_earlier_version_goes_on(tmp_path):
     train(small_model(), Balls(), replace(CONFIG, steps=1), tmp_path)
     saved = json.loads((tmp_path / "training.json").read_text())
-    for name in ("average", "clip", "balanced", "keep_last"):
-        del saved["config"][name]
+    earlier = saved["config"]
+    for name in ("clip", "balanced", "keep_last"):  # which it did not have
+        del earlier[name]
+    earlier["final"], earlier["completion"] = earlier.pop("final_rate_factor"), earlier.pop("volume_loss")
+    earlier |= {"alternating": False, "average": 0.0}  # which are gone
     (tmp_path / "training.json").write_text(json.dumps(saved))
     assert Trainer(small_model(), Balls(), CONFIG, tmp_path).step == 1
+    earlier["average"] = 0.999
+    (tmp_path / "training.json").write_text(json.dumps(saved))
+    with pytest.raises(CheckpointError, match=r"training.json: average: expected 0.0, since .* removed, got 0.999"):
+        Trainer(small_model(), Balls(), CONFIG, tmp_path)

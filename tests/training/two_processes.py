@@ -52,9 +52,9 @@ def conditioned(folder=None):
 
 
 def normalised(folder=None):
-    """Batch normalisation, a gradient that is clipped, averaged weights, steps in turns."""
+    """Batch normalisation, a gradient that is clipped."""
     model = awaken(small_model(hypernetwork=HyperNetworkConfig(**SHAPE, normalisation="batch"))).double()
-    config = replace(CONFIG, tasks=2, clip=0.02, average=0.5, alternating=True)
+    config = replace(CONFIG, tasks=2, clip=0.02)
     return Trainer(model, Precise(3), config, folder)
 
 
@@ -84,10 +84,8 @@ class Poisoned(Balls):
 
 
 def weights_of(trainer):
-    """Copies of the weights that are trained and of those that are evaluated."""
-    trained, evaluated = trainer.model.state_dict(), trainer.evaluated.state_dict()
-    both = {**trained, **{f"evaluated.{name}": value for name, value in evaluated.items()}}
-    return {name: value.clone() for name, value in both.items()}
+    """Copies of the weights."""
+    return {name: value.clone() for name, value in trainer.model.state_dict().items()}
 
 
 def end_of(call):

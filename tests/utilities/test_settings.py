@@ -101,6 +101,13 @@ def test_a_configuration_written_is_the_one_read(name, tmp_path):
     assert yaml.safe_load(document("x", chosen))["model"] == json.loads(json.dumps(chosen.model.as_json()))
 
 
+def test_settings_of_earlier_versions_are_read():
+    before = {"training": {"final": 0.1, "completion": 0.0, "alternating": False, "average": 0.0}}
+    assert changed(preset("quick"), before).training.final_rate_factor == 0.1
+    with pytest.raises(SettingsError, match=r"training\.average: expected 0.0, since .* removed, got 0.9"):
+        changed(preset("quick"), {"training": {"average": 0.9}})
+
+
 def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(
@@ -116,7 +123,7 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
     assert (chosen.model.target, chosen.model.hypernetwork) == ("nerf", None)
     assert chosen.model.network == replace(small.model.network, depth=3, grid=0)
     assert chosen.model.sampling == Hierarchical(8, 5)
-    of_any_order = {"views": (), "rotations": 0.0, "completion": 0.0}
+    of_any_order = {"views": (), "rotations": 0.0, "volume_loss": 0.0}
     assert chosen.training == replace(small.training, learning_rate=1e-3, steps=11, rays=13, **of_any_order)
     assert resolve(replace(given, method="multiplane", protocol="fast", settings=()))[1].model.sampling == Marched()
     assert resolve(replace(given, cache_size=0.5))[1].training.memory == 2**29
