@@ -16,6 +16,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from hyperplanes.utilities.threads import wait_passively
+
 if TYPE_CHECKING:
     from hyperplanes.adaptation.fine_tuned import FineTuned
     from hyperplanes.adaptation.fine_tuning import FineTuning
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from hyperplanes.training import Trainer
     from hyperplanes.utilities.metrics import psnr, ssim
     from hyperplanes.views import Task, Views
+
+wait_passively()  # before PyTorch is loaded
 
 _HOMES = {
     "DataError": "data",

@@ -1,0 +1,132 @@
+"""The same work by one, two and all threads, on the machine as it is and beside processes that keep every core busy.
+
+    python -m benchmarks busy --json FILE
+
+Each way is a process of its own, since OpenMP reads how its threads wait when PyTorch is loaded: "passive" as
+`import hyperplanes` sets it, "active" as PyTorch has it where nobody decides. The reference of every row is one thread
+under the same load. More threads are never to be slower than one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchmarks.reporting import Row, finish
+
+if TYPE_CHECKING:
+    from hyperplanes.adaptation import HyperPlanes
+    from hyperplanes.views import Task
+
+__all__ = ["main"]
+
+WORKS = ("lookup", "carving", "rendering", "fine_tuning", "training")
+SPIN = "while True: pass"
+
+
+def main(arguments: list[str]) -> int:
+    """Measure, print, and write the rows where asked.
+
+    Args:
+        arguments: see --help.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks busy", description=__doc__)
+    parser.add_argument("--works", nargs="+", choices=WORKS, default=list(WORKS))
+    parser.add_argument("--policies", nargs="+", choices=("passive", "active"), default=["passive", "active"])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="small and once: to see that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--measure", choices=WORKS, help=argparse.SUPPRESS)  # what a process of its own does
+    chosen = parser.parse_args(arguments)
+    if chosen.measure:
+        print(json.dumps(_seconds(chosen.measure, 1 if chosen.quick else chosen.repeats, chosen.quick)))
+        return 0
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    counts, rows = sorted({1, 2, cores}), []
+    for load, spinning in (("idle", 0), ("busy", cores)):
+        for work in chosen.works:
+            for policy in chosen.policies:
+                with _busy(spinning):
+                    times = {count: _in_process(work, count, policy, chosen) for count in counts}
+                for count, seconds in times.items():
+                    pairs = sorted(one / ours for one, ours in zip(times[1], seconds, strict=True))
+                    row: Row = {"name": work, "load": load, "policy": policy, "threads": count}
+                    rows.append({**row, "seconds": statistics.median(seconds), "speedup": statistics.median(pairs)})
+    return finish("busy", rows, chosen.json)
+
+
+@contextmanager
+def _busy(count: int) -> Generator[None]:
+    """So many processes beside this one that do nothing but spin."""
+    others = [subprocess.Popen([sys.executable, "-c", SPIN]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+
+
+def _in_process(work: str, threads: int, policy: str, chosen: argparse.Namespace) -> list[float]:
+    """The seconds of every repetition in a process of so many threads that wait so."""
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": policy.upper()}
+    environment.pop("GOMP_SPINCOUNT", None)
+    command = [sys.executable, "-m", "benchmarks", "busy", "--measure", work, "--repeats", str(chosen.repeats)]
+    command += ["--quick"] if chosen.quick else []
+    run = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+def _seconds(name: str, repeats: int, quick: bool) -> list[float]:
+    """The wall time of every repetition, after one that is not measured."""
+    work = _work(name, quick)
+    work()
+    times = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begun)
+    return times
+
+
+def _work(name: str, quick: bool) -> Callable[[], object]:
+    """One repetition of a work, on the scene and the model that come with the package."""
+    import torch
+
+    import hyperplanes as hp
+    from hyperplanes.adaptation.base import hull
+
+    task = hp.read_task("example-car")
+    if name == "lookup":
+        planes = hp.ImagePlanes(task.support.images, task.support.cameras)
+        points = torch.rand(2_000 if quick else 65_536, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+        return lambda: planes.lookup(points)
+    if name == "carving":
+        return lambda: hull(task.support, 32 if quick else 96)
+    model = hp.HyperPlanes.from_pretrained("small")
+    if name == "fine_tuning":
+        return lambda: model.fine_tune(task.support, 1 if quick else 5)
+    if name == "training":
+        return _training(model, task)
+    field, cameras = model.adapt(task.support), task.query[: 1 if quick else 4].cameras
+    return lambda: field.render(cameras)
+
+
+def _training(model: HyperPlanes, task: Task) -> Callable[[], object]:
+    """Steps of the packaged model's training on one object, ten views of it a step."""
+    from benchmarks.training import Objects
+    from hyperplanes.configuration.presets import preset
+    from hyperplanes.training import Trainer
+
+    objects = Objects([replace(task, name=f"{name}") for name in range(3)])  # the last two are held out
+    return Trainer(model, objects, replace(preset("small").training, tasks=1, views=(10,))).take_step
