@@ -103,17 +103,19 @@ def _work(name: str, quick: bool) -> Callable[[], object]:
     """One repetition of a work, on the scene and the model that come with the package."""
     import torch
 
-    import hyperplanes as hp
     from hyperplanes.adaptation.base import hull
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+    from hyperplanes.data import read_task
+    from hyperplanes.geometry import ImagePlanes
 
-    task = hp.read_task("example-car")
+    task = read_task("example-car")
     if name == "lookup":
-        planes = hp.ImagePlanes(task.support.images, task.support.cameras)
+        planes = ImagePlanes(task.support.images, task.support.cameras)
         points = torch.rand(2_000 if quick else 65_536, 3, generator=torch.Generator().manual_seed(0)) - 0.5
         return lambda: planes.lookup(points)
     if name == "carving":
         return lambda: hull(task.support, 32 if quick else 96)
-    model = hp.HyperPlanes.from_pretrained("small")
+    model = HyperPlanes.from_pretrained("small")
     if name == "fine_tuning":
         return lambda: model.fine_tune(task.support, 1 if quick else 5)
     if name == "training":
