@@ -1,8 +1,8 @@
 """Painted solids, and the scene they make together.
 
-All parts of an object end in ONE geometry with ONE texture: a draw call costs a renderer more than the faces of a
-wheel do. The texture is an atlas. A plain colour is a block of it, read at the block's centre by all corners of a
-face, so nothing bleeds in at any distance; a pattern is a tile with its border repeated outwards.
+All parts of one finish end in ONE geometry, and all geometries share ONE texture: a draw call costs a renderer more
+than the faces of a wheel do. The texture is an atlas. A plain colour is a block of it, read at the block's centre by
+all corners of a face, so nothing bleeds in at any distance; a pattern is a tile with its border repeated outwards.
 """
 
 from __future__ import annotations
@@ -19,9 +19,22 @@ from trimesh.visual.material import PBRMaterial
 from data_gen.shapes.materials import Material
 from data_gen.shapes.solids import Solid
 
-__all__ = ["Part", "atlas", "build_scene", "corner_normals", "pair", "pick"]
+__all__ = ["Finish", "Part", "atlas", "build_scene", "corner_normals", "pair", "pick"]
 
 _WIDTH, _BLOCK, _MARGIN = 256, 16, 8
+
+
+@dataclass(frozen=True)
+class Finish:
+    """How a surface reflects, as glTF describes it.
+
+    Attributes:
+        roughness: in [0, 1].
+        metallic: in [0, 1].
+    """
+
+    roughness: float = 0.55
+    metallic: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -33,12 +46,14 @@ class Part:
         solid: the geometry, in the object's frame.
         materials: the materials used.
         chosen: (F,) index into `materials` of each face.
+        finish: how all of it reflects.
     """
 
     name: str
     solid: Solid
     materials: tuple[Material, ...]
     chosen: np.ndarray
+    finish: Finish = Finish()
 
     @staticmethod
     def of(name: str, solid: Solid, material: Material) -> Part:
@@ -147,33 +162,53 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rows[first[order]], rank[inverse.reshape(-1)]
 
 
-def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> trimesh.Scene:
-    """Join parts into a scene with one textured geometry.
+def build_scene(name: str, parts: Sequence[Part]) -> trimesh.Scene:
+    """Join parts into a scene with one textured geometry a finish.
 
     Args:
-        name: name of the geometry.
+        name: name of the first geometry; the others have a number behind it.
         parts: the painted solids.
-        roughness: PBR roughness of all of it, in [0, 1].
 
     Returns:
         The scene. Vertices are rounded to a millionth of a unit and split where shading or texture is discontinuous;
-        the geometry's `metadata["parts"]` lists (part name, first face, number of faces).
+        a geometry's `metadata["parts"]` lists (part name, first face, number of faces).
     """
     materials: dict[bytes, Material] = {}
     for part in parts:
         for index in np.unique(part.chosen):
-            image = part.materials[index].image
-            materials.setdefault(repr(image.shape).encode() + image.tobytes(), part.materials[index])
+            materials.setdefault(_key(part.materials[index]), part.materials[index])
     keys = sorted(materials, key=lambda key: materials[key].image.size == 3)  # patterns first, then the palette
     image, maps = atlas([materials[key] for key in keys])
+    rows = {key: row for row, key in enumerate(keys)}
+    texture = Image.fromarray(image)
+    scene = trimesh.Scene()
+    for number, finish in enumerate(dict.fromkeys(part.finish for part in parts)):
+        label = f"{name}_{number}" if number else name
+        material = PBRMaterial(
+            name=label,
+            baseColorTexture=texture,
+            metallicFactor=finish.metallic,
+            roughnessFactor=finish.roughness,
+        )
+        alike = [part for part in parts if part.finish == finish]
+        scene.add_geometry(_joined(alike, rows, maps, material), node_name=label, geom_name=label)
+    return scene
+
+
+def _key(material: Material) -> bytes:
+    """What two materials share if and only if they look the same."""
+    return repr(material.image.shape).encode() + material.image.tobytes()
+
+
+def _joined(
+    parts: Sequence[Part], rows: Mapping[bytes, int], maps: np.ndarray, material: PBRMaterial
+) -> trimesh.Trimesh:
+    """Parts as one mesh, their texture coordinates mapped into the atlas."""
     positions, coordinates, names, first = [], [], [], 0
     for part in parts:
         solid = part.solid
-        rows = [
-            keys.index(repr(m.image.shape).encode() + m.image.tobytes()) if i in part.chosen else 0
-            for i, m in enumerate(part.materials)
-        ]
-        mapping = maps[np.array(rows)[part.chosen]]  # (F, 2, 2)
+        row = np.array([rows.get(_key(each), 0) for each in part.materials])  # 0 where no face has it
+        mapping = maps[row[part.chosen]]  # (F, 2, 2)
         coordinates.append(solid.uv * mapping[:, None, :, 0] + mapping[:, None, :, 1])
         positions.append(solid.vertices[solid.faces])
         names.append((part.name, first, len(solid.faces)))
@@ -182,17 +217,11 @@ def build_scene(name: str, parts: Sequence[Part], roughness: float = 0.55) -> tr
     corners = np.concatenate([column.reshape(3 * first, -1) for column in columns], axis=1)
     millionths, inverse = _distinct(np.rint(corners * 1e6).astype(np.int64))
     unique = millionths / 1e6
-    mesh = trimesh.Trimesh(
+    return trimesh.Trimesh(
         vertices=unique[:, :3],
         faces=inverse.reshape(-1, 3),
         vertex_normals=unique[:, 3:6],
-        visual=TextureVisuals(
-            uv=unique[:, 6:],
-            material=PBRMaterial(
-                name=name, baseColorTexture=Image.fromarray(image), metallicFactor=0.0, roughnessFactor=roughness
-            ),
-        ),
+        visual=TextureVisuals(uv=unique[:, 6:], material=material),
         metadata={"parts": names},
         process=False,
     )
-    return trimesh.Scene({name: mesh})

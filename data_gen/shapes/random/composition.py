@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_gen.shapes.materials import Material
 from data_gen.shapes.parts import Part, pick
+from data_gen.shapes.primitives import box, cylinder
+from data_gen.shapes.random.cuts import difference
+from data_gen.shapes.random.painting import Paint
 from data_gen.shapes.random.primitives import primitive
-from data_gen.shapes.random.textures import random_material
+from data_gen.shapes.random.structures import structure
 from data_gen.shapes.random.tubes import merged, moved
 from data_gen.shapes.solids import Solid, rotation
 
-__all__ = ["COUNTS", "Paint", "composition", "random_rotation"]
+__all__ = ["COUNTS", "composition", "random_rotation"]
 
 COUNTS = (5, 5, 5, 4, 4, 3, 2, 1, 1)
 """How often an object has 1, 2, ... 9 primitives."""
@@ -22,34 +24,18 @@ COUNTS = (5, 5, 5, 4, 4, 3, 2, 1, 1)
 RELIEF = 0.5
 """Share of the primitives with a height field."""
 
+CUTS = 0.25
+"""Share of the primitives from which others are taken away, and of the solids of a structure a quarter as many."""
+
+STRUCTURES = 0.3
+"""Share of the objects with the structure of a table, a cart, a figure and so on."""
+
 MOST_FACES = 3000
 """Faces of a primitive and its copies together."""
 
 _PROPORTIONS = {"any": 0.62, "plate": 0.14, "rod": 0.12, "cube": 0.12}
 _TURNS = {"none": 0.4, "quarter": 0.25, "upright": 0.15, "any": 0.2}
 _ARRANGEMENTS = {"single": 0.66, "mirrored": 0.14, "row": 0.1, "ring": 0.1}
-
-
-class Paint:
-    """Draws the materials of one object: one for all of it, a few that come again, or new ones all the time."""
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        self._rng = rng
-        count = int(rng.choice([1, 2, 3, 4, 0], p=[0.08, 0.14, 0.18, 0.1, 0.5]))
-        self._materials = [random_material(rng) for _ in range(count)]
-
-    def draw(self) -> Material:
-        """A material for the next surface."""
-        if self._materials:
-            return self._materials[int(self._rng.integers(len(self._materials)))]
-        return random_material(self._rng)
-
-    def part(self, name: str, solid: Solid) -> Part:
-        """A painted solid, some with other materials on their flat ends."""
-        part = Part.of(name, solid, self.draw())
-        if self._rng.random() < 0.25 and (solid.cells[:, 0] == -1).any():
-            part = part.capped(self.draw(), *((True, False), (False, True), (True, True))[int(self._rng.integers(3))])
-        return part
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
@@ -94,7 +80,22 @@ def _turn(rng: np.random.Generator) -> np.ndarray:
 def _piece(rng: np.random.Generator, thin: bool) -> Solid:
     """A primitive with its height field, its proportions and its rotation, about the origin."""
     solid = moved(primitive(rng, RELIEF), np.diag(_half_axes(rng, thin)))
+    if rng.random() < CUTS:
+        solid = _cut(rng, solid)
     return moved(solid, _turn(rng))
+
+
+def _cut(rng: np.random.Generator, solid: Solid) -> Solid:
+    """The solid without one to three primitives; where they leave less than a quarter of it, as it was."""
+    left = solid
+    low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+    for _ in range(int(rng.integers(1, 4))):
+        tool = moved(primitive(rng, 0.1), np.diag((high - low) * rng.uniform(0.12, 0.45, 3)))
+        tool = moved(tool, _turn(rng), low + (high - low) * rng.uniform(0.0, 1.0, 3))
+        smaller = difference(left, tool)
+        if smaller is not None and smaller.volume > 0.25 * solid.volume:
+            left = smaller
+    return left
 
 
 def _arranged(rng: np.random.Generator, solid: Solid) -> Solid:
@@ -106,19 +107,19 @@ def _arranged(rng: np.random.Generator, solid: Solid) -> Solid:
         axis = int(rng.choice([0, 0, 2, 1]))
         mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
         shift = np.zeros(3)
-        shift[axis] = extents[axis] * rng.uniform(0.3, 1.2)
+        shift[axis] = extents[axis] * rng.uniform(0.3, 0.75)
         return merged([moved(solid, np.eye(3), shift), moved(solid, mirror, -shift)])
     if kind == "row":
         count, axis = min(most, int(rng.integers(2, 6))), int(rng.integers(3))
         step = np.zeros(3)
-        step[axis] = extents[axis] * rng.uniform(0.7, 1.8)
+        step[axis] = extents[axis] * rng.uniform(0.6, 1.2)
         size = rng.uniform(0.5, 0.9)
         places = (np.arange(count) - (count - 1) / 2)[:, None] * step
         return merged([moved(solid, size * np.eye(3), place) for place in places])
     if kind == "ring":
         count = min(most, int(rng.integers(3, 9)))
         small = moved(solid, rng.uniform(0.3, 0.6) * np.eye(3))
-        outwards = np.array([0.0, 0.0, rng.uniform(0.3, 1.2)])
+        outwards = np.array([0.0, 0.0, rng.uniform(0.3, 0.9)])
         turns = [rotation("y", 360.0 * k / count) for k in range(count)]
         return merged([moved(moved(small, np.eye(3), outwards), turn) for turn in turns])
     return solid
@@ -139,8 +140,6 @@ def _attached(rng: np.random.Generator, solid: Solid, others: list[Solid]) -> So
 
 def _base(rng: np.random.Generator, solids: list[Solid]) -> Solid:
     """A plate under all of them."""
-    from data_gen.shapes.primitives import box, cylinder
-
     points = np.concatenate([solid.vertices for solid in solids])
     low, high = points.min(axis=0), points.max(axis=0)
     width, _, depth = (high - low) * rng.uniform(0.7, 1.4, 3) + 0.1
@@ -150,15 +149,8 @@ def _base(rng: np.random.Generator, solids: list[Solid]) -> Solid:
     return moved(plate, np.eye(3), np.array([middle[0], low[1] - 0.3 * thick, middle[2]]))
 
 
-def composition(rng: np.random.Generator) -> list[Part]:
-    """An object of one to nine random primitives and what is repeated of them.
-
-    Args:
-        rng: source of every choice.
-
-    Returns:
-        Its parts about the origin; any side may be up.
-    """
+def _composed(rng: np.random.Generator) -> list[Solid]:
+    """One to nine primitives and what is repeated of them."""
     count = 1 + int(rng.choice(len(COUNTS), p=np.array(COUNTS) / sum(COUNTS)))
     solids: list[Solid] = []
     for _ in range(count):
@@ -168,9 +160,27 @@ def composition(rng: np.random.Generator) -> list[Part]:
         mirror = np.diag([-1.0, 1.0, 1.0])
         edge = np.concatenate([solid.vertices for solid in solids])[:, 0]
         shift = np.array([-edge.min() - rng.uniform(0.1, 0.5) * np.ptp(edge), 0.0, 0.0])
-        solids = [merged([shifted := moved(solid, np.eye(3), shift), moved(shifted, mirror)]) for solid in solids]
+        shifted = [moved(solid, np.eye(3), shift) for solid in solids]
+        solids = [merged([solid, moved(solid, mirror)]) for solid in shifted]
+    return solids
+
+
+def composition(rng: np.random.Generator) -> list[Part]:
+    """An object of random primitives, composed at random or as a rough structure.
+
+    Args:
+        rng: source of every choice.
+
+    Returns:
+        Its parts about the origin; any side may be up, but most stand upright.
+    """
+    if rng.random() < STRUCTURES:
+        solids = [_cut(rng, solid) if rng.random() < CUTS / 4 else solid for solid in structure(rng)]
+        upright = 0.85
+    else:
+        solids, upright = _composed(rng), 0.75
     if rng.random() < 0.15:
         solids.append(_base(rng, solids))
-    turn = random_rotation(rng) if rng.random() < 0.25 else rotation("y", rng.uniform(0, 360))
+    turn = rotation("y", rng.uniform(0, 360)) if rng.random() < upright else random_rotation(rng)
     paint = Paint(rng)
     return [paint.part(f"piece_{index}", moved(solid, turn)) for index, solid in enumerate(solids)]

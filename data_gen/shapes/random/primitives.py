@@ -6,17 +6,20 @@ arXiv 2406.09371) composes cubes, balls, cylinders, cones and tori; lathes, loft
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from data_gen.shapes.profiles import ellipse, rectangle
+from data_gen.shapes.random.hollow import arch, pipe, vessel, wire_cage
 from data_gen.shapes.random.outlines import AROUND, blob, outline
 from data_gen.shapes.random.relief import random_relief
-from data_gen.shapes.random.tubes import merged, moved, subdivided, tube
+from data_gen.shapes.random.tubes import bar, merged, moved, subdivided, tube
 from data_gen.shapes.solids import Solid
 
-__all__ = ["FRAMES", "PRIMITIVES", "bar", "primitive", "smooth_curve"]
+__all__ = ["FRAMES", "PRIMITIVES", "Maker", "primitive", "smooth_curve"]
+
+Maker = Callable[[np.random.Generator, bool], Solid]
 
 _STATIONS = 9
 
@@ -159,12 +162,6 @@ def pebble(rng: np.random.Generator, fine: bool) -> Solid:
     return tube(spine, sections).creased(60)
 
 
-def bar(start: np.ndarray, end: np.ndarray, radius: float, sides: int) -> Solid:
-    """A straight bar between two points, of a regular section with that circumradius."""
-    spine = np.stack([start, end])
-    return tube(spine, np.tile(radius * ellipse(1.0, 1.0, sides), (2, 1, 1)), inner=0).creased(40 if sides < 6 else 65)
-
-
 def wire_box(rng: np.random.Generator, fine: bool) -> Solid:
     """The twelve edges of a cube as bars."""
     radius, sides = rng.uniform(0.04, 0.12), int(rng.choice([4, 6]))
@@ -204,7 +201,7 @@ def _smooth(places: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarra
     return PchipInterpolator(places, values)(at)
 
 
-PRIMITIVES: dict[Callable[[np.random.Generator, bool], Solid], float] = {
+PRIMITIVES: dict[Maker, float] = {
     box: 3.0,
     cylinder: 2.2,
     ball: 2.2,
@@ -215,29 +212,34 @@ PRIMITIVES: dict[Callable[[np.random.Generator, bool], Solid], float] = {
     loft: 2.5,
     bent_tube: 1.2,
     pebble: 0.7,
-    wire_box: 0.5,
+    vessel: 1.2,
+    pipe: 0.8,
+    arch: 0.8,
+    wire_box: 0.4,
+    wire_cage: 0.3,
     grille: 0.4,
     spring: 0.25,
 }
 """How often each is drawn."""
 
 
-FRAMES = (wire_box, grille, spring)
+FRAMES = (wire_box, wire_cage, grille, spring)
 """Those that are made of bars, too thin to be displaced."""
 
 
-def primitive(rng: np.random.Generator, relief: float) -> Solid:
-    """One of `PRIMITIVES`, its longest extent 2, about the origin.
+def primitive(rng: np.random.Generator, relief: float, shares: Mapping[Maker, float] = PRIMITIVES) -> Solid:
+    """A random primitive, its longest extent 2, about the origin.
 
     Args:
         rng: source of every choice.
         relief: how likely it has a height field.
+        shares: the primitives, and how often each is drawn.
 
     Returns:
         The solid.
     """
-    makers, shares = list(PRIMITIVES), np.array(list(PRIMITIVES.values()))
-    maker = makers[int(rng.choice(len(makers), p=shares / shares.sum()))]
+    makers, weights = list(shares), np.array(list(shares.values()))
+    maker = makers[int(rng.choice(len(makers), p=weights / weights.sum()))]
     fine = maker not in FRAMES and bool(rng.random() < relief)
     solid = maker(rng, fine)
     if fine:

@@ -1,4 +1,4 @@
-"""Random textures: plain colours, noise of several octaves, patterns in any direction, wood, cloth.
+"""Random textures: plain colours, noise of several octaves, patterns in any direction, wood, cloth, photographs, marks.
 
 Images are square and small; u runs around a solid and v along it, as in `data_gen.shapes.patterns`.
 """
@@ -12,6 +12,8 @@ import numpy as np
 from data_gen.shapes import patterns
 from data_gen.shapes.materials import Material, plain
 from data_gen.shapes.random.colours import near, random_colour
+from data_gen.shapes.random.marks import label, sign, writing
+from data_gen.shapes.random.photographs import photograph
 
 __all__ = ["TEXTURES", "octaves", "random_material"]
 
@@ -147,6 +149,10 @@ TEXTURES: dict[Callable[[np.random.Generator], Material], float] = {
     pattern: 2.2,
     wood: 1.0,
     cloth: 0.8,
+    photograph: 2.0,
+    writing: 0.6,
+    label: 0.6,
+    sign: 0.4,
 }
 """How often each is drawn."""
 

@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from data_gen.shapes.profiles import ellipse
 from data_gen.shapes.solids import Solid, skin
 
-__all__ = ["frames_along", "merged", "moved", "reflected", "signed_volume", "subdivided", "surface", "tube"]
+__all__ = ["bar", "frames_along", "merged", "moved", "reflected", "signed_volume", "subdivided", "surface", "tube"]
 
 
 def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -148,6 +149,12 @@ def _flat_coordinates(ring: np.ndarray, towards: float, points: np.ndarray) -> n
     axes = np.stack([first, second], axis=1) / max(np.linalg.norm(first), 1e-12)
     low, high = ((ring - middle) @ axes).min(axis=0), ((ring - middle) @ axes).max(axis=0)
     return ((points - middle) @ axes - low) / np.maximum(high - low, 1e-9)
+
+
+def bar(start: np.ndarray, end: np.ndarray, radius: float, sides: int) -> Solid:
+    """A straight bar between two points, of a regular section with that circumradius."""
+    spine = np.stack([start, end])
+    return tube(spine, np.tile(radius * ellipse(1.0, 1.0, sides), (2, 1, 1)), inner=0).creased(40 if sides < 6 else 65)
 
 
 def moved(solid: Solid, linear: np.ndarray, offset: np.ndarray | float = 0.0) -> Solid:

@@ -23,9 +23,10 @@ KINDS = tuple(name for name in CLASSES if name != "random")
 
 
 def digest(class_name: str, seed: int) -> str:
-    mesh = make(class_name, seed).geometry[class_name]
-    texture = np.asarray(mesh.visual.material.baseColorTexture)
-    arrays = (mesh.vertices, mesh.faces, mesh.vertex_normals, mesh.visual.uv, texture)
+    arrays = []
+    for mesh in make(class_name, seed).geometry.values():
+        texture = np.asarray(mesh.visual.material.baseColorTexture)
+        arrays += [mesh.vertices, mesh.faces, mesh.vertex_normals, mesh.visual.uv, texture]
     return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
 

@@ -5,11 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_gen.shapes import assemble
+from data_gen.shapes import assemble, make
+from data_gen.shapes.materials import plain
+from data_gen.shapes.parts import Finish, Part, build_scene
+from data_gen.shapes.primitives import box
 from data_gen.shapes.profiles import ellipse, rectangle
+from data_gen.shapes.random.cuts import CUT, difference
+from data_gen.shapes.random.marks import glyph
 from data_gen.shapes.random.outlines import AROUND, outline
-from data_gen.shapes.random.primitives import FRAMES, PRIMITIVES
+from data_gen.shapes.random.photographs import PHOTOGRAPHS
+from data_gen.shapes.random.primitives import FRAMES, PRIMITIVES, primitive
 from data_gen.shapes.random.relief import displaced, vertex_normals
+from data_gen.shapes.random.structures import STRUCTURES
 from data_gen.shapes.random.textures import TEXTURES
 from data_gen.shapes.random.tubes import frames_along, moved, subdivided, tube
 
@@ -31,7 +38,7 @@ def upright(height, stations):
 
 
 def test_compositions_are_watertight_and_no_two_parts_have_one_name():
-    for seed in range(40):
+    for seed in range(12):
         parts = assemble("random", seed)
         assert len({part.name for part in parts}) == len(parts)
         for part in parts:
@@ -40,11 +47,91 @@ def test_compositions_are_watertight_and_no_two_parts_have_one_name():
 
 @pytest.mark.parametrize("make", PRIMITIVES, ids=lambda make: make.__name__)
 def test_every_primitive_is_closed_right_way_out_and_fits_the_cube(make):
-    for seed in range(12):
+    for seed in range(4):
         for fine in (False, True) if make not in FRAMES else (False,):
             solid = make(np.random.default_rng(seed), fine)
             check_solid(solid, (seed, fine))
             assert np.abs(solid.vertices).max() < 2.0
+
+
+@pytest.mark.parametrize("make", STRUCTURES, ids=lambda make: make.__name__)
+def test_every_structure_is_of_closed_solids(make):
+    for seed in range(3):
+        solids = make(np.random.default_rng(seed))
+        assert len(solids) > 1
+        for number, solid in enumerate(solids):
+            check_solid(solid, (seed, number))
+
+
+def test_a_cut_keeps_the_texture_of_what_is_left_and_names_what_is_new():
+    """Closed form: a quarter cut off a cube, the new faces in the cutting planes and no others."""
+    cube, tool = box(2, 2, 2), box(2, 2, 3).moved(1, 1)
+    left = difference(cube, tool)
+    check_solid(left, "cut")
+    assert left.volume == pytest.approx(6)
+    new = left.cells[:, 0] == CUT
+    corners = left.vertices[left.faces]
+    flat = (np.abs(corners[..., :2]) < 1e-12).all(axis=1).any(axis=1)
+    np.testing.assert_array_equal(new, flat)
+    front = ~new & (corners[..., 2] > 1 - 1e-9).all(axis=1)
+    whole = (cube.vertices[cube.faces][..., 2] > 1 - 1e-9).all(axis=1)
+    affine = np.linalg.lstsq(
+        np.c_[cube.vertices[cube.faces][whole][:, :, :2].reshape(-1, 2), np.ones(6)], cube.uv[whole].reshape(-1, 2)
+    )[0]
+    expected = np.c_[corners[front][..., :2].reshape(-1, 2), np.ones(3 * front.sum())] @ affine
+    np.testing.assert_allclose(left.uv[front].reshape(-1, 2), expected, atol=1e-9)
+    assert difference(cube, box(3, 3, 3)) is None
+
+
+def test_cuts_of_random_solids_stay_closed():
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        solid, tool = primitive(rng, 0.5), primitive(rng, 0.5)
+        left = difference(solid, moved(tool, 0.6 * np.eye(3), rng.uniform(-0.6, 0.6, 3)))
+        if left is not None:
+            check_solid(left, seed)
+            assert left.volume <= solid.volume * (1 + 1e-9)
+
+
+def test_the_same_seed_gives_the_same_vertices_and_pixels():
+    def arrays(seed):
+        for mesh in make("random", seed).geometry.values():
+            yield from (mesh.vertices, mesh.faces, mesh.vertex_normals, mesh.visual.uv)
+            yield np.asarray(mesh.visual.material.baseColorTexture)
+
+    for seed in range(3):
+        for one, other in zip(arrays(seed), arrays(seed), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_parts_of_two_finishes_are_two_geometries_with_one_texture():
+    matt = Part.of("matt", box(1, 1, 1), plain((200, 20, 20)))
+    glossy = Part("glossy", box(1, 1, 1).moved(2), (plain((20, 20, 200)),), np.zeros(12, np.int64), Finish(0.35, 0.3))
+    scene = build_scene("thing", [matt, glossy, Part.of("other", box(1, 1, 1).moved(4), plain((1, 2, 3)))])
+    assert list(scene.geometry) == ["thing", "thing_1"]
+    first, second = (mesh.visual.material for mesh in scene.geometry.values())
+    assert first.baseColorTexture is second.baseColorTexture
+    assert (first.roughnessFactor, first.metallicFactor) == (0.55, 0.0)
+    assert (second.roughnessFactor, second.metallicFactor) == (0.35, 0.3)
+    assert [name for name, _, _ in scene.geometry["thing"].metadata["parts"]] == ["matt", "other"]
+    assert (scene.geometry["thing_1"].visual.to_color().vertex_colors[:, :3] == (20, 20, 200)).all()
+
+
+@pytest.mark.parametrize("name", PHOTOGRAPHS)
+def test_photographs_are_those_whose_documentation_frees_them(name):
+    """Source: scikit-image's own docstrings, which state the licence of each picture."""
+    import skimage.data
+
+    text = " ".join((getattr(skimage.data, name).__doc__ or "").split())
+    assert "CC0" in text or "Creative Commons CC0" in text or "public domain" in text.lower()
+
+
+def test_glyphs_are_drawn_in_one_stroke():
+    """Brute force: all pixels of a glyph are connected through their sides."""
+    from scipy.ndimage import label
+
+    for seed in range(50):
+        assert label(glyph(np.random.default_rng(seed)))[1] == 1
 
 
 def test_tubes_have_the_volumes_of_prisms_pyramids_and_rings():

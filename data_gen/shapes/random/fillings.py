@@ -1,0 +1,62 @@
+"""Random solids that fill a given box: the parts of structures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from data_gen.shapes.primitives import box, cushion, tapered
+from data_gen.shapes.random.primitives import PRIMITIVES, Maker, ball, cylinder, lathe, loft, pebble, primitive
+from data_gen.shapes.random.tubes import merged, moved
+from data_gen.shapes.solids import Solid
+
+__all__ = ["BODIES", "LIMBS", "crate", "filling", "one_of", "sides"]
+
+Corner = Sequence[float] | np.ndarray
+
+
+def filling(
+    rng: np.random.Generator, makers: tuple[Maker, ...], low: Corner, high: Corner, relief: float = 0.2
+) -> Solid:
+    """One of some primitives, stretched into the box between two corners.
+
+    Args:
+        rng: source of every choice.
+        makers: the primitives.
+        low: the corner (x, y, z) of smallest coordinates.
+        high: the opposite corner.
+        relief: how likely it has a height field.
+
+    Returns:
+        The solid.
+    """
+    solid = one_of(rng, makers, relief)
+    bottom, top = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+    scale = (np.asarray(high, dtype=float) - np.asarray(low, dtype=float)) / (top - bottom)
+    return moved(solid, np.diag(scale), np.asarray(low, dtype=float) - scale * bottom)
+
+
+def one_of(rng: np.random.Generator, makers: tuple[Maker, ...], relief: float) -> Solid:
+    """One of some primitives, with a height field by that chance."""
+    return primitive(rng, relief, {maker: PRIMITIVES.get(maker, 1.0) for maker in makers})
+
+
+def sides(solid: Solid) -> Solid:
+    """The solid and its mirror image at x = 0."""
+    return merged([solid, moved(solid, np.diag([-1.0, 1.0, 1.0]))])
+
+
+def crate(rng: np.random.Generator, _fine: bool) -> Solid:
+    """A box, some with rounded edges, tapered, or swollen."""
+    draw = rng.random()
+    if draw < 0.4:
+        return box(2, 2, 2, rng.choice([0.0, 0.1, 0.3]), 2)
+    if draw < 0.75:
+        top = rng.uniform(0.5, 1.0, 2) * 2
+        return tapered((2, 2), (float(top[0]), float(top[1])), 2, (float(rng.uniform(-0.4, 0.4)), 0))
+    return cushion(2, 2, 2, rng.uniform(0, 1))
+
+
+BODIES: tuple[Maker, ...] = (crate, loft, cylinder, ball, pebble, lathe)
+LIMBS: tuple[Maker, ...] = (crate, cylinder, lathe, loft)
