@@ -20,6 +20,7 @@ REQUIRED = {
     "scipy": "scipy",
     "skimage": "scikit-image",
     "trimesh": "trimesh",
+    "manifold3d": "manifold3d",
     "safetensors": "safetensors",
     "jaxtyping": "jaxtyping",
     "PIL": "pillow",
