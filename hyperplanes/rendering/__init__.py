@@ -3,11 +3,13 @@
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
 from hyperplanes.rendering.hierarchical import Hierarchical, importance, intervals, stratified
 from hyperplanes.rendering.images import Pictures
-from hyperplanes.rendering.marching import Marched, PackedSamples, march
+from hyperplanes.rendering.marching import Marched, march
 from hyperplanes.rendering.renderer import render
-from hyperplanes.rendering.samplers import FieldFunction, Sampler
+from hyperplanes.rendering.samplers import DenseSamples, PackedSamples, Sampler
+from hyperplanes.rendering.scene import FieldFunction
 
 __all__ = [
+    "DenseSamples",
     "FieldFunction",
     "Hierarchical",
     "Marched",

@@ -6,7 +6,7 @@ interval; `weights` are the compositing weights of the intervals, (ray, interval
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import torch
@@ -15,8 +15,7 @@ from torch import Tensor
 
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.rendering.compositing import Rendered, composite
-from hyperplanes.rendering.samplers import FieldFunction, evaluate
+from hyperplanes.rendering.samplers import DenseSamples
 
 __all__ = ["PLACEMENTS", "Hierarchical", "importance", "intervals", "stratified"]
 
@@ -74,43 +73,36 @@ class Hierarchical:
         """A quarter of what `Marched` takes on a CPU, since every ray has all its samples."""
         return 1 << 16 if device.type == "cuda" else 1 << 12
 
-    def render(
-        self,
-        field: FieldFunction,
-        rays: Rays,
-        *,
-        occupancy: Occupancy | None = None,
-        proposal: FieldFunction | None = None,
-        generator: torch.Generator | None = None,
-        background: float = 1.0,
-        differentiable: bool = True,
-    ) -> Rendered:
-        """The pixels of rays; `occupancy` is not read, the other arguments are those of `renderer.render`."""
+    @property
+    def stop(self) -> float:
+        """Never: the paper evaluates every sample."""
+        return 0.0
 
-        def composited(function: FieldFunction, t: Tensor, edges: Tensor) -> tuple[Rendered, Tensor]:
-            points = rays.at(t)
-            directions = rays.directions[:, None].expand_as(points)
-            colour, density = evaluate(function, points.reshape(-1, 3), directions.reshape(-1, 3), differentiable)
-            return composite(colour.reshape(*t.shape, 3), density.reshape(t.shape), edges, background, distances=t)
-
-        at_samples = self.placement == "samples"
+    def place(
+        self, rays: Rays, occupancy: Occupancy | None = None, generator: torch.Generator | None = None
+    ) -> DenseSamples:
+        """The coarse pass: stratified samples; `occupancy` is not read."""
         edges = intervals(rays, self.coarse)
-        first = stratified(edges, generator)
-        far = rays.far[:, None]
-        coarse, weights = composited(proposal or field, first, torch.cat([first, far], 1) if at_samples else edges)
+        places = stratified(edges, generator)
+        if self.placement == "samples":
+            edges = torch.cat([places, rays.far[:, None]], 1)
+        return DenseSamples(places, edges)
+
+    def refine(
+        self, rays: Rays, samples: DenseSamples, weights: Tensor, generator: torch.Generator | None = None
+    ) -> DenseSamples | None:
+        """The fine pass: the coarse samples or intervals and those that are drawn where the weight is."""
         if not self.fine:
-            return coarse
-        if at_samples:  # drawn between the middles of the coarse samples (NeRF, section 5.2)
+            return None
+        if self.placement == "samples":  # drawn between the middles of the coarse samples (NeRF, section 5.2)
+            first = samples.distances
             middles = (first[:, 1:] + first[:, :-1]) / 2
             added = importance(middles, weights[:, 1:-1], self.fine, generator)
             places = torch.cat([first, added], 1).sort(1).values
-            edges = torch.cat([places, far], 1)
-        else:
-            added = importance(edges, weights, self.fine, generator)
-            edges = torch.cat([edges, added], 1).sort(1).values
-            places = stratified(edges, generator)
-        fine, _ = composited(field, places, edges)
-        return replace(fine, samples=coarse.samples + fine.samples, coarse=coarse)
+            return DenseSamples(places, torch.cat([places, rays.far[:, None]], 1))
+        added = importance(samples.edges, weights, self.fine, generator)
+        edges = torch.cat([samples.edges, added], 1).sort(1).values
+        return DenseSamples(stratified(edges, generator), edges)
 
 
 def intervals(rays: Rays, count: int) -> Float[Tensor, "ray edge"]:

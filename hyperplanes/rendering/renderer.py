@@ -14,8 +14,10 @@ from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.hierarchical import Hierarchical
 from hyperplanes.rendering.images import Pictures, render_images
+from hyperplanes.rendering.integration import integrate
 from hyperplanes.rendering.marching import Marched
-from hyperplanes.rendering.samplers import FieldFunction, Sampler
+from hyperplanes.rendering.samplers import Sampler
+from hyperplanes.rendering.scene import FieldFunction, Scene
 
 __all__ = ["FieldFunction", "Hierarchical", "Marched", "Sampler", "allow_tf32", "render"]
 
@@ -105,8 +107,12 @@ def render(
         occupancy = full(bounds, 1, device)
     keep = isinstance(target, Rays) if differentiable is None else differentiable
 
+    scene = Scene(field, occupancy, proposal, background)
+
     def render_rays(rays: Rays) -> Rendered:
-        return _render_rays(field, rays, sampling, occupancy, proposal, generator, background, keep, chunk)
+        if keep:
+            return integrate(scene, rays, sampling, generator, differentiable=True)
+        return _in_chunks(scene, rays, sampling, generator, chunk)
 
     if isinstance(target, Rays):
         return render_rays(target)
@@ -116,28 +122,15 @@ def render(
         return render_images(target, bounds, render_rays, occupancy=seen, span=sampling.span, background=background)
 
 
-def _render_rays(
-    field: FieldFunction,
-    rays: Rays,
-    sampling: Sampler,
-    occupancy: Occupancy | None,
-    proposal: FieldFunction | None,
-    generator: torch.Generator | None,
-    background: float,
-    differentiable: bool,
-    chunk: int | None,
+@torch.no_grad()
+def _in_chunks(
+    scene: Scene, rays: Rays, sampler: Sampler, generator: torch.Generator | None, chunk: int | None
 ) -> Rendered:
-    def part(rays: Rays) -> Rendered:
-        return sampling.render(
-            field, rays, occupancy=occupancy, proposal=proposal, generator=generator, background=background,
-            differentiable=differentiable,
-        )  # fmt: skip
-
-    if differentiable:
-        return part(rays)
-    size = chunk or sampling.rays_per_chunk(rays.origins.device)
-    with torch.no_grad(), allow_tf32(rays.origins.device):
-        return _joined([part(rays[first : first + size]) for first in range(0, max(1, len(rays)), size)])
+    """The pixels of rays without gradients, so many at once."""
+    size = chunk or sampler.rays_per_chunk(rays.origins.device)
+    with allow_tf32(rays.origins.device):
+        parts = [rays[first : first + size] for first in range(0, max(1, len(rays)), size)]
+        return _joined([integrate(scene, part, sampler, generator, differentiable=False) for part in parts])
 
 
 def _joined(parts: list[Rendered]) -> Rendered:

@@ -1,21 +1,55 @@
-"""What the renderer asks of a sampler: where along rays to evaluate a field, and how to make pixels of the values."""
+"""Samplers: where along rays a field is evaluated. They place samples and know no field; the renderer composites.
+
+Samples come in two layouts, `DenseSamples` (the same number on every ray) and `PackedSamples` (any number on each).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.rendering.compositing import Rendered
 
-__all__ = ["FieldFunction", "Sampler", "evaluate", "points_per_batch"]
+__all__ = ["DenseSamples", "PackedSamples", "Sampler"]
 
-FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Points (n, 3) and unit directions (n, 3) -> colours (n, 3) in [0, 1] and densities (n,) per world unit."""
+
+@dataclass(frozen=True)
+class DenseSamples:
+    """Equally many samples on every ray.
+
+    Attributes:
+        distances: of the samples along their rays, ascending.
+        edges: of the intervals that they stand for.
+    """
+
+    distances: Float[Tensor, "ray sample"]
+    edges: Float[Tensor, "ray edge"]
+
+
+@dataclass(frozen=True)
+class PackedSamples:
+    """Samples of many rays in one row each, ray after ray, in the order of distance.
+
+    Attributes:
+        ray: index of the ray of each sample, ascending.
+        distances: of the samples along their rays.
+        step: length of the interval that each stands for, in world units.
+    """
+
+    ray: Int[Tensor, " sample"]
+    distances: Float[Tensor, " sample"]
+    step: float
+
+    def __len__(self) -> int:
+        return len(self.ray)
+
+    def __getitem__(self, index: slice | Tensor) -> PackedSamples:
+        return PackedSamples(self.ray[index], self.distances[index], self.step)
 
 
 @runtime_checkable
@@ -33,6 +67,11 @@ class Sampler(Protocol):
         ...
 
     @property
+    def stop(self) -> float:
+        """Transmittance below which a ray of packed samples is finished, where no gradient is wanted; 0 never stops."""
+        ...
+
+    @property
     def for_rendering(self) -> Sampler:
         """The sampler for images of a field that was trained with this one."""
         ...
@@ -46,56 +85,14 @@ class Sampler(Protocol):
         """How many rays are rendered at once where no gradient is wanted."""
         ...
 
-    def render(
-        self,
-        field: FieldFunction,
-        rays: Rays,
-        *,
-        occupancy: Occupancy | None = None,
-        proposal: FieldFunction | None = None,
-        generator: torch.Generator | None = None,
-        background: float = 1.0,
-        differentiable: bool = True,
-    ) -> Rendered:
-        """The pixels of rays, all at once; arguments as in `renderer.render`."""
+    def place(
+        self, rays: Rays, occupancy: Occupancy | None, generator: torch.Generator | None
+    ) -> DenseSamples | PackedSamples:
+        """The first samples of rays with near and far; a generator jitters them."""
         ...
 
-
-def evaluate(
-    field: FieldFunction, points: Tensor, directions: Tensor, differentiable: bool = True
-) -> tuple[Tensor, Tensor]:
-    """Colours and densities of a field at points.
-
-    Args:
-        field: any callable.
-        points: (n, 3) in the world.
-        directions: (n, 3) unit vectors.
-        differentiable: all points in one call; otherwise in batches, which bounds the memory of activations.
-
-    Returns:
-        Colours (n, 3) and densities (n,).
-
-    Raises:
-        ValueError: values of another shape.
-    """
-    size = len(points) if differentiable else points_per_batch(points.device)
-    parts = [field(*part) for part in zip(points.split(max(1, size)), directions.split(max(1, size)), strict=True)]
-    colour, density = parts[0] if len(parts) == 1 else (torch.cat(values) for values in zip(*parts, strict=True))
-    if colour.shape != points.shape or density.shape != points.shape[:1]:
-        raise ValueError(
-            f"field: expected colours {tuple(points.shape)} and densities {tuple(points.shape[:1])}, "
-            f"got {tuple(colour.shape)} and {tuple(density.shape)}"
-        )
-    return colour, density
-
-
-def points_per_batch(device: torch.device) -> int:
-    """How many points a field is evaluated at in one call where no gradient is kept.
-
-    On a CPU a few megabytes of activations, which stay in its cache; on a GPU a hundredth of its free memory, at about
-    8 KiB a point.
-    """
-    if device.type == "cuda":
-        free, _ = torch.cuda.mem_get_info(device)
-        return max(1 << 16, free // 100 // 8192)
-    return 1 << 13
+    def refine(
+        self, rays: Rays, samples: DenseSamples, weights: Tensor, generator: torch.Generator | None
+    ) -> DenseSamples | None:
+        """Samples in place of dense ones whose compositing weights are known; None where those are final."""
+        ...

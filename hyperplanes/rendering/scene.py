@@ -1,0 +1,73 @@
+"""What is rendered: a field, the space it may fill, the field of a coarse pass, and what stands behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hyperplanes.geometry.occupancy import Occupancy
+
+__all__ = ["FieldFunction", "Scene", "evaluate", "points_per_batch"]
+
+FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Points (n, 3) and unit directions (n, 3) -> colours (n, 3) in [0, 1] and densities (n,) per world unit."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the renderer draws.
+
+    Attributes:
+        field: any callable.
+        occupancy: voxels where the field can be anything but empty.
+        proposal: the field of the coarse pass, where it is another one.
+        background: grey value behind everything.
+    """
+
+    field: FieldFunction
+    occupancy: Occupancy | None = None
+    proposal: FieldFunction | None = None
+    background: float = 1.0
+
+
+def evaluate(
+    field: FieldFunction, points: Tensor, directions: Tensor, differentiable: bool = True
+) -> tuple[Tensor, Tensor]:
+    """Colours and densities of a field at points.
+
+    Args:
+        field: any callable.
+        points: (n, 3) in the world.
+        directions: (n, 3) unit vectors.
+        differentiable: all points in one call; otherwise in batches, which bounds the memory of activations.
+
+    Returns:
+        Colours (n, 3) and densities (n,).
+
+    Raises:
+        ValueError: values of another shape.
+    """
+    size = len(points) if differentiable else points_per_batch(points.device)
+    parts = [field(*part) for part in zip(points.split(max(1, size)), directions.split(max(1, size)), strict=True)]
+    colour, density = parts[0] if len(parts) == 1 else (torch.cat(values) for values in zip(*parts, strict=True))
+    if colour.shape != points.shape or density.shape != points.shape[:1]:
+        raise ValueError(
+            f"field: expected colours {tuple(points.shape)} and densities {tuple(points.shape[:1])}, "
+            f"got {tuple(colour.shape)} and {tuple(density.shape)}"
+        )
+    return colour, density
+
+
+def points_per_batch(device: torch.device) -> int:
+    """How many points a field is evaluated at in one call where no gradient is kept.
+
+    On a CPU a few megabytes of activations, which stay in its cache; on a GPU a hundredth of its free memory, at about
+    8 KiB a point.
+    """
+    if device.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        return max(1 << 16, free // 100 // 8192)
+    return 1 << 13
