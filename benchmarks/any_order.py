@@ -280,7 +280,7 @@ def configured(name: str, steps: int, seed: int) -> Preset:
         made.model.network, depth=3, width=96, grid=made.model.network.grid if wanted and wanted.grid else 0
     )
     reader = replace(made.model.hypernetwork, **wanted.changes) if wanted and made.model.hypernetwork else None
-    model = replace(made.model, target=name, network=network, hypernetwork=reader, hull_side=64)
+    model = replace(made.model, target=name, network=network, hypernetwork=reader, hull_resolution=64)
     return replace(made, model=model, training=training)
 
 

@@ -23,8 +23,8 @@ from torch.nn.functional import pad
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
 from hyperplanes.adaptation.base import AdaptedField, Adapter
+from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
-from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
@@ -71,7 +71,7 @@ def main(arguments: list[str]) -> int:
     chosen = parser.parse_args(arguments)
     if chosen.quick:
         chosen.counts, chosen.objects, chosen.query = [3], 2, 1
-    model, rows, sheet = load_model(Path(chosen.checkpoint)), [], []
+    model, rows, sheet = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint))), [], []
     model.config = replace(model.config, second_pass=chosen.second_pass or model.config.second_pass)
     for path in chosen.data:
         data = open_dataset(path)

@@ -20,9 +20,9 @@ from hyperplanes.utilities.threads import wait_passively
 
 if TYPE_CHECKING:
     from hyperplanes.adaptation.fine_tuned import FineTuned
-    from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
     from hyperplanes.adaptation.nearest_view import NearestView
+    from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import preset
     from hyperplanes.data import DataError, Dataset, open_dataset, read_task, read_views
     from hyperplanes.evaluation import evaluate
@@ -40,7 +40,7 @@ _HOMES = {
     "DataError": "data",
     "Dataset": "data",
     "FineTuned": "adaptation.fine_tuned",
-    "FineTuning": "adaptation.fine_tuning",
+    "FineTuning": "configuration.fine_tuning",
     "HyperPlanes": "adaptation.hyperplanes",
     "ImagePlanes": "geometry",
     "Lookup": "geometry",

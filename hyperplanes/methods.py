@@ -11,12 +11,12 @@ import torch
 
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Renderable
 from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromScratch, random_model, shuffled
-from hyperplanes.adaptation.fine_tuning import FineTuning, Steps
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.initialisation import LEARNED
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.configuration.fine_tuning import FineTuning, Steps
+from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.configuration.presets import configure
 from hyperplanes.fields import find_targets
 from hyperplanes.rendering.samplers import Sampler

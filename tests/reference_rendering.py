@@ -127,7 +127,7 @@ def small_model(**changes):
         "network": TargetConfig(depth=2, width=24, planes=4, point_octaves=3, direction_octaves=1),
         "hypernetwork": HyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16),
         "sampling": Marched(24),
-        "hull_side": 16,
+        "hull_resolution": 16,
     }
     model = HyperPlanes(ModelConfig(**{**parts, **changes}))
     model.set_rig(ball_views(ring(model.config.network.planes)))

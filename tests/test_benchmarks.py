@@ -21,7 +21,7 @@ from tests.training.test_completion import MODEL
 def test_every_weight_of_every_variant_is_trained(name):
     made = any_order.configured(name, 4, 0)
     small = replace(made.model.network, depth=2, width=16, planes=3)
-    model = HyperPlanes(replace(made.model, network=small, hull_side=16))
+    model = HyperPlanes(replace(made.model, network=small, hull_resolution=16))
     trainer = Trainer(model, Balls(views=6, size=(24, 24)), replace(made.training, rays=48, views=(3, 5), episodes=4))
     for _ in range(3):  # outputs of a hypernetwork that start at zero let nothing through in the first step
         trainer.take_step()
@@ -31,7 +31,7 @@ def test_every_weight_of_every_variant_is_trained(name):
 
 def test_pooling_reads_the_views_of_a_point_in_no_order():
     made = any_order.configured("pooled", 4, 0)
-    model = HyperPlanes(replace(made.model, hull_side=16))
+    model = HyperPlanes(replace(made.model, hull_resolution=16))
     task = Balls(views=6, size=(24, 24)).task("train0")
     field = model.adapt(task.support).field
     slots = torch.randn(5, 4, 9).index_fill_(2, torch.tensor(5), 1.0)

@@ -21,12 +21,12 @@ from small_demo import demo_folder, first_object
 
 from data_gen.rendering.renderers import RendererError
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.adaptation.fine_tuning import FineTuning
-from hyperplanes.adaptation.pretrained import find_checkpoints, load_model
+from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
 from hyperplanes.cli import main
 from hyperplanes.commands import find_verbs
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.scene import read_scene
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.data import DataError, read_task
 from hyperplanes.data.dataset import locate_scene
@@ -369,7 +369,7 @@ def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
 
 
 def test_steps_chosen_on_left_out_views_are_reported(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("hyperplanes.adaptation.fine_tuning.FineTuning", partial(FineTuning, longest=20))
+    monkeypatch.setattr("hyperplanes.configuration.fine_tuning.FineTuning", partial(FineTuning, max_steps=20))
     demo, scene = demo_folder(), str(first_object(demo_folder()))
     command = ["adapt", "--checkpoint", str(demo), "--views", scene, "--out", str(tmp_path / "weights")]
     assert main([*command, "--steps", "auto"]) == 0
@@ -489,7 +489,12 @@ def test_the_paper_protocol_is_rendered_and_evaluated_when_asked_for(tmp_path, c
     command = ["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path)]
     assert main([*command, "--protocol", "paper"]) == 0
     task = read_task(scene)
-    expected = load_model(demo).adapt(task.support).render(task.query.cameras, Hierarchical(64, 128)).images
+    expected = (
+        HyperPlanes.from_pretrained(find_checkpoint(demo))
+        .adapt(task.support)
+        .render(task.query.cameras, Hierarchical(64, 128))
+        .images
+    )
     written = np.stack([pixels(tmp_path / Path(name).name) for name in task.query.names])
     wanted = expected.clamp(0, 1).permute(0, 2, 3, 1).numpy() * 255
     assert abs(written - wanted).max() <= 1

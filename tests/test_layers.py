@@ -19,7 +19,7 @@ LAYERS = {
     "data_gen.datasets": 5.4,
     "hyperplanes.training": 4,
     "hyperplanes.evaluation": 4,
-    "hyperplanes.configuration": 4,
+    "hyperplanes.configuration": 2.5,
     "hyperplanes.methods": 4,
     "hyperplanes.configuration.presets": 4,
     "hyperplanes.configuration.settings_file": 4,

@@ -15,8 +15,8 @@ from hyperplanes.adaptation import (
     NearestView,
     Swapped,
 )
-from hyperplanes.adaptation.initialisation import LEARNED
-from hyperplanes.adaptation.pretrained import find_checkpoints
+from hyperplanes.adaptation.checkpoints import find_checkpoints
+from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.evaluation import evaluate
 from hyperplanes.hypernetwork import AutoencoderConfig

@@ -47,7 +47,7 @@ class Arguments:
 
 def checkpoint_lines(folder: Path) -> list[str]:
     """What a checkpoint holds, a line a fact."""
-    from hyperplanes.adaptation.configuration import checkpoint_folder
+    from hyperplanes.adaptation.checkpoints import checkpoint_folder
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.utilities.checkpoints import read_json
 
@@ -106,7 +106,7 @@ def recorded_diagnostics(folder: Path) -> Diagnostics | None:
 
 def _is_checkpoint(path: Path) -> bool:
     """Whether a checkpoint lies there, or a packaged one has that name."""
-    from hyperplanes.adaptation.configuration import checkpoint_folder
+    from hyperplanes.adaptation.checkpoints import checkpoint_folder
     from hyperplanes.utilities.checkpoints import CheckpointError
 
     try:

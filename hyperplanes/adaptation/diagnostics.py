@@ -11,9 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.prepared import Prepared
-from hyperplanes.hypernetwork import Autoencoder, Reader
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
@@ -75,7 +74,7 @@ class Diagnostics:
 
 
 @torch.no_grad()
-def diagnose(model: HyperPlanes, prepared: Sequence[Prepared]) -> Diagnostics:
+def diagnose(model: HyperPlanes, prepared: Sequence[SupportContext]) -> Diagnostics:
     """Norm and spread of the updates of some objects, and the activity of the head's units.
 
     Args:
@@ -96,7 +95,7 @@ def diagnose(model: HyperPlanes, prepared: Sequence[Prepared]) -> Diagnostics:
     active: list[Tensor] = []
     hooks = [
         layer.register_forward_hook(lambda module, inputs, output: active.append((output > 0).any(0).flatten()))
-        for layer in _activated(model.hypernetwork)
+        for layer in model.hypernetwork.activated
     ]
     try:
         updates = model.updates(prepared)
@@ -113,7 +112,7 @@ def diagnose(model: HyperPlanes, prepared: Sequence[Prepared]) -> Diagnostics:
 
 @torch.no_grad()
 def swap_gap(
-    model: HyperPlanes, prepared: Sequence[Prepared], queries: Sequence[Views], own: float | None = None
+    model: HyperPlanes, prepared: Sequence[SupportContext], queries: Sequence[Views], own: float | None = None
 ) -> tuple[float, float]:
     """PSNR of query views with each object's own update, and what the update of the next object costs, in dB.
 
@@ -137,11 +136,3 @@ def swap_gap(
 
     own = quality(0) if own is None else own
     return own, own - quality(1)
-
-
-def _activated(hypernetwork: Reader) -> list[torch.nn.Module]:
-    """The modules whose outputs go through an activation function."""
-    if isinstance(hypernetwork, Autoencoder):
-        return [hypernetwork.latent]
-    codes = [hypernetwork.code_normalisation] if hypernetwork.config.code_activation != "none" else []
-    return [*codes, *hypernetwork.head]

@@ -9,16 +9,16 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.fine_tuning import GRID_RATES, FineTuning, Steps
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
+from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.fields import find_targets
 from hyperplanes.views import Views
 
 __all__ = ["SCRATCH_RATES", "FieldFromScratch", "FineTuned", "FromScratch", "random_model", "shuffled"]
 
 SCRATCH_RATES = {"learning_rate": 4e-3, "muon_learning_rate": 0.05}
-"""Of Adam and of Muon from random weights: higher than those of fine-tuning, docs/adaptation.md. Those of a field with
-a grid of features are GRID_RATES."""
+"""Of Adam and of Muon from random weights: higher than those of fine-tuning, docs/adaptation.md; a field may have its
+own (`Target.fine_tuning_rates`)."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class FromScratch:
         model: whose architecture and rig are used; its weights are not.
         steps: of optimising an object, or "auto".
         settings: of the optimisation; rates that it does not state are those of SCRATCH_RATES. Its seed is that of the
-            random weights, too, and all weights are free.
+            random weights, too, and all weights are trained.
     """
 
     model: HyperPlanes
@@ -61,7 +61,7 @@ class FromScratch:
         """The field after so many steps from random weights."""
         fresh = random_model(self.model.config, self.settings.seed)
         fresh.rig.copy_(self.model.rig)
-        settings = _rated(self.settings, self.model.config)
+        settings = _rated(self.settings, fresh)
         return fresh.to(self.model.rig.device).fine_tune(support, self.steps, settings, on_step=on_step)
 
 
@@ -85,10 +85,12 @@ class FieldFromScratch:
 
     def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
         """The field after so many steps from random weights."""
-        planes = self.config.network.planes if find_targets()[self.config.target].any_order else len(support)
+        planes = (
+            self.config.network.planes if find_targets()[self.config.target].permutation_invariant else len(support)
+        )
         network = replace(self.config.network, planes=planes)
         fresh = random_model(replace(self.config, network=network, order="file"), self.settings.seed).to(self.device)
-        settings = _rated(self.settings, self.config)
+        settings = _rated(self.settings, fresh)
         return fresh.fine_tune(support, self.steps, settings, on_step=on_step)
 
 
@@ -97,9 +99,9 @@ def random_model(config: ModelConfig, seed: int) -> HyperPlanes:
     return HyperPlanes(replace(config, hypernetwork=None, autoencoder=None, initialisation=None), seed=seed)
 
 
-def _rated(settings: FineTuning, config: ModelConfig) -> FineTuning:
-    """The settings with all weights free and, where they state no rate, those from random weights."""
-    return replace(settings, free="weights").with_rates(GRID_RATES if config.network.grid else SCRATCH_RATES)
+def _rated(settings: FineTuning, model: HyperPlanes) -> FineTuning:
+    """The settings of all weights and, where they state no rate, those from random weights."""
+    return replace(settings, trainable="weights").with_rates(model.target.fine_tuning_rates or SCRATCH_RATES)
 
 
 @torch.no_grad()

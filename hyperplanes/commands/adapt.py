@@ -59,8 +59,7 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Adapt and write the weights."""
     from hyperplanes.adaptation.base import AdaptedField
-    from hyperplanes.adaptation.fine_tuning import FineTuning
-    from hyperplanes.adaptation.pretrained import adapted_model
+    from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.data.devices import choose_device
 
     console, device = Console(), choose_device(arguments.device)
@@ -73,10 +72,10 @@ def run(arguments: Arguments) -> int:
         up=arguments.up,
         downscale=arguments.downscale,
     )
-    settings = FineTuning(free=arguments.fine_tune)
+    settings = FineTuning(trainable=arguments.fine_tune)
     field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)
     assert isinstance(field, AdaptedField)
-    adapted_model(model, field).save(arguments.out)
+    model.with_weights_of(field).save(arguments.out)
     more = "" if up == "y" else f" --up={up}"
     more += " --all-views" if arguments.all_views else ""
     more += "" if arguments.downscale is None else f" --downscale {arguments.downscale}"

@@ -154,8 +154,8 @@ def with_seed(folders: Sequence[Path], seed: int) -> list[Path]:
 
 def run(arguments: Arguments) -> int:
     """Evaluate all methods, print the table and write what was asked for."""
-    from hyperplanes.adaptation.fine_tuning import FineTuning
-    from hyperplanes.adaptation.pretrained import find_checkpoints
+    from hyperplanes.adaptation.checkpoints import find_checkpoints
+    from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data import open_dataset
     from hyperplanes.data.devices import TasksOnDevice, choose_device
@@ -194,7 +194,7 @@ def run(arguments: Arguments) -> int:
             name,
             checkpoints[seed],
             device=device,
-            settings=FineTuning(free=arguments.fine_tune, seed=seed),
+            settings=FineTuning(trainable=arguments.fine_tune, seed=seed),
             objects=objects,
             preset=arguments.preset,
             protocol=arguments.protocol,

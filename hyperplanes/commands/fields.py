@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
     from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable
-    from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.console import Console
+    from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.rendering.renderer import Sampler
     from hyperplanes.views import Views
@@ -54,9 +54,10 @@ def load_adaptable(path: Path, device: torch.device, *, second_pass: bool = Fals
     Raises:
         ValueError: a second pass of a model whose field does not judge what views see.
     """
-    from hyperplanes.adaptation.pretrained import load_model
+    from hyperplanes.adaptation.checkpoints import find_checkpoint
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
 
-    model = load_model(path).to(device)
+    model = HyperPlanes.from_pretrained(find_checkpoint(path)).to(device)
     if second_pass:
         if not model.any_order:
             found = f"{path}, a model of {model.config.target}"
@@ -103,8 +104,8 @@ def adapt_to(
     Raises:
         ValueError: fine-tuning steps of a baked scene.
     """
-    from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.commands.suitability import misgivings
+    from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene
 
     if isinstance(source, BakedScene):
@@ -123,12 +124,12 @@ def adapt_to(
         def count(done: int) -> None:
             taken.append(done)
             if steps == "auto":
-                bar.show(done, settings.longest, "steps at most")
+                bar.show(done, settings.max_steps, "steps at most")
             elif steps:
                 bar.show(done, steps, "steps")
 
         def count_trials(done: int) -> None:
-            bar.show(done, settings.longest, "steps at most, to find how many")
+            bar.show(done, settings.max_steps, "steps at most, to find how many")
 
         field = source.fine_tune(shown, steps, settings, on_step=count, on_trial=count_trials)
     how = f", {taken[-1]} fine-tuning steps" if any(taken) else ""

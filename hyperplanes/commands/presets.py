@@ -40,7 +40,7 @@ def row(name: str, preset: Preset) -> tuple[str, ...]:
     from hyperplanes.hypernetwork import VOLUME
 
     model, training = preset.model, preset.training
-    hyper, anyhow = model.hypernetwork, find_targets()[model.target].any_order
+    hyper, anyhow = model.hypernetwork, find_targets()[model.target].permutation_invariant
     planes = "any" if anyhow else model.network.planes
     read = f"{hyper.views if hyper else 0} of {planes}"
     return (

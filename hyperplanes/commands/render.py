@@ -72,9 +72,9 @@ class Arguments:
 @writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
-    from hyperplanes.adaptation.fine_tuning import FineTuning
     from hyperplanes.adaptation.nearest_view import NearestView
     from hyperplanes.commands.suitability import left_out_check, worse_than_copying
+    from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.baking import BakedScene
@@ -94,7 +94,7 @@ def run(arguments: Arguments) -> int:
     )
     refuse_sources(arguments.out, arguments.views, task.query.names)
     shown, asked = task.support.to(device), task.query.to(device)
-    settings = FineTuning(free=arguments.fine_tune)
+    settings = FineTuning(trainable=arguments.fine_tune)
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
     cameras = asked.cameras
     if arguments.orbit is not None:

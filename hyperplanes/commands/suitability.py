@@ -35,7 +35,7 @@ def misgivings(model: HyperPlanes, shown: Views, steps: object = 0) -> list[str]
             "object; cut the object out (RGBA images, or a folder masks/)"
         )
     planes = model.config.network.planes
-    if len(shown) < planes and not model.any_order:
+    if len(shown) < planes and len(model.rig):
         found.append(f"{len(shown)} views are shown and the model was trained with {planes}: some stand for several")
     unlike, angle = _unlikeness(model, shown)
     if unlike is not None and unlike > UNLIKE:
@@ -105,25 +105,13 @@ def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
     """Root mean square of the standardised codes, None without such, and the mean angle from the training's rig."""
     import torch
 
-    from hyperplanes.geometry import cameras as camera
-    from hyperplanes.hypernetwork import VolumeHyperNetwork
-    from hyperplanes.hypernetwork.standardisation import RunningStandardisation
+    from hyperplanes.adaptation.context import observe
+    from hyperplanes.fields.rig import standpoints
 
     with torch.no_grad():
-        prepared = model.prepare(shown, carved=False)
-        views = prepared.views
-        standing = camera.standpoints(views.cameras, views.bounds.centre).to(model.rig)
-        angle = 0.0
-        if not model.any_order:
-            angle = float(torch.rad2deg(torch.acos((standing * model.rig).sum(-1).clamp(-1, 1))).mean())
-        network = model.hypernetwork
-        if network is None or not isinstance(network.code_normalisation, RunningStandardisation):
-            return None, angle
-        if isinstance(network, VolumeHyperNetwork):
-            assert prepared.volume is not None
-            codes = network.encode(prepared.volume[None])
-        else:
-            chosen = model.hyperplanes(views)
-            directions = camera.viewing_directions(views.cameras)[chosen]
-            codes = network.encode(views.images[chosen][None], directions[None])
-    return float(codes.square().mean().sqrt()), angle
+        context, network, angle = model.prepare(shown, carved=False), model.hypernetwork, 0.0
+        if len(model.rig):
+            cosine = (standpoints(context.views).to(model.rig) * model.rig).sum(-1)
+            angle = float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).mean())
+        codes = None if network is None else network.standardised_codes(observe([context], network.resolution))
+    return None if codes is None else float(codes.square().mean().sqrt()), angle

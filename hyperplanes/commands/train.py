@@ -244,7 +244,7 @@ def run(arguments: Arguments) -> int:
 
 
 def _run(arguments: Arguments) -> int:
-    from hyperplanes.adaptation.pretrained import find_checkpoints
+    from hyperplanes.adaptation.checkpoints import find_checkpoints
     from hyperplanes.configuration.settings_file import write_experiment
     from hyperplanes.data.dataset import open_datasets
     from hyperplanes.data.devices import choose_device

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from hyperplanes.adaptation.hyperplanes import ModelConfig
-from hyperplanes.adaptation.initialisation import LEARNED, InitialisationConfig
+from hyperplanes.configuration.initialisation import LEARNED, InitialisationConfig
 from hyperplanes.fields import TARGETS, TargetConfig, find_targets
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
@@ -93,7 +93,7 @@ class Preset:
         elif self.model.hypernetwork is None:
             raise ValueError("method: expected a configuration with a hypernetwork for hyperplanes, got one without")
         target = target or chosen.model.target
-        if not targets[target].any_order:
+        if not targets[target].permutation_invariant:
             chosen = chosen.for_known_places()
         return replace(chosen, model=replace(chosen.model, target=target))
 
@@ -163,7 +163,7 @@ PRESETS: dict[str, Preset] = {
             network=TargetConfig(depth=4, width=128, point_octaves=5, direction_octaves=2),
             hypernetwork=ALL_LAYERS,
             sampling=Marched(steps=64),
-            hull_side=64,
+            hull_resolution=64,
         ),
         TrainingConfig(
             steps=1200,
@@ -186,7 +186,7 @@ PRESETS: dict[str, Preset] = {
             network=TargetConfig(depth=4, width=128, planes=8, grid=8, point_octaves=6, direction_octaves=2),
             hypernetwork=replace(ALL_LAYERS, encoder="volume", code=256),
             sampling=Marched(steps=64),
-            hull_side=96,
+            hull_resolution=96,
         ),
         TrainingConfig(
             steps=30_000,
@@ -210,7 +210,7 @@ PRESETS: dict[str, Preset] = {
             network=TargetConfig(depth=6, width=192, point_octaves=6),
             hypernetwork=ALL_LAYERS,
             sampling=Marched(steps=96),
-            hull_side=96,
+            hull_resolution=96,
         ),
         TrainingConfig(
             steps=30_000,

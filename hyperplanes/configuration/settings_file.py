@@ -16,8 +16,9 @@ from typing import Any
 
 import yaml
 
-from hyperplanes.adaptation.configuration import ModelConfig
+from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.presets import Preset
+from hyperplanes.configuration.upgrade import upgrade_model
 from hyperplanes.training import TrainingConfig
 from hyperplanes.training.configuration import upgraded
 from hyperplanes.utilities.files import DataError, read_bytes, write_whole
@@ -103,7 +104,7 @@ def changed(chosen: Preset, changes: Mapping[str, Any]) -> Preset:
         SettingsError: an unknown entry, or a value that does not fit; its path begins with "model" or "training".
     """
     model, training = chosen.model.as_json(), asdict(chosen.training)
-    wanted = changes.get("model", {})
+    wanted = upgrade_model(changes.get("model", {}))
     if isinstance(wanted, Mapping) and wanted.get("protocol", model["protocol"]) != model["protocol"]:
         model["sampling"] = {}
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hyperplanes.adaptation import HyperPlanes, NearestView
 from hyperplanes.adaptation.base import Adapter, Pictures
-from hyperplanes.adaptation.configuration import packaged_folder
+from hyperplanes.adaptation.checkpoints import packaged_folder
 from hyperplanes.data.support import Shown
 from hyperplanes.demo.content import Exhibit, Look, Report, Row
 from hyperplanes.demo.page import render_page

@@ -153,7 +153,7 @@ def _tiny(chosen: Preset, views: int) -> Preset:
             network=replace(model.network, depth=2, width=16, planes=planes),
             hypernetwork=hyper and replace(hyper, views=min(3, planes), code=8, depth=1, width=16),
             sampling=Marched(steps=16),
-            hull_side=16,
+            hull_resolution=16,
         ),
         training=replace(chosen.training, rays=32, warmup=0, checkpoint_every=10),
     )

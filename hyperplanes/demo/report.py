@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.diagnostics import Diagnostics
-from hyperplanes.adaptation.pretrained import load_model
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
 from hyperplanes.demo.content import Pixels
 from hyperplanes.demo.pipeline import MODELS, DemoSettings, describe_row
@@ -46,7 +47,7 @@ def write_report(
     Returns:
         The page.
     """
-    model = load_model(folder / "hyperplanes")
+    model = HyperPlanes.from_pretrained(find_checkpoint(folder / "hyperplanes"))
     exhibits, rounds = [], []
     for name in sorted(data.names("test"))[: settings.exhibits]:
         task = data.task(name)
@@ -58,7 +59,7 @@ def write_report(
         chosen = sorted({len(truth) // 4, 3 * len(truth) // 4})
         looks = [Look(truth[i], _predictions(folder, settings, name, task.query.names[i])) for i in chosen]
         quality = {method: metrics[method]["objects"][name]["psnr"] for method in settings.methods}
-        read = model.hyperplanes(support).tolist()
+        read = model.prepare(task.support, carved=False).hyperplanes.tolist()
         exhibits.append(
             Exhibit(name, to_pixels(support.images), read, looks, quality, encode_animation(frames, "webp"))
         )

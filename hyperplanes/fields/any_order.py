@@ -8,6 +8,7 @@ number nor their order is built into its weights. The colour is a blend of what 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,10 +19,12 @@ from torch.nn.functional import pad, relu, softplus
 
 from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.encoding import encode, encoded_size
+from hyperplanes.fields.rig import Rig, standpoints
 from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility import ANGLE, ChosenViews, Visibility, VisibilityPlanes
-from hyperplanes.geometry.volume import SIDE, interpolate_grid
+from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
@@ -29,8 +32,13 @@ __all__ = ["AnyOrderField", "AnyOrderNeRF", "FeatureGrid"]
 
 SMALLEST_ANGLE = 1e-2
 FALLOFF = 8.0  # of depths behind the hull, in 1 / radii, where tanh makes them inputs
+VOXELS_PER_PIXEL = 3 / 4  # of a side of the pictures: 96 voxels for 128 pixels, as the preset "small" is trained
+FINEST_HULL = 192
 EMPTY = -4.0  # what the density head begins with outside the masks, before softplus
 SOLID = 4.0  # and within them
+
+GRID_RATES = {"learning_rate": 2e-2, "muon_learning_rate": 0.05}
+"""Of fine-tuning the weights of a field with a grid of features, trained or random; docs/any_order.md."""
 
 READ = 9  # numbers that the trunk reads of a view: colour, depth, coverage, validity, direction
 BLENDED = 7  # numbers that the colour head reads of a view: colour, angle, depth, coverage, validity
@@ -60,7 +68,8 @@ class AnyOrderNeRF(Target):
     the scene, the first of them through a sigmoid: weights like all others, which a hypernetwork updates.
     """
 
-    any_order: ClassVar[bool] = True
+    permutation_invariant: ClassVar[bool] = True
+    volume_size: ClassVar[tuple[int, int] | None] = (CHANNELS, SIDE)
 
     def __init__(self, config: TargetConfig) -> None:
         super().__init__(config)
@@ -90,9 +99,46 @@ class AnyOrderNeRF(Target):
         """How many numbers the trunk reads of the single views of a point."""
         return READ * self.config.planes
 
+    @property
+    def fine_tuning_rates(self) -> Mapping[str, float]:
+        """Those of a grid of features."""
+        return GRID_RATES if self.config.grid else {}
+
+    def arrange(self, support: Views, rig: Rig) -> Views:
+        """The views as they come."""
+        return support
+
+    def choose_hyperplanes(self, views: Views, rig: Rig, count: int, choice: str) -> Int[Tensor, " k"]:
+        """At most so many of the views: the first, or from the one that stands farthest from their mean onwards."""
+        count, device = min(count, len(views)), views.images.device
+        if choice == "first":
+            return torch.arange(count, device=device)
+        standing = standpoints(views).cpu()
+        first = int((standing @ standing.mean(0)).argmin())
+        return torch.tensor(farthest_first(standing, first, count), dtype=torch.long, device=device)
+
+    def hull_resolution(self, configured: int, support: Views) -> int:
+        """More than configured where masks are larger, so that the hull is as fine as they are."""
+        if support.masks is None:
+            return configured
+        return max(configured, min(FINEST_HULL, round(VOXELS_PER_PIXEL * max(support.size))))
+
     def planes_of(self, views: Views, occupancy: Occupancy) -> VisibilityPlanes:
         """The views with their masks and the depth of the hull."""
         return VisibilityPlanes(views.images, views.cameras, views.masks, occupancy)
+
+    def volume_of(self, planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
+        """What the views show of the cells of the grid."""
+        return volume_of(planes)
+
+    def with_surface(
+        self,
+        planes: VisibilityPlanes,
+        distances: Float[Tensor, "view height width"],
+        opacity: Float[Tensor, "view height width"],
+    ) -> VisibilityPlanes:
+        """The planes, whose colours come from those that see this surface, and no longer that of the hull."""
+        return planes.with_surface(distances, opacity)
 
     def bind(
         self, parameters: Parameters, planes: VisibilityPlanes | None, bounds: Sphere | None = None

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import linear, relu, softplus
 
 from hyperplanes.fields.encoding import encode, encoded_size
+from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
@@ -50,13 +52,16 @@ class Target(nn.Module):
     """F(x, z, d; theta) = (c, sigma): colour depends on the direction, density does not.
 
     The module holds theta; `bind` evaluates the network with any parameters of the same names and shapes. Subclasses
-    say what the first layer reads.
+    say what the first layer reads, and where they treat support views otherwise than the paper's fields do.
 
     Attributes:
-        any_order: takes any number of views in any order; otherwise `config.planes` of them, each known by its place.
+        permutation_invariant: takes any number of views in any order, and so could copy the view that a ray comes from;
+            otherwise `config.planes` views, each known by its place.
+        volume_size: channels and cells an axis of what `volume_of` makes; None where there is no such volume.
     """
 
-    any_order: ClassVar[bool] = False
+    permutation_invariant: ClassVar[bool] = False
+    volume_size: ClassVar[tuple[int, int] | None] = None
 
     def __init__(self, config: TargetConfig) -> None:
         super().__init__()
@@ -91,9 +96,56 @@ class Target(nn.Module):
         """What the first layer reads of world points, (point, input_size)."""
         raise TypeError(f"{type(self).__name__} does not say what it reads")
 
+    @property
+    def rig_size(self) -> int:
+        """How many planes stand in a rig; 0 for a network that knows none by its place."""
+        return 0 if self.permutation_invariant else self.config.planes
+
+    @property
+    def fine_tuning_rates(self) -> Mapping[str, float]:
+        """Learning rates that suit the weights better than those of all fields, by the names of `FineTuning`."""
+        return {}
+
+    def arrange(self, support: Views, rig: Rig) -> Views:
+        """The support views as planes: here one a plane, each the nearest to where the rig has one."""
+        return support[rig.places(support)]
+
+    def choose_hyperplanes(self, views: Views, rig: Rig, count: int, choice: str) -> Int[Tensor, " k"]:
+        """Which of the arranged views a hypernetwork reads.
+
+        Args:
+            views: as `arrange` returned them.
+            rig: where they stand.
+            count: k.
+            choice: the "farthest" apart, or the "first".
+        """
+        if choice == "first":
+            return torch.arange(count, device=views.images.device)
+        return rig.farthest(count).to(views.images.device)
+
+    def hull_resolution(self, configured: int, support: Views) -> int:
+        """Voxels an axis of the visual hull of some views; here what the model is configured with."""
+        return configured
+
     def planes_of(self, views: Views, occupancy: Occupancy) -> Any:
         """What `bind` reads of support views and their visual hull; here the ImagePlanes alone."""
         return ImagePlanes(views.images, views.cameras)
+
+    def volume_of(self, planes: Any) -> Float[Tensor, "channel x y z"] | None:
+        """What the planes show on a grid over the scene, for a hypernetwork that reads it; here nothing."""
+        return None
+
+    def with_surface(
+        self, planes: Any, distances: Float[Tensor, "view height width"], opacity: Float[Tensor, "view height width"]
+    ) -> Any:
+        """The planes with the surface that a first rendering showed each of them; here as they are.
+
+        Args:
+            planes: of `planes_of`.
+            distances: from each camera to the surface.
+            opacity: of that rendering.
+        """
+        return planes
 
     def bind(self, parameters: Parameters, planes: Any, bounds: Sphere | None = None) -> Field:
         """The field that these parameters and planes make.
@@ -112,6 +164,16 @@ class Target(nn.Module):
         if planes is not None and len(planes) != self.config.planes:
             raise ValueError(f"planes: expected {self.config.planes}, got {len(planes)}")
         return MLPField(self, parameters, planes, bounds or Sphere())
+
+    def parameters_of(self, field: object) -> Parameters:
+        """The parameters that a field of this network was bound with.
+
+        Raises:
+            ValueError: a field that is no network.
+        """
+        if not isinstance(field, Field):
+            raise ValueError(f"adapted: expected a field that HyperPlanes made, got {type(field).__name__}")
+        return field.parameters
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,9 @@ from torch import Tensor
 from hyperplanes.fields.base import Target
 from hyperplanes.fields.encoding import encode, encoded_size
 from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.views import Views
 
 __all__ = ["NeRF"]
 
@@ -24,3 +26,6 @@ class NeRF(Target):
     def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:
         """The encoded position in the unit sphere."""
         return encode(bounds.normalise(points), self.config.point_octaves)
+
+    def planes_of(self, views: Views, occupancy: Occupancy) -> None:
+        """Nothing: the network reads no image."""

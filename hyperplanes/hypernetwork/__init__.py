@@ -1,11 +1,10 @@
-"""From a few images to the update of a network's weights."""
-
-from typing import TypeAlias
+"""From what is seen of an object to the update of a network's weights."""
 
 from hyperplanes.hypernetwork.autoencoder import Autoencoder, AutoencoderConfig
+from hyperplanes.hypernetwork.base import HyperNetwork, Observed
 from hyperplanes.hypernetwork.configuration import VOLUME, HyperNetworkConfig
 from hyperplanes.hypernetwork.encoders import ConvNet, ResNet101
-from hyperplanes.hypernetwork.hypernetwork import HyperNetwork
+from hyperplanes.hypernetwork.image_hypernetwork import ImageHyperNetwork
 from hyperplanes.hypernetwork.volume_hypernetwork import VolumeHyperNetwork
 
 __all__ = [
@@ -15,10 +14,8 @@ __all__ = [
     "ConvNet",
     "HyperNetwork",
     "HyperNetworkConfig",
-    "Reader",
+    "ImageHyperNetwork",
+    "Observed",
     "ResNet101",
     "VolumeHyperNetwork",
 ]
-
-Reader: TypeAlias = HyperNetwork | VolumeHyperNetwork | Autoencoder
-"""What reads support views and writes an update of theta."""

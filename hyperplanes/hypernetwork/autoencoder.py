@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
+from hyperplanes.hypernetwork.base import HyperNetwork, Observed
 from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS, encode_objects
 from hyperplanes.parameters import Parameters
@@ -42,7 +43,7 @@ class AutoencoderConfig:
         check_choices(self, {"choice": CHOICES, "encoder": ENCODERS, "normalisation": NORMALISATIONS})
 
 
-class Autoencoder(nn.Module):
+class Autoencoder(HyperNetwork):
     """E(I_1..I_k, d_1..d_k) = z, which every layer that reads a point reads beside it: F(x, z, d; theta).
 
     All objects share theta, and no update is added to it. A layer that reads [x, z] computes
@@ -60,6 +61,7 @@ class Autoencoder(nn.Module):
         """
         super().__init__()
         self.config = config
+        self.views, self.choice = config.views, config.choice
         self.encoder = ENCODERS[config.encoder](config.code, config.normalisation)
         self.latent = nn.Linear(config.views * (config.code + 3), config.latent)
         self.biases = tuple(name for name in shapes if any(name.endswith(f".{layer}.bias") for layer in inputs))
@@ -68,32 +70,29 @@ class Autoencoder(nn.Module):
             nn.init.normal_(reader.weight, std=config.latent**-0.5)
         self.readers = nn.ModuleList(readers)
 
-    def forward(
-        self,
-        images: Float[Tensor, "*object view 3 height width"],
-        directions: Float[Tensor, "*object view 3"],
-        theta: Mapping[str, Tensor],
-    ) -> Parameters | list[Parameters]:
+    def forward(self, observed: Observed, theta: Mapping[str, Tensor]) -> list[Parameters]:
         """W_z z for every layer that reads a point, named as its bias.
 
         Args:
-            images: of one object, or of each of several, RGB in [0, 1].
-            directions: their unit viewing directions in the world.
-            theta: not read; a hypernetwork has it as an input.
+            observed: the images of several objects with their viewing directions.
+            theta: not read.
 
         Returns:
-            What is added to the biases; a list of those for several objects.
+            For each object what is added to the biases.
         """
-        several = images.ndim == 5
-        if not several:
-            images, directions = images[None], directions[None]
-        codes = self.encode(images, directions)
+        assert observed.images is not None
+        assert observed.directions is not None
+        codes = self.encode(observed.images, observed.directions)
         read = [reader(codes) for reader in self.readers]
-        results = [
+        return [
             Parameters((name, shift[index]) for name, shift in zip(self.biases, read, strict=True))
-            for index in range(len(images))
+            for index in range(len(codes))
         ]
-        return results if several else results[0]
+
+    @property
+    def activated(self) -> Sequence[nn.Module]:
+        """The layer that makes the code of an object."""
+        return [self.latent]
 
     def encode(
         self, images: Float[Tensor, "object view 3 height width"], directions: Float[Tensor, "object view 3"]

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
+from hyperplanes.hypernetwork.base import Observed
 from hyperplanes.hypernetwork.configuration import ACTIVATIONS, HyperNetworkConfig
-from hyperplanes.hypernetwork.update_writer import UpdateWriter
+from hyperplanes.hypernetwork.standardisation import RunningStandardisation
+from hyperplanes.hypernetwork.update_head import UpdateHead
 from hyperplanes.hypernetwork.volume_network import VolumeNetwork
 from hyperplanes.parameters import Parameters
 
 __all__ = ["VolumeHyperNetwork"]
 
 
-class VolumeHyperNetwork(UpdateWriter):
+class VolumeHyperNetwork(UpdateHead):
     """H(V, theta; delta), where V is what all views show on a grid over the scene (`geometry.volume.volume_of`).
 
     A grid of features among the weights of the target gets an update for every cell, from the convolutions of
@@ -34,6 +36,8 @@ class VolumeHyperNetwork(UpdateWriter):
         ValueError: layers that the target does not have.
     """
 
+    reads_volume: ClassVar[bool] = True
+
     def __init__(self, config: HyperNetworkConfig, shapes: Mapping[str, torch.Size], channels: int, side: int) -> None:
         super().__init__(config, shapes)
         self.grids = {name: shape for name, shape in self.shapes.items() if len(shape) == 4}
@@ -42,22 +46,26 @@ class VolumeHyperNetwork(UpdateWriter):
         self.code_normalisation = self.make_normalisation((config.code,))
         self.make_head(config.code, shapes)
 
-    def forward(self, volumes: Float[Tensor, "object channel x y z"], theta: Mapping[str, Tensor]) -> list[Parameters]:
+    def forward(self, observed: Observed, theta: Mapping[str, Tensor]) -> list[Parameters]:
         """The update of theta for each of several objects.
 
         Args:
-            volumes: V of each.
+            observed: the volumes of the objects.
             theta: the target's parameters.
 
         Returns:
             For each object one tensor a named parameter of the chosen layers, of its shape.
         """
-        codes, features = self.encoder(volumes)
-        updates = self.written(ACTIVATIONS[self.config.code_activation](self.code_normalisation(codes)), theta)
+        assert observed.volume is not None
+        codes, features = self.encoder(observed.volume)
+        updates = self.updates_of(ACTIVATIONS[self.config.code_activation](self.code_normalisation(codes)), theta)
         for update, cells in zip(updates, features, strict=True):
             update.update(zip(self.grids, cells.split([shape[0] for shape in self.grids.values()]), strict=True))
         return updates
 
-    def encode(self, volumes: Float[Tensor, "object channel x y z"]) -> Float[Tensor, "object code"]:
-        """The codes of objects before their activation."""
-        return self.code_normalisation(self.encoder(volumes)[0])
+    def standardised_codes(self, observed: Observed) -> Tensor | None:
+        """The codes of the volumes in deviations of those of the training; None where they are not standardised so."""
+        if not isinstance(self.code_normalisation, RunningStandardisation):
+            return None
+        assert observed.volume is not None
+        return self.code_normalisation(self.encoder(observed.volume)[0])

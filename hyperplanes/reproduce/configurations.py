@@ -87,7 +87,7 @@ def deviations(experiment: Experiment, scale: Scale) -> list[str]:
     return found
 
 
-IGNORED = ("steps", "seed", "evaluate_every", "checkpoint_every", "held_out", "memory", "hull_side")
+IGNORED = ("steps", "seed", "evaluate_every", "checkpoint_every", "held_out", "memory", "hull_resolution")
 
 
 def _shown(value: object) -> str:

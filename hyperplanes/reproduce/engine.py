@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from hyperplanes.adaptation.fine_tuning import FineTuning
-from hyperplanes.adaptation.pretrained import find_checkpoints
+from hyperplanes.adaptation.checkpoints import find_checkpoints
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.presets import PROTOCOLS, Preset
 from hyperplanes.data import open_dataset
 from hyperplanes.data.devices import TasksOnDevice
@@ -200,7 +200,7 @@ class Runner:
         self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, names: list[str], seed: int
     ) -> Score:
         checkpoints = find_checkpoints([checkpoint])
-        settings = FineTuning(free=cell.free if "hyperplanes" in checkpoints else "weights", seed=seed)
+        settings = FineTuning(trainable=cell.free if "hyperplanes" in checkpoints else "weights", seed=seed)
         planes = read_json(checkpoint / "model.json")["network"]["planes"]
         tasks = WithSupport(self.tasks(cell.on), planes)
         adapter = make_method(

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import torch
 
-from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.reproduce.engine import Runner
 from hyperplanes.reproduce.experiments import Experiment, Trained

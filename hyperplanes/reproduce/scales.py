@@ -110,7 +110,7 @@ SCALES: dict[str, Scale] = {
                 "model.initialisation.inner_steps": 2,
                 "model.initialisation.test_rays": 16,
                 "model.sampling.steps": 8,
-                "model.hull_side": 8,
+                "model.hull_resolution": 8,
                 "training.tasks": 2,
                 "training.rays": 16,
                 "training.warmup": 0,

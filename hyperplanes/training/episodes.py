@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.prepared import Prepared
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.errors import prefix_errors
@@ -35,7 +35,7 @@ class Episode:
         whole: of `whole_of`, where the training completes volumes.
     """
 
-    prepared: Prepared
+    prepared: SupportContext
     query: Views
     live: Int[Tensor, " pixel"] | None
     whole: Float[Tensor, "4 x y z"] | None = None

@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.fine_tuning import minimise, ray_loss
+from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.initialisation import InitialisationConfig
-from hyperplanes.adaptation.meta_learning import maml_gradient, reptile_gradient
-from hyperplanes.adaptation.prepared import Prepared
+from hyperplanes.configuration.initialisation import InitialisationConfig
 from hyperplanes.data.support import SingleView
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters
@@ -22,6 +20,7 @@ from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.drawing import points_in
 from hyperplanes.training.emptiness import thin_opacity
 from hyperplanes.training.episodes import Episode
+from hyperplanes.training.meta_gradients import maml_gradient, reptile_gradient
 from hyperplanes.training.trainer import Trainer
 from hyperplanes.views import Tasks
 
@@ -39,7 +38,7 @@ class _InitialisationTrainer(Trainer):
 
     def _adapted(self, episode: Episode) -> AdaptedField:
         settings = replace(self.initialisation.descent(self.config.rays), seed=self.config.seed)
-        return self.model.fine_tune(episode.prepared, self.initialisation.inner_steps, settings)
+        return self.model.fine_tune_to(episode.prepared, self.initialisation.inner_steps, settings)
 
     def _set_gradients(self, gradient: Parameters) -> None:
         for name, value in self.model.networks.named_parameters():
@@ -69,21 +68,13 @@ class ReptileTrainer(_InitialisationTrainer):
         total, adapted = 0.0, []
         theta = self.model.theta.detach()
         for episode, generator in zip(episodes, generators, strict=True):
-            free = Parameters((name, value.clone().requires_grad_(True)) for name, value in theta.items())
-            field = self.model.field(episode.prepared, free)
-
-            def showing(
-                hidden: Tensor | None, shown: Prepared = episode.prepared, free: Parameters = free
-            ) -> AdaptedField:
-                return self.model.field(shown if hidden is None else shown.hiding(hidden), free)
-
             settings = replace(self.initialisation.descent(self.config.rays), seed=_seed(generator))
-            views, steps = episode.prepared.views, self.initialisation.inner_steps
-            live = episode.support_live
-            hiding = self.model.any_order
-            for _ in minimise(showing, list(free.values()), views, steps, settings, pixels=live, hiding=hiding):
+            descent, variables = self.model.descent(episode.prepared, settings, start=theta)
+            for _ in descent.run(self.initialisation.inner_steps):
                 pass
-            adapted.append(free.detach())
+            weights = variables.weights().detach()
+            adapted.append(weights)
+            field = self.model.field(episode.prepared, weights)
             with torch.no_grad():
                 rays, truth = _draw(episode, field, self.config.rays, generator)
                 total += float(ray_loss(field.trace(rays, generator), truth))
@@ -99,7 +90,7 @@ class MAMLTrainer(_InitialisationTrainer):
     """
 
     def __init__(self, model: HyperPlanes, data: Tasks, config: TrainingConfig, folder: Path | None = None) -> None:
-        if model.any_order:
+        if model.target.permutation_invariant:
             raise ValueError(f"maml: expected a field that knows views by their places, got {model.config.target}")
         super().__init__(model, data, config, folder)
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import torch
 
-from hyperplanes.adaptation.configuration import ModelConfig, checkpoint_folder
+from hyperplanes.adaptation.checkpoints import checkpoint_folder
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.distributed import Processes

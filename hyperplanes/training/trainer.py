@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.profiler import record_function
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.context import SupportContext
+from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
-from hyperplanes.adaptation.fine_tuning import ray_loss
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.optimisers import make_optimisers
-from hyperplanes.adaptation.prepared import Prepared
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.completion import completion_loss
 from hyperplanes.training.configuration import Progress, TrainingConfig
@@ -246,7 +246,7 @@ class Trainer:
         self._updates = [update.detach() for update in updates]
         return float(total.detach()) / tasks
 
-    def _with_dropout(self, prepared: Prepared, generator: torch.Generator) -> Prepared:
+    def _with_dropout(self, prepared: SupportContext, generator: torch.Generator) -> SupportContext:
         """The object without the planes that this step hides, where the model is trained to do without some."""
         chance = self.model.config.plane_dropout
         if not chance:
@@ -342,7 +342,7 @@ class Trainer:
 
     def _adapted(self, episode: Episode) -> AdaptedField:
         """The field of a held-out object."""
-        return self.model.adapt(episode.prepared)
+        return self.model.adapt_to(episode.prepared)
 
     def save(self) -> None:
         """Write model and training state to the folder, where there is one; whole or not at all."""

@@ -8,9 +8,9 @@ import torch
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.fine_tuning import FineTuning, minimise
-from hyperplanes.adaptation.pretrained import adapted_model
+from hyperplanes.adaptation.descent import Descent
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
@@ -26,7 +26,7 @@ VOLUME = replace(SHAPE, encoder="volume")
 NETWORK = TargetConfig(depth=2, width=16, planes=4, blended=2, point_octaves=2, direction_octaves=1)
 GRID = replace(NETWORK, grid=5)
 READERS = {"images": {}, "volume": {"network": GRID, "hypernetwork": VOLUME}}
-CONFIG = ModelConfig("any_order", NETWORK, SHAPE, sampling=Marched(24), hull_side=16)
+CONFIG = ModelConfig("any_order", NETWORK, SHAPE, sampling=Marched(24), hull_resolution=16)
 
 
 def model(**changes):
@@ -102,7 +102,7 @@ def test_a_model_of_planes_reads_objects_of_several_picture_sizes():
 
 
 def test_the_hypernetwork_reads_the_views_that_stand_farthest_apart():
-    chosen = views(8)[model().hyperplanes(views(8))]
+    chosen = views(8)[model().prepare(views(8)).hyperplanes]
     standing = torch.nn.functional.normalize(centres(chosen.cameras), dim=1)
     assert len(chosen) == 3
     assert (standing @ standing.T).fill_diagonal_(-1).max() < 0.2  # three of eight, more than 78 degrees apart
@@ -162,7 +162,7 @@ def test_a_second_pass_takes_colours_by_the_surface_that_the_first_one_shows_eve
     assert torch.equal(picture(twice, support), expected)
     assert not torch.allclose(picture(once, support), expected, atol=1e-4)
     for free in ("weights", "hypernetwork"):
-        tuned = twice.fine_tune(support, 0, FineTuning(free=free))
+        tuned = twice.fine_tune(support, 0, FineTuning(trainable=free))
         torch.testing.assert_close(tuned.render(ring(2, (10, 13), shift=1)).images, expected)
 
 
@@ -191,6 +191,9 @@ class Recorder:
         self.value = torch.zeros(3, requires_grad=True)
         self.eyes, self.notes = centres(support.cameras), []
 
+    def descent(self, support, settings, pixels=None):
+        return Descent(self, [self.value], support, settings, pixels, masks_views=True)
+
     def __call__(self, hidden):
         def trace(rays, generator=None):
             sources = torch.cdist(rays.origins, self.eyes).argmin(1)
@@ -204,7 +207,7 @@ class Recorder:
 
 def test_of_two_views_one_is_hidden_from_the_rays_of_the_other():
     recorder = Recorder(views(2))
-    list(minimise(recorder, [recorder.value], views(2), 8, FineTuning(rays=16), hiding=True))
+    list(recorder.descent(views(2), FineTuning(rays=16)).run(8))
     assert all(hidden == sources and len(hidden) == 1 for hidden, sources in recorder.notes)
 
 
@@ -214,7 +217,7 @@ def test_a_single_view_is_not_fine_tuned_on_unless_it_may_be_copied():
         with pytest.raises(ValueError, match="steps: expected 0 with a single view"):
             adapter.fine_tune(views(1), steps)
     adapter.fine_tune(views(1), 0)
-    adapter.fine_tune(views(1), 1, FineTuning(hide=False))
+    adapter.fine_tune(views(1), 1, FineTuning(mask_views=False))
 
 
 @pytest.mark.parametrize("among", [False, True])
@@ -222,16 +225,16 @@ def test_rays_come_from_hidden_views_only(among):
     support = views(12)
     pixels = (support.masks[:, 0] > 0).flatten().nonzero()[:, 0] if among else None
     recorder = Recorder(support)
-    settings = FineTuning(rays=64, left_out=4)
-    assert list(minimise(recorder, [recorder.value], support, 8, settings, pixels=pixels, hiding=True))[-1] == 8
+    settings = FineTuning(rays=64, holdout=4)
+    assert list(recorder.descent(support, settings, pixels).run(8))[-1] == 8
     assert all(sources <= hidden and len(hidden) == 3 for hidden, sources in recorder.notes)
     assert len(set.union(*(hidden for hidden, _ in recorder.notes))) > 6  # others in every step
 
 
-@pytest.mark.parametrize(("count", "settings"), [(1, FineTuning()), (12, FineTuning(hide=False))])
+@pytest.mark.parametrize(("count", "settings"), [(1, FineTuning()), (12, FineTuning(mask_views=False))])
 def test_a_single_view_and_who_does_not_want_it_hide_none(count, settings):
     recorder = Recorder(views(count))
-    list(minimise(recorder, [recorder.value], views(count), 3, settings, hiding=True))
+    list(recorder.descent(views(count), settings).run(3))
     assert [hidden for hidden, _ in recorder.notes] == [None] * 3
 
 
@@ -262,7 +265,7 @@ def test_the_weights_of_one_object_make_its_field_again_after_a_second_pass(free
     twice, support = model(**READERS["volume"], second_pass=True), views(6)
     tuned = twice.fine_tune(support, 10, FineTuning(free))
     cameras = ring(2, (10, 13), shift=1)
-    again = adapted_model(twice, tuned).adapt(support).render(cameras).images
+    again = twice.with_weights_of(tuned).adapt(support).render(cameras).images
     torch.testing.assert_close(again, tuned.render(cameras).images, atol=1e-6, rtol=0)
     before = twice.adapt(support).field.planes
     assert not torch.equal(before._surface, tuned.field.planes._surface)  # that of the tuned weights

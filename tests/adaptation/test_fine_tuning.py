@@ -4,14 +4,14 @@ import pytest
 import torch
 
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
-from hyperplanes.adaptation.fine_tuning import FineTuning
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.rendering import Hierarchical
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring, small_model
 
-PAPER = FineTuning(free="hypernetwork", rays=64, learning_rate=1e-2)
-WEIGHTS = FineTuning(free="weights", rays=64, learning_rate=1e-2, muon_learning_rate=0.05)
+PAPER = FineTuning(trainable="hypernetwork", rays=64, learning_rate=1e-2)
+WEIGHTS = FineTuning(trainable="weights", rays=64, learning_rate=1e-2, muon_learning_rate=0.05)
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_wrong_settings_are_refused(model, support):
 
 def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, support):
     taken = []
-    ruinous = replace(WEIGHTS, learning_rate=1e30, muon_learning_rate=1e30, longest=12)  # NaN after the first step
+    ruinous = replace(WEIGHTS, learning_rate=1e30, muon_learning_rate=1e30, max_steps=12)  # NaN after the first step
     field = model.fine_tune(support, "auto", ruinous, on_step=taken.append)
     assert taken == [0]
     cameras = ring(1, shift=1)
@@ -126,7 +126,7 @@ def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, s
 def test_auto_goes_on_where_steps_show_left_out_views_better():
     model, support, taken, tried = awaken(small_model()), ball_views(ring(9)), [], []
     field = model.fine_tune(
-        support, "auto", replace(WEIGHTS, longest=40, left_out=3), on_step=taken.append, on_trial=tried.append
+        support, "auto", replace(WEIGHTS, max_steps=40, holdout=3), on_step=taken.append, on_trial=tried.append
     )
     assert tried == list(range(max(tried) + 1))
     assert max(taken) <= max(tried) <= 40
@@ -146,7 +146,7 @@ def test_left_out_views_are_neither_planes_nor_rays_while_the_number_of_steps_is
         return sample(self, count, **given)
 
     monkeypatch.setattr(type(support), "sample_rays", sampled)
-    model.fine_tune(support, "auto", replace(WEIGHTS, longest=10, left_out=3))
+    model.fine_tune(support, "auto", replace(WEIGHTS, max_steps=10, holdout=3))
     assert [len(views) for views in prepared] == [6, 9]
     assert drawn[0] == (3, 4096)  # the rays that judge
     assert {count for views, count in drawn[1:]} == {64}
@@ -176,11 +176,11 @@ def test_from_scratch_nothing_that_was_trained_is_used(support):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"free": "theta"}, "free: expected one of 'weights', 'hypernetwork', got 'theta'"),
+        ({"trainable": "theta"}, "trainable: expected one of 'weights', 'hypernetwork', got 'theta'"),
         ({"optimiser": "lion"}, "optimiser: expected one of .*, got 'lion'"),
         ({"rays": 0}, "rays: expected at least 1, got 0"),
-        ({"left_out": 1}, "left_out: expected at least 2, got 1"),
-        ({"longest": 0}, "longest: expected at least 1, got 0"),
+        ({"holdout": 1}, "holdout: expected at least 2, got 1"),
+        ({"max_steps": 0}, "max_steps: expected at least 1, got 0"),
         ({"learning_rate": -1.0}, "learning_rate: expected a finite number of 0 or more, got -1.0"),
         ({"muon_learning_rate": float("nan")}, "muon_learning_rate: expected a finite number"),
     ],

@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HyperPlanes, InitialisationConfig, ModelConfig, configuration
-from hyperplanes.adaptation.fine_tuning import FineTuning
+from hyperplanes.adaptation import HyperPlanes, InitialisationConfig, ModelConfig, checkpoints
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import camera_from_world, centres, look_at, pinhole, viewing_directions
 from hyperplanes.geometry.cameras import intrinsics as calibration
@@ -59,7 +59,8 @@ def test_what_the_hypernetwork_reads(model, support):
     seen = []
     model.hypernetwork.register_forward_pre_hook(lambda module, given: seen.append(given))
     model.adapt(support)
-    (images,), (directions,), theta = seen[0]
+    observed, theta = seen[0]
+    (images,), (directions,) = observed.images, observed.directions
     assert images.shape == (2, 3, 16, 16)
     assert set(theta) == set(model.theta)
     for image, direction in zip(images, directions, strict=True):
@@ -122,26 +123,26 @@ def test_hyperplanes_are_spread_as_far_as_they_can_be():
     eyes = 3 * torch.tensor([[0, 0, 1.0], [1, 0, 0], [0, 1, 0], [0, 0, -1], [-1, 0, 0], [0, -1, 0]])
     cameras = pinhole(torch.tensor([[20.0, 0, 7.5], [0, 20, 7.5], [0, 0, 1]]), look_at(eyes), 16, 16)
     wide.set_rig(ball_views(cameras))
-    assert wide.hyperplanes().tolist() == [0, 3]
+    assert wide.prepare(ball_views(cameras)).hyperplanes.tolist() == [0, 3]
 
 
 @pytest.mark.parametrize("count", [1, 3, 4])
 def test_hyperplanes_are_k_different_planes(count):
     shape = HyperNetworkConfig(views=count, normalisation="group", code=4, depth=1, width=8)
-    chosen = small_model(hypernetwork=shape).hyperplanes().tolist()
+    chosen = small_model(hypernetwork=shape).prepare(ball_views(ring(4))).hyperplanes.tolist()
     assert len(set(chosen)) == len(chosen) == count
 
 
 def test_the_first_hyperplanes_are_read_when_asked_for(support):
     config = HyperNetworkConfig(views=3, choice="first", normalisation="group", code=8, depth=2, width=16)
     first, farthest = small_model(hypernetwork=config), small_model(hypernetwork=replace(config, choice="farthest"))
-    assert first.hyperplanes().tolist() == [0, 1, 2]
+    assert first.prepare(support).hyperplanes.tolist() == [0, 1, 2]
     assert all(torch.equal(value, farthest.state_dict()[name]) for name, value in first.state_dict().items())
-    for model, chosen in ((first, [0, 1, 2]), (farthest, farthest.hyperplanes().tolist())):
+    for model, chosen in ((first, [0, 1, 2]), (farthest, farthest.prepare(support).hyperplanes.tolist())):
         seen = []
         model.hypernetwork.register_forward_pre_hook(lambda module, given, seen=seen: seen.append(given[0]))
         model.update(model.prepare(support))
-        assert torch.equal(seen[0][0], support.images[chosen])
+        assert torch.equal(seen[0].images[0], support.images[chosen])
 
 
 @pytest.mark.parametrize(("count", "expected"), [(4, [3, 1, 0, 2]), (6, [3, 1, 0, 2]), (3, [3, 1, 0, 3])])
@@ -201,7 +202,7 @@ def test_a_saved_model_is_the_same_model(model, support, tmp_path):
     [
         ModelConfig(),
         ModelConfig(hypernetwork=None, sampling=Hierarchical(3, 4), coarse_network=True),
-        ModelConfig(target="nerf", hypernetwork=HyperNetworkConfig(layers=("0", "colour")), hull_side=7),
+        ModelConfig(target="nerf", hypernetwork=HyperNetworkConfig(layers=("0", "colour")), hull_resolution=7),
         ModelConfig(hypernetwork=None, autoencoder=AutoencoderConfig(views=3, latent=9), order="file"),
         ModelConfig(hypernetwork=None, initialisation=InitialisationConfig("maml", inner_steps=2)),
     ],
@@ -278,7 +279,7 @@ def config_of(model):
         ("hypernetwork", {"views": 5}, "views: expected at most as many HyperPlanes as planes, 4, got 5"),
         (None, {"target": "voxels"}, "target: expected one of .*, got 'voxels'"),
         (None, {"target": 3}, "target: 3 instead of a name"),
-        (None, {"hull_side": 10**6}, "hull_side: 1000000 instead of a whole number from 1 to 512"),
+        (None, {"hull_resolution": 10**6}, "hull_resolution: 1000000 instead of a whole number from 1 to 512"),
         ("sampling", {"steps": 0}, "sampling.steps: 0 instead of a whole number from 1 to 16384"),
     ],
 )
@@ -296,8 +297,8 @@ def test_a_checkpoint_of_wrong_types_or_absurd_sizes_names_its_file(model, tmp_p
 
 def test_entries_that_a_newer_version_added_may_be_missing(model):
     value = config_of(model)
-    del value["network"]["density_scale"], value["hull_side"]
-    assert ModelConfig.of_json(value) == replace(model.config, hull_side=64)
+    del value["network"]["density_scale"], value["hull_resolution"]
+    assert ModelConfig.of_json(value) == replace(model.config, hull_resolution=64)
 
 
 def test_differences_of_configurations_are_named():
@@ -311,7 +312,7 @@ def test_differences_of_configurations_are_named():
 
 def test_a_packaged_model_is_found_by_its_name(model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(configuration, "PACKAGED", tmp_path / "package")
+    monkeypatch.setattr(checkpoints, "PACKAGED", tmp_path / "package")
     model.save(tmp_path / "package" / "cars-8")
     found = HyperPlanes.from_pretrained("cars-8")
     assert all(torch.equal(value, found.state_dict()[name]) for name, value in model.state_dict().items())
@@ -339,9 +340,9 @@ def test_the_seed_decides_the_weights_and_global_randomness_does_not():
 
 def test_a_model_that_was_never_shown_its_rig_is_refused(support):
     fresh = HyperPlanes(small_model().config)
-    for call in (fresh.hyperplanes, lambda: fresh.adapt(support)):
+    for call in (fresh.prepare, fresh.arrange, fresh.adapt):
         with pytest.raises(ValueError, match="rig: expected the standpoints of the training's views, got none"):
-            call()
+            call(support)
 
 
 def test_weights_are_found_in_one_way():
@@ -386,6 +387,6 @@ def test_planes_in_the_order_of_the_file_and_the_first_as_hyperplanes():
     views = ball_views(ring(6))[[4, 1, 5, 0, 2, 3]]
     assert torch.equal(model.arrange(views).images, views.images[:4])
     assert torch.equal(model.arrange(views[[1, 0, 2]]).images, views.images[[1, 0, 2, 1]])
-    assert model.hyperplanes().tolist() == [0, 1, 2]
+    assert model.prepare(views).hyperplanes.tolist() == [0, 1, 2]
     with pytest.raises(ValueError, match="order: expected one of 'matched', 'file', got 'random'"):
         ModelConfig(order="random")

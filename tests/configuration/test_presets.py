@@ -78,7 +78,7 @@ def test_a_preset_trains_and_renders_at_toy_resolution(name):
     chosen = preset(name)
     sampling = Hierarchical(4, 4) if isinstance(chosen.model.sampling, Hierarchical) else chosen.model.sampling
     torch.manual_seed(0)
-    model = HyperPlanes(replace(chosen.model, sampling=sampling, hull_side=12))
+    model = HyperPlanes(replace(chosen.model, sampling=sampling, hull_resolution=12))
     data = Balls(train=4, views=25, size=(12, 12))
     trainer = Trainer(model, data, replace(chosen.training, rays=8))
     before = {key: value.clone() for key, value in model.named_parameters()}

@@ -31,7 +31,7 @@ def make(name="point_multiplane", config=SMALL, seed=0):
     return TARGETS[name](config)
 
 
-@pytest.fixture(params=[name for name, kind in TARGETS.items() if not kind.any_order])
+@pytest.fixture(params=[name for name, kind in TARGETS.items() if not kind.permutation_invariant])
 def target(request):
     return make(request.param)
 

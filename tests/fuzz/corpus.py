@@ -10,8 +10,8 @@ from PIL import Image
 
 from data_gen.datasets.manifest import verify
 from data_gen.meshes.mesh import load_mesh, mesh_parts
+from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.pretrained import load_model
 from hyperplanes.configuration.presets import configure
 from hyperplanes.data import open_dataset, read_channel, read_task, read_views
 from hyperplanes.fields.baked import BakedField
@@ -133,7 +133,7 @@ def small_model():
     config = configure("quick", "hyperplanes").model
     network = replace(config.network, depth=1, width=8, planes=2)
     hyper = replace(config.hypernetwork, views=1, code=4, depth=1, width=8)
-    model = HyperPlanes(replace(config, network=network, hypernetwork=hyper, hull_side=8))
+    model = HyperPlanes(replace(config, network=network, hypernetwork=hyper, hull_resolution=8))
     model.rig.copy_(torch.eye(3)[: len(model.rig)])
     return model
 
@@ -147,7 +147,7 @@ def training(folder):
 
 
 def go_on(folder):
-    model = load_model(folder)
+    model = HyperPlanes.from_pretrained(find_checkpoint(folder))
     load_state(folder, model, [torch.optim.Adam(model.parameters())], CONFIG, ("steps",), {})
 
 
@@ -201,7 +201,7 @@ CORPUS = {  # how each is made, which of its files are damaged, and what reads i
     "NeuS": (neus, "**/*.*", read_views),
     "archive": (archive, "4_a.npz", lambda folder: read_views(folder / "4_a.npz")),
     "channel": (archive, "depth.npz", lambda folder: read_channel(folder, "depth")),
-    "model": (training, "model.*", load_model),
+    "model": (training, "model.*", lambda path: HyperPlanes.from_pretrained(find_checkpoint(path))),
     "training": (training, "training*", go_on),
     "baked": (baked, "*", lambda folder: BakedField.load(folder / "a.safetensors")),
     "OBJ": (meshes, "a.[omp][btn][jlg]", render_mesh("obj")),

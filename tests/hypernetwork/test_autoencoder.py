@@ -22,7 +22,7 @@ def test_the_code_is_an_input_of_every_layer_that_reads_a_point(target):
     model = make(target=target).eval()
     prepared = model.prepare(ball_views(ring(4)))
     encoder, theta = model.hypernetwork, model.theta
-    chosen = model.hyperplanes()
+    chosen = prepared.hyperplanes
     directions = prepared.views.cameras.extrinsics[chosen, 2, :3][None]  # the z axis of each camera, in the world
     code = encoder.encode(prepared.views.images[chosen][None], directions)
     points = torch.rand(7, 3) - 0.5
@@ -35,7 +35,7 @@ def test_the_code_is_an_input_of_every_layer_that_reads_a_point(target):
     hidden = relu(linear(beside, weights["layers.0"], theta["fine.layers.0.bias"]))
     own = theta["fine.layers.1.weight"][:, read.shape[1] :]
     hidden = relu(linear(beside, weights["layers.1"], theta["fine.layers.1.bias"]) + hidden @ own.T)
-    torch.testing.assert_close(model.adapt(prepared).field.hidden(points), hidden, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(model.adapt_to(prepared).field.hidden(points), hidden, rtol=1e-4, atol=1e-5)
 
 
 def test_nothing_but_biases_of_reading_layers_is_shifted():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from hyperplanes.fields import PointMultiPlaneNeRF, TargetConfig
-from hyperplanes.hypernetwork import HyperNetwork, HyperNetworkConfig
+from hyperplanes.hypernetwork import HyperNetworkConfig, ImageHyperNetwork, Observed
 from hyperplanes.hypernetwork.weights import LowRankReader
 
 CONFIG = HyperNetworkConfig(views=3, normalisation="group", code=8, depth=2, width=16)
@@ -18,9 +18,18 @@ SHAPES = {
 }
 
 
+class _OneByOne(ImageHyperNetwork):
+    """Called with the images and directions of several objects, or of one, whose update alone it returns."""
+
+    def __call__(self, images, directions, theta):
+        if images.ndim == 5:
+            return super().__call__(Observed(images, directions), theta)
+        return super().__call__(Observed(images[None], directions[None]), theta)[0]
+
+
 def make(config=CONFIG, *, awake=True):
     torch.manual_seed(0)
-    network = HyperNetwork(config, SHAPES)
+    network = _OneByOne(config, SHAPES)
     if awake:  # the outputs start at zero; here they are to say something
         for output in network.outputs:
             torch.nn.init.normal_(output.weight)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from hyperplanes.geometry.volume import CHANNELS, SIDE
-from hyperplanes.hypernetwork import HyperNetworkConfig, VolumeHyperNetwork
+from hyperplanes.hypernetwork import HyperNetworkConfig, Observed, VolumeHyperNetwork
 from hyperplanes.hypernetwork.volume_network import VolumeNetwork, _fold, _unfold
 
 SHAPES = {
@@ -27,6 +27,10 @@ def volumes(count=3):
     return torch.randn(count, CHANNELS, SIDE, SIDE, SIDE, generator=torch.Generator().manual_seed(1))
 
 
+def seen(volume):
+    return Observed(volume=volume)
+
+
 def awake(**changes):
     """A hypernetwork whose outputs are not zero."""
     torch.manual_seed(2)
@@ -47,7 +51,7 @@ def test_folding_keeps_every_value_and_blocks_become_channels():
 
 def test_an_untrained_hypernetwork_changes_nothing_and_names_every_parameter_by_its_shape():
     network = VolumeHyperNetwork(CONFIG, SHAPES, CHANNELS, SIDE)
-    for update in network(volumes(), theta()):
+    for update in network(seen(volumes()), theta()):
         assert {name: value.shape for name, value in update.items()} == SHAPES
         assert not any(value.any() for value in update.values())
 
@@ -55,9 +59,9 @@ def test_an_untrained_hypernetwork_changes_nothing_and_names_every_parameter_by_
 def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch():
     network = awake()
     with torch.no_grad():
-        together = network(volumes(), theta())
+        together = network(seen(volumes()), theta())
         for index, one in enumerate(together):
-            for name, value in network(volumes()[index : index + 1], theta())[0].items():
+            for name, value in network(seen(volumes()[index : index + 1]), theta())[0].items():
                 torch.testing.assert_close(one[name], value, atol=1e-4, rtol=1e-4)
     for name in SHAPES:
         assert not torch.allclose(together[0][name], together[1][name])
@@ -76,12 +80,12 @@ def test_a_cell_has_features_of_what_lies_around_it():
 
 
 def test_layers_can_be_chosen():
-    only = awake(layers=("grid",))(volumes(1), theta())[0]
+    only = awake(layers=("grid",))(seen(volumes(1)), theta())[0]
     assert set(only) == {"fine.grid.weight"}
     torch.manual_seed(0)
     without = VolumeHyperNetwork(
         HyperNetworkConfig(**{**CONFIG.__dict__, "layers": ("density",)}), SHAPES, CHANNELS, SIDE
     )
-    assert set(without(volumes(1), theta())[0]) == {"fine.density.weight"}
+    assert set(without(seen(volumes(1)), theta())[0]) == {"fine.density.weight"}
     with pytest.raises(ValueError, match="layers: expected"):
         awake(layers=("walls",))

@@ -20,7 +20,7 @@ MODEL = ModelConfig(
     TargetConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_octaves=2, direction_octaves=1),
     HyperNetworkConfig(encoder="volume", code=8, depth=1, width=16, layers=("all",), update="low_rank", rank=1),
     sampling=Marched(24),
-    hull_side=32,
+    hull_resolution=32,
 )
 TRAINING = TrainingConfig(
     steps=4, tasks=2, rays=32, views=(1, 3), episodes=4, volume_loss=0.1, hypernetwork_learning_rate=3e-3, held_out=0

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import FineTuned, HyperPlanes, InitialisationConfig
+from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.fine_tuned import shuffled
-from hyperplanes.adaptation.fine_tuning import FineTuning, ray_loss
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data.support import SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.parameters import Parameters
@@ -140,9 +141,9 @@ def test_what_inner_steps_do_not_do_is_refused(name, value):
 
 
 def test_gradient_steps_from_an_initialisation_are_plain_descent_unless_an_optimiser_is_stated():
-    config, given = InitialisationConfig(inner_rate=0.3), FineTuning(learning_rate=0.1, final=0.2, seed=4)
+    config, given = InitialisationConfig(inner_rate=0.3), FineTuning(learning_rate=0.1, final_rate_factor=0.2, seed=4)
     for rate, settings in ((0.3, config.descent()), (0.1, config.descent(given=given))):
-        assert (settings.optimiser, settings.learning_rate, settings.final) == ("sgd", rate, 1.0)
+        assert (settings.optimiser, settings.learning_rate, settings.final_rate_factor) == ("sgd", rate, 1.0)
     adam = config.descent(given=replace(given, optimiser="adam"))
     assert (adam.optimiser, adam.learning_rate, adam.final, adam.seed) == ("adam", 0.1, 0.2, 4)
 
@@ -226,7 +227,7 @@ def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not
         assert torch.equal(resumed.model.state_dict()[name], value), name
 
     wider = replace(given.config, network=replace(given.config.network, width=32))
-    wider = replace(wider, hull_side=32, sampling=Hierarchical(4, 4))  # neither decides on weights
+    wider = replace(wider, hull_resolution=32, sampling=Hierarchical(4, 4))  # neither decides on weights
     expected = "expected weights of the configured model, .* got .*given, hyperplanes of .* differs in {}; give {}$"
     remedy = "the --preset or --config that it was trained by"
     with pytest.raises(ValueError, match=expected.format("network.width", remedy)):

@@ -22,7 +22,7 @@ MODEL = ModelConfig(
     TargetConfig(depth=2, width=16, planes=4, blended=2, point_octaves=2, direction_octaves=1),
     HyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16, join="mean"),
     sampling=Marched(24),
-    hull_side=16,
+    hull_resolution=16,
 )
 TRAINING = TrainingConfig(
     steps=6, tasks=2, rays=32, views=(1, 3), episodes=4, random_background=True, learning_rate=1e-3, held_out=0,

@@ -388,7 +388,7 @@ def test_checkpoints_are_written_when_they_are_due_and_not_only_with_a_report(tm
     [
         ({"sampling": Marched(25)}, "sampling.steps"),
         ({"sampling": Hierarchical(4, 4)}, "protocol"),
-        ({"hull_side": 17}, "hull_side"),
+        ({"hull_resolution": 17}, "hull_resolution"),
         ({"network": replace(small_model().config.network, density_scale=3.0)}, "network.density_scale"),
         ({"hypernetwork": replace(small_model().config.hypernetwork, gain=0.5)}, "hypernetwork.gain"),
     ],

@@ -11,8 +11,8 @@ import yaml
 from small_demo import demo_folder
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig, NearestView
+from hyperplanes.adaptation.checkpoints import find_checkpoints
 from hyperplanes.adaptation.fine_tuned import FineTuned
-from hyperplanes.adaptation.pretrained import find_checkpoints
 from hyperplanes.cli import main
 from hyperplanes.commands.train import Arguments, resolve
 from hyperplanes.configuration.presets import PRESETS, configure, preset

@@ -7,18 +7,17 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from hyperplanes.adaptation.initialisation import InitialisationConfig
+from hyperplanes.configuration.initialisation import InitialisationConfig
+from hyperplanes.configuration.upgrade import upgrade_model
 from hyperplanes.fields import TargetConfig
 from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.settings import SettingsError, choose_by_tag, structure
 
-__all__ = ["ORDERS", "ModelConfig", "checkpoint_folder", "packaged_folder"]
+__all__ = ["ORDERS", "ModelConfig"]
 
 ORDERS = ("matched", "file")
-
-PACKAGED = Path(__file__).parent.parent / "pretrained"  # a folder a model, by its name
 
 choose_by_tag(Hierarchical | Marched, "protocol")
 
@@ -35,8 +34,8 @@ class ModelConfig:
         initialisation: how the weights were learned as an initialisation, if they were.
         coarse_network: whether a second network of the same shape proposes where to sample (NeRF's coarse network).
         sampling: how fields are rendered by default, in training too.
-        hull_side: voxels an axis of the visual hull; at least, where a field of any number of views is shown larger
-            pictures, up to 192.
+        hull_resolution: voxels an axis of the visual hull; at least, where a field of any number of views is shown
+            larger pictures, up to 192.
         order: which support view a plane is: the one "matched" to the standpoint that it had in training, or views in
             the order of their "file", as the paper takes them.
         plane_dropout: how likely a step of training hides a plane of an object, for a field that knows planes by their
@@ -53,7 +52,7 @@ class ModelConfig:
     initialisation: InitialisationConfig | None = None
     coarse_network: bool = False
     sampling: Hierarchical | Marched = field(default_factory=Marched)
-    hull_side: Annotated[int, range(1, 513)] = 64
+    hull_resolution: Annotated[int, range(1, 513)] = 64
     order: str = "matched"
     plane_dropout: float = 0.0
     second_pass: bool = False
@@ -105,6 +104,7 @@ class ModelConfig:
     @classmethod
     def structured(cls, value: Mapping[str, Any]) -> ModelConfig:
         """As `of_json`; SettingsError names the entry that does not fit."""
+        value = upgrade_model(value)
         for name in ("network", "sampling", "hypernetwork", "protocol"):
             if name not in value:
                 raise SettingsError(name, "a missing entry")
@@ -122,30 +122,6 @@ class ModelConfig:
         """The names of the entries in which two models differ, such as "sampling.steps"."""
         mine, others = _flat(self.as_json()), _flat(other.as_json())
         return sorted(name for name in mine | others if mine.get(name, ...) != others.get(name, ...))
-
-
-def packaged_folder(name: str) -> Path:
-    """The folder of a model that comes with the package, whatever lies in the current folder."""
-    return PACKAGED / name
-
-
-def checkpoint_folder(name: Path | str) -> Path:
-    """The folder of a checkpoint, or of a packaged one by its name.
-
-    Raises:
-        CheckpointError: a bare name that is neither a folder here nor a packaged model.
-    """
-    folder = Path(name)
-    if folder.exists() or len(folder.parts) != 1:
-        return folder
-    packaged = sorted(path.parent.name for path in PACKAGED.glob("*/model.json"))
-    if folder.name not in packaged:
-        known = ", ".join(packaged) or "this installation has none"
-        raise CheckpointError(
-            f"{name}: expected a checkpoint's folder or the name of a packaged model ({known}), found neither; "
-            "`hyperplanes train` writes a checkpoint"
-        )
-    return packaged_folder(folder.name)
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
+from hyperplanes.hypernetwork.base import HyperNetwork
 from hyperplanes.hypernetwork.configuration import ACTIVATIONS, HyperNetworkConfig
 from hyperplanes.hypernetwork.standardisation import RunningStandardisation
 from hyperplanes.hypernetwork.updates import UPDATES
 from hyperplanes.hypernetwork.weights import LowRankReader
 from hyperplanes.parameters import Parameters
 
-__all__ = ["UpdateWriter"]
+__all__ = ["UpdateHead"]
 
 
-class UpdateWriter(nn.Module):
-    """What every hypernetwork ends with: codes and theta become one tensor for each parameter of the chosen layers.
+class UpdateHead(HyperNetwork):
+    """What hypernetworks end with: codes and theta become one tensor for each parameter of the chosen layers.
 
     Args:
         config: the shape.
@@ -63,15 +64,22 @@ class UpdateWriter(nn.Module):
         for parameter in self.outputs.parameters():
             nn.init.zeros_(parameter)
 
-    def written(self, read: Float[Tensor, "object read"], theta: Mapping[str, Tensor]) -> list[Parameters]:
+    @property
+    def activated(self) -> Sequence[nn.Module]:
+        """The layers of the head."""
+        return list(self.head)
+
+    def updates_of(self, read: Float[Tensor, "object read"], theta: Mapping[str, Tensor]) -> list[Parameters]:
         """The updates of several objects, of what is read of each and of the target's parameters."""
         config = self.config
         activation = ACTIVATIONS[config.activation]
+        # the code of the object beside that of theta, through the fully connected layers
         hidden = torch.cat([read, self._weights_read(theta).expand(len(read), -1)], 1)
         for layer in self.head:
             hidden = activation(layer(hidden))
         if config.centre:  # of unit length on average, as what Adam moves an output by grows with it
             hidden = self.standardise(hidden) / config.width**0.5
+        # each parameter has an output layer of its own, and a form in which its update is written
         outputs = [output(hidden) * config.gain for output in self.outputs]
         return [
             Parameters(

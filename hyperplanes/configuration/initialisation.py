@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from hyperplanes.adaptation.fine_tuning import FineTuning
+from hyperplanes.configuration.fine_tuning import FineTuning
 
 __all__ = ["LEARNED", "InitialisationConfig"]
 
@@ -52,15 +52,15 @@ class InitialisationConfig:
         Args:
             rays: a step; those of a new object where absent.
             given: settings whose optimiser and rates, where they state any, and whose seed are kept. The rates of
-                another optimiser than "sgd" fall to `given.final`.
+                another optimiser than "sgd" fall to `given.final_rate_factor`.
         """
         given = given or FineTuning()
         optimiser = given.optimiser or "sgd"
         plain = optimiser == "sgd"
         return replace(
             given.with_rates({"learning_rate": self.inner_rate} if plain else {}),
-            free="weights",
+            trainable="weights",
             rays=rays or self.test_rays,
             optimiser=optimiser,
-            final=1.0 if plain else given.final,
+            final_rate_factor=1.0 if plain else given.final_rate_factor,
         )

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import InitialisationConfig
+from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.fine_tuned import shuffled
-from hyperplanes.adaptation.fine_tuning import ray_loss
-from hyperplanes.adaptation.meta_learning import maml_gradient, reptile_gradient
 from hyperplanes.parameters import Parameters
+from hyperplanes.training.meta_gradients import maml_gradient, reptile_gradient
 from tests.reference_rendering import ball_views, ring, small_model
 
 X, Y, RATE = torch.tensor([1.0, 2.0, -1.0]), torch.tensor([3.0, 1.0, 0.5]), 0.1
@@ -96,9 +96,12 @@ def test_shuffled_weights_are_the_same_numbers_in_another_place():
 def test_descent_is_plain_and_of_constant_rate_unless_told_otherwise():
     config = InitialisationConfig(inner_rate=0.3, test_rays=17)
     settings = config.descent()
-    (optimiser,) = settings.optimisers([torch.zeros(2, requires_grad=True)])
-    assert isinstance(optimiser, torch.optim.SGD)
-    assert (optimiser.param_groups[0]["lr"], settings.rays, settings.free) == (0.3, 17, "weights")
+    assert (settings.optimiser, settings.learning_rate, settings.rays, settings.trainable) == (
+        "sgd",
+        0.3,
+        17,
+        "weights",
+    )
     assert settings.schedule(0, 10) == settings.schedule(9, 10) == 1
     told = config.descent(5, given=type(settings)(optimiser="adam", learning_rate=1e-3, seed=4))
     assert (told.optimiser, told.learning_rate, told.rays, told.seed) == ("adam", 1e-3, 5, 4)

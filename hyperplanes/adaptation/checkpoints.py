@@ -1,0 +1,136 @@
+"""Checkpoints of models: written, found, and read again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
+from hyperplanes.utilities.files import write_json
+
+__all__ = [
+    "checkpoint_folder",
+    "find_checkpoint",
+    "find_checkpoints",
+    "packaged_folder",
+    "read_checkpoint",
+    "write_checkpoint",
+]
+
+PACKAGED = Path(__file__).parent.parent / "pretrained"  # a folder a model, by its name
+
+Model = TypeVar("Model", bound=nn.Module)
+
+
+def write_checkpoint(folder: Path | str, config: ModelConfig, weights: Mapping[str, Tensor]) -> None:
+    """Write model.json and model.safetensors.
+
+    Args:
+        folder: made where absent.
+        config: of the model.
+        weights: by name.
+    """
+    save_tensors(Path(folder) / "model.safetensors", weights)
+    write_json(Path(folder) / "model.json", config.as_json())
+
+
+def read_checkpoint(name: Path | str, make: Callable[[ModelConfig], Model]) -> Model:
+    """The model that `write_checkpoint` wrote.
+
+    Args:
+        name: its folder, or the name of a packaged model.
+        make: the model of a configuration, whose weights are replaced.
+
+    Returns:
+        The model, ready for use.
+
+    Raises:
+        CheckpointError: no such folder or name, a file that is missing or damaged, or weights of another architecture
+            than the configuration says; nothing is allocated for those.
+    """
+    folder = checkpoint_folder(name)
+    config = ModelConfig.load(folder)
+    try:
+        with torch.device("meta"):  # names and shapes alone, to be compared with what the file holds
+            model = make(config)
+    except ValueError as error:
+        raise CheckpointError(f"{folder / 'model.json'}: {error}; train again with this version") from None
+    expected = model.state_dict()
+    weights = load_tensors(folder / "model.safetensors", expected)
+    model.load_state_dict({name: weights[name].to(value.dtype) for name, value in expected.items()}, assign=True)
+    return model.eval()
+
+
+def packaged_folder(name: str) -> Path:
+    """The folder of a model that comes with the package, whatever lies in the current folder."""
+    return PACKAGED / name
+
+
+def checkpoint_folder(name: Path | str) -> Path:
+    """The folder of a checkpoint, or of a packaged one by its name.
+
+    Raises:
+        CheckpointError: a bare name that is neither a folder here nor a packaged model.
+    """
+    folder = Path(name)
+    if folder.exists() or len(folder.parts) != 1:
+        return folder
+    packaged = sorted(path.parent.name for path in PACKAGED.glob("*/model.json"))
+    if folder.name not in packaged:
+        known = ", ".join(packaged) or "this installation has none"
+        raise CheckpointError(
+            f"{name}: expected a checkpoint's folder or the name of a packaged model ({known}), found neither; "
+            "`hyperplanes train` writes a checkpoint"
+        )
+    return packaged_folder(folder.name)
+
+
+def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
+    """Checkpoints by the method that trained them.
+
+    Args:
+        folders: each a checkpoint, a folder of checkpoints such as `runs/demo`, or the name of a packaged model.
+
+    Returns:
+        Folders by the names of their methods, such as "hyperplanes"; of those in one folder the first of a name counts.
+
+    Raises:
+        CheckpointError: a folder that neither is nor holds a checkpoint, or two folders with the same method.
+    """
+    found: dict[str, Path] = {}
+    for folder in map(checkpoint_folder, folders):
+        inside = [folder] if (folder / "model.json").exists() else sorted(p.parent for p in folder.glob("*/model.json"))
+        if not inside:
+            what = "no model.json" if folder.is_dir() else "no such folder"
+            raise CheckpointError(
+                f"{folder}: expected a checkpoint, found {what}; "
+                "`hyperplanes train` writes one, `hyperplanes demo` makes a small one in minutes"
+            )
+        here: dict[str, Path] = {}
+        for path in inside:
+            here.setdefault(ModelConfig.load(path).method, path)
+        for method, path in here.items():
+            other = found.setdefault(method, path)
+            if other.resolve() != path.resolve():
+                raise CheckpointError(
+                    f"checkpoint: expected one of each method, got {other} and {path}, which are both {method}; "
+                    "give one of them at a time"
+                )
+    return found
+
+
+def find_checkpoint(folder: Path) -> Path:
+    """The checkpoint at a path, or of a folder of checkpoints that of HyperPlanes.
+
+    Raises:
+        CheckpointError: no checkpoint there, or several without a HyperPlanes among them.
+    """
+    found = find_checkpoints([folder])
+    if "hyperplanes" not in found and len(found) > 1:
+        raise CheckpointError(f"{folder}: expected one checkpoint, found {', '.join(sorted(found))}; name one of them")
+    return found.get("hyperplanes") or next(iter(found.values()))

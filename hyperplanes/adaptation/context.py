@@ -1,0 +1,137 @@
+"""What adapting to an object needs of its support views, and does not depend on weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from hyperplanes.adaptation.base import hull
+from hyperplanes.fields import Target
+from hyperplanes.fields.rig import Rig
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.hypernetwork import HyperNetwork, Observed
+from hyperplanes.rendering.footprint import footprint
+from hyperplanes.views import Views
+
+__all__ = ["SupportContext", "arrange", "live_pixels", "observe", "prepare_context"]
+
+
+@dataclass(frozen=True)
+class SupportContext:
+    """The support side of one object, computed once.
+
+    Attributes:
+        views: the support views as the field takes them: in the order of the model's rig, one a plane, or as given.
+        planes: the same as the field looks them up; None for a field that reads no image.
+        occupancy: the visual hull of all support masks.
+        hyperplanes: indices of the views that the hypernetwork reads.
+        volume: what the planes show on a grid over the scene, for a hypernetwork that reads it.
+    """
+
+    views: Views
+    planes: ImagePlanes | VisibilityPlanes | None
+    occupancy: Occupancy
+    hyperplanes: Int[Tensor, " k"]
+    volume: Float[Tensor, "channel x y z"] | None = None
+
+    def hiding(self, views: Int[Tensor, " masked"]) -> SupportContext:
+        """The same object, of which some views show the field nothing.
+
+        Args:
+            views: their indices.
+        """
+        return self if self.planes is None else replace(self, planes=self.planes.hiding(views))
+
+
+def arrange(support: Views, target: Target, rig: Rig) -> Views:
+    """The support views as a field takes them.
+
+    Raises:
+        ValueError: no view, or a rig that has not been set.
+    """
+    if not len(support):
+        raise ValueError("support: expected at least one view, got none")
+    return target.arrange(support, rig)
+
+
+def prepare_context(
+    support: Views,
+    target: Target,
+    rig: Rig,
+    hypernetwork: HyperNetwork | None,
+    hull_resolution: int,
+    *,
+    carved: bool = True,
+    masks_repeated: bool = False,
+) -> SupportContext:
+    """The support side of one object.
+
+    Args:
+        support: the views, where the weights are.
+        target: the network that looks colours up in them.
+        rig: where its planes stand.
+        hypernetwork: what reads some of them, if there is one.
+        hull_resolution: voxels an axis of the visual hull, at least.
+        carved: without, one voxel that may hold anything stands for the hull; a hypernetwork that reads the hull has it
+            carved in any case.
+        masks_repeated: where there are fewer views than planes, each view is shown at one plane alone.
+    """
+    views, device = arrange(support, target, rig), support.images.device
+
+    # the visual hull, of all views and not only of those that are planes
+    reads_volume = hypernetwork is not None and hypernetwork.reads_volume
+    if carved or reads_volume:
+        occupancy = hull(support, target.hull_resolution(hull_resolution, support))
+    else:
+        occupancy = full(support.bounds, 1, device)
+
+    # what the field looks colours up in
+    planes = target.planes_of(views, occupancy)
+    if masks_repeated and len(support) < len(views):
+        planes = planes.hiding(rig.repeated(support).to(device))
+
+    # what the hypernetwork reads: a volume of all views, or images of some of them
+    if reads_volume:
+        return SupportContext(
+            views, planes, occupancy, torch.arange(len(views), device=device), target.volume_of(planes)
+        )
+    chosen = torch.arange(0, device=device)
+    if hypernetwork is not None:
+        chosen = target.choose_hyperplanes(views, rig, hypernetwork.views, hypernetwork.choice)
+    return SupportContext(views, planes, occupancy, chosen)
+
+
+def observe(contexts: Sequence[SupportContext], resolution: int = 0) -> Observed:
+    """What a hypernetwork reads of some objects, in one batch (HyperPlanes, Eq. 7: I_1..I_k and d_1..d_k).
+
+    Args:
+        contexts: the objects; they may have different numbers of HyperPlanes, and pictures of different sizes.
+        resolution: pixels a side that pictures are resized to; 0 takes the size of the first object's.
+    """
+    if contexts[0].volume is not None:
+        return Observed(volume=torch.stack([each.volume for each in contexts if each.volume is not None]))
+    read = [each.views[each.hyperplanes] for each in contexts]
+    directions = [camera.viewing_directions(each.cameras) for each in read]
+    size = (resolution, resolution) if resolution else read[0].size
+    images = [_resized(each.images, size) for each in read]
+    # objects of fewer HyperPlanes are padded with zeros, which `present` says are no images
+    present = [torch.ones(len(each), dtype=torch.bool, device=each.device) for each in directions]
+    return Observed(*(pad_sequence(part, batch_first=True) for part in (images, directions, present)))
+
+
+def live_pixels(occupancy: Occupancy, views: Views) -> Int[Tensor, " pixel"]:
+    """Flat indices (view, row, column) of the pixels whose rays meet something."""
+    return footprint(occupancy, views.cameras).flatten().nonzero()[:, 0]
+
+
+def _resized(images: Float[Tensor, "view 3 height width"], size: tuple[int, int]) -> Tensor:
+    """Images of that size, by the mean of the pixels that one covers where there are more."""
+    return images if images.shape[2:] == size else torch.nn.functional.interpolate(images, size, mode="area")

@@ -1,0 +1,200 @@
+"""Gradient descent on the support views of one object: fine-tuning, from random weights, learned initialisations.
+
+All of them are the same loop (`Descent.run`): a field is made of some variables, rays of the support views are rendered
+by it, and the variables follow the gradient of the squared error (HyperPlanes, section 3, fine-tuning).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.optimisers import make_optimisers
+from hyperplanes.configuration.fine_tuning import RATES, FineTuning
+from hyperplanes.hypernetwork import HyperNetwork
+from hyperplanes.parameters import Parameters
+from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.views import Views
+
+__all__ = ["Descent", "Variables", "ray_loss", "split_holdout"]
+
+HOLDOUT_RAYS = 4096  # of held-out views that "auto" compares
+CHECKS = 10  # times that it compares them
+
+
+def ray_loss(seen: Rendered, truth: Tensor) -> Tensor:
+    """Mean squared error of the colours of rays, that of the coarse pass added where there was one (Eq. 2)."""
+    loss = (seen.colour - truth).square().mean()
+    return loss if seen.coarse is None else loss + (seen.coarse.colour - truth).square().mean()
+
+
+@dataclass(frozen=True)
+class Variables:
+    """What a descent optimises, and the weights of the field that it makes.
+
+    Attributes:
+        tensors: optimised in place.
+        weights: the parameters of the field, as a function of the tensors as they are now.
+    """
+
+    tensors: Sequence[Tensor]
+    weights: Callable[[], Parameters]
+
+    @classmethod
+    def of_weights(cls, start: Mapping[str, Tensor]) -> Variables:
+        """The weights themselves, copied from where the descent begins."""
+        trainable = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
+        return cls(list(trainable.values()), lambda: trainable if torch.is_grad_enabled() else trainable.detach())
+
+    @classmethod
+    def of_hypernetwork(
+        cls, hypernetwork: HyperNetwork, theta: Parameters, update: Callable[[HyperNetwork], Parameters]
+    ) -> Variables:
+        """A copy of a hypernetwork whose update is added to frozen weights, as in the paper.
+
+        Args:
+            hypernetwork: stays as it is.
+            theta: the frozen weights.
+            update: that a hypernetwork makes of the object.
+        """
+        tuned = copy.deepcopy(hypernetwork).eval().requires_grad_(True)
+        return cls([*tuned.parameters()], lambda: theta + update(tuned))
+
+
+@dataclass(frozen=True)
+class Descent:
+    """A descent on the squared error of rays of support views.
+
+    Attributes:
+        field: the field that the variables make now, to which the views of these indices, if any, are not shown.
+        tensors: what is optimised, in place.
+        views: where rays and their colours come from.
+        settings: rays, rates and seed.
+        pixels: flat indices (view, row, column) of `views` to draw from, ascending; all where None.
+        masks_views: mask the views that the rays of a step come from, as `settings.mask_views` says.
+    """
+
+    field: Callable[[Int[Tensor, " masked"] | None], AdaptedField]
+    tensors: Sequence[Tensor]
+    views: Views
+    settings: FineTuning
+    pixels: Int[Tensor, " pixel"] | None = None
+    masks_views: bool = False
+
+    def run(self, steps: int) -> Iterator[int]:
+        """Gradient steps.
+
+        Args:
+            steps: length of the schedule of the rates.
+
+        Yields:
+            The number of steps done: 0, and after each step of the schedule one more.
+        """
+        settings, views = self.settings, self.views
+        name, adam, muon = RATES[settings.trainable]
+        optimisers = make_optimisers(
+            self.tensors,
+            settings.optimiser or name,
+            adam if settings.learning_rate is None else settings.learning_rate,
+            muon if settings.muon_learning_rate is None else settings.muon_learning_rate,
+            betas=(0.9, 0.99),
+        )
+        rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
+        generator = torch.Generator().manual_seed(settings.seed)
+        masks_views = self.masks_views and settings.mask_views and len(views) > 1
+        yield 0
+        for step in range(steps):
+            with torch.enable_grad():
+                # the views that this step's rays come from, which the field is not shown
+                masked = self._draw_views(generator) if masks_views else None
+                among = self._pixels_of(masked) if masked is not None else self.pixels
+                # the field of the variables as they are now, and how far its rays are from the truth
+                field = self.field(masked)
+                rays, truth = views.sample_rays(
+                    settings.rays, generator=generator, among=among, span=field.sampling.span
+                )
+                loss = ray_loss(field.trace(rays, generator), truth)
+                # one step of every optimiser, at the rate of the schedule
+                for tensor in self.tensors:
+                    tensor.grad = None
+                loss.backward()
+                for optimiser, rate in zip(optimisers, rates, strict=True):
+                    optimiser.param_groups[0]["lr"] = rate * settings.schedule(step, steps)
+                    optimiser.step()
+            yield step + 1
+
+    def best_stop(
+        self,
+        holdout: Views,
+        *,
+        pixels: Int[Tensor, " pixel"] | None = None,
+        on_step: Callable[[int], None] | None = None,
+    ) -> int:
+        """After how many of `settings.max_steps` steps the field shows held-out views best; 0 for none.
+
+        Judged on the squared error of the same HOLDOUT_RAYS rays at 0 steps and at every CHECKS-th part of the
+        schedule; ends early after three checks without improvement.
+
+        Args:
+            holdout: the views that decide.
+            pixels: flat indices of their pixels that count.
+            on_step: called with the number of steps done, before the first and after each.
+        """
+        longest = self.settings.max_steps
+        generator = torch.Generator().manual_seed(self.settings.seed + 1)
+        with torch.no_grad():
+            span = self.field(None).sampling.span
+            rays, truth = holdout.sample_rays(HOLDOUT_RAYS, generator=generator, among=pixels, span=span)
+        errors: dict[int, float] = {}
+        every = max(1, longest // CHECKS)
+
+        best = 0
+        for step in self.run(longest):
+            if on_step is not None:
+                on_step(step)
+            if step not in (0, every // 3, longest) and step % every:
+                continue
+            with torch.no_grad():
+                error = float((self.field(None).trace(rays).colour - truth).square().mean())
+            errors[step] = error if math.isfinite(error) else math.inf
+            best = min(errors, key=lambda each: errors[each])
+            if step - best > 2 * every:
+                break
+        return best
+
+    def _draw_views(self, generator: torch.Generator) -> Int[Tensor, " masked"]:
+        """The views that a step draws rays from, among those that have a pixel to draw."""
+        drawn = torch.randperm(len(self.views), generator=generator).to(self.views.images.device)
+        if self.pixels is not None:
+            area = self.views.size[0] * self.views.size[1]
+            edges = torch.arange(len(self.views) + 1, device=self.pixels.device) * area
+            drawn = drawn[(torch.searchsorted(self.pixels, edges).diff() > 0)[drawn]]
+        return drawn[: max(1, len(self.views) // self.settings.holdout)]
+
+    def _pixels_of(self, chosen: Int[Tensor, " chosen"]) -> Int[Tensor, " among"]:
+        """Flat indices of the pixels of some views: all of them, or those of `pixels`."""
+        area = self.views.size[0] * self.views.size[1]
+        if self.pixels is None:
+            return (chosen[:, None] * area + torch.arange(area, device=chosen.device)).flatten()
+        edges = torch.searchsorted(self.pixels, torch.stack([chosen, chosen + 1], 1) * area)
+        return torch.cat([self.pixels[start:stop] for start, stop in edges.tolist()])
+
+
+def split_holdout(support: Views, settings: FineTuning) -> tuple[Views, Views]:
+    """The views that are shown while "auto" chooses the number of steps, and those that decide it.
+
+    Raises:
+        ValueError: fewer than 3 views.
+    """
+    if len(support) < 3:
+        raise ValueError(f"steps: expected at least 3 support views to choose their number by, got {len(support)}")
+    every = min(settings.holdout, len(support))
+    held_out = torch.arange(len(support)) % every == every // 2
+    return support[(~held_out).nonzero()[:, 0]], support[held_out.nonzero()[:, 0]]

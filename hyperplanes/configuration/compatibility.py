@@ -1,0 +1,78 @@
+"""What goes with what: every rule that holds between settings of different parts of a model."""
+
+from __future__ import annotations
+
+from hyperplanes.configuration.fine_tuning import FineTuning, Steps
+from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.fields import Target, find_targets
+from hyperplanes.hypernetwork import VOLUME
+
+__all__ = ["check_fine_tuning", "check_model"]
+
+
+def check_model(config: ModelConfig) -> type[Target]:
+    """The target network of a model whose parts go together.
+
+    Raises:
+        ValueError: an unknown field, or parts that do not go together; the message names the setting to change.
+    """
+    known = find_targets()
+    if config.target not in known:
+        raise ValueError(f"target: expected one of {sorted(known)}, got {config.target!r}")
+    target = known[config.target]
+    _check_hypernetwork(config, target)
+    if config.plane_dropout and (target.permutation_invariant or config.target == "nerf"):
+        raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
+    if config.second_pass and not target.permutation_invariant:
+        raise ValueError(f"second_pass: expected a field that judges what views see, got {config.target}")
+    return target
+
+
+def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
+    """What a hypernetwork reads has to be something that the field has, in a number that both can take."""
+    hypernetwork = config.hypernetwork
+    if hypernetwork is not None and hypernetwork.encoder == VOLUME:
+        if target.volume_size is None:
+            raise ValueError(
+                f"encoder: expected one that reads images for {config.target}, which knows views by their places, "
+                f"got {VOLUME!r}"
+            )
+        return
+    reader = hypernetwork or config.autoencoder
+    if reader is None:
+        return
+    if target.permutation_invariant:
+        if hypernetwork is None or hypernetwork.join != "mean":
+            found = "an autoencoder" if hypernetwork is None else repr(hypernetwork.join)
+            raise ValueError(
+                f"{config.target}: expected a hypernetwork with encoder {VOLUME!r}, or with join 'mean', which takes "
+                f"HyperPlanes in any number and order, got {found}"
+            )
+    elif reader.views > config.network.planes:
+        planes = config.network.planes
+        raise ValueError(f"views: expected at most as many HyperPlanes as planes, {planes}, got {reader.views}")
+
+
+def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: ModelConfig, target: Target) -> None:
+    """Nothing, where a model can be fine-tuned so.
+
+    Args:
+        settings: of fine-tuning.
+        steps: that are asked for.
+        views: how many support views there are.
+        config: of the model.
+        target: its network.
+
+    Raises:
+        ValueError: the hypernetwork of a model that has none, a negative number of steps, or steps on a single view by
+            a field that would learn to copy it.
+    """
+    if settings.trainable == "hypernetwork" and config.hypernetwork is None and config.autoencoder is None:
+        raise ValueError("fine_tune: expected a model with a hypernetwork, got one without")
+    if steps != "auto" and steps < 0:
+        raise ValueError(f"steps: expected 0 or more, or 'auto', got {steps}")
+    if steps and views == 1 and target.permutation_invariant and settings.mask_views:
+        raise ValueError(
+            f"steps: expected 0 with a single view, whose colours {config.target} would learn to copy, got "
+            f"{steps}; give 2 views or more"
+        )

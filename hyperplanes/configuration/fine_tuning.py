@@ -1,0 +1,75 @@
+"""How a field is fine-tuned on the support views of one object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+from hyperplanes.hypernetwork.choices import check_choices
+
+__all__ = ["RATES", "FineTuning", "Steps"]
+
+Steps: TypeAlias = int | Literal["auto"]
+
+RATES: dict[str, tuple[str, float, float]] = {
+    "weights": ("muon", 2e-3, 0.04),
+    "hypernetwork": ("adam", 3e-4, 0.0),
+}
+"""What is optimised: by which optimiser, the learning rate of Adam, that of Muon. Chosen by measurement, see
+docs/adaptation.md."""
+
+
+@dataclass(frozen=True)
+class FineTuning:
+    """How a field is fine-tuned.
+
+    Attributes:
+        trainable: what is optimised: "weights", theta + delta itself, or "hypernetwork", a copy of the hypernetwork
+            while theta is frozen, as in the paper.
+        rays: a step, drawn from all support views.
+        optimiser: "muon", "adam" or "sgd"; the best for what is trainable, see RATES, where None.
+        learning_rate: of Adam or of plain gradient descent at the first step; that of RATES where None, or of
+            the field (`Target.fine_tuning_rates`).
+        muon_learning_rate: of Muon at the first step; likewise.
+        final_rate_factor: what the rates fall to along half a cosine, as a fraction.
+        max_steps: the most steps that "auto" may choose.
+        holdout: every so many-th support view is held out of the planes and of the rays while "auto" chooses.
+        mask_views: a field that takes any number of views is not shown those that the rays of a step come from, a share
+            `1 / holdout` of them, as it could copy their colours; a single view cannot be masked.
+        seed: of rays and samples.
+
+    Raises:
+        ValueError: an unknown name, no ray, a rate that is negative or not finite, or every view held out.
+    """
+
+    trainable: Literal["weights", "hypernetwork"] = "weights"
+    rays: int = 1024
+    optimiser: Literal["adam", "muon", "sgd"] | None = None
+    learning_rate: float | None = None
+    muon_learning_rate: float | None = None
+    final_rate_factor: float = 0.1
+    max_steps: int = 300
+    holdout: int = 6
+    mask_views: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_choices(self, {"trainable": RATES, "optimiser": (None, "adam", "muon", "sgd")})
+        for name, least in (("rays", 1), ("max_steps", 1), ("holdout", 2)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+        for name in ("learning_rate", "muon_learning_rate", "final_rate_factor"):
+            rate = getattr(self, name)
+            if rate is not None and not 0 <= rate < math.inf:
+                raise ValueError(f"{name}: expected a finite number of 0 or more, got {rate}")
+
+    def with_rates(self, rates: Mapping[str, float]) -> FineTuning:
+        """The settings with these rates where they state none; `rates` are fields of the settings by name."""
+        return replace(self, **{name: rate for name, rate in rates.items() if getattr(self, name) is None})
+
+    def schedule(self, step: int, steps: int) -> float:
+        """What the rates are multiplied with at a step, counted from 0."""
+        cosine = (1 + math.cos(math.pi * step / max(1, steps))) / 2
+        return self.final_rate_factor + (1 - self.final_rate_factor) * cosine

@@ -1,0 +1,108 @@
+"""The rig: where the support views stood in training, for fields that know each of their planes by its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.views import Views
+
+__all__ = ["Rig", "match", "repeated_planes", "standpoints"]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Standpoints of the planes, and which support view becomes which plane.
+
+    Attributes:
+        positions: unit vectors from the scene's centre to where the cameras stood in training; zeros where no views
+            have been shown yet.
+        order: "matched" gives each plane the view nearest to its standpoint; "file" takes the views as they come, again
+            from the first where there are too few.
+    """
+
+    positions: Float[Tensor, "plane 3"]
+    order: str = "matched"
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @property
+    def known(self) -> Float[Tensor, "plane 3"]:
+        """The standpoints on the CPU, where views are matched to them.
+
+        Raises:
+            ValueError: no views have been shown yet.
+        """
+        positions = self.positions.float().cpu()
+        if not positions.any():
+            raise ValueError(
+                "rig: expected the standpoints of the training's views, got none; set_rig takes them from views"
+            )
+        return positions
+
+    def places(self, support: Views) -> Int[Tensor, " plane"]:
+        """The index of the view that becomes each plane."""
+        if self.order == "file":
+            chosen = torch.arange(len(self)) % len(support)
+        else:
+            chosen = match(self.known, standpoints(support).cpu())
+        return chosen.to(support.images.device)
+
+    def repeated(self, support: Views) -> Int[Tensor, " repeated"]:
+        """The planes whose view stands at another plane too, where it fits better; those to be masked."""
+        places = self.places(support)
+        near = torch.zeros(len(self))
+        if self.order != "file":
+            near = (self.known * standpoints(support[places]).cpu()).sum(1)
+        return repeated_planes(places, near)
+
+    def farthest(self, count: int) -> Int[Tensor, " k"]:
+        """So many planes that stand as far apart as they can, the first one among them."""
+        return torch.tensor(farthest_first(self.known, 0, count), dtype=torch.long, device=self.positions.device)
+
+
+def standpoints(views: Views) -> Float[Tensor, "view 3"]:
+    """Unit vectors from the scene's centre to the cameras.
+
+    Args:
+        views: of one scene.
+    """
+    return camera.standpoints(views.cameras, views.bounds.centre).float()
+
+
+def match(rig: Float[Tensor, "plane 3"], standing: Float[Tensor, "view 3"]) -> Int[Tensor, " plane"]:
+    """The view of each plane: together as near as can be to where the views of the training stood.
+
+    More views than planes: none stands at two. Fewer: some stand at several, as evenly as their numbers allow.
+
+    Args:
+        rig: standpoints of the planes in training, on the CPU.
+        standing: those of the views, on the CPU.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    cost = (1 - rig @ standing.T).double().numpy()
+    copies = -(-len(rig) // len(standing))  # of each view, so that there are enough for all planes
+    _, column = linear_sum_assignment(np.tile(cost, (1, copies)))
+    return torch.as_tensor(column % len(standing))
+
+
+def repeated_planes(places: Int[Tensor, " plane"], near: Float[Tensor, " plane"]) -> Int[Tensor, " repeated"]:
+    """The planes whose view stands at another one too: each view keeps its nearest plane, of equal ones the first.
+
+    >>> repeated_planes(torch.tensor([0, 1, 0, 1]), torch.tensor([0.5, 1.0, 0.9, 1.0])).tolist()
+    [0, 3]
+
+    Args:
+        places: the view of each plane.
+        near: how near each plane's view stands to where that of the training stood.
+    """
+    kept = {int(places[plane]): plane for plane in near.argsort(descending=True, stable=True).flip(0).tolist()}
+    return torch.tensor(sorted(set(range(len(places))) - set(kept.values())), dtype=torch.long)

@@ -1,0 +1,37 @@
+"""The hypernetwork of a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+from hyperplanes.hypernetwork.autoencoder import Autoencoder, AutoencoderConfig
+from hyperplanes.hypernetwork.base import HyperNetwork
+from hyperplanes.hypernetwork.configuration import VOLUME, HyperNetworkConfig
+from hyperplanes.hypernetwork.image_hypernetwork import ImageHyperNetwork
+from hyperplanes.hypernetwork.volume_hypernetwork import VolumeHyperNetwork
+
+__all__ = ["make_hypernetwork"]
+
+
+def make_hypernetwork(
+    config: HyperNetworkConfig | AutoencoderConfig,
+    shapes: Mapping[str, torch.Size],
+    reading_layers: tuple[str, ...],
+    volume_size: tuple[int, int] | None,
+) -> HyperNetwork:
+    """The hypernetwork of a target network.
+
+    Args:
+        config: its shape.
+        shapes: of the target's parameters by name.
+        reading_layers: names of the target's layers that read a point.
+        volume_size: channels and cells an axis of the volumes that are to be read.
+    """
+    if isinstance(config, AutoencoderConfig):
+        return Autoencoder(config, shapes, reading_layers)
+    if config.encoder == VOLUME:
+        assert volume_size is not None
+        return VolumeHyperNetwork(config, shapes, *volume_size)
+    return ImageHyperNetwork(config, shapes)
