@@ -6,7 +6,18 @@ from importlib import import_module
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.files import DataError
 
-NAMES = ("any_order", "busy", "generation", "hypernetwork", "lookup", "rendering", "training", "views", "visibility")
+NAMES = (
+    "any_order",
+    "busy",
+    "captures",
+    "generation",
+    "hypernetwork",
+    "lookup",
+    "rendering",
+    "training",
+    "views",
+    "visibility",
+)
 
 
 def main(arguments: list[str]) -> int:

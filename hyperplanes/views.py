@@ -27,6 +27,7 @@ class Views:
         masks: opacity in [0, 1], or None where the images came without.
         bounds: the sphere that holds all that is to be reconstructed.
         names: where each view came from, for messages and file names.
+        up: the direction that the files say is up, as `data.upright.y_up_from` takes it; None where they do not say.
     """
 
     images: Float[Tensor, "view 3 height width"]
@@ -34,6 +35,7 @@ class Views:
     masks: Float[Tensor, "view 1 height width"] | None = None
     bounds: Sphere = field(default_factory=Sphere)
     names: tuple[str, ...] = ()
+    up: str | None = None
 
     def __post_init__(self) -> None:
         if self.images.ndim != 4 or self.images.shape[1] != 3:
@@ -144,7 +146,7 @@ def join_views(first: Views, second: Views) -> Views:
         masks = torch.cat([first.masks, second.masks])
     names = first.names + second.names if first.names and second.names else ()
     cameras = camera.concatenate([first.cameras, second.cameras])
-    return Views(torch.cat([first.images, second.images]), cameras, masks, first.bounds, names)
+    return Views(torch.cat([first.images, second.images]), cameras, masks, first.bounds, names, first.up)
 
 
 @dataclass(frozen=True)

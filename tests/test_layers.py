@@ -20,6 +20,7 @@ LAYERS = {
     "hyperplanes.training": 4,
     "hyperplanes.evaluation": 4,
     "hyperplanes.configuration": 2.5,
+    "hyperplanes.capture": 4,
     "hyperplanes.methods": 4,
     "hyperplanes.configuration.presets": 4,
     "hyperplanes.configuration.settings_file": 4,

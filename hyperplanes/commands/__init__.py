@@ -31,6 +31,7 @@ VERBS: dict[str, str] = {
     "demo": "everything once, small: data, training, new views and a report, in minutes",
     "train": "train a model on a data set",
     "evaluate": "compare methods on objects they have never seen, as one table",
+    "capture": "photographs or a video to a scene: camera poses, masks, which way is up",
     "render": "new views of one object from a few posed images",
     "export": "one object as images, a turntable and a coloured mesh",
     "bake": "one object as a small file of voxels that renders at once, without any network",
@@ -44,6 +45,7 @@ EXAMPLES = """\
   hyperplanes demo
   hyperplanes generate --class car --count 70 --resolution 64 --seed 0 --out data/cars
   hyperplanes train --data data/cars --preset quick --out runs/cars
+  hyperplanes capture photos/ --out scene
   hyperplanes render --checkpoint runs/cars --views photos/ --out new-views/"""
 
 

@@ -52,7 +52,7 @@ def read_scene(
 
 
 def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
-    """The direction that is up in the world of one scene, as its cameras are held, or y where they do not tell.
+    """The direction that is up in the world of one scene: as stated, as its cameras are held, or y.
 
     Args:
         parts: of the scene.
@@ -61,6 +61,9 @@ def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
     from hyperplanes.data.upright import guess_up
     from hyperplanes.geometry import cameras as camera
 
+    if (stated := parts[0].up) is not None:
+        console.say(f"up: {stated}, as the files say; --up says otherwise")
+        return stated
     guessed = guess_up(camera.concatenate([part.cameras for part in parts]))
     console.say(
         f"up: {guessed}, as the cameras are held; --up says otherwise"

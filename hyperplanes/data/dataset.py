@@ -279,7 +279,7 @@ def read_task(path: str | Path, downscale: int | None = None, *, up: str | None 
 def _up_of(up: str, *parts: Views) -> str:
     if up != "auto":
         return up
-    return guess_up(camera.concatenate([part.cameras for part in parts])) or "y"
+    return parts[0].up or guess_up(camera.concatenate([part.cameras for part in parts])) or "y"
 
 
 def warn_of(notes: Sequence[str], path: str | Path) -> None:

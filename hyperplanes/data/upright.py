@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -12,9 +14,10 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError
 from hyperplanes.views import Task, Views
 
-__all__ = ["UPS", "guess_up", "upright", "upright_task", "y_up_from"]
+__all__ = ["UPS", "guess_up", "stated_up", "upright", "upright_task", "y_up_from"]
 
 UPS = ("y", "z", "x", "-y", "-z", "-x")
 """Axes that may be up in a world; three numbers with commas between them are another direction."""
@@ -51,6 +54,29 @@ def guess_up(cameras: PinholeCamera) -> str | None:
     if values[0].clamp_min(0).sqrt() > LEVEL or values[1] < 4 * LEVEL**2 or float(upward @ axis) <= LEVEL:
         return None
     return ",".join(f"{value:.4f}" for value in axis.tolist())
+
+
+def stated_up(document: dict[str, Any], path: Path) -> str | None:
+    """The "up" of a transforms.json, None where it does not say.
+
+    Args:
+        document: its content.
+        path: of the file, for the message.
+
+    Returns:
+        A direction as `y_up_from` takes it.
+
+    Raises:
+        DataError: something else.
+    """
+    up = document.get("up")
+    if up is None:
+        return None
+    try:
+        _direction(up if isinstance(up, str) else repr(up))
+    except ValueError as error:
+        raise DataError(path, "one of " + ", ".join(UPS) + " as up", repr(up)[:40], "correct the file") from error
+    return up
 
 
 def _direction(up: str) -> Float[Tensor, " 3"]:
@@ -113,7 +139,7 @@ def upright(views: Views, up: str) -> Views:
     turned = pose @ turn.T.to(pose)  # camera from old world, after old world from new
     cameras = camera.with_poses(views.cameras, turned)
     x, y, z = (turn[:3, :3] @ torch.tensor(views.bounds.centre, dtype=torch.float64)).tolist()
-    return replace(views, cameras=cameras, bounds=Sphere((x, y, z), views.bounds.radius))
+    return replace(views, cameras=cameras, bounds=Sphere((x, y, z), views.bounds.radius), up=views.up and "y")
 
 
 def upright_task(task: Task, up: str) -> Task:

@@ -91,8 +91,8 @@ def full(bounds: Sphere, side: int = 64, device: torch.device | str | None = Non
 
 
 @torch.no_grad()
-def carve(masks: Numbers, cameras: PinholeCamera, bounds: Sphere, side: int = 64) -> Occupancy:
-    """The visual hull: voxels that no mask rules out.
+def carve(masks: Numbers, cameras: PinholeCamera, bounds: Sphere, side: int = 64, votes: int = 1) -> Occupancy:
+    """The visual hull: voxels that no mask rules out, or fewer masks than `votes`.
 
     A voxel is cleared where some image contains the whole projection of the voxel's bounding ball and no pixel of the
     mask is set in the bounding box of that projection. So nothing is cut of what the masks show, however thin,
@@ -109,9 +109,12 @@ def carve(masks: Numbers, cameras: PinholeCamera, bounds: Sphere, side: int = 64
         cameras: one a mask, of the masks' size.
         bounds: the region to carve from.
         side: voxels an axis.
+        votes: masks that have to rule a voxel out. More than one leave standing what as many wrong masks less one cut
+            off, and leave of a right hull what only few views see past.
 
     Raises:
-        ValueError: cameras with lens distortion, masks of another number or size than the cameras, or an absurd side.
+        ValueError: cameras with lens distortion, masks of another number or size than the cameras, an absurd side, or
+            less than one vote.
     """
     masks = as_images(masks, "masks")
     expected = (cameras.batch_size, 1, *(camera.image_size(cameras) if cameras.batch_size else masks.shape[2:]))
@@ -119,32 +122,39 @@ def carve(masks: Numbers, cameras: PinholeCamera, bounds: Sphere, side: int = 64
         raise ValueError(f"masks: expected shape {expected}, one a camera and of its size, got {tuple(masks.shape)}")
     if not 1 <= side <= LARGEST_SIDE:
         raise ValueError(f"side: expected 1 to {LARGEST_SIDE} voxels, got {side}")
+    if votes < 1:
+        raise ValueError(f"votes: expected at least 1, got {votes}")
     if isinstance(cameras, DistortedCamera):
         raise ValueError("cameras: expected pinholes to carve with, got lens distortion; undistort the masks first")
     matrices, calibrations = camera.projection_matrices(cameras).float(), camera.intrinsics(cameras).float()
     compiled = masks.device.type == "cpu" and find_spec("numba") and masks[0:1].numel() < 2**30  # pixels in 32 bits
     carver = _carve_compiled if compiled else _carve_torch
-    return Occupancy(carver(masks[:, 0] > 0, matrices, calibrations, bounds, side), bounds)
+    return Occupancy(carver(masks[:, 0] > 0, matrices, calibrations, bounds, side, votes), bounds)
 
 
-def _carve_compiled(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int) -> Tensor:
+def _carve_compiled(
+    masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int, votes: int
+) -> Tensor:
     """The occupied voxels, by the compiled kernel. NumPy prepares its inputs: PyTorch's threads start slowly."""
     views, height, width = masks.shape
     tables = np.zeros((views, height + 1, width + 1), np.int32)
     np.cumsum(masks.numpy().cumsum(1, np.int32), 2, out=tables[:, 1:, 1:])
     grid = Occupancy(torch.from_numpy(np.ones((side, side, side), np.bool_)), bounds)
     corner = np.asarray(bounds.centre, np.float32) - np.float32(bounds.radius)
-    numbers = [np.float32(value) for value in (grid.voxel, grid.voxel * math.sqrt(3) / 2, _min_z(grid))]
+    numbers = [np.float32(value) for value in (grid.voxel, grid.voxel * math.sqrt(3) / 2, _min_z(grid), votes)]
     fixed = (matrices.contiguous().numpy(), calibrations.contiguous().numpy(), tables, corner, *numbers)
     kernel, occupied = compile_kernel("carving.carve", torch.float32), grid.occupied.numpy().view(np.uint8)
     parallel_for(lambda start, stop: kernel(*fixed, occupied, start, stop), side, 2)
     return grid.occupied
 
 
-def _carve_torch(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int) -> Tensor:
+def _carve_torch(
+    masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int, votes: int
+) -> Tensor:
     """The occupied voxels, in plain PyTorch."""
     grid, tables = full(bounds, side, masks.device), pad(masks.int().cumsum(1).cumsum(2), (1, 0, 1, 0))
     kept, points = torch.arange(grid.occupied.numel(), device=tables.device), grid.centres()
+    missing = torch.full_like(kept, votes)
     last = points.new_tensor([tables.shape[2] - 1.5, tables.shape[1] - 1.5])
     for matrix, calibration, table in zip(matrices, calibrations, tables, strict=True):
         homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
@@ -157,9 +167,9 @@ def _carve_torch(masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: 
         (left, top), (right, bottom) = (low + 0.5).long().unbind(1), ((high + 0.5).long() + 1).unbind(1)
         right, bottom = right.clamp_max(table.shape[1] - 1), bottom.clamp_max(table.shape[0] - 1)
         count = table[bottom, right] - table[bottom, left] - table[top, right] + table[top, left]
-        stays = torch.ones_like(kept, dtype=torch.bool)
-        stays[inside.nonzero()[count == 0, 0]] = False
-        kept, points = kept[stays], points[stays]
+        missing[inside.nonzero()[count == 0, 0]] -= 1
+        stays = missing > 0
+        kept, points, missing = kept[stays], points[stays], missing[stays]
     return torch.zeros_like(grid.occupied).flatten().index_fill_(0, kept, True).reshape(grid.occupied.shape)
 
 

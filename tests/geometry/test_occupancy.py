@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from hyperplanes.geometry import Sphere, cameras, carve, cast
+from hyperplanes.geometry import Sphere, cameras, carve, cast, occupancy
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import pixel_grid
 from tests import reference
@@ -51,6 +51,27 @@ def test_the_hull_never_cuts_the_object(side, shape, size):
     assert hull.contains(points[solid]).all()
     if side == 48 and size == 40:  # and it is not the whole cube: a ball of radius 0.5 fills 6.5 % of it
         assert hull.occupied.float().mean() < 0.2
+
+
+@pytest.mark.parametrize("votes", [2, 3])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_as_many_wrong_masks_as_votes_less_one_cut_nothing_off(votes, compiled, monkeypatch):
+    """Property: with masks that are empty by mistake, fewer than votes of them, all of the object is kept."""
+    if not compiled:
+        monkeypatch.setattr(occupancy, "find_spec", lambda name: None)
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(30, 30, 0.9), cameras.fibonacci_sphere(12, 2.7), 30, 30)
+    masks = pictures(ball(0.5), ours, 30)
+    damaged = masks.clone()
+    damaged[[0, 5, 7][: votes - 1]] = 0
+    points = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    assert not carve(damaged, ours, Sphere(), 20).occupied.any()
+    hull = carve(damaged, ours, Sphere(), 20, votes)
+    assert hull.contains(0.49 * points).all()
+    assert not hull.contains(0.98 * points).all()
+    ruled = sum(
+        (~carve(damaged[[view]], cameras.select(ours, [view]), Sphere(), 20).occupied).int() for view in range(12)
+    )
+    torch.testing.assert_close(hull.occupied, ruled < votes)  # brute force: a vote a view
 
 
 def test_an_object_that_the_pictures_cut_off_is_kept():

@@ -13,6 +13,7 @@ from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
 from hyperplanes.data.pictures.undistort import distortion
+from hyperplanes.data.upright import stated_up
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError, inside, read_json
 
@@ -65,7 +66,8 @@ def read_transforms(
     document, frames, _ = _listed_frames(paths, legacy, flat, root)
     source = paths[0] if len(paths) == 1 else paths[0].parent
     bounds = bounds or stated_bounds(document, paths[0])
-    return assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)[0]
+    scene, _ = assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)
+    return replace(scene, up=stated_up(document, paths[0]))
 
 
 def read_transforms_task(
@@ -111,6 +113,7 @@ def read_transforms_task(
     bounds = bounds or stated_bounds(document, files[0])
     source = files[0] if len(paths) == 1 else folder
     scene, kept = assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)
+    scene = replace(scene, up=stated_up(document, files[0]))
     if query is None:
         if len(scene) < 2:
             raise DataError(files[0], "two frames or more", f"{len(scene)}", "add views to support or to query")

@@ -7,7 +7,7 @@ from pathlib import Path
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["refuse_unposed"]
+__all__ = ["photographs_folder", "refuse_unposed"]
 
 _HOMES = (".", "images", "input", "rgb", "photos", "image")
 _COUNTED = 10_000  # entries of a folder that are looked at
@@ -29,7 +29,7 @@ def refuse_unposed(path: Path) -> None:
         remedy = f"convert it with nerfstudio: ns-process-data {kind} --data {path} --output-dir posed"
         raise DataError(path, "posed images, such as a transforms.json", f"an export of {name}", remedy)
     if path.is_file() and path.suffix.lower() in _VIDEOS:
-        remedy = f"take pictures out of it and find their poses: ns-process-data video --data {path} --output-dir posed"
+        remedy = f"find the poses of its frames: hyperplanes capture {path} --out scene, then give scene"
         raise DataError(path, "posed images", "a video", remedy)
     home, count = _photographs(path)
     if count:
@@ -37,8 +37,7 @@ def refuse_unposed(path: Path) -> None:
             path,
             "camera poses beside the photographs (transforms.json, or a COLMAP model in sparse/0)",
             f"{count} photograph{'s' if count > 1 else ''} and no poses",
-            f"find them with COLMAP (colmap automatic_reconstructor --workspace_path posed --image_path {home}) "
-            f"or nerfstudio (ns-process-data images --data {home} --output-dir posed)",
+            f"find them: hyperplanes capture {home} --out scene, then give scene",
         )
 
 
@@ -56,14 +55,25 @@ def _capture_app(path: Path) -> tuple[str, str] | None:
     return None
 
 
+def photographs_folder(path: Path, suffixes: frozenset[str] = PICTURE_SUFFIXES) -> Path | None:
+    """The folder that holds photographs: the one given, or images/ or the like in it; None where none does.
+
+    Args:
+        path: a folder.
+        suffixes: endings of photographs, in small letters.
+    """
+    homes = (path / name for name in _HOMES)
+    return next((home for home in homes if home.is_dir() and _count(home, suffixes)), None)
+
+
 def _photographs(path: Path) -> tuple[Path, int]:
     """The folder of photographs, and how many there are."""
     if path.is_file():
         return path.parent, int(path.suffix.lower() in PICTURE_SUFFIXES)
-    for home in (path / name for name in _HOMES):
-        if home.is_dir():
-            children = zip(range(_COUNTED), home.iterdir(), strict=False)
-            count = sum(child.suffix.lower() in PICTURE_SUFFIXES for _, child in children)
-            if count:
-                return home, count
-    return path, 0
+    home = photographs_folder(path)
+    return (path, 0) if home is None else (home, _count(home, PICTURE_SUFFIXES))
+
+
+def _count(home: Path, suffixes: frozenset[str]) -> int:
+    children = zip(range(_COUNTED), home.iterdir(), strict=False)
+    return sum(child.suffix.lower() in suffixes for _, child in children)

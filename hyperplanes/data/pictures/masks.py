@@ -8,15 +8,11 @@ from pathlib import Path
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.utilities.files import DataError, check_link
 
-__all__ = ["find_masks"]
+__all__ = ["find_masks", "match_masks"]
 
 
 def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path | None = None) -> list[Path | None]:
-    """The mask of each picture, found by its name or by its number.
-
-    A mask is called as its picture with any ending, or as COLMAP has it, as its picture with .png after it; white is
-    what is kept. Where no name fits, there are as many masks as pictures and all names are numbers, as NeuS publishes
-    image/000000.png beside mask/000.png, both are taken in the order of their numbers.
+    """The mask of each picture, found as `match_masks` does; white is what is kept.
 
     Args:
         folders: what may hold masks; the first one that exists counts.
@@ -32,13 +28,7 @@ def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path | N
     folder = next((folder for folder in folders if folder.is_dir()), None)
     if folder is None:
         return [None] * len(pictures)
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES)
-    for path in files:
-        check_link(path, root or folder)
-    by_name = {path.name: path for path in files} | {path.stem: path for path in files}
-    masks = [by_name.get(picture.name) or by_name.get(picture.stem) for picture in pictures]
-    if not any(masks):
-        masks = _by_number(files, pictures) or masks
+    masks = match_masks(folder, pictures, root)
     present = [mask for mask, picture in zip(masks, pictures, strict=True) if picture.exists()]
     if present and not any(present):
         remedy = "rename them as the pictures, or number as many as there are pictures"
@@ -50,6 +40,27 @@ def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path | N
             folder, f"a mask for each of the {len(present)} pictures", found, "add them, or rename the folder"
         )
     return [mask if picture.exists() else None for mask, picture in zip(masks, pictures, strict=True)]
+
+
+def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None) -> list[Path | None]:
+    """The mask of each picture, found by its name or by its number; None for those that have none.
+
+    A mask is called as its picture with any ending, as its picture with _mask after its name, or as COLMAP has it, as
+    its picture with .png after it. Where no name fits, there are as many masks as pictures and all names are numbers,
+    as NeuS publishes image/000000.png beside mask/000.png, both are taken in the order of their numbers.
+
+    Args:
+        folder: what holds masks.
+        pictures: their files.
+        root: as in `find_masks`; a link that leads out of it is a DataError.
+    """
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES)
+    for path in files:
+        check_link(path, root or folder)
+    by_name = {path.stem.removesuffix("_mask"): path for path in files}
+    by_name |= {path.name: path for path in files} | {path.stem: path for path in files}
+    masks = [by_name.get(picture.name) or by_name.get(picture.stem) for picture in pictures]
+    return masks if any(masks) else list(_by_number(files, pictures) or masks)
 
 
 def _by_number(masks: Sequence[Path], pictures: Sequence[Path]) -> list[Path] | None:

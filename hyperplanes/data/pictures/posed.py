@@ -40,6 +40,7 @@ class Posed:
         names: of the files, relative to their folder.
         depths: (view, 2), the nearest and farthest distance that the files state, or None.
         notes: what a person should know of the reading, a sentence each: what was left out, turned or scaled.
+        up: as in `Views`.
     """
 
     rgba: UInt8[Tensor, "view 4 height width"]
@@ -49,6 +50,7 @@ class Posed:
     names: tuple[str, ...]
     depths: Float[Tensor, "view 2"] | None = None
     notes: tuple[str, ...] = ()
+    up: str | None = None
 
     @cached_property
     def bounds(self) -> Sphere:
@@ -63,7 +65,7 @@ class Posed:
     def views(self) -> Views:
         """The float images over white, with masks where the files had alpha."""
         images, masks = composite_over_white(self.rgba)
-        return Views(images, self.cameras, masks if self.has_alpha else None, self.bounds, self.names)
+        return Views(images, self.cameras, masks if self.has_alpha else None, self.bounds, self.names, self.up)
 
     def select(self, index: list[int]) -> Posed:
         """The pictures at `index`, in that order; stated bounds stay, others are estimated from these alone."""

@@ -21,7 +21,7 @@ LANES = 16
 @inner
 @no_type_check
 def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius, min_z):
-    """Clears the lanes of `alive` that one view rules out; returns how many are left."""
+    """Counts down the votes left in the lanes of `alive` that one view rules out; returns how many are left in all."""
     rows, stride = np.int32(tables.shape[1]), np.int32(tables.shape[2])
     number = alive.dtype.type
     zero, half, one = number(0), number(0.5), number(1)
@@ -58,17 +58,19 @@ def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius
         count = read(tables, table, np.int32(below + last)) - read(tables, table, np.int32(below + first))
         count = np.int32(count - read(tables, table, np.int32(above + last)))
         count = np.int32(count + read(tables, table, np.int32(above + first)))
-        kept = zero if judged & (count == 0) else load(alive, k)
-        store(alive, k, kept)
-        left_over += kept
+        votes = load(alive, k)
+        votes = max(votes - one, zero) if judged & (count == 0) else votes
+        store(alive, k, votes)
+        left_over += votes
     return left_over
 
 
 @no_type_check
-def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, occupied, start, stop):
+def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, votes, occupied, start, stop):
     """Clears the voxels in layers start..stop of `occupied` that `occupancy.carve` describes as ruled out.
 
-    `tables` (view, row + 1, column + 1) count the set pixels above and left; `corner` is where voxel (0, 0, 0) starts.
+    `tables` (view, row + 1, column + 1) count the set pixels above and left; `corner` is where voxel (0, 0, 0) starts;
+    `votes` so many views have to rule a voxel out.
     """
     alive, half, planes, last = np.empty(LANES, corner.dtype), corner.dtype.type(0.5), tables.shape[0], 0
     for i in range(start, stop):
@@ -79,7 +81,7 @@ def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, occupied
                 count = min(LANES, occupied.shape[2] - begin)
                 bottom = corner[2] + corner.dtype.type(begin) * voxel
                 for k in range(LANES):
-                    alive[k] = 1 if k < count else 0
+                    alive[k] = votes if k < count else 0
                 for turn in range(planes):  # the view that ruled out the last voxels often rules out their neighbours
                     view = last + turn if last + turn < planes else last + turn - planes
                     m, c = matrices[view], calibrations[view]
@@ -87,4 +89,4 @@ def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, occupied
                         last = view
                         break
                 for k in range(count):
-                    occupied[i, j, begin + k] = np.uint8(alive[k])
+                    occupied[i, j, begin + k] = np.uint8(alive[k] > 0)

@@ -26,7 +26,7 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
     "lookup_forward.forward": f"{_IMAGES}, T, T, T[::1], T[::1], uint8[::1], boolean, int64[:, ::1]",
     "lookup_backward.backward": f"{_IMAGES}, T, {_STRIDED}, {_STRIDED}, T[::1], float64[:, ::1], int64[:, ::1]",
     "lookup_backward.image_backward": f"int64, int64, T, {_STRIDED}, int64, int64, T[::1], int64[:, ::1]",
-    "carving.carve": "T[:, :, ::1], T[:, :, ::1], int32[:, :, ::1], T[::1], T, T, T, uint8[:, :, ::1], int64, int64",
+    "carving.carve": "T[:, :, ::1], T[:, :, ::1], int32[:, :, ::1], T[::1], T, T, T, T, uint8[:, :, ::1], int64, int64",
     "visibility.choose": (
         "T[::1], T[::1], T[::1], T[::1], UniTuple(int64, 6), T[::1], int64[::1], T[::1], int64[::1], T[::1], T[::1], "
         "int64, int64"

@@ -1,0 +1,233 @@
+"""Photographs of an object on a table in a textured room, taken with a lens, exposures, blur and noise that are known.
+
+The world has y up and the object within the unit sphere around the origin. The room and the table are analytic; the
+object is either an ellipsoid, analytic too, or any mesh, drawn by `data_gen` and laid over the room.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+from scipy import ndimage
+
+from data_gen.meshes.mesh import Mesh, mesh_parts
+from data_gen.rendering.mesh_renderer import MeshRenderer
+from data_gen.rigs import Rig
+from hyperplanes.geometry.distortion import inverse_distortion, turning_radius
+
+__all__ = ["Staged", "stage", "walk_around"]
+
+Array = Float[np.ndarray, "..."]
+
+HALF_ROOM = 6.0  # from the origin to its walls
+AXES = np.array([0.75, 0.55, 0.5])  # of the ellipsoid
+LIGHT = np.array([0.4, 0.8, 0.45])
+
+
+@dataclass(frozen=True)
+class Staged:
+    """Photographs and what is true of them.
+
+    Attributes:
+        photographs: (height, width, 3) each, as a camera would have saved them.
+        masks: (height, width) each, true where the object is, through the same lens.
+        world_from_camera: (view, 4, 4), OpenCV axes.
+        calibration: (3, 3), integer pixel centres.
+        lens: k1 and k2.
+    """
+
+    photographs: list[UInt8[np.ndarray, "height width 3"]]
+    masks: list[np.ndarray]
+    world_from_camera: Array
+    calibration: Array
+    lens: tuple[float, float]
+
+    def save(self, folder: Path) -> None:
+        """Write the photographs as JPEG, named in their order."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for index, picture in enumerate(self.photographs):
+            Image.fromarray(picture).save(folder / f"photo_{index:03d}.jpg", quality=93)
+
+
+def walk_around(
+    count: int, seed: int, heights: tuple[float, ...] = (12.0, 35.0, 58.0)
+) -> Float[np.ndarray, "view 4 4"]:
+    """Poses of somebody who walks around the object once for each height, holding the camera almost level.
+
+    Args:
+        count: of poses in all.
+        seed: of what no hand holds still.
+        heights: elevations of the rounds, in degrees.
+
+    Returns:
+        world_from_camera.
+    """
+    generator = np.random.default_rng(seed)
+    poses = []
+    for index in range(count):
+        turn = 2 * np.pi * index * len(heights) / count + generator.normal(0, 0.03)
+        height = np.deg2rad(heights[index * len(heights) // count] + generator.normal(0, 2))
+        eye = (3.3 + generator.normal(0, 0.12)) * np.array(
+            [np.cos(height) * np.sin(turn), np.sin(height), np.cos(height) * np.cos(turn)]
+        )
+        forward = generator.normal(0, 0.06, 3) - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 1.0, 0.0])
+        right /= np.linalg.norm(right)
+        roll = generator.normal(0, np.deg2rad(1.5))
+        down = np.cross(forward, right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack(
+            [np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right, forward], 1
+        )
+        pose[:3, 3] = eye
+        poses.append(pose)
+    return np.stack(poses)
+
+
+def stage(
+    poses: Float[np.ndarray, "view 4 4"],
+    size: tuple[int, int],
+    *,
+    seed: int,
+    mesh: Mesh | None = None,
+    lens: tuple[float, float] = (-0.08, 0.02),
+    exposure: float = 0.12,
+    blur: float = 0.5,
+    noise: float = 0.01,
+    focal: float = 1.15,
+    samples: int = 2,
+) -> Staged:
+    """Take the photographs.
+
+    Args:
+        poses: world_from_camera, OpenCV axes.
+        size: (height, width) in pixels.
+        seed: of textures, exposures, blur and noise.
+        mesh: the object; an ellipsoid when None.
+        lens: k1 and k2 of the camera.
+        exposure: standard deviation of the logarithm of each photograph's brightness.
+        blur: largest standard deviation of a photograph's blur, in pixels.
+        noise: standard deviation of the noise of a grey pixel, of 1.
+        focal: focal length in units of the longer side.
+        samples: along a side of a pixel, of the room and the ellipsoid.
+    """
+    generator = np.random.default_rng(seed)
+    texture = generator.random((32, 32, 32, 3)).astype(np.float32)
+    height, width = size
+    calibration = np.array(
+        [[focal * max(size), 0, (width - 1) / 2], [0, focal * max(size), (height - 1) / 2], [0, 0, 1.0]]
+    )
+    drawn, floor = _drawn(mesh, poses, calibration, size)
+    rows, columns = np.mgrid[: height * samples, : width * samples]
+    pixels = (np.stack([columns, rows], -1).reshape(-1, 2) + 0.5) / samples - 0.5
+    slopes = _without_lens((pixels - calibration[:2, 2]) / calibration[[0, 1], [0, 1]], lens)
+    photographs, masks = [], []
+    for view, pose in enumerate(poses):
+        colour, mask = _seen(pose, slopes.reshape(height, samples, width, samples, 2), texture, mesh is None, floor)
+        if drawn is not None:
+            over = _through_lens(drawn[view].astype(np.float32) / 255, calibration, lens)
+            colour = over[..., :3] + colour * (1 - over[..., 3:])
+            mask = over[..., 3]
+        colour = colour * np.exp(generator.normal(0, exposure))
+        colour = ndimage.gaussian_filter(colour, (*(generator.uniform(0, blur),) * 2, 0))
+        colour = colour + generator.normal(0, noise, colour.shape) * np.sqrt(colour.clip(0.02) / 0.5)
+        photographs.append((colour.clip(0, 1) * 255).round().astype(np.uint8))
+        masks.append(mask > 0.5)
+    return Staged(photographs, masks, poses, calibration, lens)
+
+
+def _drawn(
+    mesh: Mesh | None, poses: Array, calibration: Array, size: tuple[int, int]
+) -> tuple[np.ndarray | None, float]:
+    """RGBA of the mesh through a pinhole, premultiplied, and the height of the table under it."""
+    if mesh is None:
+        return None, -float(AXES[1])
+    rig = Rig(poses, calibration, size[1], size[0], near=0.5, far=8.0)
+    with MeshRenderer() as renderer:
+        rgba = renderer.render(mesh_parts(mesh), rig).rgba
+    assert rgba is not None
+    alpha = rgba[..., 3:].astype(np.float32) / 255
+    premultiplied = np.concatenate([(rgba[..., :3] * alpha).round().astype(np.uint8), rgba[..., 3:]], -1)
+    lowest = min(
+        float((part.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 1].min()) for part, pose, _ in mesh_parts(mesh)
+    )
+    return premultiplied, lowest
+
+
+def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float) -> tuple[Array, Array]:
+    """Colour and coverage by the ellipsoid, the mean of the samples (row, sample, column, sample, 2) a pixel."""
+    shape, slopes = slopes.shape[:4], slopes.reshape(-1, 2)
+    ways = np.concatenate([slopes, np.ones_like(slopes[:, :1])], -1) @ pose[:3, :3].T
+    eye = pose[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        walls = np.where(ways > 0, (HALF_ROOM - eye) / ways, (-HALF_ROOM - eye) / ways).min(-1)
+        table = np.where(ways[:, 1] < 0, (floor - eye[1]) / ways[:, 1], np.inf)
+    distance = np.minimum(walls, table)
+    points = eye + distance[:, None] * ways
+    colour = _texture(points, texture, 1.6)
+    colour = (0.35 * colour + 0.65 * colour.mean(-1, keepdims=True)) * np.where(table < walls, 0.95, 0.75)[:, None]
+    covered = np.zeros(len(ways))
+    if ball:
+        a, b = np.square(ways / AXES).sum(-1), (ways / AXES) @ (eye / AXES)
+        root = b * b - a * (np.square(eye / AXES).sum() - 1)
+        hit = root > 0
+        near = eye + ((-b[hit] - np.sqrt(root[hit])) / a[hit])[:, None] * ways[hit]
+        normal = near / AXES**2
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        shade = 0.45 + 0.55 * (normal @ (LIGHT / np.linalg.norm(LIGHT))).clip(0)
+        colour[hit] = (0.25 + 0.75 * _texture(near, texture, 4.0)) * shade[:, None] * [1.0, 0.7, 0.45]
+        covered[hit] = 1.0
+
+    def mean(values: Array) -> Array:
+        return values.reshape(*shape, -1).mean((1, 3))
+
+    return mean(colour), mean(covered)[..., 0]
+
+
+def _texture(points: Array, table: Array, frequency: float) -> Array:
+    """Colours from noise of four octaves, trilinear between the entries of a table that repeats."""
+    total = np.zeros((len(points), 3), np.float32)
+    side = len(table)
+    flat = table.reshape(-1, 3)
+    for octave in range(4):
+        where = (points * (frequency * 2.1**octave)).astype(np.float32)
+        low = np.floor(where)
+        part, low = where - low, low.astype(np.int64)
+        for corner in np.ndindex(2, 2, 2):
+            i, j, k = ((low + corner) % side).T
+            weight = np.where(corner, part, 1 - part).prod(-1, keepdims=True)
+            total += (0.75**octave) * weight * (flat[(i * side + j) * side + k] - 0.5)
+    return (0.5 + 0.55 * total).clip(0, 1)
+
+
+def _without_lens(slopes: Array, lens: tuple[float, float]) -> Array:
+    """Slopes of the rays through distorted ones."""
+    if not any(lens):
+        return slopes
+    import torch
+
+    coefficients = torch.tensor([[*lens, 0, 0, 0, 0, 0, 0]], dtype=torch.float64)
+    count, limit = len(slopes), turning_radius(coefficients)
+    found, _ = inverse_distortion(torch.from_numpy(slopes), coefficients.expand(count, -1), limit.expand(count), 1e-6)
+    return found.numpy()
+
+
+def _through_lens(picture: Array, calibration: Array, lens: tuple[float, float]) -> Array:
+    """A pinhole's picture as the lens shows it."""
+    height, width = picture.shape[:2]
+    rows, columns = np.mgrid[:height, :width]
+    pixels = np.stack([columns, rows], -1).reshape(-1, 2)
+    focal, centre = calibration[[0, 1], [0, 1]], calibration[:2, 2]
+    source = _without_lens((pixels - centre) / focal, lens) * focal + centre
+    return np.stack(
+        [
+            ndimage.map_coordinates(picture[..., channel], source[:, ::-1].T, order=1).reshape(height, width)
+            for channel in range(picture.shape[2])
+        ],
+        -1,
+    )

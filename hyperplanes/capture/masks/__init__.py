@@ -1,0 +1,1 @@
+"""What of a photograph is the object: each way a function from pixels to opacity."""

@@ -1,0 +1,59 @@
+"""Masks in front of a plain background, such as a green screen or a sheet of paper, by its colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy import ndimage
+from skimage.color import rgb2lab
+
+from hyperplanes.capture.masks.regions import cleaned
+
+__all__ = ["PlainBackground", "is_plain"]
+
+BORDER = 0.03  # of the shorter side
+NEAR, FAR = 10.0, 18.0  # distances in CIE Lab up to which a pixel is background, and from which on it is the object
+PLAIN_BORDER, PLAIN_PICTURES = 0.7, 0.8  # of the border, and of the pictures, that have to be plain
+
+
+class PlainBackground:
+    """All that is not of the colour of the picture's border and not shut in by the object."""
+
+    def __call__(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+        """Opacity in [0, 1]."""
+        lab = rgb2lab(picture)
+        distance = np.linalg.norm(lab - _border_colour(lab), axis=-1)
+        opacity = ((distance - NEAR) / (FAR - NEAR)).clip(0, 1)
+        labels, _ = ndimage.label(opacity < 0.5)
+        outer = np.unique(labels[_border(labels.shape)])
+        reached = np.isin(labels, outer[outer > 0])
+        enclosed = (opacity < 0.5) & ~reached & (distance > NEAR / 2)  # a hole shows the very colour of the background
+        return cleaned(np.where(enclosed, 1.0, opacity))
+
+
+def is_plain(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bool:
+    """Whether most pictures have borders of one colour, each its own.
+
+    Args:
+        pictures: some of a capture.
+    """
+    plain = 0
+    for picture in pictures:
+        lab = rgb2lab(picture[:: max(1, min(picture.shape[:2]) // 200), :: max(1, min(picture.shape[:2]) // 200)])
+        border = lab[_border(lab.shape[:2])]
+        plain += float((np.linalg.norm(border - _border_colour(lab), axis=-1) < NEAR).mean()) >= PLAIN_BORDER
+    return plain >= PLAIN_PICTURES * len(pictures)
+
+
+def _border(size: tuple[int, ...]) -> np.ndarray:
+    """Which pixels are within BORDER of the picture's border."""
+    width = max(1, round(BORDER * min(size[:2])))
+    result = np.ones(size[:2], bool)
+    result[width:-width, width:-width] = False
+    return result
+
+
+def _border_colour(lab: np.ndarray) -> np.ndarray:
+    return np.median(lab[_border(lab.shape[:2])], axis=0)

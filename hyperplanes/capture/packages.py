@@ -1,0 +1,31 @@
+"""Packages of the extra `photos`, imported when they are needed."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+__all__ = ["is_installed", "require"]
+
+
+def is_installed(name: str) -> bool:
+    """Whether a package can be imported; it is not imported."""
+    return find_spec(name) is not None
+
+
+def require(name: str, purpose: str) -> Any:
+    """A package of the extra `photos`.
+
+    Args:
+        name: of its module.
+        purpose: what it does here, for the message.
+
+    Raises:
+        ValueError: it is not installed, or cannot be imported.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        missing = f"expected the package {name}, which {purpose}, found {error}"
+        raise ValueError(f"{missing}; pip install 'hyperplanes[photos]'") from error

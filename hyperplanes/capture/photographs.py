@@ -1,0 +1,248 @@
+"""Photographs as people have them: found, upright, scaled, and grouped by the camera that took them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from hyperplanes.data.formats.unposed import photographs_folder
+from hyperplanes.data.pictures.images import PICTURE_SUFFIXES, Pixels, image_header, read_image, resized, turned
+from hyperplanes.data.pictures.masks import match_masks
+from hyperplanes.utilities.files import DataError
+
+__all__ = ["FEWEST", "Photograph", "find_photographs", "list_photographs", "read_upright"]
+
+FEWEST = 3
+"""Photographs from which poses can be found at all."""
+
+_HEIF = frozenset({".heic", ".heif"})
+_MAKE, _MODEL, _EXIF = 0x010F, 0x0110, 0x8769
+_FOCAL, _FOCAL_35, _PIXELS_X = 0x920A, 0xA405, 0xA002
+_PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
+_UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # millimetres, by EXIF's number of the unit
+_FULL_FRAME = 36.0  # millimetres: the longer side of the film that 35 mm equivalents refer to
+_SCALED_MASK = 1.02  # by which the shape of a mask may differ from that of its photograph
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One photograph, of which only the header has been read.
+
+    Attributes:
+        path: the file.
+        name: a plain name without ending, its own in the capture.
+        size: (height, width) upright.
+        orientation: EXIF's number, 1 where the pixels are stored upright.
+        camera: what tells cameras apart: make, model, focal length and longer and shorter side.
+        focal: focal length in units of the longer side, None where EXIF does not say.
+        turned: whether it is stored lying on its side, turned by 90 degrees counterclockwise, to have the shape that
+            most photographs of the camera have.
+        mask: a picture of what belongs to the object, or None.
+    """
+
+    path: Path
+    name: str
+    size: tuple[int, int]
+    orientation: int
+    camera: str
+    focal: float | None
+    turned: bool = False
+    mask: Path | None = None
+
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """(height, width) after the turn."""
+        return self.size[::-1] if self.turned else self.size
+
+    @property
+    def up_in_camera(self) -> tuple[float, float, float]:
+        """Which way is up in the stored picture: x right, y down, z forward."""
+        return (-1.0, 0.0, 0.0) if self.turned else (0.0, -1.0, 0.0)
+
+
+def find_photographs(folder: Path) -> list[Path]:
+    """The photographs of a folder, or of its folder images/, input/, rgb/ or photos/, in the order of their names.
+
+    Numbers in names count as numbers, so that IMG_9 comes before IMG_10.
+
+    Args:
+        folder: what holds them.
+
+    Raises:
+        DataError: fewer than three, or HEIC photographs where nothing can read them.
+    """
+    home = photographs_folder(folder, PICTURE_SUFFIXES | _HEIF)
+    files = [] if home is None else [p for p in home.iterdir() if p.is_file() and not p.name.startswith(".")]
+    heif = [path for path in files if path.suffix.lower() in _HEIF]
+    found = sorted((path for path in files if path.suffix.lower() in PICTURE_SUFFIXES), key=_natural)
+    if heif and not _reads_heif():
+        raise DataError(
+            heif[0], "JPEG, PNG, WebP or TIFF", "HEIC", "pip install pillow-heif, or have the phone save JPEG"
+        )
+    found = sorted(found + heif, key=_natural)
+    if len(found) < FEWEST:
+        count = f"{len(found)} photographs" if len(found) != 1 else "1 photograph"
+        raise DataError(
+            folder, f"at least {FEWEST} photographs of one object", count, "20 to 60 from all around are a good number"
+        )
+    return found
+
+
+def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[list[Photograph], list[str]]:
+    """What is known of photographs before they are decoded.
+
+    Args:
+        paths: the files.
+        masks: a folder of masks named as the photographs (or NAME_mask), or None.
+
+    Returns:
+        The photographs that can be read, and a sentence about each one that cannot.
+    """
+    found, notes = [], []
+    names = Counter[str]()
+    given = match_masks(masks, paths) if masks is not None else None
+    for index, path in enumerate(paths):
+        try:
+            header = image_header(path)
+            tags = _exif(path)
+        except DataError as error:
+            notes.append(f"left out: {error}")
+            continue
+        name = re.sub(r"[^A-Za-z0-9._-]+", "_", path.stem).lstrip(".") or "photograph"
+        names[name] += 1
+        name = name if names[name] == 1 else f"{name}_{names[name]}"
+        longer, shorter = max(header.size), min(header.size)
+        camera = " ".join(
+            str(part).strip() for part in (tags.get(_MAKE, ""), tags.get(_MODEL, ""), tags.get(_FOCAL, ""))
+        )
+        camera = f"{camera} {longer}x{shorter}".strip()
+        mask = None if given is None else given[index]
+        focal = _focal(tags)
+        found.append(Photograph(path, name, header.upright_size, header.orientation, camera, focal, mask=mask))
+    return _with_one_shape(found), notes
+
+
+def read_upright(photograph: Photograph, longest: int) -> tuple[Pixels, bool]:
+    """The pixels of a photograph as it is stored in a capture: upright or on its side, scaled, its mask as alpha.
+
+    Args:
+        photograph: which one.
+        longest: pixels along the longer side at most.
+
+    Returns:
+        (height, width, 4), straight alpha, and whether alpha means anything.
+
+    Raises:
+        DataError: a photograph that is broken, or a mask of another shape.
+    """
+    picture, alpha = read_image(photograph.path)
+    stored = picture.shape[:2]
+    picture = turned(picture, photograph.orientation)
+    if photograph.mask is not None:
+        values, has_alpha = read_image(photograph.mask)
+        opacity = values[..., 3] if has_alpha and not np.ptp(values[..., :3]) else values[..., :3].max(-1)
+        if _same_shape(opacity.shape, stored) and not _same_shape(opacity.shape, picture.shape[:2]):
+            opacity = turned(opacity, photograph.orientation)  # drawn on the pixels as they are stored
+        elif stored == picture.shape[:2] and photograph.orientation != 1:
+            opacity = turned(opacity, photograph.orientation)
+        if not _same_shape(opacity.shape, picture.shape[:2]):
+            raise DataError(
+                photograph.mask,
+                f"the shape of {photograph.path.name}, {stored[1]} x {stored[0]} pixels",
+                f"{values.shape[1]} x {values.shape[0]}",
+                "give each photograph a mask of its own shape",
+            )
+        scaled = Image.fromarray(opacity).resize(picture.shape[1::-1], Image.Resampling.BILINEAR)
+        picture[..., 3] = np.array(scaled)
+        alpha = True
+    size = scaled_size(picture.shape[:2], longest)
+    picture = resized(picture, size)
+    if photograph.turned:
+        picture = np.ascontiguousarray(np.rot90(picture))
+    return picture, alpha and bool((picture[..., 3] < 255).any())
+
+
+def scaled_size(size: tuple[int, int], longest: int) -> tuple[int, int]:
+    """(height, width) scaled down so that the longer side has so many pixels at most.
+
+    >>> scaled_size((3000, 4000), 1000)
+    (750, 1000)
+    """
+    factor = min(1.0, longest / max(size))
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
+def _same_shape(size: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    return 1 / _SCALED_MASK < size[0] * other[1] / (size[1] * other[0]) < _SCALED_MASK
+
+
+def _with_one_shape(photographs: list[Photograph]) -> list[Photograph]:
+    """The same, of each camera those turned that have not the shape, upright or across, of most."""
+    across: dict[str, Counter[bool]] = {}
+    for one in photographs:
+        across.setdefault(one.camera, Counter())[one.size[1] > one.size[0]] += 1
+    return [
+        Photograph(
+            one.path,
+            one.name,
+            one.size,
+            one.orientation,
+            one.camera,
+            one.focal,
+            one.size[0] != one.size[1] and (one.size[1] > one.size[0]) != across[one.camera].most_common(1)[0][0],
+            one.mask,
+        )
+        for one in photographs
+    ]
+
+
+def _natural(path: Path) -> list[Any]:
+    """A key by which numbers in names sort as numbers."""
+    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", path.name.lower()) if part]
+
+
+def _reads_heif() -> bool:
+    if find_spec("pillow_heif") is None:
+        return False
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    return True
+
+
+def _exif(path: Path) -> dict[int, Any]:
+    """The tags of a photograph that matter here; a damaged block says nothing."""
+    with Image.open(path) as image:
+        if "exif" not in image.info:
+            return {}
+        try:
+            exif = image.getexif()
+            return {**exif, **exif.get_ifd(_EXIF)}
+        except (TypeError, ValueError, SyntaxError, OSError, KeyError):
+            return {}
+
+
+def _focal(tags: dict[int, Any]) -> float | None:
+    """The focal length in units of the longer side, from its 35 mm equivalent or from the size of the sensor."""
+
+    def number(tag: int) -> float:
+        try:
+            value = float(tags.get(tag, 0))
+        except (TypeError, ValueError, ZeroDivisionError):
+            return 0.0
+        return value if math.isfinite(value) and value > 0 else 0.0
+
+    focal = number(_FOCAL_35) / _FULL_FRAME
+    resolution, pixels = number(_PLANE_RESOLUTION), number(_PIXELS_X)
+    if not focal and resolution and pixels:
+        focal = number(_FOCAL) / (pixels / resolution * _UNITS.get(int(number(_PLANE_UNIT) or 2), 25.4))
+    return focal if 0.2 < focal < 20 else None

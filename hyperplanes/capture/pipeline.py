@@ -1,0 +1,298 @@
+"""From photographs to a scene that every other verb reads: pictures, poses, masks, in stages that can be continued."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from hyperplanes.capture.masks.choice import choose_masker
+from hyperplanes.capture.photographs import (
+    FEWEST,
+    Photograph,
+    find_photographs,
+    list_photographs,
+    read_upright,
+)
+from hyperplanes.capture.placement import Placement, place
+from hyperplanes.capture.scene import Captured, straightened, write_scene
+from hyperplanes.capture.sparse_model import SparseModel
+from hyperplanes.capture.stages import Stages, fingerprint
+from hyperplanes.capture.structure_from_motion import ATTEMPTS, Picture, find_poses
+from hyperplanes.capture.video import VIDEO_SUFFIXES, take_frames
+from hyperplanes.data.pictures.frames import listed
+from hyperplanes.data.pictures.images import Pixels, read_image
+from hyperplanes.utilities.files import DataError, encode_png, write_whole
+
+__all__ = ["Captured", "Progress", "Settings", "capture"]
+
+Progress = Callable[[str, int, int, str], None]
+"""Called with what is done, how far, of how much, and a few words."""
+
+WORK = "capture"
+"""The folder within the scene that holds what the stages made."""
+
+ENOUGH = 0.8  # of the photographs: with fewer registered, other features are tried
+QUALITY = 96  # of JPEG, without subsampled colours
+
+ADVICE = (
+    "walk around the object in small steps, about 10 degrees apart, so that neighbouring photographs show mostly the "
+    "same; keep the light and the object still; leave something with texture around it, such as a newspaper under it"
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a capture is made.
+
+    Attributes:
+        longest: pixels along the longer side, in which poses are found and pictures written.
+        mask: auto, given, colour, network, grabcut, none, or a command with {image} and {mask} in it.
+        frames: taken out of a video.
+        order: "auto", "sequence" (neighbours are matched) or "any" (all pairs are).
+    """
+
+    longest: int = 1000
+    mask: str = "auto"
+    frames: int = 60
+    order: str = "auto"
+
+
+@dataclass
+class _Work:
+    """What the stages share."""
+
+    stages: Stages
+    settings: Settings
+    progress: Progress
+    notes: list[str] = field(default_factory=list)
+
+
+def capture(
+    source: str | Path, out: str | Path, settings: Settings | None = None, progress: Progress | None = None
+) -> Captured:
+    """Find poses and masks of photographs, and write them as a scene.
+
+    Args:
+        source: a folder of photographs, in which masks/ may lie, or a video.
+        out: the folder of the scene. What the stages made lies in its folder capture/; the same call goes on there.
+        settings: how.
+        progress: called as it goes on.
+
+    Returns:
+        What was written and what there is to say of it.
+
+    Too few photographs, photographs without common features, and settings that cannot be are a ValueError.
+    """
+    source, out = Path(source), Path(out)
+    work = _Work(Stages(out / WORK), settings or Settings(), progress or (lambda stage, done, total, text: None))
+    photographs, is_video = _photographs(source, work)
+    photographs, pictures, opacities = _pictures(photographs, work)
+    model = _poses(pictures, is_video, work)
+    kept = [photographs[index] for index in model.pictures]
+    if len(kept) < len(photographs):
+        rest = [one.name for index, one in enumerate(photographs) if index not in set(model.pictures.tolist())]
+        work.notes.append(f"{len(rest)} photographs could not be posed and are left out: {listed(rest)}")
+    straight = _straight(model, pictures, opacities, work)
+    masks, how = _masks(model, straight, [one.name for one in kept], work)
+    placement = place(model, np.array([one.up_in_camera for one in kept]), masks)
+    return _written(out, model, kept, straight, masks, how, placement, work)
+
+
+def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
+    """The photographs, and whether they are the frames of a video."""
+    is_video = source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES
+    if is_video:
+        stamp = source.stat()
+        key = fingerprint(str(source.resolve()), stamp.st_size, stamp.st_mtime, work.settings.frames)
+        if work.stages.begin("frames", key) is None:
+            taken = take_frames(source, work.stages.folder / "frames", work.settings.frames, work.progress)
+            work.stages.finish("frames", key, {"count": taken})
+        home, paths = None, sorted((work.stages.folder / "frames").glob("*.jpg"))
+    else:
+        if not source.is_dir():
+            found = "a file of another kind" if source.exists() else "nothing"
+            raise DataError(source, "a folder of photographs, or a video", found, "check the path")
+        paths = find_photographs(source)
+        home = next((place for place in (source / "masks", paths[0].parent / "masks") if place.is_dir()), None)
+    wanted = work.settings.mask in ("auto", "given")
+    photographs, notes = list_photographs(paths, home if wanted else None)
+    work.notes += notes
+    if len(photographs) < FEWEST:
+        found = f"{len(photographs)} of {len(paths)}"
+        raise DataError(source, f"at least {FEWEST} photographs that can be read", found, "; ".join(notes)[:200])
+    return photographs, is_video
+
+
+def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photograph], list[Picture], dict[int, Path]]:
+    """The photographs upright and scaled, as files, and the masks that came with them by their number."""
+    longest = work.settings.longest
+    stamps = [(str(one.path.resolve()), one.path.stat().st_mtime, one.path.stat().st_size) for one in photographs]
+    masks = [None if one.mask is None else (str(one.mask), one.mask.stat().st_mtime) for one in photographs]
+    key = fingerprint(stamps, masks, longest, work.settings.mask in ("auto", "given"))
+    folder = work.stages.folder / "pictures"
+    done = work.stages.begin("pictures", key)
+    if done is None:
+        done = {"sizes": [], "opaque": [], "broken": {}}
+        for index, one in enumerate(photographs):
+            work.progress("photographs", index, len(photographs), one.path.name)
+            try:
+                picture, alpha = read_upright(one, longest)
+            except DataError as error:
+                if one.mask is not None and str(one.mask) in str(error):
+                    raise
+                done["broken"][str(index)] = f"left out: {error}"
+                done["sizes"].append(None)
+                done["opaque"].append(True)
+                continue
+            alpha = alpha and work.settings.mask in ("auto", "given")
+            write_whole(folder / f"{index:05d}.jpg", _jpeg(picture[..., :3]), durable=False)
+            if alpha:
+                write_whole(folder / f"{index:05d}.mask.png", encode_png(picture[..., 3]), durable=False)
+            done["sizes"].append(list(picture.shape[:2]))
+            done["opaque"].append(not alpha)
+        work.stages.finish("pictures", key, done)
+        work.progress("photographs", len(photographs), len(photographs), "upright and scaled")
+    work.notes += done["broken"].values()
+    readable = [index for index in range(len(photographs)) if str(index) not in done["broken"]]
+    cameras: dict[tuple[str, tuple[int, ...]], int] = {}
+    pictures = []
+    for index in readable:
+        size, one = tuple(done["sizes"][index]), photographs[index]
+        camera = cameras.setdefault((one.camera, size), len(cameras))
+        focal = None if one.focal is None else one.focal * max(size)
+        pictures.append(Picture(f"{index:05d}.jpg", camera, size, focal))
+    opacities = {
+        row: folder / f"{index:05d}.mask.png" for row, index in enumerate(readable) if not done["opaque"][index]
+    }
+    return [photographs[index] for index in readable], pictures, opacities
+
+
+def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
+    """The largest model; other features are tried while it holds few of the pictures."""
+    order = work.settings.order
+    sequential = order == "sequence" or (order == "auto" and is_video)
+    key = fingerprint([asdict(picture) for picture in pictures], sequential, work.stages.key("pictures"))
+    folder = work.stages.folder / "poses"
+    done = work.stages.begin("poses", key)
+    if done is not None:
+        return SparseModel.load(folder / "model.npz")
+    best: SparseModel | None = None
+    for number, features in enumerate(ATTEMPTS):
+        found = find_poses(
+            pictures,
+            work.stages.folder / "pictures",
+            folder / f"{number}.db",
+            features=features,
+            sequential=sequential,
+            progress=work.progress,
+        )
+        if found is not None and (best is None or len(found) > len(best)):
+            best = found
+        if best is not None and len(best) >= ENOUGH * len(pictures):
+            break
+        count = 0 if best is None else len(best)
+        work.notes.append(f"with {features.name}: {count} of {len(pictures)} photographs posed")
+    if best is None or len(best) < FEWEST:
+        raise DataError(
+            work.stages.folder.parent,
+            f"photographs of which at least {FEWEST} can be posed together",
+            f"{len(pictures)} of which none can" if best is None else f"only {len(best)} of {len(pictures)}",
+            ADVICE,
+        )
+    if len(best) < ENOUGH * len(pictures):
+        work.notes.append(f"few photographs could be posed; for the next time: {ADVICE}")
+    best.save(folder / "model.npz")
+    for used in folder.glob("*.db*"):
+        used.unlink() if used.is_file() else None
+    work.stages.finish("poses", key, {"count": len(best), "error": best.reprojection_error})
+    return best
+
+
+def _straight(model: SparseModel, pictures: Sequence[Picture], opacities: dict[int, Path], work: _Work) -> list[Pixels]:
+    """The pictures that were posed, without their lens."""
+    result = []
+    for row, index in enumerate(model.pictures.tolist()):
+        path = work.stages.folder / "pictures" / pictures[index].file
+        picture, _ = read_image(path)
+        given = opacities.get(index)
+        if given is not None:
+            picture[..., 3] = read_image(given)[0][..., 0]
+        work.progress("lens", row, len(model), path.name)
+        result.append(straightened(picture, model.calibrations[row], model.lenses[row], opaque=given is None))
+    work.progress("lens", len(model), len(model), "taken out of the pictures")
+    return result
+
+
+def _masks(
+    model: SparseModel, straight: list[Pixels], names: Sequence[str], work: _Work
+) -> tuple[list[np.ndarray] | None, str]:
+    """A mask a camera, opacity in [0, 1], and how they were found."""
+    if work.settings.mask == "none":
+        return None, "none"
+    given = [index for index, picture in enumerate(straight) if (picture[..., 3] < 255).any()]
+    if work.settings.mask == "given" and not given:
+        raise DataError(
+            "--mask given", "photographs with alpha, or a folder masks/ beside them", "neither", "leave --mask out"
+        )
+    if len(given) == len(straight):
+        return [picture[..., 3] / 255.0 for picture in straight], "given"
+    masker, how = choose_masker(work.settings.mask, model, [picture[..., :3] for picture in straight])
+    if given:
+        bare = listed([names[index] for index in range(len(straight)) if index not in set(given)])
+        work.notes.append(f"{len(straight) - len(given)} photographs came without a mask and get one by {how}: {bare}")
+    key = fingerprint(work.stages.key("poses"), how)
+    work.stages.begin("masks", key)
+    folder = work.stages.folder / "masks"
+    masks = []
+    for row, picture in enumerate(straight):
+        path = folder / f"{row:05d}.png"
+        if row in given:
+            masks.append(picture[..., 3] / 255.0)
+            continue
+        if not path.is_file():
+            work.progress("masks", row, len(straight), how)
+            opacity = masker(picture[..., :3], row)
+            write_whole(path, encode_png((opacity * 255).round().astype(np.uint8)), durable=False)
+        masks.append(read_image(path)[0][..., 0] / 255.0)
+    work.progress("masks", len(straight), len(straight), how)
+    if not any(mask.any() for mask in masks):
+        raise DataError(
+            "--mask", "an object in the photographs", f"none in any of {len(masks)}", "give --mask none or masks/"
+        )
+    return masks, how
+
+
+def _written(
+    out: Path,
+    model: SparseModel,
+    photographs: Sequence[Photograph],
+    straight: list[Pixels],
+    masks: list[np.ndarray] | None,
+    how: str,
+    placement: Placement,
+    work: _Work,
+) -> Captured:
+    moved = model.moved(placement.z_up_from_world())
+    files = {}
+    for row, (one, picture) in enumerate(zip(photographs, straight, strict=True)):
+        work.progress("writing", row, len(straight), one.name)
+        files[f"images/{one.name}.jpg"] = _jpeg(picture[..., :3])
+        if masks is not None:
+            files[f"masks/{one.name}.png"] = encode_png((masks[row] * 255).round().astype(np.uint8))
+    captured = write_scene(
+        out, moved, [one.name for one in photographs], [picture.shape[:2] for picture in straight], files
+    )
+    work.progress("writing", len(straight), len(straight), "scene")
+    return replace(captured, mask=how, up_from=placement.up_from, notes=tuple(work.notes))
+
+
+def _jpeg(picture: Pixels) -> bytes:
+    import io
+
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(picture)).save(buffer, "JPEG", quality=QUALITY, subsampling=0)
+    return buffer.getvalue()

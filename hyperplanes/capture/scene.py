@@ -1,0 +1,114 @@
+"""A capture on disk, as nerfstudio has it: transforms.json, images/, masks/ and the sparse points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from hyperplanes.capture.sparse_model import SparseModel
+from hyperplanes.data.formats.transforms_document import transforms_document
+from hyperplanes.data.pictures.images import Pixels
+from hyperplanes.data.pictures.undistort import undistort
+from hyperplanes.utilities.files import write_json, write_whole
+
+__all__ = ["Captured", "encode_points", "straightened", "write_scene"]
+
+POINTS = "sparse_pc.ply"
+STRAIGHT = 0.25  # pixels that a lens may move a corner by without being taken out
+
+
+@dataclass(frozen=True)
+class Captured:
+    """A scene that was written.
+
+    Attributes:
+        folder: what holds it.
+        count: of its pictures.
+        points: how many points structure from motion found.
+        error: mean reprojection error in pixels.
+        mask: how masks were found.
+        up_from: what told which way is up.
+        notes: what was left out, and what else there is to say, a sentence each.
+    """
+
+    folder: Path
+    count: int
+    points: int
+    error: float
+    mask: str = "none"
+    up_from: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def straightened(
+    picture: Pixels, calibration: Float[np.ndarray, "3 3"], lens: Float[np.ndarray, " 2"], *, opaque: bool
+) -> Pixels:
+    """A picture as a pinhole with the same calibration would have taken it.
+
+    Args:
+        picture: (height, width, 4).
+        calibration: of its camera.
+        lens: k1 and k2.
+        opaque: its alpha means nothing.
+    """
+    height, width = picture.shape[:2]
+    corner = np.array([width, height]) / 2 / calibration[[0, 1], [0, 1]]
+    square = float(corner @ corner)
+    if abs(lens[0] * square + lens[1] * square**2) * np.hypot(width, height) / 2 < STRAIGHT:
+        return picture
+    return undistort(picture, calibration, (float(lens[0]), float(lens[1]), *(0.0,) * 6), opaque=opaque)
+
+
+def write_scene(
+    folder: Path, model: SparseModel, names: Sequence[str], sizes: Sequence[tuple[int, int]], files: dict[str, bytes]
+) -> Captured:
+    """Write the files of a scene, transforms.json last.
+
+    Args:
+        folder: of the scene; pictures of an earlier one in its images/ and masks/ are deleted.
+        model: in a world with z up, in which the unit sphere holds the object.
+        names: of the pictures, one a camera.
+        sizes: (height, width) of each.
+        files: the pictures, and their masks where there are some, by their names within the folder.
+
+    Returns:
+        What was written.
+    """
+    (folder / "transforms.json").unlink(missing_ok=True)
+    for kind in ("images", "masks"):
+        for old in (folder / kind).glob("*"):
+            if f"{kind}/{old.name}" not in files:
+                old.unlink()
+    for name, data in files.items():
+        write_whole(folder / name, data, durable=False)
+    write_whole(folder / POINTS, encode_points(model), durable=False)
+    world_from_camera = np.linalg.inv(model.camera_from_world)
+    paths = [f"images/{name}.jpg" for name in names]
+    document = transforms_document(
+        world_from_camera, model.calibrations, sizes[0], paths, sphere=((0.0, 0.0, 0.0), 1.0), alternating=False
+    )
+    for frame, name, size in zip(document["frames"], names, sizes, strict=True):
+        if size != sizes[0]:
+            frame["h"], frame["w"] = size
+        if f"masks/{name}.png" in files:
+            frame["mask_path"] = f"masks/{name}.png"
+    write_json(folder / "transforms.json", document | {"up": "z", "ply_file_path": POINTS})
+    return Captured(folder, len(names), len(model.points), model.reprojection_error)
+
+
+def encode_points(model: SparseModel) -> bytes:
+    """The points with their colours as binary PLY."""
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    rows = np.zeros(len(model.points), kinds)
+    for axis, name in enumerate("xyz"):
+        rows[name] = model.points[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        rows[name] = model.colours[:, channel]
+    kind = {"<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property {kind[code]} {name}" for name, code in kinds] + ["end_header", ""]
+    return "\n".join(header).encode() + rows.tobytes()

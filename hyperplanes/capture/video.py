@@ -1,0 +1,90 @@
+"""Frames taken out of a video, the sharpest of each stretch."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from hyperplanes.capture.packages import require
+from hyperplanes.utilities.files import DataError, write_whole
+
+__all__ = ["VIDEO_SUFFIXES", "sharpness", "take_frames"]
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
+LOOKED_AT = 5  # frames of each stretch, of which the sharpest is taken
+SMALL = 320  # pixels along the longer side, on which sharpness is judged
+BLURRED = 0.25  # of the median sharpness: frames below are left out
+
+
+def take_frames(path: Path, folder: Path, count: int, progress: Callable[[str, int, int, str], None]) -> int:
+    """Write the sharpest frame of each of `count` stretches of a video as JPEG files, in their order.
+
+    Args:
+        path: the video.
+        folder: where the frames go.
+        count: how many.
+        progress: called as it goes on.
+
+    Returns:
+        How many were written; blurred ones are left out.
+
+    Raises:
+        DataError: a file that is no video, or has too few frames.
+    """
+    reader = require("imageio_ffmpeg", "reads videos")
+    try:
+        frames = reader.read_frames(str(path))
+        about = next(frames)
+    except (OSError, RuntimeError, StopIteration, KeyError) as error:
+        raise DataError(
+            path, "a video", f"something else ({str(error).splitlines()[-1:]})", "export it again"
+        ) from error
+    total = max(1, round(about["duration"] * about["fps"]))
+    if total < 3 or not count >= 3:
+        frames.close()
+        raise DataError(path, "a video of some seconds", f"{total} frames", "film once around the object")
+    wanted = {round(index) for index in np.linspace(0, total - 1, min(total, count * LOOKED_AT))}
+    stretch = total / min(count, total)
+    best: dict[int, tuple[float, bytes]] = {}
+    for index, picture in enumerate(_pictures(frames, about["size"])):
+        if index not in wanted:
+            continue
+        progress("frames", min(index, total), total, path.name)
+        slot, value = int(index / stretch), sharpness(picture)
+        if slot not in best or value > best[slot][0]:
+            best[slot] = value, _jpeg(picture)
+    if not best:
+        raise DataError(path, "a video with frames that can be read", "none", "export it again")
+    least = BLURRED * float(np.median([value for value, _ in best.values()]))
+    kept = [data for _, (value, data) in sorted(best.items()) if value >= least]
+    for index, data in enumerate(kept):
+        write_whole(folder / f"frame_{index:04d}.jpg", data, durable=False)
+    progress("frames", total, total, f"{len(kept)} kept")
+    return len(kept)
+
+
+def sharpness(picture: np.ndarray) -> float:
+    """Variance of the Laplacian of a small grey version: less, the more a picture is blurred by motion.
+
+    Args:
+        picture: (height, width, 3), 8 bits.
+    """
+    small = Image.fromarray(picture).convert("L")
+    small.thumbnail((SMALL, SMALL))
+    return float(ndimage.laplace(np.asarray(small, np.float64)).var())
+
+
+def _pictures(frames: Iterator[bytes], size: tuple[int, int]) -> Iterator[np.ndarray]:
+    for data in frames:
+        yield np.frombuffer(data, np.uint8).reshape(size[1], size[0], 3)
+
+
+def _jpeg(picture: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "JPEG", quality=95, subsampling=0)
+    return buffer.getvalue()

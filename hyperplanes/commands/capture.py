@@ -1,0 +1,90 @@
+"""Turn photographs or a video of an object into a scene that the other verbs read: camera poses, masks, what is up.
+
+Needs the extra `photos`: pip install 'hyperplanes[photos]'. What was interrupted goes on where it was.
+
+Example:
+    hyperplanes capture photos/ --out scene
+    hyperplanes render --checkpoint small --views scene --all-views --orbit 48 --out turntable
+    hyperplanes capture walk.mp4 --frames 80 --out scene
+    hyperplanes capture photos/ --mask "rembg i {image} {mask}" --out scene
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.writing import writes_to
+from hyperplanes.utilities.formatting import format_duration
+
+if TYPE_CHECKING:
+    from hyperplanes.commands.console import Bar
+
+__all__ = ["Arguments", "run"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What was photographed, and how to look at it.
+
+    Attributes:
+        photographs: A folder of photographs, in which masks/ may lie, or a video.
+        out: The folder for the scene: images/, masks/ and transforms.json as nerfstudio has them.
+        mask: What finds the object in the pictures: auto, given (alpha, or masks/ beside them), colour (in front of a
+            plain background), network, grabcut, none, or a command with {image} and {mask} in it.
+        size: Pixels along the longer side of the pictures, at most.
+        order: Whether neighbours are matched, as in a video, or any photograph with any other; auto goes by their
+            number.
+        frames: Taken out of a video.
+    """
+
+    photographs: tyro.conf.Positional[Path]
+    out: Path
+    mask: Annotated[str, tyro.conf.arg(metavar="{auto,given,colour,network,grabcut,none,COMMAND}")] = "auto"
+    size: int = 1000
+    order: Literal["auto", "sequence", "any"] = "auto"
+    frames: int = 60
+
+
+@writes_to(lambda arguments: arguments.out)
+def run(arguments: Arguments) -> int:
+    """Find poses and masks, write the scene, say what was found and what was left out."""
+    if arguments.size < 64:
+        raise ValueError(f"--size: expected at least 64 pixels, got {arguments.size}")
+    if arguments.frames < 3:
+        raise ValueError(f"--frames: expected at least 3, got {arguments.frames}")
+    if arguments.out.resolve() == arguments.photographs.resolve():
+        raise ValueError(f"--out: expected another folder than that of the photographs, got {arguments.out}")
+    from hyperplanes.capture import Settings, capture
+
+    console, started = Console(), time.perf_counter()
+    settings = Settings(arguments.size, arguments.mask, arguments.frames, arguments.order)
+    with ExitStack() as stack:
+        shown: dict[str, Bar] = {}
+
+        def progress(stage: str, done: int, total: int, text: str) -> None:
+            if stage not in shown:
+                stack.close()
+                shown[stage] = stack.enter_context(console.bar(stage))
+            shown[stage].show(done, total, text, important=done == 0)
+
+        captured = capture(arguments.photographs, arguments.out, settings, progress)
+    for note in captured.notes:
+        console.warn(f"{arguments.photographs}: {note}")
+    console.say(
+        f"poses: {captured.count} photographs, {captured.points:,} points, {captured.error:.2f} pixels mean error"
+    )
+    console.say(f"masks: {captured.mask}")
+    console.say(f"up: by {captured.up_from}")
+    console.say(f"{captured.folder}: a scene, in {format_duration(time.perf_counter() - started)}; for a turntable:")
+    console.say(
+        f"  hyperplanes render --checkpoint small --views {captured.folder} --all-views --orbit 48 "
+        f"--out {captured.folder}/turntable"
+    )
+    return 0

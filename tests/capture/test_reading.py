@@ -1,0 +1,95 @@
+"""Source of truth: pictures whose pixels are known before they were turned, scaled and saved."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hyperplanes.capture.photographs import find_photographs, list_photographs, read_upright
+from hyperplanes.utilities.files import DataError
+
+ORIENTATION, MODEL, EXIF, FOCAL_35 = 0x0112, 0x0110, 0x8769, 0xA405
+
+
+@pytest.fixture
+def upright():
+    """A picture of 40 x 24 pixels whose upper half is red and whose left half is bright."""
+    picture = np.zeros((24, 40, 3), np.uint8)
+    picture[:12, :, 0], picture[:, :20, 1] = 200, 100
+    return picture
+
+
+def save(picture, path, orientation=1, **tags):
+    """A photograph whose sensor was held so that EXIF's orientation shows it upright."""
+    turns = {1: 0, 8: 3, 3: 2, 6: 1}  # quarter turns counterclockwise from upright to stored
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    exif[MODEL] = tags.get("model", "phone")
+    if "focal" in tags:
+        exif.get_ifd(EXIF)[FOCAL_35] = tags["focal"]
+    Image.fromarray(np.rot90(picture, turns[orientation])).save(path, exif=exif)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_photographs_are_read_upright(upright, tmp_path, orientation):
+    for index in range(3):
+        save(upright, tmp_path / f"{index}.png", orientation)
+    (first, *_), notes = list_photographs(find_photographs(tmp_path))
+    picture, opaque = read_upright(first, 1000)
+    assert (first.size, first.turned, notes, opaque) == ((24, 40), False, [], False)
+    np.testing.assert_array_equal(picture[..., :3], upright)
+
+
+def test_the_rarer_shape_lies_on_its_side_and_knows_where_up_is(upright, tmp_path):
+    for index in range(3):
+        save(upright, tmp_path / f"{index}.png")
+    tall = np.ascontiguousarray(upright.transpose(1, 0, 2))
+    save(tall, tmp_path / "tall.png")
+    photographs, _ = list_photographs(find_photographs(tmp_path))
+    picture, _ = read_upright(photographs[3], 1000)
+    assert photographs[3].turned
+    assert photographs[3].stored_size == (24, 40)
+    x, y, _ = photographs[3].up_in_camera
+    towards = picture[12, 20] - picture[12 - round(11 * y) - 1, 20 + round(18 * x)].astype(int)
+    assert towards[1] < 0  # green is the upper half of the tall picture
+
+
+def test_numbers_in_names_count(upright, tmp_path):
+    for name in ("IMG_10.png", "IMG_9.png", "IMG_100.png"):
+        save(upright, tmp_path / name)
+    assert [path.stem for path in find_photographs(tmp_path)] == ["IMG_9", "IMG_10", "IMG_100"]
+
+
+def test_the_focal_length_comes_from_exif(upright, tmp_path):
+    for index in range(3):
+        save(upright, tmp_path / f"{index}.jpg", focal=27)
+    (first, *_), _ = list_photographs(find_photographs(tmp_path))
+    assert first.focal == pytest.approx(0.75)  # 27 mm before a film of 36 mm
+
+
+@pytest.mark.parametrize("drawn", ["as stored", "upright"])
+def test_masks_beside_turned_photographs_are_turned_with_them(upright, tmp_path, drawn):
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros((24, 40), np.uint8)
+    mask[:12] = 255
+    for index in range(3):
+        save(upright, tmp_path / f"{index}.png", 6)
+        Image.fromarray(np.rot90(mask) if drawn == "as stored" else mask).save(tmp_path / "masks" / f"{index}_mask.png")
+    (first, *_), _ = list_photographs(find_photographs(tmp_path), tmp_path / "masks")
+    picture, has_alpha = read_upright(first, 1000)
+    assert has_alpha
+    np.testing.assert_array_equal(picture[..., 3], mask)
+
+
+def test_too_few_photographs_are_refused(upright, tmp_path):
+    save(upright, tmp_path / "only.png")
+    with pytest.raises(DataError, match="at least 3 photographs .* found 1 photograph;"):
+        find_photographs(tmp_path)
+
+
+def test_a_broken_photograph_is_named_and_left_out(upright, tmp_path):
+    for index in range(3):
+        save(upright, tmp_path / f"{index}.png")
+    (tmp_path / "broken.jpg").write_bytes(b"no picture")
+    photographs, notes = list_photographs(find_photographs(tmp_path))
+    assert len(photographs) == 3
+    assert [note.startswith("left out: ") and "broken.jpg" in note for note in notes] == [True]

@@ -1,0 +1,27 @@
+"""Source of truth: what was begun, interrupted and finished."""
+
+from hyperplanes.capture.stages import Stages, fingerprint
+
+
+def test_a_finished_stage_is_not_done_again(tmp_path):
+    stages = Stages(tmp_path)
+    assert stages.begin("masks", "a") is None
+    (tmp_path / "masks" / "0.png").write_bytes(b"0")
+    stages.finish("masks", "a", {"count": 1})
+    assert Stages(tmp_path).begin("masks", "a") == {"count": 1}
+
+
+def test_an_interrupted_stage_keeps_its_files_and_another_one_does_not(tmp_path):
+    stages = Stages(tmp_path)
+    stages.begin("masks", "a")
+    (tmp_path / "masks" / "0.png").write_bytes(b"0")
+    assert stages.begin("masks", "a") is None
+    assert (tmp_path / "masks" / "0.png").exists()
+    assert stages.begin("masks", "b") is None
+    assert not (tmp_path / "masks" / "0.png").exists()
+    assert stages.key("masks") == "b"
+
+
+def test_a_fingerprint_tells_inputs_apart():
+    assert fingerprint("a", 1) == fingerprint("a", 1)
+    assert fingerprint("a", 1) != fingerprint("a", 2)
