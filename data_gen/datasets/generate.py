@@ -21,7 +21,7 @@ from hyperplanes.utilities.files import DataError, sha256
 
 __all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
 
-PICTURES = 3
+PICTURES = 4
 """Raised whenever the same arguments come to give other bytes, so that no data set is made half of each."""
 
 MOST_OBJECTS = 1_000_000

@@ -5,14 +5,16 @@ trimesh's `process=True` says nothing of what it leaves out or merges, and looks
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
+from scipy.spatial import KDTree
 from trimesh.visual import ColorVisuals, TextureVisuals
 
-from data_gen.meshes.materials import visual_of
+from data_gen.meshes.materials import LINEAR_COLOUR, select_vertices, visual_of
 
 __all__ = ["CREASE", "clean", "decimate", "is_smooth"]
 
@@ -20,10 +22,14 @@ CREASE = 40.0
 """Angle between two faces, in degrees, from which an edge counts as sharp where a file has no normals."""
 
 _MOSTLY = 0.1
+_COINCIDENT = 1e-4  # of the diagonal of its bounding box
+_HULL_FILLED = 0.7  # of the diagonal of a hull, what it is the outline of
 _MOST_FACES_TO_CLOSE = 500_000
 
 
-def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, list[str]]:
+def clean(
+    mesh: trimesh.Trimesh, label: str, parts: Sequence[trimesh.Trimesh] = ()
+) -> tuple[trimesh.Trimesh | None, list[str]]:
     """Leave out faces that cannot be drawn and vertices without faces, and make normals agree with faces.
 
     What changes no picture gives no warning unless it is so much that the file must be damaged: leaving out faces
@@ -31,9 +37,13 @@ def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, li
     earlier one, whichever way round, those are left out: what is left is seen from both sides, and the normals of two
     faces that are turned against each other would cancel.
 
+    A solid that is wound inside out is turned, unless it is meant: where it lies on another part, whose inner side it
+    is, and where it is the one-sided hull around others that cartoons draw their outlines with.
+
     Args:
         mesh: a mesh whose visual is canonical; it is not changed.
         label: what to call it in a warning.
+        parts: all parts of the object, in the same coordinates.
 
     Returns:
         The mesh, or None if no face is left; and warnings.
@@ -61,7 +71,7 @@ def clean(mesh: trimesh.Trimesh, label: str) -> tuple[trimesh.Trimesh | None, li
     if not len(kept):
         return None, warnings
     kept_faces = faces[kept]
-    if _inside_out(vertices, kept_faces):
+    if _inside_out(vertices, kept_faces) and not _meant_inwards(mesh, vertices[np.unique(kept_faces)], parts):
         warnings.append(f"{label}: wound inside out, its faces are turned")
         kept_faces = kept_faces[:, ::-1]
     used, corners = np.unique(kept_faces, return_inverse=True)
@@ -96,7 +106,6 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
         The parts with at most that many triangles, or None where textures or face colours forbid it.
     """
     import fast_simplification
-    from scipy.spatial import KDTree
 
     simple = [_is_simple(part) for part in parts]
     fixed = sum(len(part.faces) for part, free in zip(parts, simple, strict=True) if not free)
@@ -119,7 +128,7 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
             nearest = KDTree(np.asarray(part.vertices)).query(points)[1]
             visual = ColorVisuals(vertex_colors=np.asarray(visual.vertex_colors)[nearest])
         small = trimesh.Trimesh(points, faces, visual=visual, process=False)
-        small.metadata["smooth"] = is_smooth(part)
+        small.metadata |= {"smooth": is_smooth(part), "one_sided": bool(part.metadata.get("one_sided"))}
         result.append(small)
     return result if sum(len(part.faces) for part in result) <= max_faces else None
 
@@ -128,6 +137,8 @@ def _is_simple(mesh: trimesh.Trimesh) -> bool:
     if visual_of(mesh).kind == "face":
         return False
     material = getattr(mesh.visual, "material", None)
+    if LINEAR_COLOUR in getattr(mesh.visual, "vertex_attributes", {}):
+        return False
     return not any(
         getattr(material, slot, None) is not None for slot in ("baseColorTexture", "emissiveTexture", "normalTexture")
     )
@@ -193,14 +204,35 @@ def _part(
 ) -> trimesh.Trimesh:
     visual = visual_of(mesh)
     if isinstance(visual, TextureVisuals):
-        visual = TextureVisuals(uv=None if visual.uv is None else visual.uv[used], material=visual.material)
+        visual = select_vertices(visual, used)
     elif visual.kind == "face":
         visual = ColorVisuals(face_colors=np.asarray(visual.face_colors)[kept])
     else:
         visual = ColorVisuals(vertex_colors=np.asarray(visual.vertex_colors)[used])
     result = trimesh.Trimesh(mesh.vertices[used], faces, vertex_normals=normals, visual=visual, process=False)
-    result.metadata.update({key: mesh.metadata[key] for key in ("smooth",) if key in mesh.metadata})
+    result.metadata.update({key: mesh.metadata[key] for key in ("smooth", "one_sided") if key in mesh.metadata})
     return result
+
+
+def _meant_inwards(mesh: trimesh.Trimesh, points: npt.NDArray[Any], parts: Sequence[trimesh.Trimesh]) -> bool:
+    """Whether a solid wound inwards is the inner side of another part, or a one-sided hull around others."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = float(np.linalg.norm(high - low))
+    slack = _COINCIDENT * size
+    inside = []
+    for other in parts:
+        first, last = np.asarray(other.bounds)
+        if other is mesh or (last < low - slack).any() or (first > high + slack).any():
+            continue
+        vertices = np.asarray(other.vertices)
+        near = vertices[((vertices >= low - slack) & (vertices <= high + slack)).all(axis=1)]
+        if len(near) == len(vertices):
+            inside.append(near)
+        if len(near) and (KDTree(near).query(points)[0] <= slack).mean() > 0.5:
+            return True
+    if not inside or not mesh.metadata.get("one_sided"):
+        return False
+    return float(np.linalg.norm(np.ptp(np.concatenate(inside), axis=0))) > _HULL_FILLED * size
 
 
 def _inside_out(vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> bool:

@@ -14,6 +14,7 @@ import PIL.Image
 __all__ = [
     "IMAGE_FORMATS",
     "MAX_FILE_BYTES",
+    "MAX_PARTS",
     "MAX_PIXELS",
     "MAX_TEXT_BYTES",
     "MESH_SUFFIXES",
@@ -37,6 +38,9 @@ MAX_TEXT_BYTES = 1 << 28
 
 MAX_PIXELS = 1 << 26
 """Pixels of all textures of a model that are decoded at most: one of 8192 x 8192."""
+
+MAX_PARTS = 20_000
+"""Parts of a mesh at most: primitives times the nodes and instances that place them. A part takes about 2 ms."""
 
 IMAGE_FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "TGA", "WEBP", "PPM", "DDS", "JPEG2000")
 """Formats of textures that are decoded, as pillow names them; none of them runs a program."""

@@ -1,33 +1,40 @@
 """Colours, textures and materials of a mesh, brought into the few forms that every renderer draws alike.
 
 After `canonical_visual` a mesh has vertex colours, face colours, or a `PBRMaterial` whose base texture is RGB or
-RGBA and has coordinates. Textures, vertex and face colours are sRGB, the factors of materials LINEAR.
+RGBA and has coordinates. Textures, vertex and face colours are sRGB, the factors of materials LINEAR, and so are
+vertex colours that multiply a material.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 import PIL.Image
 import trimesh
 from trimesh.visual import ColorVisuals, TextureVisuals
-from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
+from trimesh.visual.material import Material, MultiMaterial, PBRMaterial, SimpleMaterial
 
 from data_gen.meshes.files import IMAGE_FORMATS
 from hyperplanes.utilities.colour import convert_8bit, linear_from_srgb, srgb_from_linear
 
 __all__ = [
     "DEFAULT_COLOUR",
+    "EMISSIVE_UV",
+    "LINEAR_COLOUR",
+    "VERTEX_COLOUR",
     "ColourSpace",
+    "DrawnMaterial",
     "LinearMaterial",
     "Visual",
+    "Wrap",
     "canonical_visual",
     "convert_image",
     "linear_factor",
     "pbr_of_mtl",
     "roughness_of_exponent",
+    "select_vertices",
     "texture_of",
     "visual_of",
 ]
@@ -38,13 +45,40 @@ ColourSpace = Literal["scene", "gltf", "srgb"]
 DEFAULT_COLOUR = (0.6, 0.6, 0.6, 1.0)
 """Linear RGBA of a surface without a colour: a light grey."""
 
+VERTEX_COLOUR, LINEAR_COLOUR, EMISSIVE_UV = "color", "linear_colour", "emissive_uv"
+"""Vertex attributes of a TextureVisuals: colours on top of its material, as the file has them and, in a canonical
+visual, as linear RGBA in [0, 1]; coordinates of its emissive texture where they are not those of the base colour."""
+
 _MAP_SLOTS = ("metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
 
 
 Visual = ColorVisuals | TextureVisuals
 
+Wrap = Literal["repeat", "clamp", "mirror"]
+"""How a texture goes on outside [0, 1]."""
 
-class LinearMaterial(PBRMaterial):
+
+class DrawnMaterial(PBRMaterial):
+    """A PBRMaterial with what glTF states and that class has no field for.
+
+    Attributes:
+        unlit: whether its base colour is seen as it is, whatever the light.
+        wrap: how its base colour texture goes on outside [0, 1], along u and along v.
+        emissive_wrap: the same of its emissive texture.
+    """
+
+    unlit: bool = False
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    emissive_wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+
+    def with_fields_of(self, other: Material) -> Self:
+        """Take the attributes above from another material, and return itself."""
+        if isinstance(other, DrawnMaterial):
+            self.unlit, self.wrap, self.emissive_wrap = other.unlit, other.wrap, other.emissive_wrap
+        return self
+
+
+class LinearMaterial(DrawnMaterial):
     """A PBRMaterial that also keeps its linear base colour in float.
 
     trimesh rounds it to 8 bits, whose steps are up to 13 of 255 apart in sRGB, where it is dark.
@@ -60,7 +94,7 @@ class LinearMaterial(PBRMaterial):
 
     def copy(self) -> LinearMaterial:
         """Another one with the same values; pictures are shared."""
-        return LinearMaterial(**{**self._data, "baseColorFactor": linear_factor(self)})
+        return LinearMaterial(**{**self._data, "baseColorFactor": linear_factor(self)}).with_fields_of(self)
 
 
 def linear_factor(material: PBRMaterial) -> npt.NDArray[np.float64] | None:
@@ -88,6 +122,14 @@ def texture_of(mesh: trimesh.Trimesh) -> TextureVisuals | None:
     """The texture of a mesh, if it has one."""
     visual = mesh.visual
     return visual if isinstance(visual, TextureVisuals) else None
+
+
+def select_vertices(visual: TextureVisuals, used: npt.NDArray[np.int64]) -> TextureVisuals:
+    """The same material with the coordinates and colours of some of its vertices."""
+    selected = TextureVisuals(material=visual.material)
+    for name, values in visual.vertex_attributes.items():
+        selected.vertex_attributes[name] = values[used]
+    return selected
 
 
 def canonical_visual(
@@ -142,21 +184,36 @@ def _textured(
     if coordinates is None:
         _drop_textures(data, label, warnings)
     vertex_colours = _material_vertex_colours(visual, len(mesh.vertices))
-    if vertex_colours is not None and data.get("baseColorTexture") is None:
+    own = material if isinstance(material, DrawnMaterial) else DrawnMaterial()
+    multiplies = data.get("baseColorTexture") is not None or own.unlit or _glows(data)
+    if vertex_colours is not None and not multiplies:
         tint = np.append(srgb_from_linear(data["baseColorFactor"][:3]), data["baseColorFactor"][3])
         if colours == "gltf":
             vertex_colours = convert_8bit(vertex_colours, srgb_from_linear)
         if data["alphaMode"] == "OPAQUE":
             vertex_colours[:, 3], tint[3] = 255, 1.0
         return _coloured((vertex_colours * tint).round(), "vertex", label, "scene")
-    if vertex_colours is not None and (vertex_colours[:, :3] < 255).any():
-        warnings.append(f"{label}: vertex colours left out, its texture counts")
     data = {key: value for key, value in data.items() if value is not None}
     if data["alphaMode"] == "OPAQUE":
         data["baseColorFactor"][3] = 1.0
         if "baseColorTexture" in data:
             data["baseColorTexture"] = _converted(data["baseColorTexture"], "RGB", images)
-    return TextureVisuals(uv=coordinates, material=LinearMaterial(**data)), warnings, _visible(data)
+    result = TextureVisuals(uv=coordinates, material=LinearMaterial(**data).with_fields_of(material))
+    if vertex_colours is not None and (vertex_colours < 255).any():
+        linear = vertex_colours / 255.0
+        if colours != "gltf":
+            linear[:, :3] = linear_from_srgb(linear[:, :3])
+        if data["alphaMode"] == "OPAQUE":
+            linear[:, 3] = 1.0
+        result.vertex_attributes[LINEAR_COLOUR] = linear
+    uv = np.asarray(visual.vertex_attributes.get(EMISSIVE_UV, ()), dtype=np.float64)
+    if "emissiveTexture" in data and uv.shape == (len(mesh.vertices), 2):
+        result.vertex_attributes[EMISSIVE_UV] = np.where(np.isfinite(uv), uv, 0.0)
+    return result, warnings, _visible(data)
+
+
+def _glows(data: dict[str, Any]) -> bool:
+    return data["emissiveFactor"] is not None and bool(data["emissiveFactor"].any())
 
 
 def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> None:

@@ -168,7 +168,7 @@ def prepare_scene(
         key = f"part_{number:04d}"
         smooth = is_smooth(part)
         moved = _transformed(part, world_from_file)
-        moved.metadata = {"smooth": smooth, "closed": closed}
+        moved.metadata = {"smooth": smooth, "closed": closed, "one_sided": bool(part.metadata.get("one_sided"))}
         ready.add_geometry(moved, geom_name=key, node_name=key)
     return Mesh(
         name=name,
@@ -210,7 +210,7 @@ def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:
 
 def _clean_parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], source: str) -> list[trimesh.Trimesh]:
     """Clean meshes in the file's axes, one a node that can be seen."""
-    parts = []
+    placed: list[tuple[str, trimesh.Trimesh]] = []
     images: dict[Any, Any] = {}
     for node in scene.graph.nodes_geometry:
         transform, key = scene.graph[node]
@@ -229,8 +229,12 @@ def _clean_parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], s
         if not visible:
             found.append(f"{key}: fully transparent, left out")
             continue
+        placed.append((str(key), _transformed(geometry, transform, visual)))
+    parts = []
+    meshes = [mesh for _, mesh in placed]
+    for label, mesh in placed:
         try:
-            part, lines = clean(_transformed(geometry, transform, visual), str(key))
+            part, lines = clean(mesh, label, meshes)
         except ValueError as error:
             raise MeshError(f"{source}: {error}; the file is damaged") from error
         found += lines
@@ -250,7 +254,7 @@ def _transformed(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visu
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         keywords["vertex_normals"] = normals / np.where(length > 0, length, 1.0)
     result = trimesh.Trimesh(vertices, faces, visual=visual or mesh.visual, process=False, **keywords)
-    result.metadata.update({key: mesh.metadata[key] for key in ("smooth",) if key in mesh.metadata})
+    result.metadata.update({key: mesh.metadata[key] for key in ("smooth", "one_sided") if key in mesh.metadata})
     return result
 
 

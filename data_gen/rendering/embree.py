@@ -14,13 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from data_gen.meshes.materials import Wrap
 from data_gen.rendering.lighting import Lighting
 from data_gen.rendering.ray_casting import Hits, RayCaster, pixel_rays
 from data_gen.rendering.shading import facing, shade
 from data_gen.rendering.surfaces import COINCIDENT, ShadedSurface
 from data_gen.rendering.textures import MipmappedTexture
 from data_gen.rigs import Rig
-from hyperplanes.utilities.colour import linear_from_srgb
+from hyperplanes.utilities.colour import linear_from_srgb, srgb_from_linear
 
 __all__ = ["EmbreeRenderer", "Geometry", "cast_geometry"]
 
@@ -113,10 +114,11 @@ class _Scene:
     def __init__(self, surfaces: Sequence[ShadedSurface]) -> None:
         self.surfaces = surfaces
         self.ray_caster = RayCaster(surfaces)
-        self._textures: dict[int, MipmappedTexture] = {}
+        self._textures: dict[tuple[int, tuple[Wrap, Wrap]], MipmappedTexture] = {}
         self._vertices = np.concatenate([surface.positions for surface in surfaces])
         self._roughness = np.array([[surface.roughness] for surface in surfaces])
         self._metallic = np.array([[surface.metallic] for surface in surfaces])
+        self._unlit = np.array([surface.unlit for surface in surfaces])
         self._emits = any(surface.emissive.any() for surface in surfaces)
 
     def extent(self, pose: Floats, intrinsics: Floats, rig: Rig) -> tuple[int, int, int, int]:
@@ -155,6 +157,8 @@ class _Scene:
                 lighting,
                 directions,
             )
+            unlit = np.flatnonzero(self._unlit[owner])
+            shaded[unlit] = srgb_from_linear(np.clip(base[unlit, :3], 0.0, 1.0))
             alpha = base[:, 3:]
             colours[seen] += transmittance[seen, None] * alpha * np.concatenate((shaded, np.ones_like(alpha)), axis=1)
             transmittance[seen] *= 1.0 - alpha[:, 0]
@@ -176,7 +180,8 @@ class _Scene:
             if surface.colours is not None:
                 colour *= _interpolate(surface.colours, surface.faces[number], hits.corners[selected])
             if surface.texture is not None:
-                texel = self._texel(surface, surface.texture, hits, selected, number, spread)
+                texture = self._texture(surface.texture, surface.wrap)
+                texel = self._texel(surface.uv, surface, texture, hits, selected, number, spread)
                 colour[:, :3] *= linear_from_srgb(np.minimum(texel[:, :3] / np.maximum(texel[:, 3:], 1e-4), 1.0))
                 colour[:, 3] *= texel[:, 3]
             if surface.cutoff is not None:
@@ -193,7 +198,9 @@ class _Scene:
             for surface, number, selected in self._by_surface(hits):
                 light[selected] = surface.emissive
                 if surface.emissive_texture is not None:
-                    texel = self._texel(surface, surface.emissive_texture, hits, selected, number, spread)
+                    texture = self._texture(surface.emissive_texture, surface.emissive_wrap)
+                    uv = surface.uv if surface.emissive_uv is None else surface.emissive_uv
+                    texel = self._texel(uv, surface, texture, hits, selected, number, spread)
                     light[selected] *= linear_from_srgb(texel[:, :3])
         return light
 
@@ -212,16 +219,16 @@ class _Scene:
 
     def _texel(
         self,
+        coordinates: Floats | None,
         surface: ShadedSurface,
-        texels: npt.NDArray[np.uint8],
+        texture: MipmappedTexture,
         hits: Hits,
         selected: npt.NDArray[np.int64],
         number: npt.NDArray[np.int64],
         spread: tuple[Floats, Floats] | None,
     ) -> Floats:
-        assert surface.uv is not None
-        texture = self._texture(texels)
-        corners = surface.uv[surface.faces[number]]
+        assert coordinates is not None
+        corners = coordinates[surface.faces[number]]
         uv = np.einsum("hc,hcx->hx", hits.corners[selected], corners)
         level = np.zeros(len(selected))
         if spread is not None:
@@ -240,10 +247,11 @@ class _Scene:
             level = np.log2(np.maximum(np.maximum(*lengths), 1e-12))
         return texture.sample(uv, level).astype(np.float64)
 
-    def _texture(self, texels: npt.NDArray[np.uint8]) -> MipmappedTexture:
-        if id(texels) not in self._textures:
-            self._textures[id(texels)] = MipmappedTexture(texels)
-        return self._textures[id(texels)]
+    def _texture(self, texels: npt.NDArray[np.uint8], wrap: tuple[Wrap, Wrap]) -> MipmappedTexture:
+        key = (id(texels), wrap)
+        if key not in self._textures:
+            self._textures[key] = MipmappedTexture(texels, wrap)
+        return self._textures[key]
 
 
 def _unpremultiplied(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:

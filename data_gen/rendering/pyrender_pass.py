@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from OpenGL import GL
-from pyrender import Mesh, MetallicRoughnessMaterial, Node, Primitive, Renderer, RenderFlags, Scene, Texture
+from pyrender import Mesh, MetallicRoughnessMaterial, Node, Primitive, Renderer, RenderFlags, Sampler, Scene, Texture
 
+from data_gen.meshes.materials import Wrap
 from data_gen.rendering.framebuffers import SampleFramebuffers
 from data_gen.rendering.lighting import Lighting
 from data_gen.rendering.shader_program import (
@@ -30,6 +31,8 @@ from data_gen.rendering.surfaces import COINCIDENT, ShadedSurface
 __all__ = ["Drawable", "SurfaceRenderer"]
 
 Floats = npt.NDArray[np.float64]
+_TextureKey = tuple[int, tuple[Wrap, Wrap]]
+_WRAPS = {"repeat": GL.GL_REPEAT, "clamp": GL.GL_CLAMP_TO_EDGE, "mirror": GL.GL_MIRRORED_REPEAT}
 
 _OUTER, _INNER = 1.0, -1.0
 # Drawn with flipped rows, so that glReadPixels, which starts at the bottom, returns the first row on top; the flip
@@ -46,23 +49,25 @@ class Drawable:
 
     Args:
         surface: what to draw.
-        textures: pyrender textures made so far, by the identity of their texels, so that surfaces share them.
+        textures: pyrender textures made so far, by the identity of their texels and how they go on, so that surfaces
+            share them.
 
     Attributes:
         defines: what its program needs to be compiled with.
         constants: what of its material may be compiled in.
     """
 
-    def __init__(self, surface: ShadedSurface, textures: dict[int, Texture]) -> None:
+    def __init__(self, surface: ShadedSurface, textures: dict[_TextureKey, Texture]) -> None:
         self.surface = surface
-        self.base_texture = _texture(surface.texture, textures)
-        self.emissive_texture = _texture(surface.emissive_texture, textures)
+        self.base_texture = _texture(surface.texture, surface.wrap, textures)
+        self.emissive_texture = _texture(surface.emissive_texture, surface.emissive_wrap, textures)
         # pyrender uploads the textures of a primitive's material; nothing else of the material is used.
         material = MetallicRoughnessMaterial(baseColorTexture=self.base_texture, emissiveTexture=self.emissive_texture)
         self.primitive = Primitive(
             positions=surface.positions,
             normals=surface.normals,
             texcoord_0=surface.uv,
+            texcoord_1=surface.emissive_uv,
             color_0=surface.colours,
             indices=surface.faces,
             material=material,
@@ -70,12 +75,15 @@ class Drawable:
         self.defines: dict[str, int] = {}
         if surface.uv is not None:
             self.defines["UV"] = 2
+        if surface.emissive_uv is not None:
+            self.defines["EMISSIVE_UV"] = 2 + len(self.defines)
         if surface.colours is not None:
             self.defines["COLOUR"] = 2 + len(self.defines)
         needs = {
             "TEXTURE": self.base_texture is not None,
             "EMISSIVE_TEXTURE": self.emissive_texture is not None,
             "TRANSLUCENT": not surface.opaque or surface.cutoff is not None,
+            "UNLIT": surface.unlit,
             "ALIGNED": _aligned(surface),
         }
         self.constants = constants_of_surface(surface)
@@ -95,7 +103,7 @@ class SurfaceRenderer(Renderer):
         Returns:
             What `draw` takes: what is solid first, by the program that draws it.
         """
-        textures: dict[int, Texture] = {}
+        textures: dict[_TextureKey, Texture] = {}
         drawables = [Drawable(surface, textures) for surface in surfaces]
         scene = Scene()
         if drawables:
@@ -146,6 +154,12 @@ class SurfaceRenderer(Renderer):
                 bound = self._draw_side(drawable, bound, view, OPAQUE_TEXELS, side)
             GL.glEnable(GL.GL_POLYGON_OFFSET_FILL)
         GL.glDisable(GL.GL_POLYGON_OFFSET_FILL)
+        # Inner sides of what is one-sided fill what would be holes, behind all else: no object reaches this far.
+        GL.glDepthRange(1.0 - 2.0**-13, 1.0)
+        for drawable in drawables:
+            if drawable.surface.culled and drawable.surface.opaque:
+                bound = self._draw_side(drawable, bound, view, OPAQUE_TEXELS, _INNER, culled=True)
+        GL.glDepthRange(0.0, 1.0)
         translucent = [drawable for drawable in drawables if not drawable.surface.opaque]
         if translucent:
             translucent.sort(key=lambda drawable: -float(np.linalg.norm(drawable.centre - camera)))
@@ -192,10 +206,18 @@ class SurfaceRenderer(Renderer):
         return program
 
     def _draw_side(
-        self, drawable: Drawable, bound: ShaderProgram | None, view: Any, layer: int, side: float
+        self,
+        drawable: Drawable,
+        bound: ShaderProgram | None,
+        view: Any,
+        layer: int,
+        side: float,
+        *,
+        culled: bool = False,
     ) -> ShaderProgram | None:
-        """Draw the faces that can be seen from a side, and return the program that is then bound."""
-        count = len(drawable.surface.faces) if side == _OUTER else drawable.surface.two_sided
+        """Draw the faces seen from a side, or the culled ones, and return the program that is then bound."""
+        every = side == _OUTER or culled
+        count = len(drawable.surface.faces) if every else drawable.surface.two_sided
         if count == 0:
             return bound
         program = self._bind(drawable, bound, view)
@@ -223,8 +245,14 @@ def _aligned(surface: ShadedSurface) -> bool:
     return bool((agreement[facets.any(axis=1)] > 0.0).all())
 
 
-def _texture(texels: npt.NDArray[np.uint8] | None, textures: dict[int, Texture]) -> Texture | None:
+def _texture(
+    texels: npt.NDArray[np.uint8] | None, wrap: tuple[Wrap, Wrap], textures: dict[_TextureKey, Texture]
+) -> Texture | None:
     if texels is None:
         return None
-    # Always four channels: OpenGL expects rows of a multiple of four bytes.
-    return textures.setdefault(id(texels), Texture(source=texels, source_channels="RGBA"))
+    key = (id(texels), wrap)
+    if key not in textures:
+        sampler = Sampler(wrapS=_WRAPS[wrap[0]], wrapT=_WRAPS[wrap[1]])
+        # Always four channels: OpenGL expects rows of a multiple of four bytes.
+        textures[key] = Texture(source=texels, source_channels="RGBA", sampler=sampler)
+    return textures[key]

@@ -2,7 +2,7 @@
 
 Embree works in single precision. It only decides which face a ray meets first; where on the face is computed from the
 face's plane in double precision, so points are exact however far the camera is. Where an inner and an outer side lie
-in the same place, the outer one is met.
+in the same place, the outer one is met; an inner side of a culled surface is met where nothing else is.
 """
 
 from __future__ import annotations
@@ -65,7 +65,14 @@ class RayCaster:
         gradients = np.stack((np.cross(edges[1], self.facets), np.cross(self.facets, edges[0])), axis=1)
         self.gradients = np.divide(gradients, area[..., None], out=np.zeros_like(gradients), where=area[..., None] > 0)
         self._triangles = np.ascontiguousarray(triangles, dtype=np.float32)
+        self._culled = np.concatenate(
+            [np.full(count, surface.culled) for surface, count in zip(surfaces, counts, strict=True)]
+        )
+        self._fills = np.concatenate(
+            [np.full(count, surface.opaque) for surface, count in zip(surfaces, counts, strict=True)]
+        )
         self._all = _EmbreeFaces(self._triangles)
+        self._met: tuple[bytes, _EmbreeFaces, Indices] | None = None
         self._outer: tuple[bytes, _EmbreeFaces, Indices] | None = None
 
     def cast(self, origin: Floats, directions: Floats, after: Floats | None = None) -> Hits:
@@ -80,7 +87,7 @@ class RayCaster:
             The hits, in the order of the rays; rays that meet nothing have none.
         """
         starts = np.broadcast_to(origin, directions.shape) if after is None else origin + after[:, None] * directions
-        faces = self._all.first(starts, directions)
+        faces = self._first(origin, starts, directions)
         rays = np.flatnonzero(faces >= 0)
         faces = faces[rays]
         faces, distances = self._outer_where_coincident(origin, starts[rays], directions[rays], faces)
@@ -92,6 +99,26 @@ class RayCaster:
         corners = np.clip(np.concatenate((1.0 - corners.sum(axis=1, keepdims=True), corners), axis=1), 0.0, 1.0)
         return Hits(rays, faces, distances, points, corners)
 
+    def _first(self, origin: Floats, starts: Floats, directions: Floats) -> Indices:
+        """The first face (ray,) on each ray, the culled ones after all others; -1 where there is none."""
+        if not self._culled.any():
+            return self._all.first(starts, directions)
+        if self._met is None or self._met[0] != origin.tobytes():  # all rays of a view have one origin
+            numbers = np.flatnonzero(~self._culled | (self._towards(origin) > 0.0))
+            self._met = origin.tobytes(), _EmbreeFaces(self._triangles[numbers]), numbers
+        _, scene, numbers = self._met
+        found = scene.first(starts, directions)
+        faces = np.full(len(found), -1, dtype=np.int64)
+        faces[found >= 0] = numbers[found[found >= 0]]
+        missed = np.flatnonzero(found < 0)
+        behind = self._all.first(starts[missed], directions[missed])
+        faces[missed] = np.where(self._fills[behind], behind, -1)
+        return faces
+
+    def _towards(self, origin: Floats) -> Floats:
+        """Positive for the faces (face,) whose outer side is seen from a point."""
+        return np.einsum("fi,fi->f", self.facets, origin - self._start)
+
     def _outer_where_coincident(
         self, origin: Floats, starts: Floats, directions: Floats, faces: Indices
     ) -> tuple[Indices, Floats]:
@@ -101,12 +128,9 @@ class RayCaster:
         if len(inner) == 0:
             return faces, distances
         if self._outer is None or self._outer[0] != origin.tobytes():  # all rays of a view have one origin
-            towards = np.einsum("fi,fi->f", self.facets, origin - self._start)
-            numbers = np.flatnonzero(towards > 0.0)
+            numbers = np.flatnonzero(self._towards(origin) > 0.0)
             self._outer = origin.tobytes(), _EmbreeFaces(self._triangles[numbers]), numbers
         _, scene, numbers = self._outer
-        if len(numbers) == 0:
-            return faces, distances
         found = scene.first(starts[inner], directions[inner])
         inner, found = inner[found >= 0], numbers[found[found >= 0]]
         beyond = self._distances(origin, directions[inner], found)
@@ -130,10 +154,12 @@ class _EmbreeFaces:
         from embreex.rtcore_scene import EmbreeScene
 
         self._scene = EmbreeScene(robust=True)
-        self._mesh = TriangleMesh(self._scene, triangles)
+        self._mesh = TriangleMesh(self._scene, triangles) if len(triangles) else None
 
     def first(self, starts: Floats, directions: Floats) -> Indices:
         """The first face (ray,) on each ray, -1 where there is none."""
+        if self._mesh is None:
+            return np.full(len(directions), -1, dtype=np.int64)
         found = self._scene.run(
             np.ascontiguousarray(starts, dtype=np.float32), np.ascontiguousarray(directions, dtype=np.float32)
         )

@@ -43,6 +43,10 @@ layout(location = 1) in vec3 normal;
 layout(location = UV) in vec2 uv;
 out vec2 point_uv;
 #endif
+#ifdef EMISSIVE_UV
+layout(location = EMISSIVE_UV) in vec2 emissive_uv;
+out vec2 point_emissive_uv;
+#endif
 #ifdef COLOUR
 layout(location = COLOUR) in vec4 colour;
 out vec4 point_colour;
@@ -58,6 +62,9 @@ void main() {
 #ifdef UV
     point_uv = uv;
 #endif
+#ifdef EMISSIVE_UV
+    point_emissive_uv = emissive_uv;
+#endif
 #ifdef COLOUR
     point_colour = colour;
 #endif
@@ -69,6 +76,9 @@ in vec3 point;
 in vec3 point_normal;
 #ifdef UV
 in vec2 point_uv;
+#endif
+#ifdef EMISSIVE_UV
+in vec2 point_emissive_uv;
 #endif
 #ifdef COLOUR
 in vec4 point_colour;
@@ -105,7 +115,11 @@ void main() {
 #endif
     vec3 emission = emissive;
 #ifdef EMISSIVE_TEXTURE
+#ifdef EMISSIVE_UV
+    emission *= linear(texture(emissive_texture, point_emissive_uv).rgb);
+#else
     emission *= linear(texture(emissive_texture, point_uv).rgb);
+#endif
 #endif
 #ifdef TRANSLUCENT
     float alpha = base.a;
@@ -113,6 +127,9 @@ void main() {
     if ((layer == TRANSLUCENT_TEXELS) == (alpha >= 0.999) || alpha < 0.001) discard;
 #endif
 
+#ifdef UNLIT
+    pixel = vec4(encoded(clamp(base.rgb, 0.0, 1.0)), 1.0);
+#else
     vec3 towards = camera - point;
     towards *= inversesqrt(dot(towards, towards));
 #ifdef ALIGNED
@@ -148,6 +165,7 @@ void main() {
     vec3 over = max(light - SHOULDER, 0.0);
     light = min(light, SHOULDER) + (1.0 - SHOULDER) * (1.0 - exp(over * (-1.0 / (1.0 - SHOULDER))));
     pixel = vec4(encoded(clamp(light + emission, 0.0, 1.0)), 1.0);
+#endif
 #ifdef TRANSLUCENT
     pixel = vec4(pixel.rgb * alpha, alpha);
 #endif
@@ -181,7 +199,7 @@ def constants_of_surface(surface: ShadedSurface) -> dict[str, str]:
         constants["metallic"] = "0.0"
     if surface.roughness in _COMMON_ROUGHNESS:
         constants |= {name: f"{value:.9g}" for name, value in _roughness_constants(surface.roughness).items()}
-    if surface.two_sided == 0:
+    if surface.two_sided == 0 and not surface.culled:
         constants["side"] = "1.0"
     return constants
 
@@ -224,8 +242,8 @@ class ShaderProgram:
     """The shaders for surfaces that need the same, and where their uniforms are.
 
     Args:
-        defines: what the surfaces need: UV and COLOUR with the number of their vertex attribute, TEXTURE,
-            EMISSIVE_TEXTURE, TRANSLUCENT and ALIGNED, and LIGHTS, how many there are.
+        defines: what the surfaces need: UV, EMISSIVE_UV and COLOUR with the number of their vertex attribute,
+            TEXTURE, EMISSIVE_TEXTURE, TRANSLUCENT, UNLIT and ALIGNED, and LIGHTS, how many there are.
         constants: GLSL of what would else be uniforms.
 
     Attributes:

@@ -22,7 +22,16 @@ from PIL import Image
 from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from data_gen.meshes.materials import linear_factor, pbr_of_mtl, texture_of, visual_of
+from data_gen.meshes.materials import (
+    EMISSIVE_UV,
+    LINEAR_COLOUR,
+    DrawnMaterial,
+    Wrap,
+    linear_factor,
+    pbr_of_mtl,
+    texture_of,
+    visual_of,
+)
 from hyperplanes.utilities.colour import linear_from_srgb
 
 __all__ = [
@@ -68,19 +77,25 @@ class ShadedSurface:
         positions: vertices `(vertex, 3)`.
         faces: vertex indices `(face, 3)`.
         normals: unit vertex normals `(vertex, 3)`; zero where there is none, which stands for the face's own.
-        uv: texture coordinates `(vertex, 2)`, v upwards, repeating outside [0, 1]; None without textures.
+        uv: texture coordinates `(vertex, 2)`, v upwards; None without textures.
         colours: linear RGBA `(vertex, 4)` that multiplies the base colour, or None.
         base_colour: linear RGBA `(4,)`.
         texture: base colour texture uint8 `(height, width, 4)`, sRGB, first row on top, PREMULTIPLIED so that
             filtering does not mix in what is transparent; None without.
         emissive: linear RGB `(3,)` that is added to the reflected light.
         emissive_texture: like texture, multiplies emissive.
+        emissive_uv: its coordinates where they are not `uv`; else None.
+        wrap: how the texture goes on outside [0, 1], along u and along v.
+        emissive_wrap: the same of emissive_texture.
         roughness: in [MIN_ROUGHNESS, 1].
         metallic: in [0, MAX_METALLIC].
         cutoff: alpha below this is transparent, from it on opaque (glTF MASK); None for alpha that blends.
         opaque: whether all of it hides what is behind.
+        unlit: whether the base colour is seen as it is, whatever the light.
         two_sided: how many of its faces, the first ones, may be seen from both sides. Of the others only the outer side
             is: none of a closed solid, and none of a face that another one, turned the other way, lies on.
+        culled: whether the inner sides of its faces hide nothing, as those of glTF's one-sided materials: they are
+            drawn where a ray meets nothing else. Left out altogether they would leave holes in masks.
     """
 
     positions: Floats
@@ -92,11 +107,16 @@ class ShadedSurface:
     texture: npt.NDArray[np.uint8] | None
     emissive: Floats
     emissive_texture: npt.NDArray[np.uint8] | None
+    emissive_uv: Floats | None
+    wrap: tuple[Wrap, Wrap]
+    emissive_wrap: tuple[Wrap, Wrap]
     roughness: float
     metallic: float
     cutoff: float | None
     opaque: bool
+    unlit: bool
     two_sided: int
+    culled: bool = False
 
 
 def shaded_surfaces(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: str = "object") -> list[ShadedSurface]:
@@ -105,7 +125,7 @@ def shaded_surfaces(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: st
     Args:
         parts: meshes, their poses `world_from_mesh` `(4, 4)` (any affine map, mirroring included) and whether each
             is shaded smoothly. Face colours are drawn flat in any case. A mesh whose `metadata["closed"]` is true
-            is taken for closed.
+            is taken for closed; the inner sides of one whose `metadata["one_sided"]` is true hide nothing.
         name: what to call the object in errors.
 
     Returns:
@@ -180,33 +200,41 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
     visual, texture = visual_of(mesh), texture_of(mesh)
     kind = visual.kind if visual.defined else None
     material = _material(None if texture is None else texture.material, images, where)
-    uv = _texture_coordinates(mesh, material, where)
+    uv, emissive_uv = _texture_coordinates(mesh, material, where)
     colours = None
     if isinstance(visual, ColorVisuals) and kind == "vertex":
         colours = _linear_colours(visual.vertex_colors)
+    elif texture is not None and LINEAR_COLOUR in texture.vertex_attributes:
+        colours = np.asarray(texture.vertex_attributes[LINEAR_COLOUR], dtype=np.float64)
     if smooth and kind != "face":
         normals = _unit(np.asarray(mesh.vertex_normals, dtype=np.float64) @ np.linalg.pinv(matrix[:3, :3]))
     else:
         corners = faces.reshape(-1)
         positions = positions[corners]
         uv = None if uv is None else uv[corners]
+        emissive_uv = None if emissive_uv is None else emissive_uv[corners]
         colours = None if colours is None else colours[corners]
         if isinstance(visual, ColorVisuals) and kind == "face":
             colours = np.repeat(_linear_colours(visual.face_colors), 3, axis=0)
         faces = np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
         edges = positions[1::3] - positions[0::3], positions[2::3] - positions[0::3]
         normals = np.repeat(_unit(np.cross(*edges)), 3, axis=0)
-    if colours is not None:
+    if colours is not None and texture is None:
         material["base_colour"] = np.ones(4)
         material["opaque"] = bool((colours[:, 3] >= 1.0).all())
+    elif colours is not None:
+        material["opaque"] &= bool((colours[:, 3] >= 1.0).all()) or material["cutoff"] is not None
     closed = bool(mesh.metadata.get("closed")) and material["opaque"] and material["cutoff"] is None
+    culled = bool(mesh.metadata.get("one_sided")) and not closed
     return ShadedSurface(
         positions=positions,
         faces=faces,
         normals=normals,
         uv=uv,
+        emissive_uv=emissive_uv,
         colours=colours,
-        two_sided=0 if closed else len(faces),
+        two_sided=0 if closed or culled else len(faces),
+        culled=culled,
         **material,
     )
 
@@ -223,9 +251,12 @@ def _linear_colours(colours: Any) -> Floats:
     return np.concatenate((linear_from_srgb(rgba[:, :3]), rgba[:, 3:4]), axis=1)
 
 
-def _texture_coordinates(mesh: trimesh.Trimesh, material: dict[str, Any], where: str) -> Floats | None:
+def _texture_coordinates(
+    mesh: trimesh.Trimesh, material: dict[str, Any], where: str
+) -> tuple[Floats | None, Floats | None]:
+    """Coordinates of the base colour texture, and those of the emissive texture where they are others."""
     if material["texture"] is None and material["emissive_texture"] is None:
-        return None
+        return None, None
     texture = texture_of(mesh)
     given = None if texture is None else texture.uv
     if given is None or len(given) != len(mesh.vertices):
@@ -234,7 +265,10 @@ def _texture_coordinates(mesh: trimesh.Trimesh, material: dict[str, Any], where:
             f"{where}: expected texture coordinates for its {len(mesh.vertices)} textured vertices, received {found}"
         )
     uv = np.asarray(given, dtype=np.float64)[:, :2]
-    return np.where(np.isfinite(uv), uv, 0.0)
+    other = None if texture is None else texture.vertex_attributes.get(EMISSIVE_UV)
+    if material["emissive_texture"] is None or other is None:
+        return np.where(np.isfinite(uv), uv, 0.0), None
+    return np.where(np.isfinite(uv), uv, 0.0), np.asarray(other, dtype=np.float64)
 
 
 def _material(material: Any, images: dict[Any, Any], where: str) -> dict[str, Any]:
@@ -257,6 +291,7 @@ def _material(material: Any, images: dict[Any, Any], where: str) -> dict[str, An
         mean = np.asarray(fine.convert("RGB"), dtype=np.float64).mean(axis=(0, 1)) / 255.0
         roughness = mean[1] * (1.0 if roughness is None else roughness)
         metallic = mean[2] * (1.0 if metallic is None else metallic)
+    drawn = material if isinstance(material, DrawnMaterial) else DrawnMaterial()
     cutoff = None
     if material.alphaMode == "MASK":
         cutoff = 0.5 if material.alphaCutoff is None else float(material.alphaCutoff)
@@ -265,6 +300,9 @@ def _material(material: Any, images: dict[Any, Any], where: str) -> dict[str, An
         "texture": texture,
         "emissive": np.asarray(material.emissiveFactor, dtype=np.float64)[:3] if glows else np.zeros(3),
         "emissive_texture": _texels(material.emissiveTexture, images, keep_alpha=False) if glows else None,
+        "wrap": drawn.wrap,
+        "emissive_wrap": drawn.emissive_wrap,
+        "unlit": drawn.unlit,
         "roughness": DEFAULT_ROUGHNESS if roughness is None else float(np.clip(roughness, MIN_ROUGHNESS, 1.0)),
         "metallic": 0.0 if metallic is None else float(np.clip(metallic, 0.0, MAX_METALLIC)),
         "cutoff": cutoff,

