@@ -16,6 +16,7 @@ from data_gen.datasets.layouts import LAYOUTS
 from data_gen.datasets.manifest import GenerationState, build_manifest
 from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
+from data_gen.meshes.files import MESH_SUFFIXES
 from data_gen.rigs import OBJECT_RADIUS
 from hyperplanes.utilities.files import DataError, sha256
 
@@ -67,7 +68,8 @@ def generate(
     """Render objects into a data set.
 
     The same arguments give the same bytes, however often the work was interrupted, on any number of workers. An
-    object that cannot be drawn, or whose worker crashes or hangs twice, is skipped and listed; the rest goes on.
+    object that cannot be drawn, takes too long, or whose worker crashes twice, is skipped and listed, as are meshes of
+    formats that are not read; the rest goes on.
 
     Args:
         source: procedural objects or mesh files.
@@ -116,6 +118,7 @@ def generate(
         if not kept:
             name, reason = skipped[0]
             raise ValueError(f"{out}: none of {len(items)} objects could be drawn; {name}: {reason}")
+        skipped += _unread(source)
         manifest = build_manifest(state.configuration, items, done.values(), skipped, _facts(render, classes))
         state.finish(manifest, LAYOUTS[render.layout].splits(kept))
     seconds = time.monotonic() - begun
@@ -144,13 +147,26 @@ def _configuration(
     return render.as_json() | {"generator": generator, "source": described, "held_out": held_out}
 
 
+def _unread(source: Source) -> list[tuple[str, str]]:
+    """Names and reasons of meshes that lie beside the others in a format that is not read."""
+    if isinstance(source, Procedural):
+        return []
+    from data_gen.meshes.find import find_unreadable
+
+    readable = ", ".join(MESH_SUFFIXES)
+    return [
+        (path.as_posix(), f"expected one of {readable}, found {path.suffix}; convert it")
+        for path in find_unreadable(source.path)
+    ]
+
+
 def _without_path(reason: str, source: Source) -> str:
     """A reason in which mesh files are named from their folder on, so that no path of this machine is written."""
     if isinstance(source, Procedural):
         return reason
     folder = Path(source.path)
     for written in (folder, folder.resolve()):
-        reason = reason.replace(f"{written}/", "")
+        reason = reason.removeprefix(f"{written}/")
     return reason
 
 

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from data_gen.datasets.worker_process import process_item
-from data_gen.datasets.workers import START_SECONDS, Outcome, WorkerLost, run_workers, worker_environment
+from data_gen.datasets.workers import START_SECONDS, Outcome, WorkerLost, WorkerTimeout, run_workers, worker_environment
 
 __all__ = ["run_on_ray"]
 
@@ -85,7 +85,7 @@ class _RayWorker:
         try:
             reply = self._ray.get(self._actor.answer.remote(item), timeout=self._timeout + self._left_to_start)
         except errors.GetTimeoutError as error:
-            raise WorkerLost(f"no answer within {self._timeout:g} s") from error
+            raise WorkerTimeout(f"expected to be done within {self._timeout:g} s, found no answer") from error
         except errors.ActorDiedError as error:
             if "creation task" in str(error) and "Error" in str(error):  # it could not start, so no item can be done
                 cause = getattr(error, "cause", None) or getattr(error, "error_msg", "")

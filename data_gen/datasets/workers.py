@@ -22,10 +22,19 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, Any, Protocol
 
-__all__ = ["Outcome", "Worker", "WorkerError", "WorkerLost", "run_isolated", "run_workers", "worker_environment"]
+__all__ = [
+    "Outcome",
+    "Worker",
+    "WorkerError",
+    "WorkerLost",
+    "WorkerTimeout",
+    "run_isolated",
+    "run_workers",
+    "worker_environment",
+]
 
 ATTEMPTS = 2
-"""How often an item is tried whose worker crashes or hangs."""
+"""How often an item is tried whose worker crashes."""
 
 START_SECONDS = 120.0
 """Time that a worker has to start, above that of its first item."""
@@ -37,6 +46,10 @@ class WorkerError(RuntimeError):
 
 class WorkerLost(Exception):
     """A worker crashed, or was too slow; the message says which."""
+
+
+class WorkerTimeout(WorkerLost):
+    """A worker was too slow. It is not tried again: what takes minutes once takes them twice."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +173,9 @@ def run_workers(
                     except WorkerLost as error:
                         close_worker(worker, kill=True)
                         worker, answer = None, {"skip": f"failed {attempt} times: {error}"}
+                        if isinstance(error, WorkerTimeout):
+                            answer = {"skip": f"{error}; simplify it, or give it more time"}
+                            break
                 if "fatal" in answer:
                     raise WorkerError(answer["fatal"])
                 left -= 1
@@ -224,7 +240,7 @@ class _ProcessWorker:
         while True:
             while b"\n" not in self._buffer:
                 if not select.select([self._answers], [], [], max(0.0, deadline - time.monotonic()))[0]:
-                    raise WorkerLost(f"no answer within {self._timeout:g} s")
+                    raise WorkerTimeout(f"expected to be done within {self._timeout:g} s, found no answer")
                 data = os.read(self._answers.fileno(), 1 << 20)
                 if not data:
                     raise WorkerLost(f"its worker {self._end()}")

@@ -16,7 +16,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 
 from data_gen.meshes.materials import LINEAR_COLOUR, select_vertices, visual_of
 
-__all__ = ["CREASE", "clean", "decimate", "is_smooth"]
+__all__ = ["CREASE", "clean", "decimate", "is_smooth", "smooth_normals"]
 
 CREASE = 40.0
 """Angle between two faces, in degrees, from which an edge counts as sharp where a file has no normals."""
@@ -91,8 +91,36 @@ def is_smooth(mesh: trimesh.Trimesh) -> bool:
         return True
     if "smooth" in mesh.metadata:
         return bool(mesh.metadata["smooth"])
-    angles = np.asarray(mesh.face_adjacency_angles)
+    angles = np.asarray(_welded(mesh)[0].face_adjacency_angles)
     return len(angles) > 0 and float((angles > np.radians(CREASE)).mean()) < _MOSTLY
+
+
+def smooth_normals(mesh: trimesh.Trimesh) -> npt.NDArray[np.float64] | None:
+    """Normals `(vertex, 3)` of a mesh without its own, the same on both sides of a seam of its texture.
+
+    Args:
+        mesh: a mesh that is smooth.
+
+    Returns:
+        The normals; None where the mesh has some, or has no seams.
+    """
+    if "vertex_normals" in mesh._cache.cache:
+        return None
+    welded, vertices = _welded(mesh)
+    return None if vertices is None else np.asarray(welded.vertex_normals)[vertices]
+
+
+def _welded(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, npt.NDArray[np.int64] | None]:
+    """A mesh without the seams of its texture, smoothing groups apart, and which of its vertices stand for the old."""
+    if not isinstance(mesh.visual, TextureVisuals) or mesh.visual.uv is None:
+        return mesh, None
+    groups = mesh.metadata.get("smoothing", np.zeros(len(mesh.vertices)))
+    keys = np.column_stack((mesh.vertices, groups))
+    unique, vertices = np.unique(keys, axis=0, return_inverse=True)
+    if len(unique) == len(keys):
+        return mesh, None
+    vertices = vertices.reshape(-1)
+    return trimesh.Trimesh(unique[:, :3], vertices[mesh.faces], process=False), vertices
 
 
 def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trimesh] | None:
@@ -211,6 +239,8 @@ def _part(
         visual = ColorVisuals(vertex_colors=np.asarray(visual.vertex_colors)[used])
     result = trimesh.Trimesh(mesh.vertices[used], faces, vertex_normals=normals, visual=visual, process=False)
     result.metadata.update({key: mesh.metadata[key] for key in ("smooth", "one_sided") if key in mesh.metadata})
+    if "smoothing" in mesh.metadata:
+        result.metadata["smoothing"] = mesh.metadata["smoothing"][used]
     return result
 
 

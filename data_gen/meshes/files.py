@@ -18,6 +18,7 @@ __all__ = [
     "MAX_PIXELS",
     "MAX_TEXT_BYTES",
     "MESH_SUFFIXES",
+    "OTHER_SUFFIXES",
     "STATES_ITS_AXIS",
     "MeshError",
     "check_image",
@@ -26,6 +27,12 @@ __all__ = [
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", ".dae")
 """Endings of mesh files, lower case."""
+
+OTHER_SUFFIXES = (
+    *(".3ds", ".3mf", ".abc", ".blend", ".c4d", ".fbx", ".lwo", ".ma", ".max", ".mb", ".skp", ".stp", ".step"),
+    *(".usd", ".usda", ".usdc", ".usdz", ".vrm", ".wrl", ".x3d"),
+)
+"""Endings of mesh files that are not read, lower case."""
 
 STATES_ITS_AXIS = (".glb", ".gltf", ".dae")
 """Endings of formats that say which axis points up: glTF y, by its specification, COLLADA in the file."""

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from data_gen.meshes.files import MESH_SUFFIXES, MeshError
+from data_gen.meshes.files import MESH_SUFFIXES, OTHER_SUFFIXES, MeshError
 from data_gen.meshes.shapenet import class_of_synset, find_models, is_shapenet, paper_split, read_split_file
 
-__all__ = ["MeshFile", "find_meshes", "safe_name"]
+__all__ = ["MeshFile", "find_meshes", "find_unreadable", "safe_name"]
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,23 @@ def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> 
     return _unique(MeshFile(safe_name(path.relative_to(root).with_suffix("").as_posix()), path) for path in paths)
 
 
-def _is_mesh(path: Path, root: Path) -> bool:
-    if path.suffix.lower() not in MESH_SUFFIXES:
+def find_unreadable(folder: str | Path) -> list[Path]:
+    """List the files under a folder that are meshes of a format which is not read.
+
+    Args:
+        folder: the folder.
+
+    Returns:
+        Their paths from the folder on, sorted; none of a ShapeNetCore tree.
+    """
+    root = Path(folder)
+    if is_shapenet(root):
+        return []
+    return sorted(path.relative_to(root) for path in root.rglob("*") if _is_mesh(path, root, OTHER_SUFFIXES))
+
+
+def _is_mesh(path: Path, root: Path, suffixes: tuple[str, ...] = MESH_SUFFIXES) -> bool:
+    if path.suffix.lower() not in suffixes:
         return False
     hidden = any(part.startswith(".") or part == "__MACOSX" for part in path.relative_to(root).parts)
     return not hidden and path.is_file()

@@ -1,4 +1,4 @@
-"""Reads PLY, STL and COLLADA files with trimesh, after checks, and OFF files without it.
+"""Reads PLY and STL files with trimesh, after checks, and OFF files without it.
 
 Each check compares the length of the file with what its header declares. trimesh alone loads, without a warning, an
 ASCII PLY that was cut at 24 of 233 places, an ASCII STL at 5 of 440 and an OFF at 24 of 89, with faces missing, and
@@ -12,13 +12,16 @@ import re
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import trimesh
+from trimesh.exchange.ply import load_ply
 
 from data_gen.meshes.files import MeshError
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.mtl import decode_text
+from data_gen.meshes.triangulate import fan, retriangulate
 
-__all__ = ["declared_up", "read_dae", "read_off", "read_ply", "read_stl"]
+__all__ = ["read_off", "read_ply", "read_stl"]
 
 _CUT = "the last line does not end: the file may have been cut"
 _PLY_BYTES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
@@ -91,22 +94,81 @@ def _fixed_bytes(header: str, counts: dict[str, int]) -> int:
 
 
 def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
-    """The geometry of a PLY file, and warnings; a MeshError if it was cut or holds no faces."""
+    """The geometry of a PLY file, and warnings.
+
+    trimesh cuts every polygon into a fan and gives each triangle the colour of the polygon of its own number, and draws
+    coordinates without a texture dark.
+
+    Raises:
+        MeshError: if it was cut or holds no faces.
+    """
     vertices, faces, warnings = _check_ply(data, folder)
     if not faces:
         raise MeshError(f"{folder.path}: expected faces, found {vertices} points only; make a surface of them first")
-    scene = trimesh.load_scene(io.BytesIO(data), file_type="ply", resolver=folder, process=False)
-    found = sum(len(mesh.faces) for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh))
-    if found < faces:
-        raise MeshError(f"{folder.path}: expected {faces} faces, found {found}: the file was cut; fetch it again")
+    loaded = load_ply(io.BytesIO(data), resolver=folder)
+    elements = loaded["metadata"].pop("_ply_raw")
+    if loaded.pop("entities", None) is not None:  # edges, whose points take the place of the vertices
+        loaded["vertices"] = np.column_stack([elements["vertex"]["data"][axis] for axis in "xyz"])
+    if "vertices" in loaded:
+        _cut_polygons(loaded, elements, folder)
     texture = re.search(rb"^comment\s+TextureFile\s+(.+)$", data[:65536], re.MULTILINE | re.IGNORECASE)
+    if texture is None or folder.lost:
+        loaded.pop("visual", None)
+    mesh = trimesh.Trimesh(**loaded | {"process": False})
+    if len(mesh.faces) < faces:
+        raise MeshError(
+            f"{folder.path}: expected {faces} faces, found {len(mesh.faces)}: the file was cut; fetch it again"
+        )
     if texture and folder.lost:
         warnings.append(f"drawn without its texture {decode_text(texture.group(1)).strip()}")
-    return scene, warnings
+    return trimesh.Scene(mesh), warnings
+
+
+def _cut_polygons(loaded: dict[str, Any], elements: dict[str, Any], folder: ModelFolder) -> None:
+    """Cut the polygons of a PLY file anew where a fan is wrong, or each triangle needs the colour of its polygon.
+
+    Raises:
+        MeshError: if a face refers to a vertex that is not there.
+    """
+    polygons = _ply_polygons(elements.get("face", {}).get("data"))
+    vertices = np.asarray(loaded["vertices"], dtype=np.float64)
+    if polygons is None or len(vertices) != elements["vertex"]["length"]:
+        return  # taken apart where its texture has seams
+    sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
+    if sizes.max(initial=3) == 3:
+        return
+    starts = np.cumsum(np.maximum(sizes - 2, 0)) - np.maximum(sizes - 2, 0)
+    fans = [np.asarray(polygon, dtype=np.int64)[fan(len(polygon))] for polygon in polygons if len(polygon) > 2]
+    triangles = np.concatenate(fans)
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise MeshError(
+            f"{folder.path}: expected faces on its {len(vertices)} vertices, found one on vertex {triangles.max()}; "
+            "the file is damaged"
+        )
+    before = triangles.copy()
+    larger = [(int(starts[index]), list(polygons[index])) for index in np.flatnonzero(sizes > 3)]
+    retriangulate(triangles, larger, vertices)
+    colours = loaded.get("face_colors")
+    if colours is not None and len(colours) == len(polygons):
+        loaded["face_colors"] = np.asarray(colours)[np.repeat(np.arange(len(sizes)), np.maximum(sizes - 2, 0))]
+    elif (before == triangles).all():
+        return
+    loaded["faces"] = triangles
+
+
+def _ply_polygons(data: Any) -> Any:
+    """The vertex indices of each face, as trimesh read them; None where there are none."""
+    names = ("vertex_indices", "vertex_index")
+    if isinstance(data, dict):
+        return next((data[name] for name in names if name in data), None)
+    if isinstance(data, np.ndarray) and data.dtype.names:
+        name = next((name for name in names if name in data.dtype.names), data.dtype.names[0])
+        return data[name]["f1"] if data[name].dtype.names else None
+    return data if isinstance(data, np.ndarray) and data.ndim == 2 else None
 
 
 def read_off(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
-    """The geometry of an OFF file with the colours of its vertices (COFF) or faces, polygons as fans; and warnings."""
+    """The geometry of an OFF file with the colours of its vertices (COFF) or faces; and warnings."""
     lines = [line.partition("#")[0].split() for line in decode_text(data).splitlines()]
     lines = [line for line in lines if line]
     if not lines or not re.fullmatch(r"(ST|C|N){0,3}OFF.*", lines[0][0]):
@@ -137,15 +199,17 @@ def _off_body(lines: list[list[str]], folder: ModelFolder) -> tuple[Any, Any, An
         if min(vertex_count, face_count) < 0 or len(lines) < last:
             raise ValueError(f"{vertex_count} vertices and {face_count} faces declared in {len(lines) - 1} lines")
         table = np.array(lines[1 : vertex_count + 1], dtype=np.float64).reshape(vertex_count, -1)
-        return table, *_off_faces(lines[vertex_count + 1 : last], vertex_count)
+        return table, *_off_faces(lines[vertex_count + 1 : last], table[:, :3])
     except (ValueError, IndexError) as error:
         raise MeshError(
             f"{folder.path}: expected whole OFF vertices and faces, found {error}; the file is damaged or was cut"
         ) from error
 
 
-def _off_faces(lines: list[list[str]], vertex_count: int) -> tuple[Any, Any]:
+def _off_faces(lines: list[list[str]], positions: npt.NDArray[np.float64]) -> tuple[Any, Any]:
+    vertex_count = len(positions)
     triangles: list[tuple[int, int, int]] = []
+    polygons: list[tuple[int, list[int]]] = []
     colours: list[list[float]] = []
     for line in lines:
         size = int(line[0])
@@ -153,44 +217,18 @@ def _off_faces(lines: list[list[str]], vertex_count: int) -> tuple[Any, Any]:
         if len(corners) != size or not all(0 <= corner < vertex_count for corner in corners):
             raise ValueError(" ".join(line)[:60])
         colour = [float(word) for word in line[size + 1 : size + 5]]
+        if size > 3:
+            polygons.append((len(triangles), corners))
         for index in range(1, size - 1):
             triangles.append((corners[0], corners[index], corners[index + 1]))
             colours.append(colour)
     widths = {len(colour) for colour in colours}
     usable = widths in ({3}, {4})
-    return np.array(triangles, dtype=np.int64).reshape(-1, 3), np.array(colours) if usable else None
+    faces = np.array(triangles, dtype=np.int64).reshape(-1, 3)
+    retriangulate(faces, polygons, positions)
+    return faces, np.array(colours) if usable else None
 
 
 def _colours(values: Any) -> Any:
     values = np.asarray(values, dtype=np.float64)
     return np.clip(np.round(values * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
-
-
-def read_dae(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
-    """The geometries of a COLLADA file, factors of materials as in the file (sRGB), and warnings.
-
-    Raises:
-        MeshError: if it declares a document type, which COLLADA needs for nothing, or a number is NaN.
-    """
-    if re.search(rb"<!\s*(DOCTYPE|ENTITY)", data, re.IGNORECASE):
-        raise MeshError(f"{folder.path}: expected plain COLLADA, found a document type or entity; export it again")
-    arrays = re.findall(rb"<(?:\w+:)?float_array[^>]*>([^<]*)<", data)
-    unknown = sum(len(re.findall(rb"nan", array, re.IGNORECASE)) for array in arrays)
-    if unknown:  # pycollada would read them as 0
-        raise MeshError(f"{folder.path}: expected numbers, found {unknown} times NaN; repair or export it again")
-    from trimesh.exchange.dae import load_collada
-
-    loaded = load_collada(io.BytesIO(data), resolver=folder)
-    for geometry in loaded["geometry"].values():
-        geometry["process"] = False
-    warnings = []
-    drawn = len(re.findall(rb"<(?:\w+:)?(?:lines|linestrips|trifans|tristrips)\b", data))
-    if drawn:
-        warnings.append(f"{drawn} sets of lines, strips or fans left out, only triangles and polygons are drawn")
-    return trimesh.load_scene(loaded), warnings
-
-
-def declared_up(data: bytes) -> str | None:
-    """The axis, `x`, `y` or `z`, that a COLLADA file declares as up; None if it declares none."""
-    found = re.search(rb"<(?:\w+:)?up_axis>\s*([XYZ])_UP", data)
-    return found.group(1).decode().lower() if found else None

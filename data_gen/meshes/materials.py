@@ -223,6 +223,10 @@ def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> Non
         mean = np.asarray(image.convert("RGB"), dtype=np.float64).reshape(-1, 3).mean(axis=0)
         data["baseColorFactor"][:3] *= linear_from_srgb(mean / 255.0)
         warnings.append(f"{label}: texture without texture coordinates; its mean colour taken")
+    glow = data.get("emissiveTexture")
+    if glow is not None and data["emissiveFactor"] is not None:
+        mean = np.asarray(glow.convert("RGB"), dtype=np.float64).reshape(-1, 3).mean(axis=0)
+        data["emissiveFactor"] = data["emissiveFactor"] * linear_from_srgb(mean / 255.0)
     for slot in ("baseColorTexture", *_MAP_SLOTS):
         data.pop(slot, None)
 

@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from data_gen.meshes.clean import clean, decimate, is_smooth
-from data_gen.meshes.files import MAX_FILE_BYTES, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, read_bytes
+from data_gen.meshes.clean import clean, decimate, is_smooth, smooth_normals
+from data_gen.meshes.dae import declared_up
+from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PARTS, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, read_bytes
 from data_gen.meshes.find import safe_name
-from data_gen.meshes.formats import declared_up
 from data_gen.meshes.materials import ColourSpace, canonical_visual
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.read import read_scene
@@ -167,6 +167,9 @@ def prepare_scene(
     for number, part in enumerate(parts):
         key = f"part_{number:04d}"
         smooth = is_smooth(part)
+        normals = smooth_normals(part) if smooth else None
+        if normals is not None:
+            part.vertex_normals = normals
         moved = _transformed(part, world_from_file)
         moved.metadata = {"smooth": smooth, "closed": closed, "one_sided": bool(part.metadata.get("one_sided"))}
         ready.add_geometry(moved, geom_name=key, node_name=key)
@@ -197,8 +200,10 @@ def mesh_parts(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float64
 
 
 def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:
-    """Count the triangles of all instances before any is copied."""
-    faces = 0
+    """Count the parts and the triangles of all instances before any is copied."""
+    faces, parts = 0, len(scene.graph.nodes_geometry)
+    if parts > MAX_PARTS:
+        raise MeshError(f"{source}: expected at most {MAX_PARTS} parts, found {parts}; merge them")
     for node in scene.graph.nodes_geometry:
         faces += len(getattr(scene.geometry[scene.graph[node][1]], "faces", ()))
     if faces > _DECIMATED_FROM * max_faces:
@@ -254,7 +259,9 @@ def _transformed(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visu
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         keywords["vertex_normals"] = normals / np.where(length > 0, length, 1.0)
     result = trimesh.Trimesh(vertices, faces, visual=visual or mesh.visual, process=False, **keywords)
-    result.metadata.update({key: mesh.metadata[key] for key in ("smooth", "one_sided") if key in mesh.metadata})
+    result.metadata.update(
+        {key: mesh.metadata[key] for key in ("smooth", "smoothing", "one_sided") if key in mesh.metadata}
+    )
     return result
 
 

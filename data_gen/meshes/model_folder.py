@@ -7,6 +7,7 @@ trimesh's FilePathResolver drops ShapeNet's `../images/x.jpg` without a warning,
 from __future__ import annotations
 
 import re
+import unicodedata
 import urllib.parse
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
@@ -15,7 +16,12 @@ from trimesh.resolvers import Resolver
 
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PIXELS, MeshError, check_image, read_bytes
 
-__all__ = ["ModelFolder", "model_root"]
+__all__ = ["MAX_REFERENCES", "ModelFolder", "model_root"]
+
+MAX_REFERENCES = 2000
+"""Different names of other files in a mesh at most. One that is not there takes about 1 ms to look for."""
+
+_CODE_PAGES = ("cp1252", "cp437", "cp932", "gb18030", "cp1251")
 
 _MTL_OPTION = re.compile(
     r"^\s*-(?:(?:blendu|blendv|cc|clamp|imfchan|type|texres|boost|bm)\s+\S+|(?:o|s|t)(?:\s+[-+.\deE]+){1,3}"
@@ -72,6 +78,7 @@ class ModelFolder(Resolver):
         self.refused: MeshError | None = None
         self.file_name = path.name
         self._bytes: dict[Path, bytes] = {}
+        self._places: dict[str, Path | None] = {}
         self._images: set[Path] = set()
 
     def get(self, name: str) -> bytes:
@@ -134,7 +141,8 @@ class ModelFolder(Resolver):
             self.refused = self.refused or error
             raise
         if found is None:
-            self.lost.setdefault(name, "not found")
+            outside = _is_absolute(name.strip().strip('"'))
+            self.lost.setdefault(name, "absolute path not followed" if outside else "not found")
             raise FileNotFoundError(name)
         return found
 
@@ -161,6 +169,8 @@ class ModelFolder(Resolver):
     def locate(self, name: str) -> Path | None:
         """Find a file of the model without reading it.
 
+        What an absolute path names is never opened; a file of its name beside the mesh is.
+
         Args:
             name: how the mesh refers to it.
 
@@ -168,8 +178,18 @@ class ModelFolder(Resolver):
             The file, or None if there is none.
 
         Raises:
-            MeshError: if the name leaves the model's folder.
+            MeshError: if the name leaves the model's folder, or the mesh refers to too many files.
         """
+        if name not in self._places:
+            if len(self._places) >= MAX_REFERENCES:
+                raise MeshError(
+                    f"{self.path}: expected at most {MAX_REFERENCES} references to other files, found more; merge its "
+                    "materials"
+                )
+            self._places[name] = self._locate(name)
+        return self._places[name]
+
+    def _locate(self, name: str) -> Path | None:
         plain = name.strip().strip('"')
         if "\0" in plain:
             return None
@@ -186,10 +206,10 @@ class ModelFolder(Resolver):
                     why = "absolute path not followed" if _is_absolute(plain) else "not there"
                     self._note(f"{plain}: {why}, {found.relative_to(self.root).as_posix()} taken")
                     return found
-        if _is_absolute(plain) or any(self._leaves(place) for place in places):
-            what = f"the absolute path {plain!r}" if _is_absolute(plain) else f"{plain!r}, which leaves it"
+        if any(self._leaves(place) for place in places):
             raise MeshError(
-                f"{self.path}: expected references inside {self.root.name}/, found {what}; put the file beside the mesh"
+                f"{self.path}: expected references inside {self.root.name}/, found {plain!r}, which leaves it; put the "
+                "file beside the mesh"
             )
         return None
 
@@ -207,7 +227,7 @@ class ModelFolder(Resolver):
 
     def _usual_folders(self) -> Iterator[Path]:
         for folder in dict.fromkeys((self.folder, model_root(self.path))):
-            for name in ("", "textures", "texture", "images", "materials/textures"):
+            for name in ("", "textures", "texture", "images", "maps", "materials/textures"):
                 yield folder / name
 
     def _leaves(self, place: Path) -> bool:
@@ -229,8 +249,9 @@ class ModelFolder(Resolver):
     def _other_case(self, path: Path) -> Path | None:
         if path == self.root or not path.parent.is_dir():
             return None
+        wanted = _plain_case(path.name)
         for entry in sorted(path.parent.iterdir()):
-            if entry.name.casefold() == path.name.casefold() and entry.is_file():
+            if _plain_case(entry.name) == wanted and entry.is_file():
                 return entry if entry.resolve().is_relative_to(self.root) else None
         return None
 
@@ -268,6 +289,23 @@ def _candidates(name: str) -> Iterator[str]:
         unprefixed = unprefixed[option.end() :]
     if unprefixed != plain:
         yield unprefixed.strip()
+    yield from _other_code_pages(unprefixed.strip())
+
+
+def _other_code_pages(name: str) -> Iterator[str]:
+    """What a name that was read as Latin-1 is in the code pages of other systems."""
+    if name.isascii():
+        return
+    for page in _CODE_PAGES:
+        try:
+            yield name.encode("latin-1").decode(page)
+        except UnicodeError:
+            continue
+
+
+def _plain_case(name: str) -> str:
+    """A name without what differs between file systems: case, and how accents are encoded."""
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _is_absolute(name: str) -> bool:

@@ -1,6 +1,7 @@
 """Reads the MTL files (materials and their textures) of an OBJ file.
 
-trimesh's reader drops opacity (`d`, `Tr`), emission, and textures behind options (`map_Kd -s 1 1 1 wood.png`).
+trimesh's reader drops opacity (`d`, `Tr`), emission, and textures behind options (`map_Kd -s 1 1 1 wood.png`). Of the
+options, those that move a texture (`-s`, `-o`) and `-clamp` are drawn.
 
 A texture takes the place of `Kd`, as in Blender and so in the pictures of ShapeNet: exporters write any Kd beside it.
 Opacity is that of `d` times that of `map_d` (its alpha where it has one, else its brightness), never the alpha of
@@ -13,29 +14,51 @@ dark 0.2 (51 of 255) comes out at up to 143 in place of 97.
 
 from __future__ import annotations
 
+import codecs
 import io
+import re
 from typing import Any
 
 import numpy as np
 import PIL.Image
 
-from data_gen.meshes.files import IMAGE_FORMATS, MAX_TEXT_BYTES
+from data_gen.meshes.files import IMAGE_FORMATS, MAX_TEXT_BYTES, MeshError
 from data_gen.meshes.materials import LinearMaterial, convert_image, roughness_of_exponent
 from data_gen.meshes.model_folder import ModelFolder
 from hyperplanes.utilities.colour import linear_from_srgb
 
-__all__ = ["decode_text", "read_materials"]
+__all__ = ["MAX_LIBRARIES", "MtlMaterial", "decode_text", "read_materials"]
+
+MAX_LIBRARIES = 1000
+"""Different material libraries of an OBJ file at most."""
+
+_MOVE = re.compile(r"(?:^|\s)-(s|o)((?:\s+[-+]?[\d.]+(?:[eE][-+]?\d+)?(?=\s)){1,3})")
+_CLAMP = re.compile(r"(?:^|\s)-clamp\s+on\s")
+
+
+class MtlMaterial(LinearMaterial):
+    """A LinearMaterial whose texture is scaled and moved.
+
+    Attributes:
+        scale: factors `(2,)` of u and v.
+        offset: what is added then `(2,)`.
+    """
+
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
 
 
 def decode_text(data: bytes) -> str:
-    """Text of a file that does not declare its encoding: UTF-8, else Latin-1."""
+    """Text of a file that does not declare its encoding: UTF-16 with its mark, UTF-8, else Latin-1."""
+    if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return data.decode("utf-16", errors="replace")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
 
 
-def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str]) -> dict[str, LinearMaterial]:
+def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str]) -> dict[str, MtlMaterial]:
     """Read all material libraries of an OBJ file; the folder refuses what lies outside it.
 
     Args:
@@ -45,9 +68,17 @@ def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str
 
     Returns:
         Materials by name, colours linear.
+
+    Raises:
+        MeshError: if there are too many libraries.
     """
-    materials: dict[str, LinearMaterial] = {}
-    for line in libraries:
+    materials: dict[str, MtlMaterial] = {}
+    different = list(dict.fromkeys(libraries))
+    if len(different) > MAX_LIBRARIES:
+        raise MeshError(
+            f"{folder.path}: expected at most {MAX_LIBRARIES} material libraries, found {len(different)}; merge them"
+        )
+    for line in different:
         whole = folder.locate(line) is not None or not line.lower().endswith(".mtl")
         names = [line] if whole or len(line.split()) < 2 else line.split()
         for name in names:
@@ -80,7 +111,7 @@ def _statements(text: str, library: str, warnings: list[str]) -> list[dict[str, 
     return found
 
 
-def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) -> LinearMaterial:
+def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) -> MtlMaterial:
     label = f"material {values['name']!r}"
     colour = np.array([*_floats(values.get("kd"), 3, (0.8, 0.8, 0.8), f"{label}: Kd", warnings), 1.0])
     colour[:3] = linear_from_srgb(np.clip(colour[:3], 0.0, 1.0))
@@ -90,9 +121,10 @@ def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) 
         colour[:3] = 1.0
     exponent = _floats(values.get("ns"), 1, (10.0,), f"{label}: Ns", warnings)[0]
     glow = np.clip(_floats(values.get("ke"), 3, (0.0, 0.0, 0.0), f"{label}: Ke", warnings), 0.0, 1.0)
+    glow_map = _image(values.get("map_ke"), f"{label}: drawn without its glow and its map", folder, warnings)
     if values.get("map_ke"):
-        warnings.append(f"{label}: its glow map {values['map_ke']} left out")
-    return LinearMaterial(
+        glow = np.zeros(3) if glow_map is None else glow if glow.any() else np.ones(3)
+    material = MtlMaterial(
         name=values["name"],
         baseColorFactor=colour,
         baseColorTexture=image,
@@ -100,7 +132,20 @@ def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) 
         metallicFactor=0.0,
         roughnessFactor=roughness_of_exponent(exponent),
         emissiveFactor=glow if glow.any() else None,
+        emissiveTexture=glow_map if glow.any() else None,
     )
+    options = values.get("map_kd") or values.get("map_ka") or values.get("map_d") or values.get("map_ke") or ""
+    for option, numbers in _MOVE.findall(options):
+        u, v, *_ = *(float(number) for number in numbers.split()), *([1.0, 1.0] if option == "s" else [0.0, 0.0])
+        if not np.isfinite((u, v)).all():
+            warnings.append(f"{label}: -{option} of its texture is not finite; left out")
+        elif option == "s":
+            material.scale = u, v
+        else:
+            material.offset = u, v
+    if _CLAMP.search(options):
+        material.wrap = material.emissive_wrap = ("clamp", "clamp")
+    return material
 
 
 def _opacity(values: dict[str, Any], label: str, warnings: list[str]) -> float:

@@ -22,7 +22,8 @@ from trimesh.visual.material import PBRMaterial
 from data_gen.meshes.files import MeshError
 from data_gen.meshes.materials import DEFAULT_COLOUR
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.mtl import decode_text, read_materials
+from data_gen.meshes.mtl import MtlMaterial, decode_text, read_materials
+from data_gen.meshes.triangulate import retriangulate
 
 __all__ = ["read_obj"]
 
@@ -32,12 +33,30 @@ _DROPPED = {"l": "lines", "p": "points", "curv": "curves", "curv2": "curves", "s
 
 @dataclass
 class _Group:
-    """The faces of one material and one smoothing."""
+    """The faces of one material, smooth or not.
+
+    Attributes:
+        smooth: whether the file wants interpolated normals; None where it does not say.
+        corners: the index of each different corner in the current smoothing group.
+        rows: vertex, texture coordinate and normal of each corner, counted from 0, -1 for none.
+        smoothing: the smoothing group of each corner; normals are not interpolated across two of them.
+        triangles: corners, three a triangle; polygons as fans.
+        polygons: where the fan of each begins, and its corners.
+    """
 
     smooth: bool | None
     corners: dict[Any, int] = field(default_factory=dict)
     rows: list[tuple[int, int, int]] = field(default_factory=list)
+    smoothing: list[int] = field(default_factory=list)
     triangles: list[int] = field(default_factory=list)
+    polygons: list[tuple[int, list[int]]] = field(default_factory=list)
+    number: int = 0
+    _corners: dict[int, dict[Any, int]] = field(default_factory=dict)
+
+    def enter(self, number: int) -> _Group:
+        """Go on in a smoothing group."""
+        self.number, self.corners = number, self._corners.setdefault(number, {})
+        return self
 
 
 def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
@@ -49,12 +68,15 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
 
     Returns:
         One geometry a material, in the file's coordinates; and warnings that name what was lost. Plain colours are
-        linear in materials and sRGB at vertices. `metadata["smooth"]` is what the file's smoothing groups say.
+        linear in materials and sRGB at vertices. `metadata["smooth"]` is what the file's smoothing groups say, and
+        `metadata["smoothing"]` the group of each vertex.
 
     Raises:
         MeshError: if a line cannot be understood, a face refers to a vertex that is not there, or there are no faces.
     """
     text = decode_text(data)
+    if "\r" in text:
+        text = text.replace("\r\n", "\n").replace("\r", "\n")
     warnings: list[str] = []
     rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
     numbers: dict[str, list[int]] = {"v": [], "vt": [], "vn": []}
@@ -63,7 +85,9 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     skipped: Counter[str] = Counter()
     material: str | None = None
     smooth: bool | None = None
+    smoothing = 0
     group: _Group | None = None
+    elsewhere: list[str] = []
     for number, line in _lines(text):
         keyword, _, rest = line.partition(" ")
         if keyword in rows:
@@ -71,16 +95,17 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
             numbers[keyword].append(number)
         elif keyword == "f":
             if group is None:
-                group = groups.setdefault((material, smooth), _Group(smooth))
+                group = groups.setdefault((material, smooth), _Group(smooth)).enter(smoothing)
             _add_face(rest, group, rows, number, folder, skipped)
         elif keyword == "usemtl":
             material, group = rest.strip() or None, None
         elif keyword == "s":
-            smooth, group = rest.strip() not in ("off", "0"), None
+            smooth, smoothing, group = *_smoothing(rest.strip(), number, folder), None
         elif keyword == "mtllib":
             libraries.append(rest.strip())
         elif keyword in _DROPPED:
             skipped[f"{_DROPPED[keyword]} left out, only faces are drawn"] += 1
+            elsewhere += rest.split() if keyword in ("l", "p") else []
         elif keyword not in _IGNORED:
             skipped["lines not understood"] += 1
     if not any(group.triangles for group in groups.values()):
@@ -91,7 +116,7 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     if text and not text.endswith("\n"):
         warnings.append("the last line does not end: the file may have been cut")
     tables = {key: _table(rows[key], numbers[key], key, folder) for key in rows}
-    _check_indices(groups, tables, folder, warnings)
+    _check_indices(groups, tables, elsewhere, folder, warnings)
     materials = read_materials(libraries, folder, warnings)
     wanted = {name for name, _ in groups if name is not None}
     for name in sorted(wanted - set(materials)):
@@ -105,8 +130,8 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
 
 def _lines(text: str) -> Any:
     """Number and content of each statement; continued lines are joined, comments removed."""
-    if "\\\n" in text or "\\\r\n" in text:
-        text = text.replace("\\\r\n", " ").replace("\\\n", " ")
+    if "\\\n" in text:
+        text = text.replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), 1):
         line = line.strip()
         if line and not line.startswith("#"):
@@ -128,6 +153,7 @@ def _add_face(
     if len(face) == 3:
         group.triangles += face
         return
+    group.polygons.append((len(group.triangles) // 3, face))
     for first, second in pairwise(face[1:]):
         group.triangles += (face[0], first, second)
 
@@ -146,7 +172,23 @@ def _index(corner: str, group: _Group, rows: dict[str, list[str]], number: int, 
         index = group.corners.setdefault(key, len(group.rows))
         if index == len(group.rows):
             group.rows.append(row)
+            group.smoothing.append(group.number)
     return index
+
+
+def _smoothing(text: str, number: int, folder: ModelFolder) -> tuple[bool, int]:
+    """Whether an `s` line asks for interpolated normals, and the number of its group."""
+    if text in ("off", "0"):
+        return False, 0
+    if text == "on":
+        return True, 1
+    try:
+        return True, int(float(text.split()[0])) if text else 1
+    except (ValueError, OverflowError):
+        raise MeshError(
+            f"{folder.path}: line {number}: expected a smoothing group or off after s, found {text!r:.60}; "
+            "repair the line"
+        ) from None
 
 
 def _corner(text: str, rows: dict[str, list[str]]) -> tuple[int, int, int]:
@@ -202,6 +244,7 @@ def _numbers(row: str, least: int) -> bool:
 def _check_indices(
     groups: dict[tuple[str | None, bool | None], _Group],
     tables: dict[str, npt.NDArray[np.float64]],
+    elsewhere: list[str],
     folder: ModelFolder,
     warnings: list[str],
 ) -> None:
@@ -212,13 +255,20 @@ def _check_indices(
             f"{folder.path}: expected faces on its {count} vertices, found one on vertex {used[:, 0].max() + 1}; "
             "the file is damaged or was cut"
         )
-    unused = count - len(np.unique(used[:, 0]))
+    unused = count - len(np.union1d(used[:, 0], _vertices_of(elsewhere, count)))
     if unused:
         warnings.append(f"{unused} of {count} vertices belong to no face: the file may have been cut")
     for column, key, what in ((1, "vt", "texture coordinate"), (2, "vn", "normal")):
         wrong = int((used[:, column] >= len(tables[key])).sum())
         if wrong:
             warnings.append(f"{wrong} corners refer to a {what} that is not there; taken as having none")
+
+
+def _vertices_of(corners: list[str], count: int) -> npt.NDArray[np.int64]:
+    """Indices from 0 of the vertices that lines and points refer to; what cannot be understood is not counted."""
+    found = [int(corner.partition("/")[0]) for corner in corners if corner.partition("/")[0].isdecimal()]
+    indices = np.array([index for index in found if index <= count], dtype=np.int64) - 1
+    return indices[indices >= 0]
 
 
 def _geometry(
@@ -231,6 +281,8 @@ def _geometry(
     uv = None
     if (rows[:, 1] >= 0).any():
         uv = np.where(rows[:, 1:2] >= 0, tables["vt"][rows[:, 1], :2], 0.0)
+        if isinstance(material, MtlMaterial):
+            uv = uv * material.scale + material.offset
         missing = int((rows[:, 1] < 0).sum())
         if missing and material is not None and material.baseColorTexture is not None:
             warnings.append(f"{name}: {missing} of {len(rows)} corners have no texture coordinates; (0, 0) taken")
@@ -249,9 +301,10 @@ def _geometry(
             if material is not None
             else f"{name}: vertex colours left out, some vertices have none"
         )
-    mesh = trimesh.Trimesh(
-        vertices[:, :3], np.array(group.triangles, dtype=np.int64).reshape(-1, 3), process=False, **keywords
-    )
+    triangles = np.array(group.triangles, dtype=np.int64).reshape(-1, 3)
+    retriangulate(triangles, group.polygons, vertices[:, :3])
+    mesh = trimesh.Trimesh(vertices[:, :3], triangles, process=False, **keywords)
+    mesh.metadata["smoothing"] = np.array(group.smoothing, dtype=np.int64)
     if group.smooth is not None:
         mesh.metadata["smooth"] = group.smooth
     return mesh

@@ -9,8 +9,9 @@ from collections.abc import Generator
 
 import trimesh
 
+from data_gen.meshes.dae import read_dae
 from data_gen.meshes.files import MeshError
-from data_gen.meshes.formats import read_dae, read_off, read_ply, read_stl
+from data_gen.meshes.formats import read_off, read_ply, read_stl
 from data_gen.meshes.gltf import read_gltf
 from data_gen.meshes.materials import ColourSpace
 from data_gen.meshes.model_folder import ModelFolder

@@ -161,10 +161,12 @@ def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path)
     (meshes / "empty.obj").write_text("")
     cut = "mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 1\nusemtl paint\nf 1 2 3\n"
     (meshes / "grey.obj").write_text(cut)
+    (meshes / "ball.fbx").write_text("a format that is not read")
     report = generate(MeshFolder(meshes), tmp_path / "out", GenerationConfig(held_out=0, **SMALL))
     assert report.written == 3
-    assert [name for name, _ in report.skipped] == ["broken", "empty"]
-    assert all(reason.startswith(f"{name}.") for name, reason in report.skipped), "no path of this machine"
+    assert [name for name, _ in report.skipped] == ["ball.fbx", "broken", "empty"]
+    assert report.skipped[0][1].endswith("found .fbx; convert it")
+    assert all(reason.startswith(f"{name}.") for name, reason in report.skipped[1:]), "no path of this machine"
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert [(entry["name"], entry["reason"]) for entry in manifest["skipped"]] == report.skipped
     assert Dataset(tmp_path / "out").names() == ["ball", "box", "grey"]

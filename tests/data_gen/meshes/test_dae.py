@@ -1,0 +1,56 @@
+"""Source of truth: the COLLADA 1.4 schema, on files of a tetrahedron."""
+
+import numpy as np
+import pytest
+from mesh_writers import TETRAHEDRON_FACES, dae_text
+
+from data_gen.meshes.mesh import MeshError, load_mesh
+
+CONTROLLER = """<library_controllers><controller id="c"><skin source="#g"></skin></controller></library_controllers>
+<library_visual_scenes>"""
+
+
+def written(folder, text):
+    (folder / "a.dae").write_text(text)
+    return folder / "a.dae"
+
+
+def test_what_a_controller_deforms_is_drawn_and_said(tmp_path):
+    text = dae_text().replace("<library_visual_scenes>", CONTROLLER)
+    text = text.replace('<instance_geometry url="#g">', '<instance_controller url="#c"><skeleton>#j</skeleton>')
+    mesh = load_mesh(written(tmp_path, text.replace("</instance_geometry>", "</instance_controller>")))
+    assert mesh.face_count == 4
+    assert mesh.warnings == ("1 controllers: drawn in the pose of their meshes, not of their skeletons",)
+
+
+def test_what_pycollada_leaves_out_is_said(tmp_path):
+    text = dae_text()
+    lost = '<node id="n2"><instance_geometry url="#gone"/></node></visual_scene>'
+    mesh = load_mesh(written(tmp_path, text.replace("</visual_scene>", lost)))
+    assert mesh.face_count == 4
+    (line,) = mesh.warnings
+    assert "left out" in line
+    assert "gone" in line
+
+
+@pytest.mark.parametrize(("tag", "corners"), [("tristrips", "0 2 1 3"), ("trifans", "0 2 1 3")])
+def test_strips_and_fans_are_drawn_and_not_said_to_be_left_out(tmp_path, tag, corners):
+    text = dae_text().replace('<triangles count="4" material="s">', f'<{tag} count="1" material="s">')
+    text = text.replace("</triangles>", f"</{tag}>")
+    text = text.replace(" ".join(str(index) for index in np.reshape(TETRAHEDRON_FACES, -1)), corners)
+    mesh = load_mesh(written(tmp_path, text))
+    assert mesh.face_count == 2
+    assert mesh.warnings == ()
+
+
+def test_lines_are_said_to_be_left_out(tmp_path):
+    line = '</triangles><lines count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1</p></lines>'
+    mesh = load_mesh(written(tmp_path, dae_text().replace("</triangles>", line)))
+    assert mesh.warnings == ("1 sets of lines or curves left out, only triangles and polygons are drawn",)
+
+
+def test_a_controller_of_nothing_is_no_endless_loop(tmp_path):
+    text = dae_text().replace("<library_visual_scenes>", CONTROLLER.replace('source="#g"', 'source="#c"'))
+    text = text.replace('<instance_geometry url="#g">', '<instance_controller url="#c">')
+    with pytest.raises(MeshError, match="found none"):
+        load_mesh(written(tmp_path, text.replace("</instance_geometry>", "</instance_controller>")))
