@@ -30,6 +30,9 @@ CUTS = 0.25
 STRUCTURES = 0.3
 """Share of the objects with the structure of a table, a cart, a figure and so on."""
 
+APART = 0.003
+"""Copies are so much out of line, in extents of the solid: faces of two in one plane would flicker where they meet."""
+
 MOST_FACES = 3000
 """Faces of a primitive and its copies together."""
 
@@ -103,25 +106,27 @@ def _arranged(rng: np.random.Generator, solid: Solid) -> Solid:
     kind = pick(rng, _ARRANGEMENTS)
     most = max(2, MOST_FACES // len(solid.faces))
     extents = np.ptp(solid.vertices, axis=0)
+    apart = np.full(3, APART * extents.max())
     if kind == "mirrored":
         axis = int(rng.choice([0, 0, 2, 1]))
         mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
         shift = np.zeros(3)
         shift[axis] = extents[axis] * rng.uniform(0.3, 0.75)
-        return merged([moved(solid, np.eye(3), shift), moved(solid, mirror, -shift)])
+        return merged([moved(solid, np.eye(3), shift), moved(solid, mirror, apart - shift)])
     if kind == "row":
         count, axis = min(most, int(rng.integers(2, 6))), int(rng.integers(3))
         step = np.zeros(3)
         step[axis] = extents[axis] * rng.uniform(0.6, 1.2)
         size = rng.uniform(0.5, 0.9)
         places = (np.arange(count) - (count - 1) / 2)[:, None] * step
-        return merged([moved(solid, size * np.eye(3), place) for place in places])
+        return merged([moved(solid, size * np.eye(3), place + k * apart) for k, place in enumerate(places)])
     if kind == "ring":
         count = min(most, int(rng.integers(3, 9)))
         small = moved(solid, rng.uniform(0.3, 0.6) * np.eye(3))
         outwards = np.array([0.0, 0.0, rng.uniform(0.3, 0.9)])
         turns = [rotation("y", 360.0 * k / count) for k in range(count)]
-        return merged([moved(moved(small, np.eye(3), outwards), turn) for turn in turns])
+        outer = moved(small, np.eye(3), outwards)
+        return merged([moved(outer, turn, k * apart) for k, turn in enumerate(turns)])
     return solid
 
 
@@ -161,7 +166,8 @@ def _composed(rng: np.random.Generator) -> list[Solid]:
         edge = np.concatenate([solid.vertices for solid in solids])[:, 0]
         shift = np.array([-edge.min() - rng.uniform(0.1, 0.5) * np.ptp(edge), 0.0, 0.0])
         shifted = [moved(solid, np.eye(3), shift) for solid in solids]
-        solids = [merged([solid, moved(solid, mirror)]) for solid in shifted]
+        apart = np.array([0.0, APART, APART]) * np.ptp(edge)
+        solids = [merged([solid, moved(solid, mirror, apart)]) for solid in shifted]
     return solids
 
 
