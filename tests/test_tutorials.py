@@ -1,0 +1,34 @@
+"""Source of truth: the notebooks of docs/tutorials, whose cells run as they stand there."""
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+
+from hyperplanes.cli import main
+
+TUTORIALS = sorted((Path(__file__).resolve().parent.parent / "docs" / "tutorials").glob("*.ipynb"))
+
+
+def cells(path):
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            yield "".join(cell["source"])
+
+
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+def test_the_tutorial_runs(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for cell in cells(path):
+        if cell.startswith("!hyperplanes "):
+            assert main(shlex.split(cell)[1:]) == 0, cell
+        else:
+            exec(cell, names)
+
+
+def test_notebooks_carry_no_output():
+    for path in TUTORIALS:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        assert not any(cell.get("outputs") for cell in document["cells"]), path
