@@ -29,8 +29,8 @@ bench: $(DEVELOP)  ## the benchmarks that need no data of yours, the short way
 		if [ -f benchmarks/$$name.py ]; then $(BIN)/python -m benchmarks $$name --quick || exit 1; fi; \
 	done
 
-docs: $(DEVELOP)  ## the interfaces as web pages in build/docs
-	$(BIN)/python scripts/docs.py build/docs
+docs: $(DEVELOP)  ## all pages, tutorials and the reference as one site in build/docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:  ## what was built; environments and runs/ stay
 	rm -rf build dist *.egg-info .pytest_cache .ruff_cache

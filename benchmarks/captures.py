@@ -23,7 +23,7 @@ from benchmarks.reporting import Row, finish
 from benchmarks.staged_photographs import Staged, stage, walk_around
 from data_gen.meshes.find import find_meshes
 from data_gen.meshes.mesh import load_mesh
-from hyperplanes.adaptation.pretrained import load_model
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.capture import Settings, capture
 from hyperplanes.capture.scene import straightened
 from hyperplanes.capture.sparse_model import SparseModel
@@ -170,5 +170,5 @@ def _write_true(folder: Path, staged: Staged) -> None:
 def _quality(scene: Path, checkpoint: str) -> float:
     """PSNR in dB of the views that were not shown."""
     task = read_task(scene, up="auto")
-    pictures = load_model(Path(checkpoint)).adapt(task.support).render(task.query.cameras).images
+    pictures = HyperPlanes.from_pretrained(Path(checkpoint)).adapt(task.support).render(task.query.cameras).images
     return float(psnr(pictures.clamp(0, 1), task.query.images).mean())
