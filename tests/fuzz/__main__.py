@@ -9,6 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 from tests.fuzz.campaign import run_campaign
+from tests.fuzz.corpus import CORPUS
 
 
 def main():
@@ -17,11 +18,12 @@ def main():
     parser.add_argument("--files", type=int, default=10_000, help="how many damaged files")
     parser.add_argument("--seed", type=int, default=0, help="of all damages")
     parser.add_argument("--only", type=int, help="the number of a single case")
+    parser.add_argument("--kinds", nargs="+", choices=CORPUS, help="of files; all when not given")
     options = parser.parse_args()
     faulthandler.enable()
     cases = range(options.files) if options.only is None else [options.only]
     started, home = time.monotonic(), Path(tempfile.mkdtemp(prefix="hyperplanes-fuzz-"))
-    failures = run_campaign(cases, options.seed, home)
+    failures = run_campaign(cases, options.seed, home, options.kinds)
     for failure in failures:
         print(failure)
     kinds = ", ".join(f"{count} of {kind}" for kind, count in Counter(each.kind for each in failures).items())

@@ -68,10 +68,12 @@ def judge(read, folder):
     return None
 
 
-def prepare(home):
-    """The whole inputs, each in a folder of its own, and each checked to be read."""
+def prepare(home, kinds=None):
+    """The whole inputs of these kinds, each in a folder of its own, and each checked to be read."""
     made = {}
     for kind, (make, pattern, read) in CORPUS.items():
+        if kinds is not None and kind not in kinds:
+            continue
         folder = home / kind
         make(folder)
         files = sorted(path.relative_to(folder) for path in folder.glob(pattern) if path.is_file())
@@ -89,18 +91,19 @@ def judge_whole(read, folder):
     return None
 
 
-def run_campaign(cases, seed, home: Path):
+def run_campaign(cases, seed, home: Path, kinds=None):
     """Failures of these cases.
 
     Args:
         cases: their numbers.
         seed: of the campaign.
         home: an empty folder to work in.
+        kinds: of files, as the corpus names them; all when None.
 
     Returns:
         One `Failure` for each case that went wrong.
     """
-    made = prepare(home / "whole")
+    made = prepare(home / "whole", kinds)
     failures = []
     for case in cases:
         draw = random.Random(f"{seed} {case}")

@@ -183,6 +183,100 @@ def render_mesh(suffix):
     return lambda folder: mesh_parts(load_mesh(folder / f"a.{suffix}"))
 
 
+def gltf(folder):
+    """A glTF of all that is read of one: morph target, skin, instances, sparse and quantised accessors, textures."""
+    folder.mkdir(parents=True)
+    Image.fromarray(pictures()[0]).save(folder / "a.png")
+    positions = np.array([corner.split() for corner in CORNERS], np.float32)
+    arrays = [
+        (positions, 5126, "VEC3"),
+        (np.array(FACES, np.uint16).ravel(), 5123, "SCALAR"),
+        (np.array([[0, 0], [255, 0], [0, 255], [255, 255]], np.uint8), 5121, "VEC2"),
+        (np.array([[0, 0, 0, 0]] * 4, np.uint8), 5121, "VEC4"),
+        (np.array([[1, 0, 0, 0]] * 4, np.float32), 5126, "VEC4"),
+        (np.eye(4, dtype=np.float32)[None], 5126, "MAT4"),
+        (np.array([[2, 0, 0], [0, 2, 0]], np.float32), 5126, "VEC3"),
+        (np.array([3], np.uint16), 5123, "SCALAR"),
+        (np.array([[0, 0, 2]], np.float32), 5126, "VEC3"),
+    ]
+    views, accessors, buffer = [], [], b""
+    for number, (array, component, kind) in enumerate(arrays):
+        data = array.tobytes()
+        views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)})
+        accessors.append({"bufferView": number, "componentType": component, "count": len(array), "type": kind})
+        buffer += data + b"\0" * (-len(data) % 4)
+    accessors[2]["normalized"] = True
+    sparse = {"count": 1, "indices": {"bufferView": 7, "componentType": 5123}, "values": {"bufferView": 8}}
+    accessors.append(accessors[0] | {"sparse": sparse})
+    moved = {"KHR_texture_transform": {"offset": [0.5, 0], "rotation": 1, "scale": [2, 1]}}
+    glossy = {"diffuseTexture": {"index": 0}, "specularFactor": [0.1, 0.1, 0.1], "glossinessFactor": 0.5}
+    materials = [
+        {
+            "pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "extensions": moved}, "metallicFactor": 0},
+            "emissiveTexture": {"index": 0},
+            "emissiveFactor": [0.5, 0.5, 0.5],
+            "extensions": {
+                "KHR_materials_emissive_strength": {"emissiveStrength": 2},
+                "KHR_materials_transmission": {"transmissionFactor": 0.5},
+            },
+        },
+        {"extensions": {"KHR_materials_pbrSpecularGlossiness": glossy, "KHR_materials_unlit": {}}},
+    ]
+    plain = {"attributes": {"POSITION": 9, "TEXCOORD_0": 2}, "indices": 1, "material": 1}
+    plain["targets"] = [{"POSITION": 0}]
+    skinned = {"attributes": {"POSITION": 0, "TEXCOORD_0": 2, "JOINTS_0": 3, "WEIGHTS_0": 4}, "material": 0, "mode": 5}
+    instances = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 6}}}
+    header = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0, 1]}],
+        "nodes": [{"mesh": 0, "extensions": instances, "weights": [0.5]}, {"mesh": 1, "skin": 0, "children": [2]}, {}],
+        "skins": [{"joints": [2], "inverseBindMatrices": 5}],
+        "meshes": [{"primitives": [plain]}, {"primitives": [skinned]}],
+        "materials": materials,
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [{"wrapS": 33071, "wrapT": 33648}],
+        "images": [{"uri": "a.png"}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"uri": "a.bin", "byteLength": len(buffer)}],
+    }
+    (folder / "a.gltf").write_text(json.dumps(header))
+    (folder / "a.bin").write_bytes(buffer)
+
+
+DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><created>2020-01-01T00:00:00</created><modified>2020-01-01T00:00:00</modified><up_axis>Z_UP</up_axis></asset>
+<library_effects><effect id="e"><profile_COMMON><technique sid="t"><lambert><diffuse><color>1 0 0 1</color></diffuse>
+</lambert></technique></profile_COMMON></effect></library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="15">0 0 0 2 0 0 1 1 0 0 2 0 0 0 1
+</float_array><technique_common><accessor source="#a" count="5" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<polylist count="2" material="s"><input semantic="VERTEX" source="#v" offset="0"/><vcount>4 3</vcount>
+<p>1 2 3 0 0 1 4</p></polylist></mesh></geometry></library_geometries>
+<library_controllers><controller id="c"><skin source="#g"/></controller></library_controllers>
+<library_visual_scenes><visual_scene id="vs"><node id="n"><instance_controller url="#c"><bind_material>
+<technique_common><instance_material symbol="s" target="#m"/></technique_common></bind_material></instance_controller>
+</node></visual_scene></library_visual_scenes><scene><instance_visual_scene url="#vs"/></scene></COLLADA>
+"""
+
+
+def polygons(folder):
+    """Concave polygons with the colours of faces, smoothing groups and options of textures."""
+    folder.mkdir(parents=True)
+    (folder / "a.dae").write_text(DAE)
+    corners = ["0 0 0", "2 0 0", "1 1 0", "0 2 0", "0 0 1"]
+    head = "ply\nformat ascii 1.0\nelement vertex 5\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "element face 2\nproperty list uchar int vertex_indices\n"
+    head += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
+    (folder / "a.ply").write_text(head + "\n".join(corners) + "\n4 1 2 3 0 9 8 7\n3 0 1 4 1 2 3\n")
+    Image.fromarray(pictures()[0]).save(folder / "a.png")
+    (folder / "a.mtl").write_text("newmtl red\nKe 1 1 1\nmap_Ke a.png\nmap_Kd -clamp on -s 2 2 1 -o 0.5 0 a.png\n")
+    lines = ["mtllib a.mtl", *(f"v {corner}" for corner in corners), "vt 0 0", "vt 1 1", "usemtl red", "s 1"]
+    (folder / "a.obj").write_text("\n".join([*lines, "f 2/1 3/2 4/1 1/2", "s 2", "f 1/1 2/1 5/2", "l 1 2"]) + "\n")
+
+
 def read_all(folder):
     data = open_dataset(folder)
     for name in data.names():
@@ -208,5 +302,9 @@ CORPUS = {  # how each is made, which of its files are damaged, and what reads i
     "GLB": (meshes, "a.glb", render_mesh("glb")),
     "PLY": (meshes, "a.ply", render_mesh("ply")),
     "STL": (meshes, "a.stl", render_mesh("stl")),
+    "glTF": (gltf, "a.*", render_mesh("gltf")),
+    "COLLADA": (polygons, "a.dae", render_mesh("dae")),
+    "polygons of PLY": (polygons, "a.ply", render_mesh("ply")),
+    "polygons of OBJ": (polygons, "a.[omp][btn][jlg]", render_mesh("obj")),
     "OFF": (meshes, "a.off", render_mesh("off")),
 }

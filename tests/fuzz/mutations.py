@@ -90,7 +90,7 @@ BINARY = (flip, overwrite, overwrite, cut, repeat, empty, change_number, change_
 
 def mutate(data, name, draw):
     """The content of a file with one to three damages that suit its kind."""
-    kinds = TEXT if name.endswith((".json", ".txt", ".obj", ".off", ".mtl", ".ply")) else BINARY
+    kinds = TEXT if name.endswith((".json", ".txt", ".obj", ".off", ".mtl", ".ply", ".gltf", ".dae")) else BINARY
     for _ in range(draw.choice([1, 1, 1, 2, 3])):
         if data:
             data = draw.choice(kinds)(data, draw)
