@@ -23,11 +23,11 @@ from torch.nn.functional import conv2d, relu
 
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.configuration.presets import Preset, preset
+from hyperplanes.configuration.presets import ALL_LAYERS, Preset, preset
 from hyperplanes.data.dataset import Dataset, open_dataset, open_datasets
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
-from hyperplanes.fields import TARGETS, AnyOrderNeRF, TargetConfig
+from hyperplanes.fields import TARGETS, AnyOrderConfig, AnyOrderNeRF
 from hyperplanes.fields.any_order import READ, AnyOrderField
 from hyperplanes.geometry import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
@@ -117,7 +117,7 @@ class _PooledField(AnyOrderField):
 class _Pooled(AnyOrderNeRF):
     field_type: ClassVar[type[AnyOrderField]] = _PooledField
 
-    def __init__(self, config: TargetConfig) -> None:
+    def __init__(self, config: AnyOrderConfig) -> None:
         super().__init__(config)
         self.of_view, self.weight = nn.Linear(self.slot_size, POOLED), nn.Linear(POOLED, 1)
 
@@ -154,7 +154,7 @@ class _FeatureField(AnyOrderField):
 
 
 class _WithFeatures(AnyOrderNeRF):
-    def __init__(self, config: TargetConfig) -> None:
+    def __init__(self, config: AnyOrderConfig) -> None:
         super().__init__(config)
         layers = (nn.Conv2d(3, 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, CHANNELS, 3, padding=2, dilation=2))
         self.encoder = nn.Sequential(*layers)
@@ -185,6 +185,7 @@ class _Reader:
     """What of the hypernetwork is changed or left out."""
 
     changes: dict[str, Any] = field(default_factory=dict)
+    images: bool = False
     grid: bool = True
     completed: bool = True
 
@@ -194,9 +195,7 @@ HYPERNETWORKS = {
     "without_completion": _Reader(completed=False),
     "only_grid": _Reader({"layers": ("grid",)}),
     "without_grid": _Reader(grid=False, completed=False),
-    "reads_images": _Reader(
-        {"encoder": "convnet", "join": "mean", "views": 6, "resolution": 64, "code": 128}, grid=False, completed=False
-    ),
+    "reads_images": _Reader(images=True, grid=False, completed=False),
 }
 """What the hypernetwork of the field is worth, and what its parts are."""
 
@@ -276,10 +275,13 @@ def configured(name: str, steps: int, seed: int) -> Preset:
         random_background=name != "white",
         volume_loss=made.training.volume_loss if wanted and wanted.completed else 0.0,
     )
-    network = replace(
-        made.model.network, depth=3, width=96, grid=made.model.network.grid if wanted and wanted.grid else 0
-    )
-    reader = replace(made.model.hypernetwork, **wanted.changes) if wanted and made.model.hypernetwork else None
+    network = made.model.network
+    assert isinstance(network, AnyOrderConfig)
+    network = replace(network, depth=3, width=96, grid=network.grid if wanted and wanted.grid else 0)
+    volume = made.model.hypernetwork
+    reader = None if wanted is None or volume is None else replace(volume, **wanted.changes)
+    if wanted is not None and wanted.images:
+        reader = replace(ALL_LAYERS, join="mean", views=6, resolution=64)
     model = replace(made.model, target=name, network=network, hypernetwork=reader, hull_resolution=64)
     return replace(made, model=model, training=training)
 

@@ -23,6 +23,7 @@ from hyperplanes.adaptation.diagnostics import diagnose
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.presets import Preset, preset
 from hyperplanes.data.dataset import open_datasets
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer
 from hyperplanes.training.episodes import prepare_episode
 from hyperplanes.utilities.metrics import psnr
@@ -32,7 +33,7 @@ __all__ = ["VARIANTS", "main", "measure", "variant"]
 
 NONE: dict[str, Any] = {"none": True}
 PAPER_UPDATE = {"layers": ("colour", "density"), "update": "full", "activation": "relu", "weights_seen": "updated"}
-UNSTANDARDISED = {"code_activation": "relu", "code_normalisation": "none", "centre": False}
+UNSTANDARDISED = {"code_normalisation": "none", "centre": False}
 
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "none": ("no hypernetwork", NONE),
@@ -45,13 +46,12 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "undirected": ("viewing directions are no input", {"see_directions": False}),
     "last_layers": ("full update of the colour and density layers, as in the paper; codes, outputs standardised",
                     PAPER_UPDATE),
-    "published": ("the same with ReLU on the codes and nothing standardised", {**PAPER_UPDATE, **UNSTANDARDISED}),
-    "gain_4": ("outputs multiplied with 4", {"gain": 4.0}),
+    "published": ("the same with nothing standardised", {**PAPER_UPDATE, **UNSTANDARDISED}),
     "last_layers_low_rank": ("low-rank update of colour and density layers only", {"layers": ("colour", "density")}),
     "no_warmup": ("full rates from the first step", {}),
     "paper_rates": ("1e-4 for theta and the hypernetwork by Adam, no warm-up, no schedule", {}),
 }  # fmt: skip
-"""Names, what they change, and the entries of HyperNetworkConfig that differ from the preset's."""
+"""Names, what they change, and the entries of ImageHyperNetworkConfig that differ from the preset's."""
 
 PAPER_RATES = {"learning_rate": 1e-4, "hypernetwork_learning_rate": 1e-4, "warmup": 0, "final_rate_factor": 1.0}
 TRAINING: dict[str, dict[str, Any]] = {"no_warmup": {"warmup": 0}, "paper_rates": {"optimiser": "adam", **PAPER_RATES}}
@@ -106,7 +106,7 @@ def variant(name: str, *, planes: int = 25, optimiser: str = "muon", tasks: int 
     made, changes = preset("quick"), VARIANTS[name][1]
     trained = {"optimiser": optimiser, **TRAINING.get(name, {})}
     hyper = made.model.hypernetwork
-    assert hyper is not None
+    assert isinstance(hyper, ImageHyperNetworkConfig)
     hyper = None if changes is NONE else replace(hyper, views=min(hyper.views, planes), **changes)
     return replace(
         made,

@@ -11,7 +11,7 @@ from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import fibonacci_sphere, look_at, pinhole, symmetric_intrinsics
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
-from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Marched
 from hyperplanes.views import Task, Views
 
@@ -124,8 +124,8 @@ def small_model(**changes):
     """A HyperPlanes model of four planes with weights that say something; milliseconds to train and render."""
     torch.manual_seed(0)
     parts = {
-        "network": TargetConfig(depth=2, width=24, planes=4, point_octaves=3, direction_octaves=1),
-        "hypernetwork": HyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16),
+        "network": TargetConfig(depth=2, width=24, planes=4, point_frequencies=3, direction_frequencies=1),
+        "hypernetwork": ImageHyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16),
         "sampling": Marched(24),
         "hull_resolution": 16,
     }

@@ -14,17 +14,17 @@ import torch
 from benchmarks.objects import held_out
 from hyperplanes.adaptation import HyperPlanes, diagnose, swap_gap
 from hyperplanes.fields import TargetConfig
-from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.rotation import Rotation
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, small_model
 
 SMALL = {"views": 1, "normalisation": "group", "code": 16, "depth": 2, "width": 32}
-ALL_LAYERS = HyperNetworkConfig(
+ALL_LAYERS = ImageHyperNetworkConfig(
     **SMALL, layers=("all",), update="low_rank", weights_seen="all", activation="silu", rank=2
 )
-LAST_LAYERS = HyperNetworkConfig(**{**SMALL, "normalisation": "batch"})
+LAST_LAYERS = ImageHyperNetworkConfig(**{**SMALL, "normalisation": "batch"})
 
 
 class ManyBalls(Balls):
@@ -37,7 +37,7 @@ class ManyBalls(Balls):
 @cache
 def trained(shape):
     """A field that reads no image, so that all it knows of an object is the update; some seconds of training."""
-    network = TargetConfig(depth=2, width=24, planes=1, point_octaves=2, direction_octaves=1)
+    network = TargetConfig(depth=2, width=24, planes=1, point_frequencies=2, direction_frequencies=1)
     model = small_model(target="nerf", network=network, hypernetwork=shape)
     config = TrainingConfig(steps=160, tasks=4, rays=48, learning_rate=3e-3, hypernetwork_learning_rate=3e-3)
     trainer = Trainer(model, ManyBalls(), replace(config, held_out=0))
@@ -82,10 +82,10 @@ def test_a_hypernetwork_whose_encoder_is_switched_off_is_found_out(shape):
 
 
 def test_the_published_form_is_found_out_when_its_codes_are_dead():
-    # ReLU on codes that are all negative: the update is the same for every object, whatever the pictures show.
-    shape = replace(LAST_LAYERS, code_activation="relu", code_normalisation="none", centre=False)
+    # Codes that are all zero: the update is the same for every object, whatever the pictures show.
+    shape = replace(LAST_LAYERS, code_normalisation="none", centre=False)
     model = small_model(hypernetwork=replace(shape, views=2))
-    torch.nn.init.constant_(model.hypernetwork.encoder.code.bias, -100.0)
+    torch.nn.init.zeros_(model.hypernetwork.encoder.code.weight)
     for output in model.hypernetwork.outputs:
         torch.nn.init.normal_(output.weight)
     data = Balls(test=2)

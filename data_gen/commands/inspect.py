@@ -49,6 +49,7 @@ def checkpoint_lines(folder: Path) -> list[str]:
     """What a checkpoint holds, a line a fact."""
     from hyperplanes.adaptation.checkpoints import checkpoint_folder
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
+    from hyperplanes.hypernetwork import ImageHyperNetworkConfig
     from hyperplanes.utilities.checkpoints import read_json
 
     folder = checkpoint_folder(folder)
@@ -61,9 +62,13 @@ def checkpoint_lines(folder: Path) -> list[str]:
     ]
     if config.hypernetwork is not None and model.hypernetwork is not None:
         hyper = config.hypernetwork
-        views = "all views" if model.reads_volume else f"{hyper.views} views"
+        read = (
+            f"{hyper.encoder} reads {hyper.views} views"
+            if isinstance(hyper, ImageHyperNetworkConfig)
+            else ("volume reads all views")
+        )
         lines.append(
-            f"hypernetwork: {hyper.encoder} reads {views}, {hyper.update} update of "
+            f"hypernetwork: {read}, {hyper.update} update of "
             f"{', '.join(hyper.layers)}, {sum(p.numel() for p in model.hypernetwork.parameters()):,} weights"
         )
         lines.append(f"diagnostics: {recorded_diagnostics(folder) or 'not recorded; `hyperplanes train` does'}")

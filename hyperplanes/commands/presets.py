@@ -37,18 +37,19 @@ class Arguments:
 def row(name: str, preset: Preset) -> tuple[str, ...]:
     """One preset as the cells of the table."""
     from hyperplanes.fields import find_targets
-    from hyperplanes.hypernetwork import VOLUME
+    from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 
     model, training = preset.model, preset.training
     hyper, anyhow = model.hypernetwork, find_targets()[model.target].permutation_invariant
     planes = "any" if anyhow else model.network.planes
-    read = f"{hyper.views if hyper else 0} of {planes}"
+    images = hyper if isinstance(hyper, ImageHyperNetworkConfig) else None
+    read = f"{images.views if images else 0} of {planes}"
     return (
         name,
         str(preset.resolution),
         f"{model.network.depth} x {model.network.width}",
-        hyper.encoder if hyper else "-",
-        "all views" if hyper and hyper.encoder == VOLUME else read,
+        images.encoder if images else "volume" if hyper else "-",
+        "all views" if hyper and not images else read,
         model.sampling.summary,
         f"{training.steps:,}",
         str(training.rays * training.tasks),

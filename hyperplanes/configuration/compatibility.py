@@ -5,7 +5,7 @@ from __future__ import annotations
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target, find_targets
-from hyperplanes.hypernetwork import VOLUME
+from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 
 __all__ = ["check_fine_tuning", "check_model"]
 
@@ -20,6 +20,9 @@ def check_model(config: ModelConfig) -> type[Target]:
     if config.target not in known:
         raise ValueError(f"target: expected one of {sorted(known)}, got {config.target!r}")
     target = known[config.target]
+    if not isinstance(config.network, target.config_type):
+        expected, found = target.config_type.__name__, type(config.network).__name__
+        raise ValueError(f"network: expected a {expected} for {config.target}, got a {found}")
     _check_hypernetwork(config, target)
     if config.plane_dropout and (target.permutation_invariant or config.target == "nerf"):
         raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
@@ -31,11 +34,11 @@ def check_model(config: ModelConfig) -> type[Target]:
 def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
     """What a hypernetwork reads has to be something that the field has, in a number that both can take."""
     hypernetwork = config.hypernetwork
-    if hypernetwork is not None and hypernetwork.encoder == VOLUME:
+    if isinstance(hypernetwork, VolumeHyperNetworkConfig):
         if target.volume_size is None:
             raise ValueError(
-                f"encoder: expected one that reads images for {config.target}, which knows views by their places, "
-                f"got {VOLUME!r}"
+                f"hypernetwork.kind: expected one that reads images for {config.target}, which knows views by their "
+                "places, got 'volume'"
             )
         return
     reader = hypernetwork or config.autoencoder
@@ -45,7 +48,7 @@ def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
         if hypernetwork is None or hypernetwork.join != "mean":
             found = "an autoencoder" if hypernetwork is None else repr(hypernetwork.join)
             raise ValueError(
-                f"{config.target}: expected a hypernetwork with encoder {VOLUME!r}, or with join 'mean', which takes "
+                f"{config.target}: expected a hypernetwork of kind 'volume', or with join 'mean', which takes "
                 f"HyperPlanes in any number and order, got {found}"
             )
     elif reader.views > config.network.planes:

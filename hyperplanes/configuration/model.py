@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from hyperplanes.configuration.initialisation import InitialisationConfig
 from hyperplanes.configuration.upgrade import upgrade_model
-from hyperplanes.fields import TargetConfig
-from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
+from hyperplanes.fields import TargetConfig, find_targets
+from hyperplanes.hypernetwork import KINDS, AutoencoderConfig, HyperNetworkConfig, ImageHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
-from hyperplanes.utilities.settings import SettingsError, choose_by_tag, structure
+from hyperplanes.utilities.settings import SettingsError, choose_by_tag, structure, tagged
 
 __all__ = ["ORDERS", "ModelConfig"]
 
 ORDERS = ("matched", "file")
 
-choose_by_tag(Hierarchical | Marched, "protocol")
+PROTOCOLS = {"hierarchical": Hierarchical, "marched": Marched}
+"""Samplers by the entry `protocol`."""
+
+choose_by_tag(Hierarchical | Marched, "protocol", PROTOCOLS)
+choose_by_tag(HyperNetworkConfig | None, "kind", KINDS)
 
 
 @dataclass(frozen=True)
@@ -28,8 +32,9 @@ class ModelConfig:
 
     Attributes:
         target: which field: "point_multiplane", "multiplane", "nerf" or "any_order".
-        network: the shape of the target.
-        hypernetwork: the shape of the hypernetwork, or None for one set of weights for all objects.
+        network: the shape of the target, of the dataclass that the field names (`Target.config_type`).
+        hypernetwork: the shape of the hypernetwork, which reads images or a volume; None for one set of weights for all
+            objects.
         autoencoder: the shape of an encoder whose code the target reads, in place of a hypernetwork.
         initialisation: how the weights were learned as an initialisation, if they were.
         coarse_network: whether a second network of the same shape proposes where to sample (NeRF's coarse network).
@@ -47,7 +52,7 @@ class ModelConfig:
 
     target: str = "point_multiplane"
     network: TargetConfig = field(default_factory=TargetConfig)
-    hypernetwork: HyperNetworkConfig | None = field(default_factory=HyperNetworkConfig)
+    hypernetwork: HyperNetworkConfig | None = field(default_factory=ImageHyperNetworkConfig)
     autoencoder: AutoencoderConfig | None = None
     initialisation: InitialisationConfig | None = None
     coarse_network: bool = False
@@ -75,9 +80,19 @@ class ModelConfig:
             return "autoencoder"
         return self.target if self.initialisation is None else self.initialisation.method
 
+    def with_target(self, name: str) -> ModelConfig:
+        """The same model of another field, in whose shape the settings that both have stay as they are."""
+        kind = find_targets()[name].config_type
+        shared = {each.name for each in fields(kind)} & {each.name for each in fields(self.network)}
+        network = kind(**{name: getattr(self.network, name) for name in shared})
+        return replace(self, target=name, network=network)
+
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""
-        return {**asdict(self), "protocol": type(self.sampling).__name__.lower()}
+        sampling = tagged(self.sampling, "protocol", PROTOCOLS) or {}
+        protocol = sampling.pop("protocol")
+        hypernetwork = tagged(self.hypernetwork, "kind", KINDS)
+        return {**asdict(self), "hypernetwork": hypernetwork, "sampling": sampling, "protocol": protocol}
 
     @classmethod
     def of_json(cls, value: Mapping[str, Any], where: Path | str = "configuration") -> ModelConfig:
@@ -108,10 +123,18 @@ class ModelConfig:
         for name in ("network", "sampling", "hypernetwork", "protocol"):
             if name not in value:
                 raise SettingsError(name, "a missing entry")
-        sampling, protocol = value["sampling"], value["protocol"]
-        if isinstance(sampling, Mapping):
-            sampling = {**sampling, "protocol": protocol}
-        return structure(cls, {**{k: v for k, v in value.items() if k != "protocol"}, "sampling": sampling})
+        entries = {name: entry for name, entry in value.items() if name not in ("network", "protocol")}
+        if isinstance(entries["sampling"], Mapping):
+            entries["sampling"] = {**entries["sampling"], "protocol": value["protocol"]}
+        made = structure(cls, entries)
+
+        # the field says which dataclass its shape is
+        known = find_targets()
+        kind = known[made.target].config_type if made.target in known else TargetConfig
+        try:
+            return replace(made, network=structure(kind, value["network"]))
+        except SettingsError as error:
+            raise SettingsError(f"network.{error.path}" if error.path else "network", error.problem) from None
 
     @classmethod
     def load(cls, folder: Path) -> ModelConfig:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 from hyperplanes.adaptation.hyperplanes import ModelConfig
 from hyperplanes.configuration.initialisation import LEARNED, InitialisationConfig
-from hyperplanes.fields import TARGETS, TargetConfig, find_targets
-from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
+from hyperplanes.fields import TARGETS, AnyOrderConfig, TargetConfig, find_targets
+from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import TrainingConfig
 
@@ -95,13 +95,11 @@ class Preset:
         target = target or chosen.model.target
         if not targets[target].permutation_invariant:
             chosen = chosen.for_known_places()
-        return replace(chosen, model=replace(chosen.model, target=target))
+        return replace(chosen, model=chosen.model.with_target(target))
 
     def for_known_places(self) -> Preset:
-        """Without what only a field of any number of views has: the grid of features, episodes of some of the views."""
-        network = replace(self.model.network, grid=0)
-        training = replace(_of_all_views(self.training), volume_loss=0.0)
-        return replace(self, model=replace(self.model, network=network), training=training)
+        """Without what only a field of any number of views can be trained by: episodes of some of the views."""
+        return replace(self, training=replace(_of_all_views(self.training), volume_loss=0.0))
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
@@ -148,7 +146,7 @@ MATCHING_RATE = 1e-3
 """Of Adam on random weights that are matched to an initialisation."""
 
 
-ALL_LAYERS = HyperNetworkConfig(
+ALL_LAYERS = ImageHyperNetworkConfig(
     normalisation="group", activation="silu", layers=("all",), update="low_rank", weights_seen="all"
 )
 """What served best in docs/hypernetwork.md: a low-rank update of every layer, and no batch statistics."""
@@ -160,7 +158,7 @@ more objects are read for the standardisation."""
 PRESETS: dict[str, Preset] = {
     "quick": Preset(
         ModelConfig(
-            network=TargetConfig(depth=4, width=128, point_octaves=5, direction_octaves=2),
+            network=TargetConfig(depth=4, width=128, point_frequencies=5, direction_frequencies=2),
             hypernetwork=ALL_LAYERS,
             sampling=Marched(steps=64),
             hull_resolution=64,
@@ -183,8 +181,10 @@ PRESETS: dict[str, Preset] = {
     "small": Preset(
         ModelConfig(
             target="any_order",
-            network=TargetConfig(depth=4, width=128, planes=8, grid=8, point_octaves=6, direction_octaves=2),
-            hypernetwork=replace(ALL_LAYERS, encoder="volume", code=256),
+            network=AnyOrderConfig(depth=4, width=128, planes=8, grid=8, point_frequencies=6, direction_frequencies=2),
+            hypernetwork=VolumeHyperNetworkConfig(
+                code=256, activation="silu", layers=("all",), update="low_rank", weights_seen="all"
+            ),
             sampling=Marched(steps=64),
             hull_resolution=96,
         ),
@@ -207,7 +207,7 @@ PRESETS: dict[str, Preset] = {
     ),
     "small-paper": Preset(
         ModelConfig(
-            network=TargetConfig(depth=6, width=192, point_octaves=6),
+            network=TargetConfig(depth=6, width=192, point_frequencies=6),
             hypernetwork=ALL_LAYERS,
             sampling=Marched(steps=96),
             hull_resolution=96,
@@ -250,7 +250,7 @@ PRESETS: dict[str, Preset] = {
     ),
     "paper-200": Preset(
         ModelConfig(
-            hypernetwork=HyperNetworkConfig(views=25, encoder="resnet101", depth=10),
+            hypernetwork=ImageHyperNetworkConfig(views=25, encoder="resnet101", depth=10),
             coarse_network=True,
             sampling=PAPER_SAMPLING,
         ),

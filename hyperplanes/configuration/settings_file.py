@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ import yaml
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.presets import Preset
 from hyperplanes.configuration.upgrade import upgrade_model
+from hyperplanes.fields import find_targets
+from hyperplanes.hypernetwork import KINDS
 from hyperplanes.training import TrainingConfig
 from hyperplanes.training.configuration import upgraded
 from hyperplanes.utilities.files import DataError, read_bytes, write_whole
@@ -104,17 +106,34 @@ def changed(chosen: Preset, changes: Mapping[str, Any]) -> Preset:
         SettingsError: an unknown entry, or a value that does not fit; its path begins with "model" or "training".
     """
     model, training = chosen.model.as_json(), asdict(chosen.training)
-    wanted = upgrade_model(changes.get("model", {}))
-    if isinstance(wanted, Mapping) and wanted.get("protocol", model["protocol"]) != model["protocol"]:
-        model["sampling"] = {}
     try:
         path = "model"
+        wanted = upgrade_model(changes.get("model", {}))
+        if isinstance(wanted, Mapping) and wanted.get("protocol", model["protocol"]) != model["protocol"]:
+            model["sampling"] = {}
+        _change_kind(model, wanted)
         made = ModelConfig.structured(_merged(model, wanted))
         path = "training"
         trained = structure(TrainingConfig, _merged(training, upgraded(changes.get("training", {}))))
     except SettingsError as error:
         raise SettingsError(f"{path}.{error.path}" if error.path else path, error.problem) from None
     return replace(chosen, model=made, training=trained)
+
+
+def _change_kind(model: dict[str, Any], wanted: Any) -> None:
+    """Keep of the shape of a hypernetwork, and of a network, what that of the wanted kind or field has too."""
+    if not isinstance(wanted, Mapping):
+        return
+    known = find_targets()
+    if (target := wanted.get("target")) in known:
+        shared = {each.name for each in fields(known[target].config_type)}
+        model["network"] = {name: value for name, value in model["network"].items() if name in shared}
+    hypernetwork = wanted.get("hypernetwork")
+    kind = KINDS.get(hypernetwork.get("kind", "")) if isinstance(hypernetwork, Mapping) else None
+    if kind is not None and model["hypernetwork"] is not None:
+        shared = {each.name for each in fields(kind)}
+        entries = {name: value for name, value in model["hypernetwork"].items() if name in shared}
+        model["hypernetwork"] = entries
 
 
 def _merged(base: Mapping[str, Any], changes: Any) -> Any:

@@ -3,7 +3,7 @@
 Another package adds one by an entry point of the group `hyperplanes.fields` that names a subclass of `Target`.
 """
 
-from hyperplanes.fields.any_order import AnyOrderNeRF
+from hyperplanes.fields.any_order import AnyOrderConfig, AnyOrderNeRF
 from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.multiplane import MultiPlaneNeRF, PointMultiPlaneNeRF
 from hyperplanes.fields.nerf import NeRF
@@ -11,6 +11,7 @@ from hyperplanes.utilities.entry_points import load_entries
 
 __all__ = [
     "TARGETS",
+    "AnyOrderConfig",
     "AnyOrderNeRF",
     "Field",
     "MultiPlaneNeRF",

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -28,7 +28,7 @@ from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-__all__ = ["AnyOrderField", "AnyOrderNeRF", "FeatureGrid"]
+__all__ = ["AnyOrderConfig", "AnyOrderField", "AnyOrderNeRF", "FeatureGrid"]
 
 SMALLEST_ANGLE = 1e-2
 FALLOFF = 8.0  # of depths behind the hull, in 1 / radii, where tanh makes them inputs
@@ -60,6 +60,19 @@ class FeatureGrid(nn.Module):
         self.weight = nn.Parameter(torch.zeros(channels, SIDE, SIDE, SIDE))
 
 
+@dataclass(frozen=True)
+class AnyOrderConfig(TargetConfig):
+    """The shape of a field of any number of views.
+
+    Attributes:
+        blended: views whose colours are blended.
+        grid: features of the cells of a grid over the scene that are read beside the views; 0 is no grid.
+    """
+
+    blended: Annotated[int, range(1, 65)] = 4
+    grid: Annotated[int, range(65)] = 0
+
+
 class AnyOrderNeRF(Target):
     """F(x, z, d; theta) = (c, sigma), where z is sorted by visibility.
 
@@ -68,16 +81,18 @@ class AnyOrderNeRF(Target):
     the scene, the first of them through a sigmoid: weights like all others, which a hypernetwork updates.
     """
 
+    config_type: ClassVar[type[TargetConfig]] = AnyOrderConfig
     permutation_invariant: ClassVar[bool] = True
+    config: AnyOrderConfig
     volume_size: ClassVar[tuple[int, int] | None] = (CHANNELS, SIDE)
 
-    def __init__(self, config: TargetConfig) -> None:
+    def __init__(self, config: AnyOrderConfig) -> None:
         super().__init__(config)
         width, blended = config.width, config.blended
         if config.grid:
             self.grid = FeatureGrid(config.grid)
         self.density = nn.Linear(width + 1, 1)
-        self.view = nn.Linear(width + encoded_size(config.direction_octaves) + BLENDED * blended, width // 2)
+        self.view = nn.Linear(width + encoded_size(config.direction_frequencies) + BLENDED * blended, width // 2)
         self.colour = nn.Linear(width // 2, blended + 3)
         with torch.no_grad():
             for layer in (self.density, self.view, self.colour):
@@ -92,7 +107,7 @@ class AnyOrderNeRF(Target):
     def input_size(self) -> int:
         """The encoded point, what the best views show, and what all of them have in common."""
         config = self.config
-        return encoded_size(config.point_octaves) + self.views_size + OVERALL + config.grid
+        return encoded_size(config.point_frequencies) + self.views_size + OVERALL + config.grid
 
     @property
     def views_size(self) -> int:
@@ -193,7 +208,7 @@ class AnyOrderField(Field):
         number = visibility.number.clamp_min(1).log()
         overall = [mean, variance, colours[:, 0] - mean, torch.stack([visibility.coverage, number], 1)]
 
-        inputs = [encode(self.bounds.normalise(points), config.point_octaves)]
+        inputs = [encode(self.bounds.normalise(points), config.point_frequencies)]
         inputs += [self.joined(slots), *overall]
         if config.grid:
             features = interpolate_grid(self.parameters["grid.weight"], points, self.bounds)
@@ -239,7 +254,7 @@ class AnyOrderField(Field):
         colours, valid = _of(shown, seen.views), seen.valid[..., None]
 
         slots = torch.cat([(2 * colours - 1) * valid, angle[:, :count, None] * valid, _described(seen)], -1)
-        along = encode(directions, config.direction_octaves)
+        along = encode(directions, config.direction_frequencies)
         value = torch.cat([self.layer("feature", hidden), along, _padded(slots, config.blended).flatten(1)], 1)
         factors, shift = self.layer("colour", relu(self.layer("view", value))).split([config.blended, 3], 1)
         weights = torch.softmax(weights.log() + factors[:, :count], 1)

@@ -29,11 +29,10 @@ class TargetConfig:
     Attributes:
         depth: fully connected layers before the heads.
         width: of each of them.
-        planes: number of ImagePlanes the network is made for; of "any_order", the views that are read at a point.
-        blended: views whose colours "any_order" blends; the other fields have none.
-        grid: features of the cells of a grid over the scene that "any_order" reads beside the views; 0 is no grid.
-        point_octaves: of the positional encoding of points.
-        direction_octaves: of the positional encoding of viewing directions.
+        planes: number of ImagePlanes the network is made for; of a field that takes any number of views, those
+            that are read at a point.
+        point_frequencies: number of frequencies of the positional encoding of points.
+        direction_frequencies: number of frequencies of the positional encoding of viewing directions.
         density_scale: what the density head is multiplied with; an object of unit radius is a few voxels deep, so
             densities of tens are the rule.
     """
@@ -41,10 +40,8 @@ class TargetConfig:
     depth: Annotated[int, range(1, 257)] = 8
     width: Annotated[int, range(1, 8193)] = 256
     planes: Annotated[int, range(1, 1025)] = 25
-    blended: Annotated[int, range(1, 65)] = 4
-    grid: Annotated[int, range(65)] = 0
-    point_octaves: Annotated[int, range(33)] = 10
-    direction_octaves: Annotated[int, range(33)] = 4
+    point_frequencies: Annotated[int, range(33)] = 10
+    direction_frequencies: Annotated[int, range(33)] = 4
     density_scale: float = 25.0
 
 
@@ -55,11 +52,13 @@ class Target(nn.Module):
     say what the first layer reads, and where they treat support views otherwise than the paper's fields do.
 
     Attributes:
+        config_type: the dataclass of its shape.
         permutation_invariant: takes any number of views in any order, and so could copy the view that a ray comes from;
             otherwise `config.planes` views, each known by its place.
         volume_size: channels and cells an axis of what `volume_of` makes; None where there is no such volume.
     """
 
+    config_type: ClassVar[type[TargetConfig]] = TargetConfig
     permutation_invariant: ClassVar[bool] = False
     volume_size: ClassVar[tuple[int, int] | None] = None
 
@@ -74,7 +73,7 @@ class Target(nn.Module):
             self.layers.append(nn.Linear(size + (self.input_size if index == self.skip > 0 else 0), width))
         self.density = nn.Linear(width, 1)
         self.feature = nn.Linear(width, width)
-        self.view = nn.Linear(width + encoded_size(config.direction_octaves), width // 2)
+        self.view = nn.Linear(width + encoded_size(config.direction_frequencies), width // 2)
         self.colour = nn.Linear(width // 2, 3)
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
@@ -249,7 +248,7 @@ class MLPField(Field):
         self, hidden: Float[Tensor, "point width"], directions: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point 3"]:
         """The colour head."""
-        seen = encode(directions, self.target.config.direction_octaves)
+        seen = encode(directions, self.target.config.direction_frequencies)
         value = relu(self.layer("view", torch.cat([self.layer("feature", hidden), seen], -1)))
         return torch.sigmoid(self.layer("colour", value))
 
@@ -260,5 +259,5 @@ class MLPField(Field):
         width = self.target.config.width
         weight, bias = self.parameters["view.weight"], self.parameters["view.bias"]
         here = linear(self.layer("feature", hidden), weight[:, :width], bias)
-        along = linear(encode(directions, self.target.config.direction_octaves), weight[:, width:])
+        along = linear(encode(directions, self.target.config.direction_frequencies), weight[:, width:])
         return torch.sigmoid(self.layer("colour", relu(here[:, None] + along)))

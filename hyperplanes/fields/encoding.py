@@ -9,27 +9,27 @@ from torch import Tensor
 __all__ = ["encoded_size", "encode"]
 
 
-def encoded_size(octaves: int, size: int = 3) -> int:
+def encoded_size(frequencies: int, size: int = 3) -> int:
     """Length of an encoded vector."""
-    return size * (1 + 2 * octaves)
+    return size * (1 + 2 * frequencies)
 
 
-def encode(values: Float[Tensor, "*batch size"], octaves: int) -> Float[Tensor, "*batch encoded"]:
+def encode(values: Float[Tensor, "*batch size"], frequencies: int) -> Float[Tensor, "*batch encoded"]:
     """(v, sin(2^0 v), ..., sin(2^(L-1) v), cos(2^0 v), ..., cos(2^(L-1) v)) (NeRF, Eq. 4, without its factor pi).
 
     Only the first sine and cosine are computed; the others follow by doubling the angle.
 
     Args:
         values: coordinates within about [-1, 1].
-        octaves: L.
+        frequencies: L.
 
     >>> encode(torch.tensor([0.0, 0.0, 0.0]), 1).tolist()
     [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
     """
-    if octaves == 0:
+    if frequencies == 0:
         return values
     sine, cosine = [values.sin()], [values.cos()]
-    for _ in range(octaves - 1):
+    for _ in range(frequencies - 1):
         sine_now, cosine_now = sine[-1], cosine[-1]
         sine.append(2 * sine_now * cosine_now)
         cosine.append(1 - 2 * sine_now.square())

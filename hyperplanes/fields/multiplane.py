@@ -48,9 +48,9 @@ class PointMultiPlaneNeRF(MultiPlaneNeRF):
     @property
     def input_size(self) -> int:
         """Z and the encoded point."""
-        return super().input_size + encoded_size(self.config.point_octaves)
+        return super().input_size + encoded_size(self.config.point_frequencies)
 
     def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:
         """z(x, I) and the encoded position in the unit sphere."""
-        here = encode(bounds.normalise(points), self.config.point_octaves)
+        here = encode(bounds.normalise(points), self.config.point_frequencies)
         return torch.cat([super().inputs(points, planes, bounds), here], -1)

@@ -21,11 +21,11 @@ class NeRF(Target):
     @property
     def input_size(self) -> int:
         """The encoded point."""
-        return encoded_size(self.config.point_octaves)
+        return encoded_size(self.config.point_frequencies)
 
     def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:
         """The encoded position in the unit sphere."""
-        return encode(bounds.normalise(points), self.config.point_octaves)
+        return encode(bounds.normalise(points), self.config.point_frequencies)
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> None:
         """Nothing: the network reads no image."""

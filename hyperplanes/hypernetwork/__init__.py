@@ -2,20 +2,27 @@
 
 from hyperplanes.hypernetwork.autoencoder import Autoencoder, AutoencoderConfig
 from hyperplanes.hypernetwork.base import HyperNetwork, Observed
-from hyperplanes.hypernetwork.configuration import VOLUME, HyperNetworkConfig
+from hyperplanes.hypernetwork.configuration import (
+    KINDS,
+    HyperNetworkConfig,
+    ImageHyperNetworkConfig,
+    VolumeHyperNetworkConfig,
+)
 from hyperplanes.hypernetwork.encoders import ConvNet, ResNet101
 from hyperplanes.hypernetwork.image_hypernetwork import ImageHyperNetwork
 from hyperplanes.hypernetwork.volume_hypernetwork import VolumeHyperNetwork
 
 __all__ = [
-    "VOLUME",
+    "KINDS",
     "Autoencoder",
     "AutoencoderConfig",
     "ConvNet",
     "HyperNetwork",
     "HyperNetworkConfig",
     "ImageHyperNetwork",
+    "ImageHyperNetworkConfig",
     "Observed",
     "ResNet101",
     "VolumeHyperNetwork",
+    "VolumeHyperNetworkConfig",
 ]

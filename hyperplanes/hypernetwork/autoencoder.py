@@ -27,7 +27,7 @@ class AutoencoderConfig:
         views: number of images it reads.
         choice: which of the planes they are: "farthest" apart, or the "first".
         encoder: "convnet" or "resnet101".
-        normalisation: of the encoder, as in `HyperNetworkConfig`.
+        normalisation: of the encoder, as in `ImageHyperNetworkConfig`.
         code: length of the code of one image.
         latent: length of the code of an object.
     """

@@ -1,10 +1,10 @@
-"""The shape of a hypernetwork."""
+"""The shapes of hypernetworks, one dataclass for each kind; `docs/hypernetwork.md` has what each choice is worth."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 from torch import Tensor
 from torch.nn.functional import relu, silu
@@ -13,35 +13,29 @@ from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
 from hyperplanes.hypernetwork.updates import UPDATES
 
-__all__ = ["ACTIVATIONS", "VOLUME", "HyperNetworkConfig"]
+__all__ = [
+    "ACTIVATIONS",
+    "KINDS",
+    "HeadConfig",
+    "HyperNetworkConfig",
+    "ImageHyperNetworkConfig",
+    "VolumeHyperNetworkConfig",
+]
 
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": relu, "silu": silu, "none": lambda value: value}
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": relu, "silu": silu}
 CODE_NORMALISATIONS = ("none", "layer", "running")
 JOINS = ("concatenate", "mean")
 WEIGHTS_SEEN = ("updated", "all")
-VOLUME = "volume"
 
 
 @dataclass(frozen=True)
-class HyperNetworkConfig:
-    """The shape of a hypernetwork. `docs/hypernetwork.md` has what each choice is worth in dB.
+class HeadConfig:
+    """What hypernetworks of every kind end with: from the code of an object to an update.
 
     Attributes:
-        views: k, the number of HyperPlanes it reads; the most it reads with a field that takes any number of views.
-        choice: which k of the n planes they are: the "farthest" apart, or the "first".
-        resolution: pixels a side that HyperPlanes are resized to before they are encoded, so that pictures of every
-            size are read alike; 0 leaves them as they are, and resizes those of a step to the size of its first object.
-        encoder: "convnet" (ShapeNet 128) or "resnet101" (ShapeNet 200) read images; "volume" reads what all views show
-            on a grid over the scene, `VolumeHyperNetwork`, and ignores `views`, `choice`, `resolution`,
-            `normalisation`, `join` and `see_directions`.
-        normalisation: of the encoder: "batch" as in the paper, by running statistics in use; "batch_statistics", by the
-            statistics of the HyperPlanes at hand in use too, as the published code does; or "group", image by image.
-        code: length of the code of one image.
-        code_activation: applied to the codes: "none", or "relu".
-        code_normalisation: of the codes before that: "running" standardises them by running statistics over objects,
-            "layer" each over its own entries, "none" leaves them.
-        join: how the codes of k images become one: "concatenate" as in the paper, or "mean", in which case each code is
-            joined with its viewing direction first and the order of the images does not matter.
+        code: length of the code of one image, or of a volume.
+        code_normalisation: of the codes: "running" standardises them by running statistics over objects, "layer" each
+            over its own entries, "none" leaves them.
         depth: fully connected layers of the head before its outputs.
         width: of each of them.
         activation: of the head: "relu" as in the paper, or "silu".
@@ -52,21 +46,12 @@ class HyperNetworkConfig:
         weights_seen: how much of it: "updated", the weights of the layers that are updated, or "all". The paper says
             theta. It is the same for every object, so it carries no information about the object; in training it lets
             the update follow the weights it is added to.
-        see_directions: the viewing directions are an input.
         centre: what the output layers read is standardised by running statistics over objects, and they have no bias:
             the update has mean zero over objects, so that what is the same for every object can only go into theta.
-        gain: what the outputs are multiplied with.
     """
 
-    views: Annotated[int, range(1, 1025)] = 5
-    choice: str = "farthest"
-    resolution: Annotated[int, range(8193)] = 0
-    encoder: str = "convnet"
-    normalisation: str = "batch"
     code: Annotated[int, range(1, 8193)] = 128
-    code_activation: str = "none"
     code_normalisation: str = "running"
-    join: str = "concatenate"
     depth: Annotated[int, range(1, 257)] = 3
     width: Annotated[int, range(1, 8193)] = 256
     activation: str = "relu"
@@ -75,22 +60,53 @@ class HyperNetworkConfig:
     rank: Annotated[int, range(1, 1025)] = 4
     see_weights: bool = True
     weights_seen: str = "updated"
-    see_directions: bool = True
     centre: bool = True
-    gain: float = 1.0
 
     def __post_init__(self) -> None:
-        check_choices(
-            self,
-            {
-                "choice": CHOICES,
-                "encoder": (*ENCODERS, VOLUME),
-                "normalisation": NORMALISATIONS,
-                "code_activation": ACTIVATIONS,
-                "code_normalisation": CODE_NORMALISATIONS,
-                "join": JOINS,
-                "activation": ACTIVATIONS,
-                "update": UPDATES,
-                "weights_seen": WEIGHTS_SEEN,
-            },
-        )
+        known = {"activation": ACTIVATIONS, "update": UPDATES, "weights_seen": WEIGHTS_SEEN}
+        check_choices(self, {"code_normalisation": CODE_NORMALISATIONS, **known})
+
+
+@dataclass(frozen=True)
+class ImageHyperNetworkConfig(HeadConfig):
+    """A hypernetwork that reads images, as in the paper (`ImageHyperNetwork`).
+
+    Attributes:
+        views: k, the number of HyperPlanes it reads; the most it reads with a field that takes any number of views.
+        choice: which k of the n planes they are: the "farthest" apart, or the "first".
+        resolution: pixels a side that HyperPlanes are resized to before they are encoded, so that pictures of every
+            size are read alike; 0 leaves them as they are, and resizes those of a step to the size of its first object.
+        encoder: "convnet" (ShapeNet 128) or "resnet101" (ShapeNet 200).
+        normalisation: of the encoder: "batch" as in the paper, by running statistics in use; "batch_statistics", by the
+            statistics of the HyperPlanes at hand in use too, as the published code does; or "group", image by image.
+        join: how the codes of k images become one: "concatenate" as in the paper, or "mean", in which case each code is
+            joined with its viewing direction first and the order of the images does not matter.
+        see_directions: the viewing directions are an input.
+    """
+
+    views: Annotated[int, range(1, 1025)] = 5
+    choice: str = "farthest"
+    resolution: Annotated[int, range(8193)] = 0
+    encoder: str = "convnet"
+    normalisation: str = "batch"
+    join: str = "concatenate"
+    see_directions: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known = {"choice": CHOICES, "encoder": ENCODERS, "normalisation": NORMALISATIONS, "join": JOINS}
+        check_choices(self, known)
+
+
+@dataclass(frozen=True)
+class VolumeHyperNetworkConfig(HeadConfig):
+    """A hypernetwork that reads what all views show on a grid over the scene (`VolumeHyperNetwork`)."""
+
+
+HyperNetworkConfig: TypeAlias = ImageHyperNetworkConfig | VolumeHyperNetworkConfig
+
+KINDS: dict[str, type[ImageHyperNetworkConfig] | type[VolumeHyperNetworkConfig]] = {
+    "images": ImageHyperNetworkConfig,
+    "volume": VolumeHyperNetworkConfig,
+}
+"""By the entry `kind` of files of settings."""

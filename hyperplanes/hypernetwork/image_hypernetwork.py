@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import silu
 
 from hyperplanes.hypernetwork.base import Observed
-from hyperplanes.hypernetwork.configuration import ACTIVATIONS, HyperNetworkConfig
+from hyperplanes.hypernetwork.configuration import ImageHyperNetworkConfig
 from hyperplanes.hypernetwork.encoders import ENCODERS, encode_objects
 from hyperplanes.hypernetwork.standardisation import RunningStandardisation
 from hyperplanes.hypernetwork.update_head import UpdateHead
@@ -25,8 +25,9 @@ class ImageHyperNetwork(UpdateHead):
     The outputs start at zero: an untrained hypernetwork changes nothing.
     """
 
-    def __init__(self, config: HyperNetworkConfig, shapes: Mapping[str, torch.Size]) -> None:
+    def __init__(self, config: ImageHyperNetworkConfig, shapes: Mapping[str, torch.Size]) -> None:
         super().__init__(config, shapes)
+        self.config = config
         self.views, self.choice, self.resolution = config.views, config.choice, config.resolution
         self.encoder = ENCODERS[config.encoder](config.code, config.normalisation)
         concatenated = config.join == "concatenate"
@@ -72,19 +73,13 @@ class ImageHyperNetwork(UpdateHead):
         assert observed.directions is not None
         return self.encode(observed.images, observed.directions, observed.present)
 
-    @property
-    def activated(self) -> Sequence[nn.Module]:
-        """The layers of the head, and the codes where they have an activation."""
-        codes = [self.code_normalisation] if self.config.code_activation != "none" else []
-        return [*codes, *super().activated]
-
     def encode(
         self,
         images: Float[Tensor, "object view 3 height width"],
         directions: Float[Tensor, "object view 3"],
         present: Bool[Tensor, "object view"] | None = None,
     ) -> Float[Tensor, "object ..."]:
-        """The codes of the images before their activation: (object, view, code), or (object, code) of their mean."""
+        """The codes of the images: (object, view, code), or (object, code) of their mean."""
         apart = self.config.normalisation == "batch_statistics" and not self.training
         codes = encode_objects(self.encoder, images, present, apart=apart)
         if self.config.join == "mean":
@@ -98,7 +93,7 @@ class ImageHyperNetwork(UpdateHead):
 
     def _joined(self, codes: Tensor, directions: Tensor) -> Float[Tensor, "object read"]:
         """What the head reads of the object: codes and viewing directions."""
-        parts = [ACTIVATIONS[self.config.code_activation](codes).flatten(1)]
+        parts = [codes.flatten(1)]
         if self.config.join == "concatenate":
             seen = directions if self.config.see_directions else torch.zeros_like(directions)
             parts.append(seen.flatten(1))

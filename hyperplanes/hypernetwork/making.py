@@ -8,7 +8,7 @@ import torch
 
 from hyperplanes.hypernetwork.autoencoder import Autoencoder, AutoencoderConfig
 from hyperplanes.hypernetwork.base import HyperNetwork
-from hyperplanes.hypernetwork.configuration import VOLUME, HyperNetworkConfig
+from hyperplanes.hypernetwork.configuration import HyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.hypernetwork.image_hypernetwork import ImageHyperNetwork
 from hyperplanes.hypernetwork.volume_hypernetwork import VolumeHyperNetwork
 
@@ -31,7 +31,7 @@ def make_hypernetwork(
     """
     if isinstance(config, AutoencoderConfig):
         return Autoencoder(config, shapes, reading_layers)
-    if config.encoder == VOLUME:
+    if isinstance(config, VolumeHyperNetworkConfig):
         assert volume_size is not None
         return VolumeHyperNetwork(config, shapes, *volume_size)
     return ImageHyperNetwork(config, shapes)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import relu
 
 from hyperplanes.hypernetwork.base import HyperNetwork
-from hyperplanes.hypernetwork.configuration import ACTIVATIONS, HyperNetworkConfig
+from hyperplanes.hypernetwork.configuration import ACTIVATIONS, HeadConfig
 from hyperplanes.hypernetwork.standardisation import RunningStandardisation
 from hyperplanes.hypernetwork.updates import UPDATES
 from hyperplanes.hypernetwork.weights import LowRankReader
@@ -30,7 +30,7 @@ class UpdateHead(HyperNetwork):
         ValueError: layers that the target does not have.
     """
 
-    def __init__(self, config: HyperNetworkConfig, shapes: Mapping[str, torch.Size]) -> None:
+    def __init__(self, config: HeadConfig, shapes: Mapping[str, torch.Size]) -> None:
         super().__init__()
         self.config = config
         known = {name.split(".")[-2] for name in shapes}
@@ -80,7 +80,7 @@ class UpdateHead(HyperNetwork):
         if config.centre:  # of unit length on average, as what Adam moves an output by grows with it
             hidden = self.standardise(hidden) / config.width**0.5
         # each parameter has an output layer of its own, and a form in which its update is written
-        outputs = [output(hidden) * config.gain for output in self.outputs]
+        outputs = [output(hidden) for output in self.outputs]
         return [
             Parameters(
                 (name, update(output[index], theta[name]))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.hypernetwork.base import Observed
-from hyperplanes.hypernetwork.configuration import ACTIVATIONS, HyperNetworkConfig
+from hyperplanes.hypernetwork.configuration import VolumeHyperNetworkConfig
 from hyperplanes.hypernetwork.standardisation import RunningStandardisation
 from hyperplanes.hypernetwork.update_head import UpdateHead
 from hyperplanes.hypernetwork.volume_network import VolumeNetwork
@@ -27,7 +27,7 @@ class VolumeHyperNetwork(UpdateHead):
     has a part that all objects share.
 
     Args:
-        config: its encoder is "volume".
+        config: the shape.
         shapes: of the parameters by name; those of four dimensions are grids of features, with as many cells as V.
         channels: numbers that V has of a cell.
         side: cells of V an axis.
@@ -38,7 +38,9 @@ class VolumeHyperNetwork(UpdateHead):
 
     reads_volume: ClassVar[bool] = True
 
-    def __init__(self, config: HyperNetworkConfig, shapes: Mapping[str, torch.Size], channels: int, side: int) -> None:
+    def __init__(
+        self, config: VolumeHyperNetworkConfig, shapes: Mapping[str, torch.Size], channels: int, side: int
+    ) -> None:
         super().__init__(config, shapes)
         self.grids = {name: shape for name, shape in self.shapes.items() if len(shape) == 4}
         self.shapes = {name: shape for name, shape in self.shapes.items() if name not in self.grids}
@@ -58,7 +60,7 @@ class VolumeHyperNetwork(UpdateHead):
         """
         assert observed.volume is not None
         codes, features = self.encoder(observed.volume)
-        updates = self.updates_of(ACTIVATIONS[self.config.code_activation](self.code_normalisation(codes)), theta)
+        updates = self.updates_of(self.code_normalisation(codes), theta)
         for update, cells in zip(updates, features, strict=True):
             update.update(zip(self.grids, cells.split([shape[0] for shape in self.grids.values()]), strict=True))
         return updates

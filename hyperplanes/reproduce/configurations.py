@@ -56,7 +56,7 @@ def configuration(experiment: Experiment, trained: Trained, scale: Scale, object
     changes["model.network.planes"] = scale.planes(trained.planes)
     for part in ("hypernetwork", "autoencoder"):
         reader, name = getattr(chosen.model, part), f"model.{part}.views"
-        if reader is not None:
+        if hasattr(reader, "views"):
             views = trained.changes.get(name, reader.views)
             assert isinstance(views, int)
             changes[name] = scale.planes(views)

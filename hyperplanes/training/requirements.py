@@ -29,8 +29,10 @@ def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
             )
     if config.rotations and not config.views:
         raise ValueError(f"training.rotations: expected 0 without training.views, got {config.rotations}")
-    if config.volume_loss and not (model.reads_volume and model.config.network.grid >= COMPLETED and config.views):
+    if config.volume_loss and not (
+        model.reads_volume and getattr(model.config.network, "grid", 0) >= COMPLETED and config.views
+    ):
         raise ValueError(
-            f"training.volume_loss: expected training.views, a hypernetwork with encoder 'volume' and a grid of at "
+            f"training.volume_loss: expected training.views, a hypernetwork of kind 'volume' and a grid of at "
             f"least {COMPLETED} features, got another model or training"
         )

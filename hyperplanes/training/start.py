@@ -112,8 +112,8 @@ def _check_views(model: HyperPlanes, tasks: Tasks) -> None:
     if len(task.support) >= planes:
         return
     count = min(planes, len(task.support) + len(task.query))
-    reader = model.config.hypernetwork or model.config.autoencoder
-    fewer = f" --model.hypernetwork.views {count}" if reader and reader.views > count else ""
+    read = 0 if model.hypernetwork is None else model.hypernetwork.views
+    fewer = f" --model.hypernetwork.views {count}" if read > count else ""
     raise ValueError(
         f"{task.name}: expected a support view for each of {planes} planes, got {len(task.support)}; "
         f"`train --support {count}{fewer}` takes query views too{', and as many planes' * (count < planes)}"

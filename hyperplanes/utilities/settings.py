@@ -9,15 +9,15 @@ import difflib
 import math
 import reprlib
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar, get_type_hints
+from dataclasses import asdict, fields, is_dataclass
+from types import NoneType
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from cattrs import Converter, IterableValidationError
 from cattrs.errors import ClassValidationError, ForbiddenExtraKeysError
 from cattrs.gen import make_dict_structure_fn, override
-from cattrs.strategies import configure_tagged_union
 
-__all__ = ["SettingsError", "choose_by_tag", "nearest", "structure"]
+__all__ = ["SettingsError", "choose_by_tag", "nearest", "structure", "tagged"]
 
 Made = TypeVar("Made")
 
@@ -67,9 +67,33 @@ def structure(kind: type[Made], value: object) -> Made:
         raise found from None
 
 
-def choose_by_tag(union: Any, tag: str) -> None:
-    """Let an entry `tag` say which dataclass of a union is meant, by its name in lower case."""
-    configure_tagged_union(union, _CONVERTER, lambda kind: kind.__name__.lower(), tag)
+def choose_by_tag(union: Any, tag: str, kinds: Mapping[str, type]) -> None:
+    """Let an entry of that name say which dataclass of a union is meant.
+
+    Args:
+        union: of dataclasses, and of None where there may be none.
+        tag: the entry.
+        kinds: the dataclasses by what the entry may be.
+    """
+
+    def hook(value: Any, _: Any) -> Any:
+        if value is None and NoneType in get_args(union):
+            return None
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{reprlib.repr(value)} instead of its entries")
+        chosen = value.get(tag)
+        if not isinstance(chosen, str) or chosen not in kinds:
+            raise ValueError(f"{tag}: expected one of {', '.join(kinds)}, got {chosen!r}")
+        return _CONVERTER.structure({name: entry for name, entry in value.items() if name != tag}, kinds[chosen])
+
+    _CONVERTER.register_structure_hook_func(lambda kind: kind == union, hook)
+
+
+def tagged(value: Any, tag: str, kinds: Mapping[str, type]) -> dict[str, Any] | None:
+    """The entries of a dataclass with the one that `choose_by_tag` asks; None of None."""
+    if value is None:
+        return None
+    return {tag: next(name for name, kind in kinds.items() if type(value) is kind), **asdict(value)}
 
 
 def nearest(name: str, known: list[str]) -> str:
@@ -97,8 +121,6 @@ def _first(error: BaseException, kind: Any, path: tuple[str, ...]) -> SettingsEr
         name = str(sorted(error.extra_fields, key=str)[0])
         known = [each.name for each in fields(error.cl)] if is_dataclass(error.cl) else []
         return SettingsError(".".join([*path, name]), f"an unknown entry; {nearest(name, known)}")
-    if isinstance(error, KeyError):  # of the tag
-        return SettingsError(where, f"an unknown kind {error}")
     if isinstance(error, ValueError | TypeError):
         return SettingsError(where, " ".join(str(error).split()))
     return None

@@ -11,19 +11,20 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.descent import Descent
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FineTuning
-from hyperplanes.fields import TargetConfig
+from hyperplanes.fields import AnyOrderConfig, TargetConfig
 from hyperplanes.geometry.cameras import centres
-from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
+from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering import Marched
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring
 
-SHAPE = HyperNetworkConfig(
+SHAPE = ImageHyperNetworkConfig(
     views=3, normalisation="group", code=8, depth=2, width=16, join="mean", layers=("all",), update="low_rank", rank=1
 )
-VOLUME = replace(SHAPE, encoder="volume")
-NETWORK = TargetConfig(depth=2, width=16, planes=4, blended=2, point_octaves=2, direction_octaves=1)
+VOLUME = VolumeHyperNetworkConfig(code=8, depth=2, width=16, layers=("all",), update="low_rank", rank=1)
+NETWORK = AnyOrderConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=2, direction_frequencies=1)
+PLACED = TargetConfig(depth=2, width=16, planes=4, point_frequencies=2, direction_frequencies=1)
 GRID = replace(NETWORK, grid=5)
 READERS = {"images": {}, "volume": {"network": GRID, "hypernetwork": VOLUME}}
 CONFIG = ModelConfig("any_order", NETWORK, SHAPE, sampling=Marched(24), hull_resolution=16)
@@ -94,7 +95,7 @@ def test_images_that_are_not_there_count_in_no_statistics(normalisation, trainin
 
 def test_a_model_of_planes_reads_objects_of_several_picture_sizes():
     shape = replace(SHAPE, join="concatenate", choice="first", views=2, resolution=16)
-    adapter = model(target="point_multiplane", hypernetwork=shape, order="file")
+    adapter = model(target="point_multiplane", network=PLACED, hypernetwork=shape, order="file")
     with torch.no_grad():
         prepared = [adapter.prepare(ball_views(ring(4, size))) for size in ((16, 16), (20, 24))]
         for one, each in zip(adapter.updates(prepared), prepared, strict=True):
@@ -149,8 +150,8 @@ def test_the_grid_of_an_object_is_that_of_its_own_volume():
 
 
 def test_fields_that_know_views_by_their_places_have_no_use_for_a_volume():
-    with pytest.raises(ValueError, match="encoder: expected one that reads images"):
-        HyperPlanes(replace(CONFIG, target="point_multiplane", hypernetwork=VOLUME))
+    with pytest.raises(ValueError, match="hypernetwork.kind: expected one that reads images"):
+        HyperPlanes(replace(CONFIG, target="point_multiplane", network=PLACED, hypernetwork=VOLUME))
 
 
 def test_a_second_pass_takes_colours_by_the_surface_that_the_first_one_shows_every_view():

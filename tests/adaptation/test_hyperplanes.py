@@ -10,7 +10,7 @@ from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import camera_from_world, centres, look_at, pinhole, viewing_directions
 from hyperplanes.geometry.cameras import intrinsics as calibration
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.hypernetwork import AutoencoderConfig, HyperNetworkConfig
+from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.views import Views
@@ -128,13 +128,13 @@ def test_hyperplanes_are_spread_as_far_as_they_can_be():
 
 @pytest.mark.parametrize("count", [1, 3, 4])
 def test_hyperplanes_are_k_different_planes(count):
-    shape = HyperNetworkConfig(views=count, normalisation="group", code=4, depth=1, width=8)
+    shape = ImageHyperNetworkConfig(views=count, normalisation="group", code=4, depth=1, width=8)
     chosen = small_model(hypernetwork=shape).prepare(ball_views(ring(4))).hyperplanes.tolist()
     assert len(set(chosen)) == len(chosen) == count
 
 
 def test_the_first_hyperplanes_are_read_when_asked_for(support):
-    config = HyperNetworkConfig(views=3, choice="first", normalisation="group", code=8, depth=2, width=16)
+    config = ImageHyperNetworkConfig(views=3, choice="first", normalisation="group", code=8, depth=2, width=16)
     first, farthest = small_model(hypernetwork=config), small_model(hypernetwork=replace(config, choice="farthest"))
     assert first.prepare(support).hyperplanes.tolist() == [0, 1, 2]
     assert all(torch.equal(value, farthest.state_dict()[name]) for name, value in first.state_dict().items())
@@ -202,7 +202,7 @@ def test_a_saved_model_is_the_same_model(model, support, tmp_path):
     [
         ModelConfig(),
         ModelConfig(hypernetwork=None, sampling=Hierarchical(3, 4), coarse_network=True),
-        ModelConfig(target="nerf", hypernetwork=HyperNetworkConfig(layers=("0", "colour")), hull_resolution=7),
+        ModelConfig(target="nerf", hypernetwork=ImageHyperNetworkConfig(layers=("0", "colour")), hull_resolution=7),
         ModelConfig(hypernetwork=None, autoencoder=AutoencoderConfig(views=3, latent=9), order="file"),
         ModelConfig(hypernetwork=None, initialisation=InitialisationConfig("maml", inner_steps=2)),
     ],
@@ -240,8 +240,8 @@ def test_a_configuration_with_a_hole_is_a_checkpoint_error(missing):
 @pytest.mark.parametrize(
     "change",
     [
-        {"network": {"depth": 3, "width": 24, "planes": 4, "point_octaves": 3, "direction_octaves": 1}},
-        {"network": {"depth": 2, "width": 20, "planes": 4, "point_octaves": 3, "direction_octaves": 1}},
+        {"network": {"depth": 3, "width": 24, "planes": 4, "point_frequencies": 3, "direction_frequencies": 1}},
+        {"network": {"depth": 2, "width": 20, "planes": 4, "point_frequencies": 3, "direction_frequencies": 1}},
         {"hypernetwork": None},
         {"coarse_network": True},
     ],
@@ -303,9 +303,9 @@ def test_entries_that_a_newer_version_added_may_be_missing(model):
 
 def test_differences_of_configurations_are_named():
     one = ModelConfig()
-    other = replace(one, sampling=replace(one.sampling, steps=7), hypernetwork=replace(one.hypernetwork, gain=2.0))
+    other = replace(one, sampling=replace(one.sampling, steps=7), hypernetwork=replace(one.hypernetwork, rank=2))
     assert one.differences(one) == []
-    assert one.differences(other) == ["hypernetwork.gain", "sampling.steps"]
+    assert one.differences(other) == ["hypernetwork.rank", "sampling.steps"]
     assert "hypernetwork" in one.differences(replace(one, hypernetwork=None))
     assert "protocol" in one.differences(replace(one, sampling=Hierarchical()))
 
@@ -352,11 +352,11 @@ def test_weights_are_found_in_one_way():
 
 def test_more_hyperplanes_than_planes_are_refused():
     with pytest.raises(ValueError, match="views: expected at most as many HyperPlanes as planes, 4, got 5"):
-        small_model(hypernetwork=HyperNetworkConfig(views=5))
+        small_model(hypernetwork=ImageHyperNetworkConfig(views=5))
 
 
 def test_adapting_and_fine_tuning_leave_the_model_in_its_mode(support):
-    batch = awaken(small_model(hypernetwork=HyperNetworkConfig(views=2, code=8, depth=2, width=16)))
+    batch = awaken(small_model(hypernetwork=ImageHyperNetworkConfig(views=2, code=8, depth=2, width=16)))
     batch.train()
     batch.hypernetwork.encoder.eval()
     before = {name: part.training for name, part in batch.named_modules()}
@@ -382,7 +382,7 @@ def test_without_a_hull_one_voxel_holds_everything(model, support):
 
 
 def test_planes_in_the_order_of_the_file_and_the_first_as_hyperplanes():
-    hypernetwork = HyperNetworkConfig(views=3, choice="first", code=8, width=16)
+    hypernetwork = ImageHyperNetworkConfig(views=3, choice="first", code=8, width=16)
     model = small_model(order="file", hypernetwork=hypernetwork)
     views = ball_views(ring(6))[[4, 1, 5, 0, 2, 3]]
     assert torch.equal(model.arrange(views).images, views.images[:4])

@@ -8,7 +8,7 @@ from hyperplanes.data.support import SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
-from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import TrainingConfig, train
 from tests.reference_rendering import Balls, small_model
 
@@ -36,8 +36,8 @@ def test_more_views_than_there_are_and_none_are_refused():
 
 def test_fifty_planes_are_trained_and_evaluated_with_support_and_query_unified():
     data = WithSupport(Balls(train=1, views=25), 50)
-    network = TargetConfig(depth=2, width=16, planes=50, point_octaves=2, direction_octaves=1)
-    hypernetwork = HyperNetworkConfig(views=50, normalisation="group", code=2, depth=1, width=8)
+    network = TargetConfig(depth=2, width=16, planes=50, point_frequencies=2, direction_frequencies=1)
+    hypernetwork = ImageHyperNetworkConfig(views=50, normalisation="group", code=2, depth=1, width=8)
     model = HyperPlanes(small_model(network=network, hypernetwork=hypernetwork).config)  # which has no rig yet
     trainer = train(model, data, TrainingConfig(steps=1, tasks=1, rays=16, held_out=0))
     assert trainer.model.rig.shape == (50, 3)

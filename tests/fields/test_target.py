@@ -11,7 +11,7 @@ from hyperplanes.parameters import Parameters
 from tests.reference_rendering import ring
 
 PLANES = 3
-SMALL = TargetConfig(depth=4, width=12, planes=PLANES, point_octaves=2, direction_octaves=2)
+SMALL = TargetConfig(depth=4, width=12, planes=PLANES, point_frequencies=2, direction_frequencies=2)
 
 
 def planes(count=PLANES, seed=0, dtype=torch.float32):
@@ -48,14 +48,14 @@ def slow_field(parameters, inputs, direction, config, radius=1.0):
             value = torch.cat([inputs, value])
         value = layer(f"layers.{index}", value).clamp_min(0)
     density = torch.log1p(torch.exp(layer("density", value))) * config.density_scale / radius
-    seen = torch.cat([layer("feature", value), encode(direction, config.direction_octaves)])
+    seen = torch.cat([layer("feature", value), encode(direction, config.direction_frequencies)])
     return 1 / (1 + torch.exp(-layer("colour", layer("view", seen).clamp_min(0)))), density[0]
 
 
 @pytest.mark.parametrize("depth", [1, 2, 5])
 @torch.no_grad()
 def test_a_field_is_its_formula_point_by_point(depth):
-    config = TargetConfig(depth=depth, width=8, planes=PLANES, point_octaves=2, direction_octaves=1)
+    config = TargetConfig(depth=depth, width=8, planes=PLANES, point_frequencies=2, direction_frequencies=1)
     network = make(config=config).double()
     images, bounds = planes(dtype=torch.float64), Sphere((0.1, 0.0, -0.2), 1.5)
     parameters = Parameters.of(network)
@@ -127,7 +127,7 @@ def test_density_is_per_world_unit():
 
 
 def test_gradients_reach_parameters_points_and_directions():
-    config = TargetConfig(depth=2, width=4, planes=2, point_octaves=1, direction_octaves=1)
+    config = TargetConfig(depth=2, width=4, planes=2, point_frequencies=1, direction_frequencies=1)
     network = make(config=config).double()
     images = planes(2, dtype=torch.float64)
     points, directions = queries(2, seed=4, dtype=torch.float64)
@@ -171,7 +171,7 @@ def ray_of_one_camera(images, count=6):
 @torch.no_grad()
 def test_multiplane_sees_only_projections_and_point_multiplane_the_point_too():
     # all points of a ray through the only plane project onto one pixel
-    config = TargetConfig(depth=3, width=16, planes=1, point_octaves=2)
+    config = TargetConfig(depth=3, width=16, planes=1, point_frequencies=2)
     images = planes(1)
     points = ray_of_one_camera(images)
     blind = MultiPlaneNeRF(config)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from hyperplanes.geometry.volume import CHANNELS, SIDE
-from hyperplanes.hypernetwork import HyperNetworkConfig, Observed, VolumeHyperNetwork
+from hyperplanes.hypernetwork import Observed, VolumeHyperNetwork, VolumeHyperNetworkConfig
 from hyperplanes.hypernetwork.volume_network import VolumeNetwork, _fold, _unfold
 
 SHAPES = {
@@ -13,8 +13,8 @@ SHAPES = {
     "fine.layers.0.bias": torch.Size((12,)),
     "fine.density.weight": torch.Size((1, 12)),
 }
-CONFIG = HyperNetworkConfig(
-    encoder="volume", code=16, depth=1, width=16, layers=("all",), update="low_rank", rank=1, weights_seen="all"
+CONFIG = VolumeHyperNetworkConfig(
+    code=16, depth=1, width=16, layers=("all",), update="low_rank", rank=1, weights_seen="all"
 )
 
 
@@ -34,7 +34,9 @@ def seen(volume):
 def awake(**changes):
     """A hypernetwork whose outputs are not zero."""
     torch.manual_seed(2)
-    network = VolumeHyperNetwork(HyperNetworkConfig(**{**CONFIG.__dict__, **changes}), SHAPES, CHANNELS, SIDE).eval()
+    network = VolumeHyperNetwork(
+        VolumeHyperNetworkConfig(**{**CONFIG.__dict__, **changes}), SHAPES, CHANNELS, SIDE
+    ).eval()
     for layer in (*network.outputs, network.encoder.last):
         torch.nn.init.normal_(layer.weight, std=0.1)
     return network
@@ -84,7 +86,7 @@ def test_layers_can_be_chosen():
     assert set(only) == {"fine.grid.weight"}
     torch.manual_seed(0)
     without = VolumeHyperNetwork(
-        HyperNetworkConfig(**{**CONFIG.__dict__, "layers": ("density",)}), SHAPES, CHANNELS, SIDE
+        VolumeHyperNetworkConfig(**{**CONFIG.__dict__, "layers": ("density",)}), SHAPES, CHANNELS, SIDE
     )
     assert set(without(seen(volumes(1)), theta())[0]) == {"fine.density.weight"}
     with pytest.raises(ValueError, match="layers: expected"):

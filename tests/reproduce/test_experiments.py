@@ -77,7 +77,7 @@ def test_changes_reach_the_entry_they_name_and_nothing_else():
     assert after.model == replace(before.model, hypernetwork=replace(before.model.hypernetwork, views=3))
     plain = before.without_hypernetwork()
     assert change(plain, {"model.hypernetwork.views": 3}) == plain
-    with pytest.raises(ValueError, match="expected an entry of HyperNetworkConfig, got 'planets'"):
+    with pytest.raises(ValueError, match="expected an entry of ImageHyperNetworkConfig, got 'planets'"):
         change(before, {"model.hypernetwork.planets": 3})
 
 

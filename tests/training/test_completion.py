@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
-from hyperplanes.fields import TargetConfig
-from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.fields import AnyOrderConfig
+from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Marched
 from hyperplanes.training import Trainer, TrainingConfig
@@ -17,8 +17,8 @@ from tests.reference_rendering import Balls
 
 MODEL = ModelConfig(
     "any_order",
-    TargetConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_octaves=2, direction_octaves=1),
-    HyperNetworkConfig(encoder="volume", code=8, depth=1, width=16, layers=("all",), update="low_rank", rank=1),
+    AnyOrderConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1),
+    VolumeHyperNetworkConfig(code=8, depth=1, width=16, layers=("all",), update="low_rank", rank=1),
     sampling=Marched(24),
     hull_resolution=32,
 )

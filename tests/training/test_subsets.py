@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
-from hyperplanes.fields import TargetConfig
+from hyperplanes.fields import AnyOrderConfig
 from hyperplanes.geometry.cameras import centres
-from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Marched
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.drawing import episode_object
@@ -19,8 +19,8 @@ from tests.reference_rendering import Balls, ball_views, ring, small_model
 
 MODEL = ModelConfig(
     "any_order",
-    TargetConfig(depth=2, width=16, planes=4, blended=2, point_octaves=2, direction_octaves=1),
-    HyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16, join="mean"),
+    AnyOrderConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=2, direction_frequencies=1),
+    ImageHyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16, join="mean"),
     sampling=Marched(24),
     hull_resolution=16,
 )

@@ -13,7 +13,7 @@ from hyperplanes.adaptation import Diagnostics, HyperPlanes, base, diagnose
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.train import follow
 from hyperplanes.geometry import occupancy
-from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer, TrainingConfig, train
 from hyperplanes.training.watching import TensorBoard
@@ -79,7 +79,7 @@ ALL_LAYERS = {"layers": ("all",), "update": "low_rank", "weights_seen": "all"}
     ids=str,
 )
 def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, optimiser, parts, changes):
-    shape = HyperNetworkConfig(**{"views": 2, "code": 8, "depth": 2, "width": 16, **parts})
+    shape = ImageHyperNetworkConfig(**{"views": 2, "code": 8, "depth": 2, "width": 16, **parts})
     config = with_(steps=5, warmup=2, final_rate_factor=0.1, optimiser=optimiser, **changes)
     whole = train(small_model(hypernetwork=shape), Balls(), config, tmp_path / "whole")
 
@@ -103,7 +103,7 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, 
 @pytest.mark.parametrize("reference_objects", [0, 3])
 def test_reference_objects_take_what_objects_share_out_of_the_gradient_of_their_codes(reference_objects):
     # Property: batch normalisation over the objects of a step has a gradient that sums to zero over them.
-    shape = HyperNetworkConfig(views=2, code=8, depth=2, width=16, normalisation="group", **ALL_LAYERS)
+    shape = ImageHyperNetworkConfig(views=2, code=8, depth=2, width=16, normalisation="group", **ALL_LAYERS)
     model = awaken(small_model(hypernetwork=shape))
     trainer = Trainer(model, Balls(), with_(tasks=1, reference_objects=reference_objects))
     trainer.take_step()  # the running statistics are those of a step before
@@ -390,7 +390,7 @@ def test_checkpoints_are_written_when_they_are_due_and_not_only_with_a_report(tm
         ({"sampling": Hierarchical(4, 4)}, "protocol"),
         ({"hull_resolution": 17}, "hull_resolution"),
         ({"network": replace(small_model().config.network, density_scale=3.0)}, "network.density_scale"),
-        ({"hypernetwork": replace(small_model().config.hypernetwork, gain=0.5)}, "hypernetwork.gain"),
+        ({"hypernetwork": replace(small_model().config.hypernetwork, rank=5)}, "hypernetwork.rank"),
     ],
 )
 def test_a_model_that_differs_in_no_weight_is_another_all_the_same(tmp_path, change, name):

@@ -18,7 +18,7 @@ from hyperplanes import cli
 from hyperplanes.adaptation import InitialisationConfig
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.train import follow
-from hyperplanes.hypernetwork import HyperNetworkConfig
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.meta_training import initialisation_trainer
 from hyperplanes.utilities.checkpoints import save_tensors
@@ -47,13 +47,13 @@ class Data(Balls):
 
 def conditioned(folder=None):
     """Standardised codes and outputs, reference objects, Muon."""
-    model = awaken(small_model(hypernetwork=HyperNetworkConfig(**SHAPE, normalisation="group"))).double()
+    model = awaken(small_model(hypernetwork=ImageHyperNetworkConfig(**SHAPE, normalisation="group"))).double()
     return Trainer(model, Precise(6), replace(CONFIG, reference_objects=2, optimiser="muon", steps=3), folder)
 
 
 def normalised(folder=None):
     """Batch normalisation, a gradient that is clipped."""
-    model = awaken(small_model(hypernetwork=HyperNetworkConfig(**SHAPE, normalisation="batch"))).double()
+    model = awaken(small_model(hypernetwork=ImageHyperNetworkConfig(**SHAPE, normalisation="batch"))).double()
     config = replace(CONFIG, tasks=2, clip=0.02)
     return Trainer(model, Precise(3), config, folder)
 

@@ -17,7 +17,7 @@ from hyperplanes.cli import main
 from hyperplanes.commands.train import Arguments, resolve
 from hyperplanes.configuration.presets import PRESETS, configure, preset
 from hyperplanes.configuration.settings_file import changed, document, parse_options, read_experiment, write_experiment
-from hyperplanes.fields import NeRF, find_targets
+from hyperplanes.fields import NeRF, TargetConfig, find_targets
 from hyperplanes.methods import Method, describe_method, make_method
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.utilities import entry_points
@@ -121,7 +121,9 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
     small = preset("small")
     assert method == "nerf"
     assert (chosen.model.target, chosen.model.hypernetwork) == ("nerf", None)
-    assert chosen.model.network == replace(small.model.network, depth=3, grid=0)
+    assert chosen.model.network == TargetConfig(
+        depth=3, width=128, planes=8, point_frequencies=6, direction_frequencies=2
+    )
     assert chosen.model.sampling == Hierarchical(8, 5)
     of_any_order = {"views": (), "rotations": 0.0, "volume_loss": 0.0}
     assert chosen.training == replace(small.training, learning_rate=1e-3, steps=11, rays=13, **of_any_order)
@@ -144,7 +146,7 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
         (["--model.protocol", "guessed"], "guessed"),
         (
             ["--model.hypernetwork.encoder", "vgg"],
-            "encoder: expected one of 'convnet', 'resnet101', 'volume', got 'vgg'",
+            "encoder: expected one of 'convnet', 'resnet101', got 'vgg'",
         ),
         (["--model.network", "3"], "--model.network: 3 instead of its entries"),
         (["--training.rays", "["], "--training.rays: expected a plain value"),

@@ -1,0 +1,65 @@
+"""Source of truth: what version 0.1 wrote. The files in former/ are its packaged models and `hyperplanes presets`."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hyperplanes.adaptation.checkpoints import packaged_folder
+from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.configuration.presets import preset
+from hyperplanes.configuration.settings_file import changed, parse_options, read_experiment
+from hyperplanes.configuration.upgrade import upgrade_model
+from hyperplanes.fields import AnyOrderConfig
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig, VolumeHyperNetworkConfig
+from hyperplanes.utilities.settings import SettingsError
+
+FORMER = Path(__file__).parent / "former"
+
+
+@pytest.mark.parametrize("name", ["small", "small-paper", "cars-64"])
+def test_former_checkpoints_are_those_that_are_packaged(name):
+    former = ModelConfig.of_json(json.loads((FORMER / f"{name}.json").read_text()))
+    assert former.target == ModelConfig.load(packaged_folder(name)).target
+    assert ModelConfig.of_json(json.loads(json.dumps(former.as_json()))) == former
+    kind = VolumeHyperNetworkConfig if name == "small" else ImageHyperNetworkConfig
+    assert type(former.hypernetwork) is kind
+
+
+@pytest.mark.parametrize("name", ["quick", "small"])
+def test_former_files_of_settings_say_what_the_presets_say(name):
+    given = read_experiment(FORMER / f"{name}.yaml")
+    for base in ("quick", "small"):  # whatever they are laid over
+        made = changed(preset(base), given)
+        assert (made.model, made.training) == (preset(name).model, preset(name).training)
+
+
+def test_another_kind_keeps_what_both_kinds_have():
+    small = preset("small").model.hypernetwork
+    made = changed(preset("small"), parse_options(["--model.hypernetwork.kind", "images"])).model.hypernetwork
+    assert isinstance(made, ImageHyperNetworkConfig)
+    assert (made.code, made.activation, made.layers) == (small.code, small.activation, small.layers)
+    wanted = {"target": "point_multiplane", "hypernetwork": {"kind": "images"}}
+    assert not isinstance(changed(preset("small"), {"model": wanted}).model.network, AnyOrderConfig)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            ["--model.hypernetwork.gain", "2"],
+            r"hypernetwork\.gain: expected 1.0, since this setting was removed, got 2",
+        ),
+        (["--model.hypernetwork.kind", "grid"], "kind: expected one of images, volume, got 'grid'"),
+        (["--model.network.grid", "8"], r"model\.network\.grid: an unknown entry"),
+    ],
+)
+def test_what_there_is_not_is_refused_by_its_name(options, words):
+    with pytest.raises(SettingsError, match=words):
+        changed(preset("quick"), parse_options(options))
+
+
+def test_what_is_of_this_version_stays_as_it_is():
+    for name in ("quick", "small", "paper-128"):
+        entries = preset(name).model.as_json()
+        assert upgrade_model(entries) == entries
