@@ -12,6 +12,8 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
+from importlib.metadata import entry_points
+from types import ModuleType
 
 from hyperplanes.commands import EXAMPLES, find_verb, find_verbs, split_settings
 from hyperplanes.utilities.interrupts import Terminated, interruptible
@@ -77,11 +79,18 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
     parsed = tyro.cli(
         module.Arguments,
         prog=f"hyperplanes {verb}",
-        description=inspect.cleandoc(module.__doc__ or ""),
+        description="\n\n".join([inspect.cleandoc(module.__doc__ or ""), *_brought(module)]),
         args=rest,
         config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
     )
     return module.run(replace(parsed, settings=tuple(settings)) if settings else parsed)
+
+
+def _brought(module: ModuleType) -> list[str]:
+    """What other installed packages add to the names that a verb takes; only their names are read."""
+    groups: dict[str, str] = getattr(module, "BROUGHT", {})
+    found = {what: sorted(each.name for each in entry_points(group=group)) for what, group in groups.items()}
+    return [f"{what} of other packages: {', '.join(names)}." for what, names in found.items() if names]
 
 
 def _one_line(error: Exception) -> str:

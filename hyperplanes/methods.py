@@ -1,11 +1,18 @@
-"""Methods by name: what `evaluate --method` takes."""
+"""Methods by name: what `evaluate --method` takes, of this package and of others, in one registry.
+
+A name may end in a number of gradient steps on the support views (`hyperplanes_100`), in `_auto`, as many as serve
+views that are held out, or in `_swapped`, each object with what was made for another, where the method takes that.
+Another package adds a method by an entry point of the group `hyperplanes.methods` that names a `Method`.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import torch
 
@@ -21,76 +28,221 @@ from hyperplanes.configuration.presets import configure
 from hyperplanes.fields import find_targets
 from hyperplanes.rendering.samplers import Sampler
 from hyperplanes.utilities.entry_points import load_entries
+from hyperplanes.utilities.errors import did_you_mean
 from hyperplanes.views import Views
 
-__all__ = ["METHODS", "Method", "at_steps", "WithSampler", "describe_method", "find_methods", "make_method"]
+__all__ = ["METHODS", "Method", "Request", "WithSampler", "at_steps", "describe_method", "find_methods", "make_method"]
 
-METHODS: dict[str, str] = {
-    "nearest_view": "the nearest support view, copied",
-    "hull_blend": "support views blended on the visual hull",
-    "nerf": "NeRF, one set of weights for all objects",
-    "multiplane": "MultiPlaneNeRF, one set of weights for all objects",
-    "point_multiplane": "PointMultiPlaneNeRF, one set of weights for all objects",
-    "hyperplanes": "HyperPlanes in one step",
-    "hyperplanes_swapped": "HyperPlanes with the update of another object",
-    "autoencoder": "a field that reads the code of an encoder",
-    "scratch": "the same field from random weights",
-    "nerf_scratch": "NeRF of one object from random weights",
-    "multiplane_scratch": "MultiPlaneNeRF of one object from random weights",
-    "point_multiplane_scratch": "PointMultiPlaneNeRF of one object from random weights",
-    "standard": "random weights, optimised as the learned initialisations are",
-    "mv_shuffled": "the weights of mv_meta in random order",
-    **LEARNED,
-}
-"""Names and what they stand for. All but nearest_view, hull_blend and hyperplanes_swapped take _N, N gradient steps on
-the support views, or _auto, as many as serve views that are left out. Those with "scratch" need one of the two; an
-initialisation without is optimised for as many steps as its checkpoint says."""
 
-_NAME = re.compile(r"(?P<base>.+?)(?:_(?P<steps>\d+|auto))?")
-_WITHOUT_STEPS = ("nearest_view", "hull_blend", "hyperplanes_swapped")
-_INITIALISATIONS = ("standard", "mv_shuffled", *LEARNED)
-_NEED_STEPS = ("scratch", "nerf_scratch", "multiplane_scratch", "point_multiplane_scratch")
+@dataclass(frozen=True)
+class Request:
+    """What a method is made of.
+
+    Attributes:
+        name: as it was asked for, such as "hyperplanes_100".
+        steps: gradient steps on the support views of an object, "auto", or None where the name has no number.
+        checkpoints: folders by the names of the methods that trained them, such as "hyperplanes".
+        device: where weights go.
+        settings: of fine-tuning.
+        objects: the support views of the objects that will be asked for.
+        preset: the shape of fields that need no checkpoint.
+        protocol: how those are sampled while they are optimised.
+    """
+
+    name: str
+    steps: Steps | None = None
+    checkpoints: Mapping[str, Path] = field(default_factory=dict)
+    device: torch.device | str = "cpu"
+    settings: FineTuning = field(default_factory=FineTuning)
+    objects: Iterable[Views] = ()
+    preset: str = "quick"
+    protocol: str = "default"
+
+    def model(self, method: str) -> HyperPlanes:
+        """The model of the checkpoint of a method, on the device.
+
+        Raises:
+            ValueError: no such checkpoint was given.
+        """
+        if method not in self.checkpoints:
+            alone = f"; or name the field, as point_multiplane_{self.name}" if self.name.startswith("scratch") else ""
+            raise ValueError(
+                f"method {self.name}: expected a checkpoint of {method}, got none; `hyperplanes train` makes one{alone}"
+            )
+        return HyperPlanes.from_pretrained(self.checkpoints[method]).to(self.device)
+
+    @property
+    def needed_steps(self) -> Steps:
+        """The number of steps of a method whose name always has one."""
+        assert self.steps is not None
+        return self.steps
 
 
 @dataclass(frozen=True)
 class Method:
-    """A method of another package, which names it by an entry point of the group `hyperplanes.methods`.
+    """A method of this or of another package.
 
     Attributes:
         about: what it stands for.
-        make: its adapter; called with `checkpoints`, `device`, `settings` and `objects`, as `make_method` is.
+        make: its adapter.
+        steps: whether its name takes a number of gradient steps: "none", "optional", or "required".
+        tuned: what it stands for where fine-tuning steps follow; empty where the steps are part of the method itself.
+        begins_at_zero: 0 steps are written _0, as they are not what the bare name says.
+        swapped: each object with what the method makes for another, where it has such a control.
     """
 
     about: str
-    make: Callable[..., Adapter]
+    make: Callable[[Request], Adapter]
+    steps: Literal["none", "optional", "required"] = "none"
+    tuned: str = ""
+    begins_at_zero: bool = False
+    swapped: Callable[[Request], Adapter] | None = None
+
+    def describe(self, steps: Steps | None) -> str:
+        """The method in words, after so many steps."""
+        if steps is None:
+            return self.about
+        kind = "fine-tuning steps" if self.tuned else "steps"
+        count = f"as many {kind} as left-out views ask for" if steps == "auto" else f"{steps} {kind}"
+        return f"{self.tuned} after {count}" if self.tuned else f"{self.about}, {count}"
+
+
+def _of_checkpoint(name: str) -> Callable[[Request], Adapter]:
+    """The model that a method's name trained, fine-tuned where steps are asked for."""
+
+    def make(request: Request) -> Adapter:
+        model = request.model(name)
+        return model if request.steps is None else FineTuned(model, request.steps, request.settings)
+
+    return make
+
+
+def _shared_weights(name: str, about: str) -> Method:
+    """A field whose weights are the same for all objects."""
+    return Method(f"{about}, one set of weights for all objects", _of_checkpoint(name), "optional", tuned=about)
+
+
+def _scratch(request: Request) -> Adapter:
+    """The architecture of any checkpoint that there is, from random weights."""
+    known = ("hyperplanes", *request.checkpoints)
+    family = next((each for each in known if each in request.checkpoints), "hyperplanes")
+    return FromScratch(request.model(family), request.needed_steps, request.settings)
+
+
+def _field_scratch(name: str, request: Request) -> Adapter:
+    """A field of the preset's shape, from random weights."""
+    config = configure(request.preset, name, protocol=request.protocol).model
+    return FieldFromScratch(config, request.needed_steps, request.settings, request.device)
+
+
+def _optimised(model: HyperPlanes, request: Request) -> FineTuned:
+    """Gradient descent from these weights, as the learned initialisations of the model are optimised."""
+    initialisation = model.config.initialisation
+    assert initialisation is not None
+    steps = initialisation.steps if request.steps is None else request.steps
+    return FineTuned(model.to(request.device), steps, initialisation.descent(given=request.settings))
+
+
+def _standard(request: Request) -> Adapter:
+    """Random weights in the architecture of the learned initialisations that they stand beside."""
+    family = next((each for each in LEARNED if each in request.checkpoints), None)
+    trained = None if family is None else request.model(family)
+    config = replace(configure(request.preset, "mv_meta", protocol=request.protocol).model, order="file")
+    model = random_model(config if trained is None else trained.config, request.settings.seed)
+    if trained is not None:
+        model.rig.copy_(trained.rig)
+    initialisation = (config if trained is None else trained.config).initialisation
+    assert initialisation is not None
+    steps = initialisation.steps if request.steps is None else request.steps
+    return FineTuned(model.to(request.device), steps, initialisation.descent(given=request.settings))
+
+
+METHODS: dict[str, Method] = {
+    "nearest_view": Method("the nearest support view, copied", lambda request: NearestView()),
+    "hull_blend": Method("support views blended on the visual hull", lambda request: HullBlend()),
+    "nerf": _shared_weights("nerf", "NeRF"),
+    "multiplane": _shared_weights("multiplane", "MultiPlaneNeRF"),
+    "point_multiplane": _shared_weights("point_multiplane", "PointMultiPlaneNeRF"),
+    "hyperplanes": Method(
+        "HyperPlanes in one step",
+        _of_checkpoint("hyperplanes"),
+        "optional",
+        tuned="HyperPlanes",
+        swapped=lambda request: Swapped(request.model("hyperplanes"), request.objects),
+    ),
+    "autoencoder": Method(
+        "a field that reads the code of an encoder",
+        _of_checkpoint("autoencoder"),
+        "optional",
+        tuned="a field that reads the code of an encoder",
+    ),
+    "scratch": Method("the same field from random weights", _scratch, "required"),
+    **{
+        f"{name}_scratch": Method(
+            f"{about} of one object from random weights", partial(_field_scratch, name), "required"
+        )
+        for name, about in {
+            "nerf": "NeRF",
+            "multiplane": "MultiPlaneNeRF",
+            "point_multiplane": "PointMultiPlaneNeRF",
+        }.items()
+    },
+    "standard": Method(
+        "random weights, optimised as the learned initialisations are", _standard, "optional", begins_at_zero=True
+    ),
+    "mv_shuffled": Method(
+        "the weights of mv_meta in random order",
+        lambda request: _optimised(shuffled(request.model("mv_meta"), request.settings.seed), request),
+        "optional",
+        begins_at_zero=True,
+    ),
+    **{
+        name: Method(
+            about,
+            lambda request, name=name: _optimised(request.model(name), request),
+            "optional",
+            begins_at_zero=True,
+        )
+        for name, about in LEARNED.items()
+    },
+}
+"""The methods of this package. Those with "scratch" need a number of steps; an initialisation without is optimised for
+as many as its checkpoint says."""
+
+_SUFFIX = re.compile(r"(?P<base>.+)_(?P<steps>\d+|auto)")
+_SWAPPED = "_swapped"
 
 
 def find_methods() -> dict[str, Method]:
-    """The methods of the other packages that are installed, by name."""
-    return load_entries("hyperplanes.methods", METHODS)
+    """All methods by name: of this package, of other packages that are installed, and their fields; with controls."""
+    found = METHODS | load_entries("hyperplanes.methods", METHODS)
+    found |= {name: _shared_weights(name, name) for name in find_targets() if name not in found}
+    swapped = {
+        f"{name}{_SWAPPED}": Method(f"{method.tuned or method.about} with the update of another object", method.swapped)
+        for name, method in found.items()
+        if method.swapped is not None
+    }
+    return found | swapped
 
 
-def _parse(name: str) -> tuple[str, Steps | None]:
-    """The entry of METHODS and the number of steps.
+def _parse(name: str) -> tuple[str, Method, Steps | None]:
+    """The name of a method without its number of steps, the method, and that number.
 
     Raises:
-        ValueError: no method has that name.
+        ValueError: no method has that name, or its name takes no number or needs one.
     """
-    if name in (registered := find_methods()):
-        return name, None
-    match = _NAME.fullmatch(name)
-    base, steps = (match["base"], match["steps"]) if match else (name, None)
-    if (
-        (base not in METHODS and base not in find_targets())
-        or (steps and base in _WITHOUT_STEPS)
-        or (base in _NEED_STEPS and not steps)
-    ):
-        every = {**METHODS, **find_targets(), **registered}
-        known = ", ".join(f"{each}_N" if each in _NEED_STEPS else each for each in every)
+    known = find_methods()
+    base, steps = name, None
+    if name not in known and (match := _SUFFIX.fullmatch(name)) is not None:
+        base, steps = match["base"], match["steps"]
+    method = known.get(base)
+    if method is None or (method.steps == "none" and steps) or (method.steps == "required" and not steps):
+        listed = ", ".join(f"{each}_N" if known[each].steps == "required" else each for each in known)
         raise ValueError(
-            f"method: expected one of {known}, with _N or _auto after it for so many gradient steps, got {name!r}"
+            f"method: expected one of {listed}, with _N or _auto after it for so many gradient steps, got {name!r}"
+            + did_you_mean(base, known)
         )
-    return base, steps if steps in (None, "auto") else int(steps)
+    return base, method, steps if steps in (None, "auto") else int(steps)
 
 
 def at_steps(name: str, steps: Sequence[int]) -> list[str]:
@@ -103,11 +255,12 @@ def at_steps(name: str, steps: Sequence[int]) -> list[str]:
         name: without steps, or it stays alone.
         steps: 0 is the method itself, of an initialisation its weights as they are; "scratch" has no such row.
     """
-    if not steps or name in _WITHOUT_STEPS or name in find_methods() or _NAME.fullmatch(name)["steps"]:  # pyright: ignore[reportOptionalSubscript]
+    method = find_methods().get(name)
+    if not steps or method is None or method.steps == "none":
         return [name]
-    if name in _INITIALISATIONS:
+    if method.begins_at_zero:
         return [f"{name}_{count}" for count in steps]
-    return [f"{name}_{count}" if count else name for count in steps if count or name not in _NEED_STEPS]
+    return [f"{name}_{count}" if count else name for count in steps if count or method.steps == "optional"]
 
 
 def describe_method(name: str) -> str:
@@ -119,17 +272,8 @@ def describe_method(name: str) -> str:
     Args:
         name: such as "hyperplanes_100".
     """
-    base, steps = _parse(name)
-    registered = find_methods()
-    plain = METHODS.get(base, f"{base}, one set of weights for all objects")
-    whole = registered[base].about if base in registered else plain
-    if steps is None:
-        return whole
-    about = whole.removesuffix(" in one step").replace(", one set of weights for all objects", "")
-    if base in _NEED_STEPS or base in _INITIALISATIONS:
-        return f"{about}, {'as many steps as left-out views ask for' if steps == 'auto' else f'{steps} steps'}"
-    count = "as many fine-tuning steps as left-out views ask for" if steps == "auto" else f"{steps} fine-tuning steps"
-    return f"{about} after {count}"
+    _, method, steps = _parse(name)
+    return method.describe(steps)
 
 
 def make_method(
@@ -145,7 +289,7 @@ def make_method(
     """The adapter behind a method's name.
 
     Args:
-        name: one of METHODS, perhaps with a number of steps.
+        name: of a method, perhaps with a number of steps.
         checkpoints: folders by the names of the methods that trained them, such as "hyperplanes".
         device: where its weights go.
         settings: of fine-tuning.
@@ -156,70 +300,9 @@ def make_method(
     Returns:
         An adapter; ValueError for an unknown name, or a checkpoint that the method needs and that is not given.
     """
-    base, steps = _parse(name)
+    _, method, steps = _parse(name)
     settings = settings or FineTuning()
-    if base in (registered := find_methods()):
-        return registered[base].make(checkpoints=checkpoints, device=device, settings=settings, objects=objects)
-    if base == "nearest_view":
-        return NearestView()
-    if base == "hull_blend":
-        return HullBlend()
-    if base.endswith("_scratch"):
-        assert steps is not None
-        config = configure(preset, base.removesuffix("_scratch"), protocol=protocol).model
-        return FieldFromScratch(config, steps, settings, device)
-    if base in _INITIALISATIONS:
-        return _initialisation(name, checkpoints, device, settings, preset, protocol)
-    family = "hyperplanes" if base == "hyperplanes_swapped" else base
-    if base == "scratch":  # the architecture of any checkpoint that there is
-        family = next((each for each in ("hyperplanes", *checkpoints) if each in checkpoints), "hyperplanes")
-    model = _load(name, family, checkpoints).to(device)
-    if base == "hyperplanes_swapped":
-        return Swapped(model, objects)
-    if base == "scratch":
-        assert steps is not None
-        return FromScratch(model, steps, settings)
-    return model if steps is None else FineTuned(model, steps, settings)
-
-
-def _initialisation(
-    name: str,
-    checkpoints: Mapping[str, Path],
-    device: torch.device | str,
-    settings: FineTuning,
-    preset: str,
-    protocol: str,
-) -> FineTuned:
-    """Gradient descent from learned weights, or from those that they are compared with."""
-    base, steps = _parse(name)
-    if base == "standard":  # the architecture of the initialisations that it stands beside
-        family = next((each for each in LEARNED if each in checkpoints), None)
-        if family is None:
-            config, rig = replace(configure(preset, "mv_meta", protocol=protocol).model, order="file"), None
-        else:
-            trained = _load(name, family, checkpoints)
-            config, rig = trained.config, trained.rig
-        model = random_model(config, settings.seed)
-        if rig is not None:
-            model.rig.copy_(rig)
-    else:
-        model = _load(name, "mv_meta" if base == "mv_shuffled" else base, checkpoints)
-        config = model.config
-        if base == "mv_shuffled":
-            model = shuffled(model, settings.seed)
-    assert config.initialisation is not None
-    steps = config.initialisation.steps if steps is None else steps
-    return FineTuned(model.to(device), steps, config.initialisation.descent(given=settings))
-
-
-def _load(name: str, family: str, checkpoints: Mapping[str, Path]) -> HyperPlanes:
-    """The model of a checkpoint that a method needs."""
-    if family not in checkpoints:
-        more = "" if name.split("_")[0] != "scratch" else f"; or name the field, as point_multiplane_{name}"
-        raise ValueError(
-            f"method {name}: expected a checkpoint of {family}, got none; `hyperplanes train` makes one{more}"
-        )
-    return HyperPlanes.from_pretrained(checkpoints[family])
+    return method.make(Request(name, steps, checkpoints, device, settings, objects, preset, protocol))
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,11 @@ def folders(tmp_path):
 def test_methods_by_name(folders):
     data = Balls(test=2)
     objects = [data.task(name).support for name in data.names("test")]
-    made = {name: make_method(name, folders, objects=objects) for name in METHODS if not name.endswith("scratch")}
+    made = {
+        name: make_method(name, folders, objects=objects)
+        for name in (*METHODS, "hyperplanes_swapped")
+        if not name.endswith("scratch")
+    }
     assert all(isinstance(each, Adapter) for each in made.values())
     assert {name: made[name].steps for name in (*LEARNED, "standard", "mv_shuffled")} == dict.fromkeys(
         (*LEARNED, "standard", "mv_shuffled"), 3

@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Arguments", "as_json", "compared_rows", "headings", "rows", "run", "with_seed"]
 
+BROUGHT = {"Methods": "hyperplanes.methods", "Fields": "hyperplanes.fields"}
+"""Groups of entry points whose names are methods."""
+
 SEED = "{seed}"
 LARGEST_TABLE = 12  # pairs shown in the terminal; all are in the files
 

@@ -53,6 +53,10 @@ if TYPE_CHECKING:
 __all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 
 
+BROUGHT = {"Fields": "hyperplanes.fields"}
+"""Groups of entry points whose names are fields and methods."""
+
+
 @dataclass(frozen=True)
 class Arguments:
     """What to train, and on what.

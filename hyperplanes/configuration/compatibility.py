@@ -6,6 +6,7 @@ from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target, find_targets
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
+from hyperplanes.utilities.errors import did_you_mean
 
 __all__ = ["check_fine_tuning", "check_model"]
 
@@ -18,7 +19,9 @@ def check_model(config: ModelConfig) -> type[Target]:
     """
     known = find_targets()
     if config.target not in known:
-        raise ValueError(f"target: expected one of {sorted(known)}, got {config.target!r}")
+        raise ValueError(
+            f"target: expected one of {sorted(known)}, got {config.target!r}{did_you_mean(config.target, known)}"
+        )
     target = known[config.target]
     if not isinstance(config.network, target.config_type):
         expected, found = target.config_type.__name__, type(config.network).__name__

@@ -10,6 +10,7 @@ from hyperplanes.fields import TARGETS, AnyOrderConfig, TargetConfig, find_targe
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import TrainingConfig
+from hyperplanes.utilities.errors import did_you_mean
 
 __all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]
 
@@ -79,10 +80,10 @@ class Preset:
         targets = find_targets()
         known = [*TRAINABLE, *(name for name in targets if name not in TRAINABLE)]
         if method not in known:
-            raise ValueError(f"method: expected one of {', '.join(known)}, got {method!r}")
+            raise ValueError(f"method: expected one of {', '.join(known)}, got {method!r}{did_you_mean(method, known)}")
         if target is not None and (target not in targets or (method in targets and method != target)):
             expected = repr(method) if method in targets else f"one of {', '.join(targets)}"
-            raise ValueError(f"target: expected {expected}, got {target!r}")
+            raise ValueError(f"target: expected {expected}, got {target!r}{did_you_mean(target, targets)}")
         chosen = self
         if method in targets:
             chosen, target = self.without_hypernetwork(), method
@@ -268,7 +269,7 @@ def preset(name: str) -> Preset:
         ValueError: an unknown name.
     """
     if name not in PRESETS:
-        raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {name!r}")
+        raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {name!r}{did_you_mean(name, PRESETS)}")
     return PRESETS[name]
 
 

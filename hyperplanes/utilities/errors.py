@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+import difflib
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 
-__all__ = ["prefix_errors"]
+__all__ = ["did_you_mean", "prefix_errors"]
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """The end of a message about an unknown name: the nearest one that there is, or nothing.
+
+    >>> did_you_mean("hyperplane", ["hyperplanes", "nerf"])
+    '; did you mean hyperplanes?'
+
+    Args:
+        name: what was given.
+        known: what there is.
+    """
+    close = difflib.get_close_matches(str(name), list(known), 1)
+    return f"; did you mean {close[0]}?" if close else ""
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import torch
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.fields import AnyOrderConfig
-from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Marched
 from hyperplanes.training import Trainer, TrainingConfig
@@ -91,7 +91,7 @@ def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):
     ("changes", "training"),
     [
         ({"network": replace(MODEL.network, grid=3)}, TRAINING),
-        ({"hypernetwork": replace(MODEL.hypernetwork, encoder="convnet", join="mean")}, TRAINING),
+        ({"hypernetwork": ImageHyperNetworkConfig(views=2, code=8, depth=1, width=16, join="mean")}, TRAINING),
         ({}, replace(TRAINING, views=())),
     ],
 )

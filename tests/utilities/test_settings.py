@@ -10,7 +10,7 @@ import pytest
 import yaml
 from small_demo import demo_folder
 
-from hyperplanes.adaptation import HyperPlanes, ModelConfig, NearestView
+from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, NearestView
 from hyperplanes.adaptation.checkpoints import find_checkpoints
 from hyperplanes.adaptation.fine_tuned import FineTuned
 from hyperplanes.cli import main
@@ -238,7 +238,12 @@ BROUGHT = {
     "hyperplanes.fields": {"constant": f"{__name__}:Constant"},
     "hyperplanes.methods": {"copycat": f"{__name__}:COPYCAT"},
 }
-COPYCAT = Method("the nearest support view, from another package", lambda **given: NearestView())
+COPYCAT = Method(
+    "the nearest support view, from another package",
+    lambda request: NearestView(),
+    steps="optional",
+    swapped=lambda request: HullBlend(),
+)
 
 
 @pytest.fixture
@@ -270,8 +275,24 @@ def test_a_field_of_another_package_is_trained_saved_and_loaded(other_package, t
 def test_a_method_of_another_package_is_made_and_described(other_package):
     assert describe_method("copycat") == "the nearest support view, from another package"
     assert isinstance(make_method("copycat", {}), NearestView)
+    assert describe_method("copycat_7") == "the nearest support view, from another package, 7 steps"
+    assert isinstance(make_method("copycat_auto", {}), NearestView)
+    assert isinstance(make_method("copycat_swapped", {}), HullBlend)
     with pytest.raises(ValueError, match="copycat"):
         make_method("unheard_of", {})
+    with pytest.raises(ValueError, match=r"got 'copycats'; did you mean copycat\?"):
+        make_method("copycats", {})
+
+
+def test_names_that_other_packages_bring_are_in_the_help(monkeypatch, capsys):
+    brought = {"hyperplanes.methods": ["copycat"], "hyperplanes.fields": ["constant"]}
+    points = {group: [EntryPoint(name, "nowhere:nothing", group) for name in names] for group, names in brought.items()}
+    monkeypatch.setattr("hyperplanes.cli.entry_points", lambda group: points.get(group, []))
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--help"])
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Methods of other packages: copycat." in told
+    assert "Fields of other packages: constant." in told
 
 
 def test_an_entry_point_that_cannot_be_loaded_names_its_package(other_package, monkeypatch):
