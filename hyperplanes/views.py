@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -12,6 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 
 __all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views"]
@@ -53,6 +55,15 @@ class Views:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def __repr__(self) -> str:
+        height, width = self.size
+        masks, names = "" if self.masks is None else ", masks", f", {self.names[0]} ..." if self.names else ""
+        return f"Views({len(self)} of {width}x{height}{masks}{names})"
+
+    def _repr_html_(self) -> str:
+        """The pictures and where their cameras stand, for notebooks."""
+        return show_views(repr(self), self.images, self.cameras, self.bounds)
 
     def __getitem__(self, index: slice | list[int] | Int[Tensor, " chosen"]) -> Views:
         names = self.names
@@ -162,6 +173,13 @@ class Task:
     support: Views
     query: Views
     name: str = ""
+
+    def __repr__(self) -> str:
+        return f"Task({self.name!r}, support={self.support!r}, query={self.query!r})"
+
+    def _repr_html_(self) -> str:
+        """The support and the query views, for notebooks."""
+        return f"<p><b>{escape(self.name)}</b></p>{self.support._repr_html_()}{self.query._repr_html_()}"
 
 
 @runtime_checkable

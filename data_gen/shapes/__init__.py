@@ -6,6 +6,7 @@ origin lies wherever the object stands or balances; whoever renders them normali
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 
 import numpy as np
@@ -17,11 +18,13 @@ from data_gen.shapes.lamp import lamp
 from data_gen.shapes.parts import Part, build_scene
 from data_gen.shapes.plane import plane
 from data_gen.shapes.random import composition
+from hyperplanes.utilities.entry_points import load_entries
+from hyperplanes.utilities.errors import did_you_mean
 
-__all__ = ["CLASSES", "assemble", "make"]
+__all__ = ["CLASSES", "assemble", "find_classes", "make"]
 
 CLASSES: tuple[str, ...] = ("car", "chair", "plane", "lamp", "random")
-"""Names of the classes; the position of a name is part of its objects' seed, so the order is fixed."""
+"""Names of the classes of this package; the position of a name is part of its objects' seed, so the order is fixed."""
 
 _MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
     "car": car,
@@ -32,11 +35,20 @@ _MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
 }
 
 
+def find_classes() -> dict[str, Callable[[np.random.Generator], list[Part]]]:
+    """What makes the objects of each class: those of this package, then those of other packages that are installed.
+
+    Another package adds a class by an entry point of the group `data_gen.shapes` that names such a function: it draws
+    all that is random from the generator and returns painted solids in metres, y up, front along +z.
+    """
+    return _MAKERS | load_entries("data_gen.shapes", _MAKERS)
+
+
 def assemble(class_name: str, seed: int) -> list[Part]:
     """The painted solids of an object, before they are joined.
 
     Args:
-        class_name: one of `CLASSES`.
+        class_name: one of `find_classes`.
         seed: any non-negative integer; the same one gives the same parts.
 
     Returns:
@@ -45,11 +57,14 @@ def assemble(class_name: str, seed: int) -> list[Part]:
     Raises:
         ValueError: if the class is unknown or the seed is negative.
     """
-    if class_name not in CLASSES:
-        raise ValueError(f"class_name: expected one of {', '.join(CLASSES)}, got {class_name!r}")
+    known = find_classes()
+    if class_name not in known:
+        near = did_you_mean(class_name, known)
+        raise ValueError(f"class_name: expected one of {', '.join(known)}, got {class_name!r}{near}")
     if seed < 0:
         raise ValueError(f"seed: expected a non-negative integer, got {seed}")
-    return _MAKERS[class_name](np.random.default_rng([CLASSES.index(class_name), seed]))
+    number = CLASSES.index(class_name) if class_name in CLASSES else zlib.crc32(class_name.encode())
+    return known[class_name](np.random.default_rng([number, seed]))
 
 
 def make(class_name: str, seed: int) -> trimesh.Scene:

@@ -13,6 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.occupancy import Occupancy, carve, full
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
@@ -59,6 +60,20 @@ class AdaptedField:
     sampling: Sampler
     proposal: FieldFunction | None = None
     densities: tuple[Callable[[Tensor], Tensor], ...] = ()
+
+    def __repr__(self) -> str:
+        side = self.occupancy.occupied.shape[0]
+        share = float(self.occupancy.occupied.float().mean())
+        return f"AdaptedField({self.field!r}, {self.sampling!r}, {share:.0%} of {side}^3 voxels)"
+
+    def _repr_html_(self) -> str:
+        """Four pictures of the field from around it, for notebooks."""
+        bounds = self.occupancy.bounds
+        angles = torch.arange(4) * (torch.pi / 2)
+        eyes = torch.stack([angles.sin(), torch.full((4,), 0.4), angles.cos()], 1) * 3 * bounds.radius
+        poses = camera.look_at(eyes + torch.tensor(bounds.centre), bounds.centre)
+        cameras = camera.pinhole(camera.symmetric_intrinsics(96, 96, 0.8), poses, 96, 96)
+        return show_views(repr(self), self.render(cameras).images, cameras, bounds)
 
     @property
     def dtype(self) -> torch.dtype:

@@ -176,9 +176,11 @@ class AnyOrderNeRF(Target):
         return AnyOrderField(self, parameters, planes, bounds or planes.occupancy.bounds)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class AnyOrderField(Field):
     """The field of `AnyOrderNeRF`."""
+
+    target: AnyOrderNeRF
 
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]

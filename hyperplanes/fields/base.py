@@ -191,6 +191,11 @@ class Field:
     planes: Any
     bounds: Sphere
 
+    def __repr__(self) -> str:
+        weights = sum(value.numel() for value in self.parameters.values())
+        planes = "" if self.planes is None else f", {len(self.planes)} planes"
+        return f"{type(self).__name__}({type(self.target).__name__}, {weights:,} weights{planes})"
+
     @property
     def dtype(self) -> torch.dtype:
         """The precision of the weights, in which points are expected."""
@@ -220,7 +225,7 @@ class Field:
         return linear(value, self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class MLPField(Field):
     """The field of a network whose first layer reads all planes at a point."""
 

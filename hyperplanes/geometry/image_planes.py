@@ -16,6 +16,7 @@ from hyperplanes.geometry.distortion import DistortedCamera, distorted_pixels
 from hyperplanes.geometry.inputs import Numbers, as_images, as_indices, as_points, check_indices
 from hyperplanes.geometry.lookup import Lookup, choose, lookup
 from hyperplanes.geometry.lookup_torch import MIN_Z
+from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.packed_images import PackedImages, pack
 
 __all__ = ["MIN_Z", "ImagePlanes", "Lookup"]
@@ -68,6 +69,14 @@ class ImagePlanes:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def __repr__(self) -> str:
+        count, channels, height, width = self.images.shape
+        return f"ImagePlanes({count} of {width}x{height}, {channels} channels, {self.images.device})"
+
+    def _repr_html_(self) -> str:
+        """The images and where their cameras stand, for notebooks."""
+        return show_views(repr(self), self.images, self.cameras)
 
     def hiding(self, views: Int[Tensor, " hidden"]) -> ImagePlanes:
         """The same planes, some more of which show no point: their colours are the background, and nothing is valid.

@@ -11,13 +11,14 @@ from hyperplanes.data.formats.catalogue import FORMAT, Catalogue, native
 from hyperplanes.data.formats.transforms_json import find_transforms, read_transforms, read_transforms_task
 from hyperplanes.data.formats.unposed import refuse_unposed
 from hyperplanes.data.pictures.posed import Posed, PosedTask
+from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.files import DataError, read_json
 
-__all__ = ["find_catalogue", "read_posed", "read_posed_task"]
+__all__ = ["LAYOUTS", "Layout", "find_catalogue", "find_layouts", "read_posed", "read_posed_task"]
 
 
 @dataclass(frozen=True)
-class _Format:
+class Layout:
     """A layout of one posed scene.
 
     Attributes:
@@ -36,28 +37,33 @@ class _Format:
         return PosedTask.alternating(self.read(folder, downscale, root), name)
 
 
-_FORMATS = (
-    _Format(
+LAYOUTS = (
+    Layout(
         lambda folder: bool(find_transforms(folder)),
         lambda folder, downscale, root: read_transforms(find_transforms(folder), downscale=downscale, root=root),
         lambda folder, name, downscale, root: read_transforms_task(folder, name, downscale=downscale, root=root),
     ),
-    _Format(
+    Layout(
         nsvf.is_nsvf,
         lambda folder, downscale, root: nsvf.read_nsvf(folder, downscale=downscale, root=root),
         lambda folder, name, downscale, root: nsvf.read_nsvf_task(folder, name, downscale=downscale, root=root),
     ),
-    _Format(srn.is_srn, lambda folder, downscale, root: srn.read_srn(folder, root=root).downscaled(downscale)),
-    _Format(
+    Layout(srn.is_srn, lambda folder, downscale, root: srn.read_srn(folder, root=root).downscaled(downscale)),
+    Layout(
         lambda folder: colmap.find_model(folder) is not None,
         lambda folder, downscale, root: colmap.read_colmap(folder, downscale=downscale, root=root),
     ),
-    _Format(llff.is_llff, lambda folder, downscale, root: llff.read_llff(folder, downscale=downscale, root=root)),
-    _Format(
+    Layout(llff.is_llff, lambda folder, downscale, root: llff.read_llff(folder, downscale=downscale, root=root)),
+    Layout(
         lambda folder: idr.camera_file(folder) is not None,
         lambda folder, downscale, root: idr.read_idr(folder, downscale=downscale, root=root),
     ),
 )
+
+
+def find_layouts() -> tuple[Layout, ...]:
+    """The layouts of this package, then those that entry points of the group `hyperplanes.layouts` name."""
+    return (*LAYOUTS, *load_entries("hyperplanes.layouts").values())
 
 
 def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
@@ -147,11 +153,11 @@ def _read_child(root: Path, name: str) -> PosedTask:
     return _format(root / name).task(root / name, name, None, root)
 
 
-def _find_format(folder: Path) -> _Format | None:
-    return next((each for each in _FORMATS if each.found(folder)), None)
+def _find_format(folder: Path) -> Layout | None:
+    return next((each for each in find_layouts() if each.found(folder)), None)
 
 
-def _format(folder: Path) -> _Format:
+def _format(folder: Path) -> Layout:
     """The layout of a folder.
 
     Raises:
