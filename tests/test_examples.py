@@ -1,5 +1,6 @@
 """Source of truth: the lines of README and of the pages, run as they stand there."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -47,3 +48,35 @@ def test_every_public_name_is_there():
         assert getattr(hyperplanes, name) is not None
     assert set(hyperplanes.__all__) <= set(dir(hyperplanes))
     assert hyperplanes.__version__
+
+
+def test_the_template_of_a_package_adds_its_field_and_its_method(monkeypatch, tmp_path):
+    """Its entry points are read from its pyproject.toml; its field is the same on both sides."""
+    import tomllib
+    from importlib.metadata import EntryPoint, EntryPoints
+
+    import torch
+
+    from hyperplanes.adaptation import FineTuning, HyperPlanes
+    from hyperplanes.configuration.presets import PRESETS, configure
+    from hyperplanes.methods import describe_method, make_method
+    from hyperplanes.utilities import entry_points
+    from tests.reference_rendering import ball_views, ring, small_model
+
+    named = tomllib.loads((ROOT / "examples/plugin/pyproject.toml").read_text())["project"]["entry-points"]
+    found = {
+        group: EntryPoints(EntryPoint(name, value, group) for name, value in entries.items())
+        for group, entries in named.items()
+    }
+    monkeypatch.syspath_prepend(ROOT / "examples/plugin")
+    monkeypatch.setattr(entry_points, "entry_points", lambda group: found.get(group, ()))
+    monkeypatch.setitem(
+        PRESETS, "quick", dataclasses.replace(PRESETS["quick"], model=small_model(hypernetwork=None).config)
+    )
+
+    assert describe_method("symmetric_scratch_3") == "a symmetric NeRF of one object from random weights, 3 steps"
+    field = make_method("symmetric_scratch_3", {}, settings=FineTuning(rays=16)).adapt(ball_views(ring(4)))
+    points = torch.rand(20, 3) - 0.5
+    torch.testing.assert_close(field.density(points), field.density(points * torch.tensor([-1.0, 1.0, 1.0])))
+    HyperPlanes(configure("quick", "symmetric").model).save(tmp_path)
+    assert HyperPlanes.from_pretrained(tmp_path).config.target == "symmetric"

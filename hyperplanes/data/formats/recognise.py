@@ -32,6 +32,7 @@ class Layout:
     read_task: Callable[[Path, str, int | None, Path], PosedTask] | None = None
 
     def task(self, folder: Path, name: str, downscale: int | None, root: Path) -> PosedTask:
+        """Support and query of the scene in a folder."""
         if self.read_task is not None:
             return self.read_task(folder, name, downscale, root)
         return PosedTask.alternating(self.read(folder, downscale, root), name)
