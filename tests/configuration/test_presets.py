@@ -5,7 +5,9 @@ import torch
 from torch import nn
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.presets import PRESETS, preset
+from hyperplanes.fields import find_targets
 from hyperplanes.hypernetwork import ConvNet, ResNet101
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer
@@ -66,7 +68,7 @@ def test_the_papers_protocol_and_training(name):
 def test_every_preset_survives_json_and_fits_its_own_parts(name):
     chosen = preset(name)
     assert ModelConfig.of_json(chosen.model.as_json()) == chosen.model
-    assert chosen.model.hypernetwork.views <= chosen.model.network.planes
+    assert check_model(chosen.model) is find_targets()[chosen.model.target]
     assert chosen.without_hypernetwork().model == replace(chosen.model, hypernetwork=None)
     assert chosen.without_hypernetwork().training == replace(chosen.training, volume_loss=0.0)
     assert "\n" not in chosen.about
