@@ -21,6 +21,7 @@ REQUIRED = {
     "skimage": "scikit-image",
     "trimesh": "trimesh",
     "manifold3d": "manifold3d",
+    "mapbox_earcut": "mapbox-earcut",
     "safetensors": "safetensors",
     "jaxtyping": "jaxtyping",
     "PIL": "pillow",
@@ -36,6 +37,7 @@ OPTIONAL = {
     "matplotlib": "plots of benchmarks and cameras",
     "tensorboard": "train --tensorboard",
     "ray": "data generation on a cluster",
+    "DracoPy": "meshes that Draco compressed",
 }
 """What some things need: modules, each the package of its name, and what for."""
 

@@ -11,7 +11,7 @@ import PIL.Image
 import pytest
 from mesh_writers import TETRAHEDRON, TETRAHEDRON_FACES, glb_bytes, gltf, write_glb, write_gltf
 
-from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts
+from data_gen.meshes.mesh import MeshError, load_mesh, lost_in_export, mesh_parts
 from data_gen.rendering.mesh_renderer import MeshRenderer
 from data_gen.rendering.renderers import probe
 from data_gen.rigs import Rig, orbit
@@ -123,6 +123,15 @@ def test_each_texture_takes_its_own_coordinates(tmp_path, backend):
     assert [at(found, u, 0.2) for u in (0.2, 0.8)] == [GREEN, RED]
     found = draw(sheet(tmp_path / "b.glb", change=emissive), backend)
     assert [at(found, u, 0.2) for u in (0.2, 0.8)] == [[1, 1, 0], [1, 1, 0]]  # the red of one, the green of the other
+
+
+def test_what_the_exported_mesh_does_not_hold_is_named(tmp_path):
+    mesh = sheet(tmp_path / "a.glb", colours=np.array([[1, 0, 1, 1]] * 4))
+    assert lost_in_export(mesh) == (
+        "mesh.glb: written without unlit materials",
+        "mesh.glb: written without vertex colours on top of textures",
+    )
+    assert lost_in_export(load_mesh(write_glb(tmp_path / "b.glb"))) == ()
 
 
 def test_vertex_colours_multiply_the_texture(tmp_path, backend):
