@@ -1,3 +1,7 @@
+"""Sources of truth: the names of DESIGN and README, query views filled with NaN that no method may read, and updates of
+other objects swapped by hand.
+"""
+
 from dataclasses import replace
 from functools import partial
 

@@ -1,3 +1,5 @@
+"""Source of truth: sums of tensors by hand."""
+
 import pytest
 import torch
 from torch import nn

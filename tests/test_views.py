@@ -1,3 +1,5 @@
+"""Sources of truth: the pixels of the images themselves, and the uniform distribution of drawn rays."""
+
 from dataclasses import replace
 
 import jaxtyping

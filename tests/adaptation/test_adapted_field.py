@@ -1,3 +1,7 @@
+"""Sources of truth: one pixel computed by the loops of tests/reference.py, a solid ball in closed form, and properties
+(similarity transforms of the scene, permuted views, each view alone).
+"""
+
 from dataclasses import replace
 
 import pytest

@@ -1,3 +1,7 @@
+"""Sources of truth: properties of descent (what is frozen stays to the bit, no step is adapting, the seed decides), and
+a loss that falls on the support views.
+"""
+
 from dataclasses import replace
 
 import pytest

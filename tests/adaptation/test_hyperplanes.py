@@ -1,3 +1,7 @@
+"""Sources of truth: theta + delta by hand, brute-force matching of views to planes, and properties (an untrained model
+is its target, permuted views make the same field, what is saved is read).
+"""
+
 import json
 from dataclasses import replace
 

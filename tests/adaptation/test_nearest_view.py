@@ -1,3 +1,5 @@
+"""Source of truth: the support images themselves, copied; angles between standpoints by hand."""
+
 import torch
 
 from hyperplanes.adaptation import NearestView

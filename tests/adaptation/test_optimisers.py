@@ -1,3 +1,5 @@
+"""Sources of truth: torch.optim's own steps, singular values of an orthogonalised matrix, the minimum of a quadratic."""
+
 import pytest
 import torch
 

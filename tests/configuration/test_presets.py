@@ -1,3 +1,5 @@
+"""Source of truth: Appendix B of the paper, written out here as numbers."""
+
 from dataclasses import replace
 
 import pytest

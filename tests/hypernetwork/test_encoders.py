@@ -1,3 +1,7 @@
+"""Sources of truth: the published layers and numbers of weights, and properties (each image by itself, the statistics
+that normalise it).
+"""
+
 import pytest
 import torch
 from torch import nn

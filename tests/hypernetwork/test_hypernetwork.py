@@ -1,3 +1,7 @@
+"""Sources of truth: the formulas of the updates, and properties (an untrained one changes nothing, a batch is its
+objects one by one, centred updates have mean zero, a mean of codes knows no order).
+"""
+
 from dataclasses import replace
 
 import pytest

@@ -1,3 +1,5 @@
+"""Sources of truth: two slabs by hand, constant density in closed form, the loops of tests/reference.py, gradcheck."""
+
 import math
 
 import pytest

@@ -1,3 +1,5 @@
+"""Source of truth: brute force, every pixel's ray against every occupied voxel."""
+
 import math
 
 import pytest

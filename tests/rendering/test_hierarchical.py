@@ -1,3 +1,5 @@
+"""Sources of truth: closed forms, the histogram that importance samples reproduce, and NeRF's own placement."""
+
 import numpy as np
 import pytest
 import torch

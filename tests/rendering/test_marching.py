@@ -1,3 +1,5 @@
+"""Source of truth: a walk along each ray, step by step, that asks the grid at every one."""
+
 import pytest
 import torch
 

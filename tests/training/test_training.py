@@ -1,3 +1,7 @@
+"""Sources of truth: the uninterrupted training that an interrupted one must equal to the bit, the steps of the optimisers
+by hand, and properties of what is drawn.
+"""
+
 import csv
 import json
 import signal

@@ -1,3 +1,5 @@
+"""Sources of truth: what was written, and files damaged on purpose."""
+
 import errno
 import io
 import json

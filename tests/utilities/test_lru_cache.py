@@ -1,3 +1,5 @@
+"""Source of truth: the order of use by hand."""
+
 from dataclasses import dataclass
 
 from hyperplanes.utilities.lru_cache import LRUCache

@@ -1,3 +1,5 @@
+"""Sources of truth: scikit-image's PSNR and SSIM, and a constant error by hand."""
+
 import math
 
 import jaxtyping
