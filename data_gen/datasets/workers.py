@@ -174,7 +174,7 @@ def run_workers(
                         close_worker(worker, kill=True)
                         worker, answer = None, {"skip": f"failed {attempt} times: {error}"}
                         if isinstance(error, WorkerTimeout):
-                            answer = {"skip": f"{error}; simplify it, or give it more time"}
+                            answer = {"skip": f"{error}; simplify it"}
                             break
                 if "fatal" in answer:
                     raise WorkerError(answer["fatal"])
