@@ -193,8 +193,6 @@ class _Reader:
 HYPERNETWORKS = {
     "hypernetwork": _Reader(),
     "without_completion": _Reader(completed=False),
-    "only_grid": _Reader({"layers": ("grid",)}),
-    "without_grid": _Reader(grid=False, completed=False),
     "reads_images": _Reader(images=True, grid=False, completed=False),
 }
 """What the hypernetwork of the field is worth, and what its parts are."""

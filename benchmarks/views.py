@@ -1,11 +1,16 @@
 """PSNR over the number of support views: a model that takes any number of them, beside what learns nothing.
 
     python -m benchmarks views --checkpoint small --data data/cars data/chairs --json FILE
+    python -m benchmarks views --suite random --objects 10 --json FILE
 
 Of every held-out object some query views are kept back to be judged by; of all others, support and query alike, so many
 are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
 (where there are masks); the same field from random weights; the model without its hypernetwork, with the update of
-another object of the data set, and with its own; and fine-tuned.
+another object of the data set, with its own where no left-out views may decide otherwise, and as it is used; and
+fine-tuned. Beside each mean stands how far it lies above
+`hull_blend`, with the 95 % interval of that difference over the objects (paired, Student's t).
+
+The suites are the data sets that every model is judged by; none of their objects is in any training.
 """
 
 from __future__ import annotations
@@ -28,7 +33,8 @@ from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
-from hyperplanes.evaluation import evaluate
+from hyperplanes.evaluation import Score, evaluate
+from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
 from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.parameters import Parameters
@@ -50,14 +56,20 @@ def main(arguments: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks views", description=__doc__)
     parser.add_argument("--checkpoint", default="small", help="a folder, or the name of a packaged model")
-    parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets, or single scenes")
+    parser.add_argument("--data", type=Path, nargs="+", help="data sets, or single scenes")
+    parser.add_argument("--suite", choices=SUITES, help="instead of --data: data sets in the folder --root")
+    parser.add_argument("--root", type=Path, default=Path("data"), help="of the suites")
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 3, 5, 10, 25], help="numbers of support views")
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="of fine-tuning, and of the same field "
                         "from random weights")  # fmt: skip
     parser.add_argument("--objects", type=int, default=3, help="of each data set")
     parser.add_argument("--query", type=int, default=3, help="views of each object to be judged by")
     parser.add_argument(
-        "--methods", nargs="*", choices=(*METHODS, *PARTS), default=list(METHODS), help="beside the model itself"
+        "--methods",
+        nargs="*",
+        choices=(*METHODS, *PARTS),
+        default=["nearest_view", "hull_blend", "swapped"],
+        help="beside the model itself",
     )
     parser.add_argument(
         "--rotated", type=float, default=0.0, metavar="DEGREES", help="every scene, about its vertical axis"
@@ -69,6 +81,15 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--quick", action="store_true", help="one count and object: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)
+    if (chosen.data is None) == (chosen.suite is None):
+        parser.error("--data, --suite: expected one of the two")
+    if chosen.suite is not None:
+        chosen.data = [chosen.root / name for name in SUITES[chosen.suite]]
+        for path in chosen.data:
+            if not path.exists():
+                parser.error(
+                    f"--root: expected {path}, found nothing there; make it by\n  {made_by(chosen.suite, path)}"
+                )
     if chosen.quick:
         chosen.counts, chosen.objects, chosen.query = [3], 2, 1
     model, rows, sheet = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint))), [], []
@@ -80,6 +101,7 @@ def main(arguments: list[str]) -> int:
         for count in chosen.counts:
             shown = _Rotated(Shown(data, count, chosen.query), chosen.rotated)
             steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
+            plain: Score | None = None
             for method, adapter in adapters(model, shown, names, chosen.methods, steps).items():
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
                 row |= {"second_pass": True} if chosen.second_pass else {}
@@ -94,6 +116,9 @@ def main(arguments: list[str]) -> int:
                 )
                 row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
                 row["worst"] = min(each.psnr for each in score.objects)
+                plain = score if method == "hull_blend" else plain
+                if plain is not None and plain is not score:
+                    row |= _above(score, plain)
                 rows.append(row)
                 print(rows[-1], flush=True)
         sheet += _best_median_worst(seen)
@@ -103,6 +128,36 @@ def main(arguments: list[str]) -> int:
         sheet = [pad(row, (0, widest - row.shape[2]), value=1.0) for row in sheet]
         write_whole(chosen.pictures, encode_png(to_pixels(torch.cat(sheet, 1)[None])[0], small=True))
     return 0
+
+
+SUITES: dict[str, dict[str, str]] = {
+    "procedural": {
+        f"{kind}s": f"--class {kind} --count 320 --held-out 20 --resolution 128 --rig random --seed 1300"
+        for kind in ("car", "chair", "plane", "lamp")
+    },
+    "random": {"random-unseen": "--class random --count 12 --held-out 10 --resolution 128 --rig random --seed 9001"},
+    "cc0": {
+        f"cc0/{kind}": f"--meshes MESHES/{kind} --resolution 128 --rig random --seed 5 --held-out 0.99"
+        for kind in ("cars", "chairs", "lamps", "planes")
+    },
+    "posed": {"chair": ""},
+}
+"""Data sets of each suite, and how `hyperplanes generate` makes them."""
+
+
+def made_by(suite: str, path: Path) -> str:
+    """The command that makes a data set of a suite, or where it is from."""
+    options = next(options for name, options in SUITES[suite].items() if path.as_posix().endswith(name))
+    return f"hyperplanes generate {options} --out {path}" if options else "hand: chair of the NeRF synthetic scenes"
+
+
+def _above(score: Score, plain: Score) -> Row:
+    """By how much a method exceeds `hull_blend`, with the interval over the objects where there are several."""
+    found = compare(score, plain)
+    row: Row = {"over_hull_blend": found.mean}
+    if found.low is not None and found.high is not None:
+        row |= {"over_hull_blend_low": found.low, "over_hull_blend_high": found.high}
+    return row
 
 
 @dataclass(frozen=True)
@@ -187,15 +242,12 @@ METHODS = {
     "random_weights": lambda model, *_: FromScratch(model, 0),
     "theta": lambda model, *_: _Partly(model, lambda name: False),
     "swapped": _swapped,
+    "unjudged": lambda model, *_: _Partly(model),
 }
 
 PARTS = {
-    "grid_alone": lambda model, *_: _Partly(model, lambda name: ".grid." in name),
-    "without_grid": lambda model, *_: _Partly(model, lambda name: ".grid." not in name),
     "without_share": lambda model, *_: _Partly(model, hidden=(0,)),
     "without_colours": lambda model, *_: _Partly(model, hidden=(1, 2, 3)),
-    "without_variance": lambda model, *_: _Partly(model, hidden=(4, 5, 6)),
-    "without_penalty": lambda model, *_: _Partly(model, hidden=(7,)),
-    "without_number": lambda model, *_: _Partly(model, hidden=(8,)),
+    "without_number": lambda model, *_: _Partly(model, hidden=(4,)),
 }
-"""Parts of what a hypernetwork that reads a volume reads and writes, left out at use."""
+"""Parts of what a hypernetwork that reads a volume reads, left out at use."""

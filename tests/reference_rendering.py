@@ -136,8 +136,9 @@ def small_model(**changes):
 
 def awaken(model):
     """Let the hypernetwork, whose outputs start at zero, change something."""
-    for output in model.hypernetwork.outputs:
-        torch.nn.init.normal_(output.weight, std=0.3)
     if model.reads_volume:
         torch.nn.init.normal_(model.hypernetwork.encoder.last.weight, std=0.05)
+        return model
+    for output in model.hypernetwork.outputs:
+        torch.nn.init.normal_(output.weight, std=0.3)
     return model

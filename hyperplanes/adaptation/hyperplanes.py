@@ -14,6 +14,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.checkpoints import read_checkpoint, write_checkpoint
 from hyperplanes.adaptation.context import SupportContext, arrange, live_pixels, observe, prepare_context
 from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
+from hyperplanes.adaptation.judging import judge_strength
 from hyperplanes.configuration.compatibility import check_fine_tuning, check_model
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
@@ -147,13 +148,30 @@ class HyperPlanes(nn.Module):
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6)."""
+        """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6).
+
+        Where `config.judged` says so, two of the views decide how much of what was learned counts.
+        """
         return self.adapt_to(self.prepare(support))
 
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:
         """As `adapt`, of an object that is prepared."""
-        return self.rendering_field(context, self._adapted_weights(context))
+        weights = self._adapted_weights(context)
+        if self.config.judged:
+            with _in_use(self):
+                weights = self.attenuated(weights, judge_strength(self, context.views))
+        return self.rendering_field(context, weights)
+
+    def attenuated(self, parameters: Parameters, strength: float) -> Parameters:
+        """Weights of a field between that of given ones and one of which nothing is learned (`Target.attenuated`).
+
+        Args:
+            parameters: theta + delta.
+            strength: 1 leaves them as they are.
+        """
+        parts = {name: network.attenuated(parameters.under(name), strength) for name, network in self.targets.items()}
+        return Parameters((f"{name}.{key}", value) for name, part in parts.items() for key, value in part.items())
 
     def rendering_field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
         """As `field`, after a second pass where the model takes two."""
@@ -184,8 +202,9 @@ class HyperPlanes(nn.Module):
     ) -> AdaptedField:
         """The field of one object after gradient steps on its support views; the model itself stays as it is.
 
-        It begins at theta + delta, the field of `adapt`. Either these weights themselves are optimised, or, as in the
-        paper, a copy of the hypernetwork while theta is frozen (HyperPlanes, section 3, fine-tuning).
+        It begins at theta + delta, of which `settings.fresh` is replaced by random weights. Either these weights
+        themselves are optimised, or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes,
+        section 3, fine-tuning). No step is the field of `adapt`.
 
         Args:
             support: the views of the object.
@@ -237,6 +256,10 @@ class HyperPlanes(nn.Module):
             on_step: as in `fine_tune`.
         """
         check_fine_tuning(settings, steps, len(views or context.views), self.config, self.target)
+        if not steps:
+            if on_step is not None:
+                on_step(0)
+            return self.adapt_to(context)
         descent, variables = self.descent(context, settings, views)
         for done in descent.run(steps if schedule is None else schedule):
             if on_step is not None:
@@ -278,7 +301,18 @@ class HyperPlanes(nn.Module):
         if settings.trainable == "hypernetwork" and self.hypernetwork is not None:
             observed, theta = observe([context], self.hypernetwork.resolution), self.theta.detach()
             return Variables.of_hypernetwork(self.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
-        return Variables.of_weights(self._adapted_weights(context) if start is None else start)
+        if start is None:
+            start = self._refreshed(self._adapted_weights(context), settings, len(context.views))
+        return Variables.of_weights(start)
+
+    def _refreshed(self, weights: Parameters, settings: FineTuning, views: int) -> Parameters:
+        """Trained weights interpolated with random ones, where a hypernetwork writes a grid; others as they are."""
+        share = settings.fresh_share(views)
+        if not share or not self.reads_volume:
+            return weights
+        made = HyperPlanes(replace(self.config, hypernetwork=None, judged=False), settings.seed)
+        random = made.to(self.rig.device, self.rig.dtype).theta.detach()
+        return Parameters((name, torch.lerp(value, random[name], share)) for name, value in weights.items())
 
     def _live_pixels(self, context: SupportContext, views: Views) -> Tensor | None:
         """Flat indices of the pixels of views that look into the hull; None where all are drawn from."""

@@ -31,6 +31,8 @@ def check_model(config: ModelConfig) -> type[Target]:
         raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
     if config.second_pass and not target.permutation_invariant:
         raise ValueError(f"second_pass: expected a field that judges what views see, got {config.target}")
+    if config.judged and not target.permutation_invariant:
+        raise ValueError(f"judged: expected a field that takes any number of views, got {config.target}")
     return target
 
 
@@ -43,6 +45,8 @@ def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
                 f"hypernetwork.kind: expected one that reads images for {config.target}, which knows views by their "
                 "places, got 'volume'"
             )
+        if not getattr(config.network, "grid", 0):
+            raise ValueError("network.grid: expected features of a grid for hypernetwork.kind 'volume' to write, got 0")
         return
     reader = hypernetwork or config.autoencoder
     if reader is None:

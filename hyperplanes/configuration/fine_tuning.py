@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 
 from hyperplanes.hypernetwork.choices import check_choices
 
-__all__ = ["RATES", "FineTuning", "Steps"]
+__all__ = ["FRESH", "FRESH_VIEWS", "RATES", "FineTuning", "Steps"]
 
 Steps: TypeAlias = int | Literal["auto"]
 
@@ -19,6 +19,13 @@ RATES: dict[str, tuple[str, float, float]] = {
 }
 """What is optimised: by which optimiser, the learning rate of Adam, that of Muon. Chosen by measurement, see
 docs/adaptation.md."""
+
+
+FRESH = 0.5
+"""Share of random weights that fine-tuning a field with a grid of features begins with; docs/any_order.md."""
+
+FRESH_VIEWS = 10
+"""Support views from which on it does; with fewer, what was learned is worth more than what the steps learn."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +45,10 @@ class FineTuning:
         holdout: every so many-th support view is held out of the planes and of the rays while "auto" chooses.
         mask_views: a field that takes any number of views is not shown those that the rays of a step come from, a share
             `1 / holdout` of them, as it could copy their colours; a single view cannot be masked.
-        seed: of rays and samples.
+        fresh: share of random weights in those that the steps begin with, where a hypernetwork writes a grid of
+            features: trained weights interpolated with random ones learn more in the same steps (Ash & Adams 2020, "On
+            warm-starting neural network training"). Where None, FRESH with FRESH_VIEWS views or more, else none.
+        seed: of rays and samples, and of random weights.
 
     Raises:
         ValueError: an unknown name, no ray, a rate that is negative or not finite, or every view held out.
@@ -53,6 +63,7 @@ class FineTuning:
     max_steps: int = 300
     holdout: int = 6
     mask_views: bool = True
+    fresh: float | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -64,6 +75,13 @@ class FineTuning:
             rate = getattr(self, name)
             if rate is not None and not 0 <= rate < math.inf:
                 raise ValueError(f"{name}: expected a finite number of 0 or more, got {rate}")
+
+        if self.fresh is not None and not 0 <= self.fresh <= 1:
+            raise ValueError(f"fresh: expected a share from 0 to 1, got {self.fresh}")
+
+    def fresh_share(self, views: int) -> float:
+        """How much of the first weights is random, with so many support views."""
+        return (FRESH if views >= FRESH_VIEWS else 0.0) if self.fresh is None else self.fresh
 
     def with_rates(self, rates: Mapping[str, float]) -> FineTuning:
         """The settings with these rates where they state none; `rates` are fields of the settings by name."""

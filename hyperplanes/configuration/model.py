@@ -48,6 +48,9 @@ class ModelConfig:
             plane and the others are hidden, not filled with views that stand elsewhere.
         second_pass: a field of any number of views renders those that it is shown, and then takes colours from the
             views that see the surface found there, and not that of the visual hull. Training does without.
+        judged: of five or more views of an object, two that are held out decide whether a field of any number of views
+            is used as it was learned, halfway to the plain visual hull in blended colours, or not at all
+            (`adaptation.judging`). Training does without.
     """
 
     target: str = "point_multiplane"
@@ -61,6 +64,7 @@ class ModelConfig:
     order: str = "matched"
     plane_dropout: float = 0.0
     second_pass: bool = False
+    judged: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.plane_dropout < 1:

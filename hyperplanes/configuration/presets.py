@@ -183,9 +183,7 @@ PRESETS: dict[str, Preset] = {
         ModelConfig(
             target="any_order",
             network=AnyOrderConfig(depth=4, width=128, planes=8, grid=8, point_frequencies=6, direction_frequencies=2),
-            hypernetwork=VolumeHyperNetworkConfig(
-                code=256, activation="silu", layers=("all",), update="low_rank", weights_seen="all"
-            ),
+            hypernetwork=VolumeHyperNetworkConfig(),
             sampling=Marched(steps=64),
             hull_resolution=96,
         ),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
+from hyperplanes.hypernetwork.configuration import HeadConfig
 from hyperplanes.utilities.settings import SettingsError
 
 __all__ = ["upgrade_model"]
@@ -18,6 +20,7 @@ TARGETS: dict[str, str] = {}
 
 OF_IMAGE_BASED = ("blended", "grid")
 OF_IMAGES = ("encoder", "views", "choice", "resolution", "normalisation", "join", "see_directions")
+OF_HEADS = tuple(each.name for each in fields(HeadConfig))
 """What every network, and every hypernetwork, was once written with, whether it read it or not."""
 
 REMOVED: dict[str, object] = {"gain": 1.0, "code_activation": "none"}
@@ -62,8 +65,11 @@ def _hypernetwork(entries: Mapping[str, Any]) -> dict[str, Any]:
             problem = f"expected {off!r}, since this setting was removed, got {entries[name]!r}"
             raise SettingsError(f"hypernetwork.{name}", problem)
     result = {name: value for name, value in entries.items() if name not in REMOVED}
+    if result.get("kind") == "volume":
+        return {name: value for name, value in result.items() if name not in OF_HEADS}
+    dropped = (*OF_IMAGES, *OF_HEADS)
     if "encoder" not in result or "kind" in result:
         return result
     if result["encoder"] == "volume":
-        return {"kind": "volume", **{name: value for name, value in result.items() if name not in OF_IMAGES}}
+        return {"kind": "volume", **{name: value for name, value in result.items() if name not in dropped}}
     return {"kind": "images", **result}

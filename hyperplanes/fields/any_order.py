@@ -40,6 +40,7 @@ SOLID = 4.0  # and within them
 GRID_RATES = {"learning_rate": 2e-2, "muon_learning_rate": 0.05}
 """Of fine-tuning the weights of a field with a grid of features, trained or random; docs/any_order.md."""
 
+
 READ = 9  # numbers that the trunk reads of a view: colour, depth, coverage, validity, direction
 BLENDED = 7  # numbers that the colour head reads of a view: colour, angle, depth, coverage, validity
 OVERALL = 11  # mean, variance and difference to the best of the colours, least coverage, number of views
@@ -102,6 +103,23 @@ class AnyOrderNeRF(Target):
             self.density.weight[0, width] = SOLID - EMPTY
             self.density.bias.fill_(EMPTY)
             self.colour.weight *= 0.1
+
+    def attenuated(self, parameters: Parameters, strength: float) -> Parameters:
+        """Weights of a field between that of given ones and the plain hull that training began with.
+
+        The heads are linear, so that interpolating their weights interpolates their outputs: the density before
+        softplus, and what the network changes of the blended colour. What was learned is scaled by `strength`.
+
+        Args:
+            parameters: theta + delta.
+            strength: 0 is a density of the masks alone and the plain blend, 1 leaves both as they are.
+        """
+        changed = Parameters(parameters)
+        for name in (f"{head}.{part}" for head in ("density", "colour") for part in ("weight", "bias")):
+            changed[name] = strength * parameters[name]
+        changed["density.weight"][:, -1] += (1 - strength) * (SOLID - EMPTY)
+        changed["density.bias"] += (1 - strength) * EMPTY
+        return changed
 
     @property
     def input_size(self) -> int:

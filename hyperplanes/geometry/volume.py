@@ -13,9 +13,8 @@ from hyperplanes.geometry.visibility import VisibilityPlanes
 __all__ = ["CHANNELS", "SIDE", "interpolate_grid", "volume_of"]
 
 SIDE = 32  # cells an axis
-CHANNELS = 9  # of a cell: occupied share, mean and variance of the colours, penalty of the best view, number of views
+CHANNELS = 5  # of a cell: occupied share, mean colour, number of views
 BEST = 8  # views of a cell that count
-WORST = 2.0  # what penalties are cut to
 
 
 @torch.no_grad()
@@ -26,9 +25,9 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
         planes: of one object.
 
     Returns:
-        Nine channels: the share of the cell that the hull occupies; mean and variance of the colours, in [-1, 1], that
-        the views which see the cell best show at its centre; how badly the best of them sees it, as
-        `VisibilityPlanes.choose` says; and the logarithm of the number of views that show it.
+        Five channels: the share of the cell that the hull occupies; the mean of the colours, in [-1, 1], that the views
+        which see the cell best show at its centre; and the logarithm of the number of views that show it. The variance
+        of these colours and the penalty of the best view brought nothing (docs/any_order.md).
     """
     occupancy = planes.occupancy
     share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.guides), SIDE)[0, 0]
@@ -39,13 +38,10 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
     seen = visibility.best
     shown = planes.colours.lookup(points).colours
     colours = 2 * shown.gather(1, seen.views[..., None].expand(-1, -1, 3)) - 1
-    weights = seen.weights[..., None]
-    mean = (weights * colours).sum(1)
-    variance = (weights * (colours - mean[:, None]).square()).sum(1)
+    mean = (seen.weights[..., None] * colours).sum(1)
     number = visibility.number.clamp_min(1).log()
     x, y, z = cells.unbind(1)
-    penalty = seen.penalty[:, 0].clamp(-WORST, WORST)
-    values = torch.cat([share[x, y, z][:, None], mean, variance, penalty[:, None], number[:, None]], 1)
+    values = torch.cat([share[x, y, z][:, None], mean, number[:, None]], 1)
     volume = share.new_zeros(CHANNELS, SIDE, SIDE, SIDE)
     volume[:, x, y, z] = values.T
     return volume

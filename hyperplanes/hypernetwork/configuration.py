@@ -30,10 +30,10 @@ WEIGHTS_SEEN = ("updated", "all")
 
 @dataclass(frozen=True)
 class HeadConfig:
-    """What hypernetworks of every kind end with: from the code of an object to an update.
+    """What hypernetworks that read images end with: from the code of an object to an update.
 
     Attributes:
-        code: length of the code of one image, or of a volume.
+        code: length of the code of one image.
         code_normalisation: of the codes: "running" standardises them by running statistics over objects, "layer" each
             over its own entries, "none" leaves them.
         depth: fully connected layers of the head before its outputs.
@@ -99,8 +99,8 @@ class ImageHyperNetworkConfig(HeadConfig):
 
 
 @dataclass(frozen=True)
-class VolumeHyperNetworkConfig(HeadConfig):
-    """A hypernetwork that reads what all views show on a grid over the scene (`VolumeHyperNetwork`)."""
+class VolumeHyperNetworkConfig:
+    """A hypernetwork that reads what all views show on a grid over the scene (`VolumeHyperNetwork`); no settings."""
 
 
 HyperNetworkConfig: TypeAlias = ImageHyperNetworkConfig | VolumeHyperNetworkConfig

@@ -1,4 +1,4 @@
-"""The network that reads what all views show on a coarse grid: a code of the object, and features of every cell."""
+"""The network that reads what all views show on a coarse grid, and writes features of every cell."""
 
 from __future__ import annotations
 
@@ -40,15 +40,17 @@ class VolumeNetwork(nn.Module):
     Args:
         channels: numbers that are read of a cell.
         side: cells an axis, a multiple of eight.
-        code: length of the code.
-        features: of every cell; 0 makes the code alone.
+        features: of every cell.
         widths: channels at half, a quarter and an eighth of the side.
+
+    Raises:
+        ValueError: another side.
     """
 
-    def __init__(
-        self, channels: int, side: int, code: int, features: int, widths: tuple[int, int, int] = (32, 64, 128)
-    ) -> None:
+    def __init__(self, channels: int, side: int, features: int, widths: tuple[int, int, int] = (32, 64, 128)) -> None:
         super().__init__()
+        if side % (4 * FOLD):
+            raise ValueError(f"side: expected a multiple of {4 * FOLD}, got {side}")
         fine, middle, coarse = widths
         self.features = features
         folded = channels * FOLD**3
@@ -57,9 +59,6 @@ class VolumeNetwork(nn.Module):
         self.strided = nn.ModuleList(
             [nn.Conv3d(fine, middle, 3, stride=2, padding=1), nn.Conv3d(middle, coarse, 3, stride=2, padding=1)]
         )
-        self.code = nn.Linear(coarse * (side // (4 * FOLD)) ** 3, code)
-        if not features:
-            return
         self.upwards = nn.ModuleList([_Residual(coarse), _Residual(middle), _Residual(fine)])
         self.widened = nn.ModuleList([nn.Conv3d(coarse, middle, 1), nn.Conv3d(middle, fine, 1)])
         self.normalisation = nn.GroupNorm(GROUPS, fine)
@@ -67,20 +66,15 @@ class VolumeNetwork(nn.Module):
         for parameter in self.last.parameters():
             nn.init.zeros_(parameter)
 
-    def forward(
-        self, volumes: Float[Tensor, "object channel x y z"]
-    ) -> tuple[Float[Tensor, "object code"], Float[Tensor, "object feature x y z"]]:
-        """A code and the features of every cell for each of several objects."""
+    def forward(self, volumes: Float[Tensor, "object channel x y z"]) -> Float[Tensor, "object feature x y z"]:
+        """The features of every cell for each of several objects."""
         folded = _fold(volumes).contiguous(memory_format=torch.channels_last_3d)
         fine = self.downwards[0](self.first(folded))
         middle = self.downwards[1](self.strided[0](fine))
         coarse = self.downwards[2](self.strided[1](middle))
-        codes = self.code(silu(coarse).flatten(1))
-        if not self.features:
-            return codes, volumes[:, :0]
         middle = self.upwards[1](middle + _doubled(self.widened[0](self.upwards[0](coarse))))
         fine = self.upwards[2](fine + _doubled(self.widened[1](middle)))
-        return codes, _unfold(self.last(torch.cat([silu(self.normalisation(fine)), folded], 1)), self.features)
+        return _unfold(self.last(torch.cat([silu(self.normalisation(fine)), folded], 1)), self.features)
 
 
 def _doubled(value: Tensor) -> Tensor:

@@ -40,8 +40,7 @@ def test_cells_at_the_surface_have_the_colour_of_the_ball_and_those_outside_are_
 def test_the_number_of_views_that_show_a_cell_is_that_of_all():
     volume = volume_of(planes_of(ball_views(ring(7, (48, 48)))))
     assert len(volume) == CHANNELS
-    assert volume[8].max() == pytest.approx(math.log(7))
-    assert volume[7].min() < 0.01  # some cell lies at the surface that a view sees
+    assert volume[4].max() == pytest.approx(math.log(7))
 
 
 def test_the_order_of_the_views_does_not_matter():

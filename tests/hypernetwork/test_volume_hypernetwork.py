@@ -4,42 +4,15 @@ import pytest
 import torch
 
 from hyperplanes.geometry.volume import CHANNELS, SIDE
-from hyperplanes.hypernetwork import Observed, VolumeHyperNetwork, VolumeHyperNetworkConfig
+from hyperplanes.hypernetwork import Observed, VolumeHyperNetwork
 from hyperplanes.hypernetwork.volume_network import VolumeNetwork, _fold, _unfold
 
-SHAPES = {
-    "fine.grid.weight": torch.Size((5, SIDE, SIDE, SIDE)),
-    "fine.layers.0.weight": torch.Size((12, 7)),
-    "fine.layers.0.bias": torch.Size((12,)),
-    "fine.density.weight": torch.Size((1, 12)),
-}
-CONFIG = VolumeHyperNetworkConfig(
-    code=16, depth=1, width=16, layers=("all",), update="low_rank", rank=1, weights_seen="all"
-)
-
-
-def theta():
-    generator = torch.Generator().manual_seed(0)
-    return {name: torch.randn(shape, generator=generator) for name, shape in SHAPES.items()}
+GRIDS = {"coarse.grid.weight": torch.Size((2, SIDE, SIDE, SIDE)), "fine.grid.weight": torch.Size((5, SIDE, SIDE, SIDE))}
+SHAPES = {**GRIDS, "fine.layers.0.weight": torch.Size((12, 7)), "fine.layers.0.bias": torch.Size((12,))}
 
 
 def volumes(count=3):
     return torch.randn(count, CHANNELS, SIDE, SIDE, SIDE, generator=torch.Generator().manual_seed(1))
-
-
-def seen(volume):
-    return Observed(volume=volume)
-
-
-def awake(**changes):
-    """A hypernetwork whose outputs are not zero."""
-    torch.manual_seed(2)
-    network = VolumeHyperNetwork(
-        VolumeHyperNetworkConfig(**{**CONFIG.__dict__, **changes}), SHAPES, CHANNELS, SIDE
-    ).eval()
-    for layer in (*network.outputs, network.encoder.last):
-        torch.nn.init.normal_(layer.weight, std=0.1)
-    return network
 
 
 def test_folding_keeps_every_value_and_blocks_become_channels():
@@ -51,43 +24,38 @@ def test_folding_keeps_every_value_and_blocks_become_channels():
     assert torch.equal(folded[1, 16:24, 2, 1, 3], block)
 
 
-def test_an_untrained_hypernetwork_changes_nothing_and_names_every_parameter_by_its_shape():
-    network = VolumeHyperNetwork(CONFIG, SHAPES, CHANNELS, SIDE)
-    for update in network(seen(volumes()), theta()):
-        assert {name: value.shape for name, value in update.items()} == SHAPES
+def test_an_untrained_hypernetwork_changes_nothing_and_names_the_grids_by_their_shapes():
+    network = VolumeHyperNetwork(SHAPES, CHANNELS, SIDE)
+    for update in network(Observed(volume=volumes()), {}):
+        assert {name: value.shape for name, value in update.items()} == GRIDS
         assert not any(value.any() for value in update.values())
 
 
 def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch():
-    network = awake()
+    torch.manual_seed(2)
+    network = VolumeHyperNetwork(SHAPES, CHANNELS, SIDE).eval()
+    torch.nn.init.normal_(network.encoder.last.weight, std=0.1)
     with torch.no_grad():
-        together = network(seen(volumes()), theta())
+        together = network(Observed(volume=volumes()), {})
         for index, one in enumerate(together):
-            for name, value in network(seen(volumes()[index : index + 1]), theta())[0].items():
+            for name, value in network(Observed(volume=volumes()[index : index + 1]), {})[0].items():
                 torch.testing.assert_close(one[name], value, atol=1e-4, rtol=1e-4)
-    for name in SHAPES:
+    for name in GRIDS:
         assert not torch.allclose(together[0][name], together[1][name])
 
 
 def test_a_cell_has_features_of_what_lies_around_it():
-    network = VolumeNetwork(CHANNELS, SIDE, 8, 4).eval()
+    network = VolumeNetwork(CHANNELS, SIDE, 4).eval()
     torch.nn.init.normal_(network.last.weight, std=0.1)
     first = volumes(1)
     second = first.clone()
     second[:, :, 16:18, 16:18, 16:18] += 3.0
     with torch.no_grad():
-        moved = (network(second)[1] - network(first)[1]).abs().amax((0, 1))
+        moved = (network(second) - network(first)).abs().amax((0, 1))
     assert moved[16, 16, 16] > 10 * moved[0, 0, 0]
     assert moved[12, 16, 16] > 0
 
 
-def test_layers_can_be_chosen():
-    only = awake(layers=("grid",))(seen(volumes(1)), theta())[0]
-    assert set(only) == {"fine.grid.weight"}
-    torch.manual_seed(0)
-    without = VolumeHyperNetwork(
-        VolumeHyperNetworkConfig(**{**CONFIG.__dict__, "layers": ("density",)}), SHAPES, CHANNELS, SIDE
-    )
-    assert set(without(seen(volumes(1)), theta())[0]) == {"fine.density.weight"}
-    with pytest.raises(ValueError, match="layers: expected"):
-        awake(layers=("walls",))
+def test_a_side_that_cannot_be_halved_three_times_is_refused():
+    with pytest.raises(ValueError, match="side: expected a multiple of 8, got 12"):
+        VolumeNetwork(CHANNELS, 12, 4)

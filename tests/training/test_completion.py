@@ -18,7 +18,7 @@ from tests.reference_rendering import Balls
 MODEL = ModelConfig(
     "any_order",
     AnyOrderConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1),
-    VolumeHyperNetworkConfig(code=8, depth=1, width=16, layers=("all",), update="low_rank", rank=1),
+    VolumeHyperNetworkConfig(),
     sampling=Marched(24),
     hull_resolution=32,
 )

@@ -1,0 +1,58 @@
+"""How much of what was learned an object gets: support views that are left out for the purpose decide."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from hyperplanes.adaptation.context import live_pixels
+from hyperplanes.fields.rig import standpoints
+from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.views import Views
+
+if TYPE_CHECKING:
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+
+__all__ = ["FEWEST", "STRENGTHS", "judge_strength"]
+
+STRENGTHS = (1.0, 0.5, 0.0)
+"""What is compared: the trained field, halfway to the plain visual hull in blended colours, and that alone."""
+
+FEWEST = 5  # views, of which some can be left out
+LEFT_OUT = 2
+RAYS = 2048  # of the views that are left out
+
+
+@torch.no_grad()
+def judge_strength(model: HyperPlanes, support: Views) -> float:
+    """The strength, of STRENGTHS, with which views that are left out are shown best.
+
+    A trained field has expectations of its objects, and an object of another kind may be shown worse with them than
+    without. Left out are the LEFT_OUT views that the others stand closest around, and the squared error of RAYS of
+    their rays through the hull counts. Wortsman et al. 2022, "Robust fine-tuning of zero-shot models", interpolate
+    weights likewise; here it is the outputs (`Target.attenuated`).
+
+    Args:
+        model: of a field that takes any number of views.
+        support: the views of an object, where the model is.
+
+    Returns:
+        The strength; of equally good ones the greatest, and 1 with fewer than FEWEST views.
+    """
+    if len(support) < FEWEST:
+        return STRENGTHS[0]
+    standing = standpoints(support).cpu()
+    order = farthest_first(standing, int((standing @ standing.mean(0)).argmin()), len(support))
+    shown, judged = support[sorted(order[:-LEFT_OUT])], support[order[-LEFT_OUT:]]
+    context = model.prepare(shown)
+    weights = model.theta + model.update(context)
+    fields = [model.field(context, model.attenuated(weights, strength)) for strength in STRENGTHS]
+    rays, truth = judged.sample_rays(
+        RAYS,
+        generator=torch.Generator().manual_seed(0),
+        among=live_pixels(context.occupancy, judged),
+        span=fields[0].sampling.span,
+    )
+    errors = [float((field.trace(rays).colour - truth).square().mean()) for field in fields]
+    return STRENGTHS[errors.index(min(errors))]

@@ -1,0 +1,101 @@
+"""Source of truth: closed forms of the plain hull and of what lies halfway, and which views may decide."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.nn.functional import softplus
+
+from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.adaptation.judging import FEWEST, STRENGTHS, judge_strength
+from hyperplanes.fields import AnyOrderConfig
+from hyperplanes.fields.any_order import EMPTY, SOLID
+from hyperplanes.geometry.cameras import centres
+from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
+from hyperplanes.rendering import Marched
+from tests.reference_rendering import awaken, ball_views, ring
+
+NETWORK = AnyOrderConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1)
+CONFIG = ModelConfig(
+    "any_order", NETWORK, VolumeHyperNetworkConfig(), sampling=Marched(24), hull_resolution=16, judged=True
+)
+
+
+def model(seed=0):
+    torch.manual_seed(seed)
+    made = awaken(HyperPlanes(CONFIG, seed)).eval()
+    with torch.no_grad():
+        made.networks["fine"].density.weight *= 5
+        made.networks["fine"].colour.weight *= 5
+    return made
+
+
+@torch.no_grad()
+def outputs(adapter, context, strength, points, directions):
+    """Density before softplus, and what the network changes of the blend's logit, at points."""
+    weights = adapter.attenuated(adapter.theta + adapter.update(context), strength)
+    field = adapter.field(context, weights)
+    colour, density = field(points, directions)
+    scale = NETWORK.density_scale / context.occupancy.bounds.radius
+    return torch.log(torch.expm1((density / scale).double())), colour
+
+
+@torch.no_grad()
+def test_nothing_of_what_was_learned_is_the_hull_of_the_masks_in_blended_colours():
+    generator = torch.Generator().manual_seed(1)
+    points = torch.rand(200, 3, generator=generator) - 0.5
+    directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=1)
+    support = ball_views(ring(6, (24, 24)))
+    one, other = model(), model(seed=7)
+    context = one.prepare(support)
+    coverage = context.planes.choose(points, best=1).coverage
+    scale = NETWORK.density_scale / context.occupancy.bounds.radius
+    colours = []
+    for adapter in (one, other):  # other weights, the same plain hull
+        field = adapter.field(context, adapter.attenuated(adapter.theta + adapter.update(context), 0.0))
+        colour, density = field(points, directions)
+        torch.testing.assert_close(density, softplus(EMPTY + (SOLID - EMPTY) * coverage) * scale)
+        colours.append(colour)
+    assert torch.equal(*colours)
+
+
+def test_halfway_the_density_before_softplus_is_the_mean_of_both():
+    generator = torch.Generator().manual_seed(2)
+    points = torch.rand(100, 3, generator=generator) - 0.5
+    adapter = model()
+    context = adapter.prepare(ball_views(ring(6, (24, 24))))
+    whole, half, none = (outputs(adapter, context, each, points, points)[0] for each in STRENGTHS)
+    torch.testing.assert_close(half, (whole + none) / 2, atol=1e-3, rtol=1e-3)
+    assert not torch.allclose(whole, none, atol=0.1)
+
+
+def test_the_views_that_decide_are_not_shown(monkeypatch):
+    adapter, support, shown = model(), ball_views(ring(7, (24, 24))), []
+    prepare = adapter.prepare
+    monkeypatch.setattr(adapter, "prepare", lambda views, **given: shown.append(views) or prepare(views, **given))
+    assert judge_strength(adapter, support) in STRENGTHS
+    (rest,) = shown
+    assert len(rest) == 5
+    apart = torch.cdist(centres(support.cameras), centres(rest.cameras)).amin(1)
+    assert int((apart > 1e-3).sum()) == 2
+
+
+def test_the_strength_is_the_one_that_shows_the_left_out_views_best():
+    """The truth itself as the field of one strength, and its negative as those of the others."""
+    adapter, support = model(), ball_views(ring(8, (24, 24)))
+    for best in STRENGTHS:
+        changed = model()
+        changed.attenuated = lambda weights, strength, best=best: adapter.attenuated(weights, float(strength != best))
+        adapter.theta["fine.density.bias"].data.fill_(-50)  # what was learned is that there is nothing
+        assert judge_strength(changed, support) == best
+
+
+def test_with_fewer_views_all_that_was_learned_is_used():
+    adapter = model()
+    for count in (1, FEWEST - 1):
+        assert judge_strength(adapter, ball_views(ring(count, (24, 24)))) == 1
+
+
+def test_a_field_that_knows_views_by_their_places_has_no_plain_hull():
+    with pytest.raises(ValueError, match="judged: .* got point_multiplane"):
+        HyperPlanes(replace(ModelConfig(), judged=True))
