@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from hyperplanes.capture.masks.choice import choose_masker
+from hyperplanes.capture.masks.consistency import agree
 from hyperplanes.capture.photographs import (
     FEWEST,
     Photograph,
@@ -17,7 +18,7 @@ from hyperplanes.capture.photographs import (
     list_photographs,
     read_upright,
 )
-from hyperplanes.capture.placement import Placement, place
+from hyperplanes.capture.placement import Placement, find_up, object_points, object_sphere
 from hyperplanes.capture.scene import Captured, straightened, write_scene
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages, fingerprint
@@ -25,6 +26,7 @@ from hyperplanes.capture.structure_from_motion import ATTEMPTS, Picture, find_po
 from hyperplanes.capture.video import VIDEO_SUFFIXES, take_frames
 from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import Pixels, read_image
+from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError, encode_png, write_whole
 
 __all__ = ["Captured", "Progress", "Settings", "capture"]
@@ -34,6 +36,8 @@ Progress = Callable[[str, int, int, str], None]
 
 WORK = "capture"
 """The folder within the scene that holds what the stages made."""
+
+ROOM = 1.5  # times the radius of the points of the object, within which its hull is carved: what is smooth has none
 
 ENOUGH = 0.8  # of the photographs: with fewer registered, other features are tried
 QUALITY = 96  # of JPEG, without subsampled colours
@@ -98,7 +102,7 @@ def capture(
         work.notes.append(f"{len(rest)} photographs could not be posed and are left out: {listed(rest)}")
     straight = _straight(model, pictures, opacities, work)
     masks, how = _masks(model, straight, [one.name for one in kept], work)
-    placement = place(model, np.array([one.up_in_camera for one in kept]), masks)
+    placement, masks = _placed(model, kept, masks, work)
     return _written(out, model, kept, straight, masks, how, placement, work)
 
 
@@ -264,6 +268,26 @@ def _masks(
             "--mask", "an object in the photographs", f"none in any of {len(masks)}", "give --mask none or masks/"
         )
     return masks, how
+
+
+def _placed(
+    model: SparseModel, photographs: Sequence[Photograph], masks: list[np.ndarray] | None, work: _Work
+) -> tuple[Placement, list[np.ndarray] | None]:
+    """Where the object is, and the masks after they were compared with each other."""
+    chosen = object_points(model, masks)
+    sphere = object_sphere(model, chosen)
+    if masks is not None:
+        work.progress("agreement", 0, 1, "of the masks with each other")
+        found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius))
+        if found.wrong:
+            names = listed([photographs[row].name for row in found.wrong])
+            work.notes.append(
+                f"{len(found.wrong)} masks contradicted the others and were mended by what these show together: {names}"
+            )
+        work.progress("agreement", 1, 1, f"{1 - float(found.disagreement.mean()):.1%} of their area")
+        masks, sphere = found.masks, found.sphere or sphere
+    up, source = find_up(model, np.array([one.up_in_camera for one in photographs]), sphere, chosen)
+    return Placement(sphere, up, source), masks
 
 
 def _written(

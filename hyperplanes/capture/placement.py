@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from hyperplanes.capture.sparse_model import SparseModel
-from hyperplanes.data.pictures.bounds import nearest_point
+from hyperplanes.data.pictures.bounds import nearest_point, smallest_ball
 from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["Placement", "find_up", "object_points", "object_sphere", "place"]
+__all__ = ["Placement", "find_up", "object_points", "object_sphere"]
 
 Mask = Float[np.ndarray, "height width"]
 
@@ -54,24 +54,6 @@ class Placement:
         return result
 
 
-def place(
-    model: SparseModel,
-    up_in_camera: Float[np.ndarray, "camera 3"],
-    masks: Sequence[Mask] | None,
-) -> Placement:
-    """The sphere around the object and the direction that is up.
-
-    Args:
-        model: of structure from motion.
-        up_in_camera: which way is up in each picture, as EXIF says it was held.
-        masks: of each camera's picture without its lens, or None.
-    """
-    points = object_points(model, masks)
-    sphere = object_sphere(model, points)
-    up, source = find_up(model, up_in_camera, sphere, points)
-    return Placement(sphere, up, source)
-
-
 def object_points(model: SparseModel, masks: Sequence[Mask] | None) -> Bool[np.ndarray, " point"]:
     """Which points belong to the object: those that nearly all of their cameras show within their masks.
 
@@ -79,7 +61,7 @@ def object_points(model: SparseModel, masks: Sequence[Mask] | None) -> Bool[np.n
 
     Args:
         model: of structure from motion.
-        masks: as in `place`.
+        masks: of each camera's picture without its lens, or None.
     """
     if masks is None:
         eyes, axes = _eyes_and_axes(model)
@@ -110,9 +92,8 @@ def object_sphere(model: SparseModel, chosen: Bool[np.ndarray, " point"]) -> Sph
     if len(points) < FEWEST_POINTS:
         centre = nearest_point(eyes, axes)
         return Sphere(tuple(centre.tolist()), 0.4 * float((eyes - centre).norm(dim=-1).median()))
-    centre, radius = _ball(points)
-    nearest = float(np.linalg.norm(model.centres - centre, axis=-1).min())
-    return Sphere(tuple(centre.tolist()), min(MARGIN * radius, 0.95 * nearest))
+    ball = smallest_ball(torch.from_numpy(points))
+    return Sphere(ball.centre, MARGIN * ball.radius)
 
 
 def find_up(
@@ -162,15 +143,6 @@ def _without_strays(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     result = np.zeros_like(chosen)
     result[index[distance <= STRAY * np.median(distance) + 1e-12]] = True
     return result
-
-
-def _ball(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Nearly the smallest ball around points (Badoiu and Clarkson, 2003)."""
-    centre = (points.min(0) + points.max(0)) / 2
-    for step in range(1, 100):
-        farthest = points[np.square(points - centre).sum(-1).argmax()]
-        centre = centre + (farthest - centre) / (step + 1)
-    return centre, float(np.linalg.norm(points - centre, axis=-1).max())
 
 
 def _ground(points: np.ndarray, up: np.ndarray, sphere: Sphere, seed: int = 0) -> np.ndarray | None:

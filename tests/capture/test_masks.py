@@ -74,3 +74,59 @@ def test_the_network_finds_what_stands_out():
     picture = np.random.default_rng(0).normal(150, 6, (150, 200, 3))
     picture[mask] = [200, 60, 30]
     assert overlap(SalientObject(1)(picture.clip(0, 255).astype(np.uint8)), mask) > 0.9
+
+
+@pytest.fixture(scope="module")
+def ball_seen():
+    """A ball seen by 24 cameras around it: the model, its sphere and its masks."""
+    from hyperplanes.capture.sparse_model import SparseModel
+    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.geometry.rays import Sphere
+
+    count, size = 24, 96
+    poses = camera.orbit(count, 3.0, 0.3).numpy().astype(float)
+    calibration = np.tile(np.array([[110.0, 0, 47.5], [0, 110.0, 47.5], [0, 0, 1]]), (count, 1, 1))
+    nothing = np.zeros((0, 2))
+    model = SparseModel(
+        np.arange(count), poses, calibration, np.zeros((count, 2)), np.zeros((0, 3)), np.zeros((0, 3), np.uint8),
+        np.zeros(0), nothing.astype(int), nothing,
+    )  # fmt: skip
+    rows, columns = np.mgrid[:size, :size]
+    mask = np.hypot(rows - 47.5, columns - 47.5) < 110 * 0.7 / np.sqrt(9 - 0.49)
+    return model, Sphere(radius=1.1), [mask.astype(float) for _ in range(count)]
+
+
+def test_masks_that_agree_are_left_alone(ball_seen):
+    from hyperplanes.capture.masks.consistency import agree
+
+    model, sphere, masks = ball_seen
+    found = agree(masks, model, sphere)
+    assert (found.votes, found.wrong) == (1, [])
+    for before, after in zip(masks, found.masks, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_masks_damaged_on_purpose_are_named_and_mended(ball_seen):
+    from hyperplanes.capture.masks.consistency import agree
+    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.geometry.occupancy import carve
+
+    model, sphere, masks = ball_seen
+    damaged = [mask.copy() for mask in masks]
+    damaged[2][:, :48] = 0  # half of it is missing
+    damaged[9][38:58, 38:58] = 0  # a hole
+    damaged[13][5:25, 70:92] = 1  # something else beside it
+    found = agree(damaged, model, sphere)
+    assert found.wrong == [2, 9, 13]
+    assert min(overlap(mended, mask > 0.5) for mended, mask in zip(found.masks, masks, strict=True)) > 0.9
+    import torch
+
+    cameras = camera.pinhole(
+        torch.from_numpy(model.calibrations).float(), torch.from_numpy(model.camera_from_world).float(), 96, 96
+    )
+    volume = [  # of the hull of true, damaged and mended masks
+        int(carve(torch.from_numpy(np.stack(each))[:, None].float(), cameras, sphere, 40).occupied.sum())
+        for each in (masks, damaged, found.masks)
+    ]
+    assert volume[1] < 0.6 * volume[0]  # what single masks carve away
+    assert abs(volume[2] / volume[0] - 1) < 0.05

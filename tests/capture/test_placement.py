@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hyperplanes.capture.placement import find_up, object_points, object_sphere, place
+from hyperplanes.capture.placement import Placement, find_up, object_points, object_sphere
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.geometry import cameras as camera
 
@@ -53,6 +53,12 @@ def scene(elevation=0.6, views=12, seed=0, plane=False):
         model.pictures, model.camera_from_world, model.calibrations, model.lenses, points, model.colours, model.errors,
         observed[kept], pixels.reshape(-1, 2)[kept],
     ), masks, middle  # fmt: skip
+
+
+def place(model, ups, masks):
+    chosen = object_points(model, masks)
+    sphere = object_sphere(model, chosen)
+    return Placement(sphere, *find_up(model, ups, sphere, chosen))
 
 
 def degrees(found, true=UP):

@@ -16,7 +16,7 @@ from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Views
 
-__all__ = ["CoarseHull", "coarse_hull", "masks_tell", "small_masks"]
+__all__ = ["CoarseHull", "coarse_hull", "masks_tell", "silhouettes", "small_masks"]
 
 SIDE = 32
 MASK = 64
@@ -39,7 +39,7 @@ class CoarseHull:
         """Mean intersection over union of masks with the silhouettes of the hull."""
         if self.grid is None:
             return 0.0
-        seen, wanted = _silhouettes(self.points, self.grid, cameras), masks[:, 0] > 0
+        seen, wanted = silhouettes(self.points, self.grid, cameras), masks[:, 0] > 0
         union = (seen | wanted).flatten(1).sum(1)
         return float(((seen & wanted).flatten(1).sum(1) / union.clamp_min(1)).mean())
 
@@ -47,7 +47,7 @@ class CoarseHull:
         """How much of each mask the hull's silhouette covers, on average: nearly all with right poses."""
         if self.grid is None:
             return 0.0
-        seen, wanted = _silhouettes(self.points, self.grid, cameras), masks[:, 0] > 0
+        seen, wanted = silhouettes(self.points, self.grid, cameras), masks[:, 0] > 0
         filled = wanted.flatten(1).any(1)
         covered = (seen & wanted).flatten(1).sum(1) / wanted.flatten(1).sum(1).clamp_min(1)
         return float(covered[filled].mean()) if filled.any() else 0.0
@@ -101,10 +101,16 @@ def small_masks(views: Views) -> tuple[Float[Tensor, "view 1 height width"], Pin
     return (interpolate(masks, size, mode="area") > 0.2).float(), camera.resized(cameras, *size)
 
 
-def _silhouettes(
+def silhouettes(
     points: Float[Tensor, "voxel 3"], hull: Occupancy, cameras: PinholeCamera
 ) -> Bool[Tensor, "view height width"]:
-    """Which pixels see a voxel: its centre's pixel, and those around it as far as half the voxel reaches."""
+    """Which pixels see a voxel: its centre's pixel, and those around it as far as half the voxel reaches.
+
+    Args:
+        points: centres of the voxels.
+        hull: their grid.
+        cameras: one a silhouette.
+    """
     height, width = camera.image_size(cameras)
     matrices = camera.projection_matrices(cameras)
     seen = torch.zeros(len(matrices), height, width, dtype=torch.bool)

@@ -17,7 +17,7 @@ from hyperplanes.geometry.occupancy import carve
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["estimate_bounds", "nearest_point", "stated_bounds"]
+__all__ = ["estimate_bounds", "nearest_point", "smallest_ball", "stated_bounds"]
 
 HULL_SIDE = 48
 HULL_MARGIN = 1.05
@@ -58,7 +58,7 @@ def estimate_bounds(
         points = points[sphere.normalise(points).norm(dim=-1) <= 1]
         if not len(points):
             break
-        ball = _smallest_ball(points)
+        ball = smallest_ball(points)
         radius = HULL_MARGIN * (ball.radius + sphere.radius / HULL_SIDE * 3**0.5)
         sphere = Sphere(ball.centre, min(radius, outer.radius))
     return sphere
@@ -127,8 +127,12 @@ def _look_past_it(centre: Tensor, eyes: Tensor, axes: Tensor, depths: Tensor) ->
     return float(((ahead < low) | (ahead > high)).float().mean()) >= 0.25
 
 
-def _smallest_ball(points: Tensor) -> Sphere:
-    """Nearly the smallest sphere around points (Badoiu and Clarkson, 2003: 100 steps are within a few percent)."""
+def smallest_ball(points: Float[Tensor, "point 3"]) -> Sphere:
+    """Nearly the smallest sphere around points (Badoiu and Clarkson, 2003: 100 steps are within a few percent).
+
+    Args:
+        points: one or more.
+    """
     centre = (points.amin(0) + points.amax(0)) / 2
     for step in range(1, 100):
         farthest = points[(points - centre).square().sum(-1).argmax()]

@@ -1,0 +1,181 @@
+"""Masks of one object seen from many sides must agree: each is judged by the visual hull of all others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from kornia.geometry.camera import PinholeCamera
+from PIL import Image
+from scipy import ndimage
+from torch import Tensor
+
+from hyperplanes.capture.sparse_model import SparseModel
+from hyperplanes.data.inspection.silhouettes import silhouettes
+from hyperplanes.data.pictures.bounds import smallest_ball
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import Occupancy, carve
+from hyperplanes.geometry.rays import Sphere
+
+__all__ = ["Agreement", "agree"]
+
+SIDE = 80  # voxels an axis
+LONGEST = 160  # pixels of the masks that are compared
+FEWEST = 8  # views, below which masks are not judged
+SEEN = 0.25  # of the views must show a place within their borders for it to belong to the object
+MOST_VOTES = 0.125  # of the views
+SETTLED = 0.01  # of the masks' area, that more votes would add
+DEEP = 0.05  # of the square root of an area: differences thinner than that are the hull's own
+NEIGHBOUR = np.deg2rad(30)  # within which another view must look for a mask to be filled
+DISAGREES = 0.05  # of the object's area
+
+Mask = Float[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Masks after they were compared.
+
+    Attributes:
+        masks: one a camera; parts that contradict the others are filled or taken away.
+        disagreement: for each camera, the area that was wrong, of that of the object.
+        votes: how many masks had to rule a place out.
+        hull: what they show together, None where they show nothing.
+    """
+
+    masks: list[Mask]
+    disagreement: Float[np.ndarray, " camera"]
+    votes: int
+    hull: Occupancy | None
+
+    @property
+    def sphere(self) -> Sphere | None:
+        """The sphere around the hull, None where there is none."""
+        if self.hull is None:
+            return None
+        points = self.hull.surface().centres()
+        inside = points[self.hull.bounds.normalise(points).norm(dim=-1) <= 1]
+        if not len(inside):
+            return None
+        ball = smallest_ball(inside)
+        return Sphere(ball.centre, min(ball.radius + self.hull.voxel, self.hull.bounds.radius))
+
+    @property
+    def wrong(self) -> list[int]:
+        """The cameras whose mask contradicted the others."""
+        return np.flatnonzero(self.disagreement > DISAGREES).tolist()
+
+
+def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreement:
+    """Compare each mask with the silhouette of the hull of all others, and mend what they contradict.
+
+    A place belongs to the hull where fewer than `votes` masks rule it out, and where a quarter of the pictures show it
+    within their borders. As many votes are asked for as it takes until more would add less than one percent to what the
+    hull covers of the masks: one with masks that agree, at most one for every eight views.
+
+    The hull of the others is larger than the object by what only this view sees past, a thin seam where views are
+    many. So only differences that a disc fits into count, and a mask is filled only where another camera looks from
+    nearly the same side.
+
+    Args:
+        masks: one a camera, opacity of the picture without its lens.
+        model: its cameras.
+        sphere: that holds the object.
+    """
+    small = [_reduced(mask) for mask in masks]
+    pairs = [(each, _camera(model, row, masks[row], each.shape)) for row, each in enumerate(small)]
+    ruled = torch.stack([_ruled_out(mask, one, sphere) for mask, one in pairs])
+    shown = sum((_ruled_out(np.zeros_like(mask), one, sphere).int() for mask, one in pairs), torch.zeros(()))
+    candidate = shown >= max(2.0, SEEN * len(masks))
+    counts = ruled.sum(0)
+    votes = _votes(counts, candidate, pairs, sphere)
+    hull = Occupancy(candidate & (counts < votes), sphere)
+    if not hull.occupied.any():
+        return Agreement(list(masks), np.zeros(len(masks)), votes, None)
+    if len(masks) < FEWEST:
+        return Agreement(list(masks), np.zeros(len(masks)), votes, hull)
+    near = _has_neighbour(model, sphere)
+    mended, disagreement = [], []
+    for row, (reduced, one) in enumerate(pairs):
+        others = Occupancy(candidate & (counts - ruled[row].int() < votes), sphere)
+        seen = silhouettes(others.centres(), others, one)[0].numpy()
+        lost, extra = _differences(reduced, seen)
+        lost &= near[row]
+        mended.append(_mended(masks[row], lost, extra))
+        disagreement.append((lost.sum() + extra.sum()) / max(1, seen.sum()))
+    return Agreement(mended, np.array(disagreement), votes, hull)
+
+
+def _reduced(mask: Mask) -> Bool[np.ndarray, "height width"]:
+    height, width = mask.shape
+    factor = min(1.0, LONGEST / max(height, width))
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    return np.asarray(Image.fromarray(mask.astype(np.float32)).resize(size, Image.Resampling.BOX)) > 0.4
+
+
+def _camera(model: SparseModel, row: int, mask: Mask, size: tuple[int, ...]) -> PinholeCamera:
+    calibration = torch.from_numpy(model.calibrations[row : row + 1]).float()
+    pose = torch.from_numpy(model.camera_from_world[row : row + 1]).float()
+    return camera.resized(camera.pinhole(calibration, pose, *mask.shape), size[0], size[1])
+
+
+def _ruled_out(mask: np.ndarray, one: PinholeCamera, sphere: Sphere) -> Bool[Tensor, "x y z"]:
+    """The voxels that one mask rules out."""
+    return ~carve(torch.from_numpy(mask)[None, None], one, sphere, SIDE).occupied
+
+
+def _votes(counts: Tensor, candidate: Tensor, pairs: Sequence[tuple[np.ndarray, PinholeCamera]], sphere: Sphere) -> int:
+    """The least number of votes with which the hull covers nearly as much of the masks as with the most."""
+    most = max(1, int(MOST_VOTES * len(pairs)))
+    chosen = pairs[:: max(1, len(pairs) // 12)]
+
+    def covered(votes: int) -> float:
+        hull = Occupancy(candidate & (counts < votes), sphere)
+        points = hull.centres()
+        parts = []
+        for mask, one in chosen:
+            if mask.any():
+                seen = silhouettes(points, hull, one)[0].numpy()
+                parts.append((seen & mask).sum() / mask.sum())
+        return float(np.mean(parts)) if parts else 0.0
+
+    best = covered(most)
+    return next((votes for votes in range(1, most) if covered(votes) >= best - SETTLED), most)
+
+
+def _differences(mask: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a mask lacks of a silhouette, and what it has beside it, where a disc fits in."""
+    radius = max(2, round(DEEP * float(np.sqrt(seen.sum()))))
+    rows, columns = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    disc = rows**2 + columns**2 <= radius**2
+
+    def deep(difference: np.ndarray) -> np.ndarray:
+        padded = np.pad(difference, radius, mode="edge")  # the border of the picture is no border of the difference
+        opened = ndimage.binary_opening(padded, disc)[radius:-radius, radius:-radius]
+        return ndimage.binary_dilation(opened, iterations=radius) & difference
+
+    return deep(seen & ~mask), deep(mask & ~ndimage.binary_dilation(seen, iterations=2))
+
+
+def _mended(mask: Mask, lost: np.ndarray, extra: np.ndarray) -> Mask:
+    """A mask with what it lacked filled and what it had beside the object taken away, where there is any."""
+    if not (lost.any() or extra.any()):
+        return mask
+
+    def scaled(part: np.ndarray) -> np.ndarray:
+        grown = Image.fromarray(part.astype(np.float32)).resize(mask.shape[::-1], Image.Resampling.BILINEAR)
+        return np.asarray(grown, np.float64)
+
+    return np.maximum(mask * (1 - scaled(extra)), scaled(lost))
+
+
+def _has_neighbour(model: SparseModel, sphere: Sphere) -> Bool[np.ndarray, " camera"]:
+    """Which cameras have another that looks at the sphere from nearly the same side."""
+    ways = model.centres - np.array(sphere.centre)
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    cosine = ways @ ways.T
+    np.fill_diagonal(cosine, -1)
+    return cosine.max(1) > np.cos(NEIGHBOUR)
