@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from kornia.geometry.camera import PinholeCamera
 from PIL import Image
 from scipy import ndimage
@@ -27,7 +28,8 @@ LONGEST = 160  # pixels of the masks that are compared
 FEWEST = 8  # views, below which masks are not judged
 SEEN = 0.25  # of the views must show a place within their borders for it to belong to the object
 MOST_VOTES = 0.125  # of the views
-SETTLED = 0.01  # of the masks' area, that more votes would add
+SETTLED = 0.01  # of intersection over union, by which more votes must be better
+ZOOM = 1.15  # times the radius of the hull: where it is judged again
 DEEP = 0.05  # of the square root of an area: differences thinner than that are the hull's own
 NEIGHBOUR = np.deg2rad(30)  # within which another view must look for a mask to be filled
 DISAGREES = 0.05  # of the object's area
@@ -54,14 +56,7 @@ class Agreement:
     @property
     def sphere(self) -> Sphere | None:
         """The sphere around the hull, None where there is none."""
-        if self.hull is None:
-            return None
-        points = self.hull.surface().centres()
-        inside = points[self.hull.bounds.normalise(points).norm(dim=-1) <= 1]
-        if not len(inside):
-            return None
-        ball = smallest_ball(inside)
-        return Sphere(ball.centre, min(ball.radius + self.hull.voxel, self.hull.bounds.radius))
+        return None if self.hull is None else _ball(self.hull)
 
     @property
     def wrong(self) -> list[int]:
@@ -73,8 +68,9 @@ def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreemen
     """Compare each mask with the silhouette of the hull of all others, and mend what they contradict.
 
     A place belongs to the hull where fewer than `votes` masks rule it out, and where a quarter of the pictures show it
-    within their borders. As many votes are asked for as it takes until more would add less than one percent to what the
-    hull covers of the masks: one with masks that agree, at most one for every eight views.
+    within their borders. The number of votes is the one with which the silhouettes of the hull agree best with the
+    masks (median over the views of intersection over union): one with masks that agree, at most one for every eight
+    views.
 
     The hull of the others is larger than the object by what only this view sees past, a thin seam where views are
     many. So only differences that a disc fits into count, and a mask is filled only where another camera looks from
@@ -87,20 +83,22 @@ def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreemen
     """
     small = [_reduced(mask) for mask in masks]
     pairs = [(each, _camera(model, row, masks[row], each.shape)) for row, each in enumerate(small)]
-    ruled = torch.stack([_ruled_out(mask, one, sphere) for mask, one in pairs])
-    shown = sum((_ruled_out(np.zeros_like(mask), one, sphere).int() for mask, one in pairs), torch.zeros(()))
-    candidate = shown >= max(2.0, SEEN * len(masks))
-    counts = ruled.sum(0)
-    votes = _votes(counts, candidate, pairs, sphere)
-    hull = Occupancy(candidate & (counts < votes), sphere)
+    judged = _judged(pairs, sphere)
+    votes = _votes(judged, pairs)
+    hull = judged.hull(votes)
+    ball = _ball(hull)
+    if ball is not None and ZOOM * ball.radius < sphere.radius:  # the same again, finer
+        judged = _judged(pairs, Sphere(ball.centre, ZOOM * ball.radius))
+        votes = _votes(judged, pairs)
+        hull = judged.hull(votes)
     if not hull.occupied.any():
         return Agreement(list(masks), np.zeros(len(masks)), votes, None)
     if len(masks) < FEWEST:
         return Agreement(list(masks), np.zeros(len(masks)), votes, hull)
-    near = _has_neighbour(model, sphere)
+    near = _has_neighbour(model, hull.bounds)
     mended, disagreement = [], []
     for row, (reduced, one) in enumerate(pairs):
-        others = Occupancy(candidate & (counts - ruled[row].int() < votes), sphere)
+        others = judged.hull(votes, without=row)
         seen = silhouettes(others.centres(), others, one)[0].numpy()
         lost, extra = _differences(reduced, seen)
         lost &= near[row]
@@ -122,28 +120,59 @@ def _camera(model: SparseModel, row: int, mask: Mask, size: tuple[int, ...]) -> 
     return camera.resized(camera.pinhole(calibration, pose, *mask.shape), size[0], size[1])
 
 
+@dataclass(frozen=True)
+class _Judged:
+    """What each mask says of the voxels of a grid: whether it rules them out, and which of them may be the object."""
+
+    ruled: Bool[Tensor, "camera x y z"]
+    candidate: Bool[Tensor, "x y z"]
+    sphere: Sphere
+
+    def hull(self, votes: int, without: int | None = None) -> Occupancy:
+        """The voxels that fewer than so many masks rule out, one of them left out where asked."""
+        counts = self.counts if without is None else self.counts - self.ruled[without].int()
+        return Occupancy(self.candidate & (counts < votes), self.sphere)
+
+    @cached_property
+    def counts(self) -> Int[Tensor, "x y z"]:
+        """How many masks rule each voxel out."""
+        return self.ruled.sum(0, dtype=torch.int32)
+
+
+def _judged(pairs: Sequence[tuple[np.ndarray, PinholeCamera]], sphere: Sphere) -> _Judged:
+    ruled = torch.stack([_ruled_out(mask, one, sphere) for mask, one in pairs])
+    shown = sum((_ruled_out(np.zeros_like(mask), one, sphere).int() for mask, one in pairs), torch.zeros(()))
+    return _Judged(ruled, shown >= max(2.0, SEEN * len(pairs)), sphere)
+
+
 def _ruled_out(mask: np.ndarray, one: PinholeCamera, sphere: Sphere) -> Bool[Tensor, "x y z"]:
     """The voxels that one mask rules out."""
     return ~carve(torch.from_numpy(mask)[None, None], one, sphere, SIDE).occupied
 
 
-def _votes(counts: Tensor, candidate: Tensor, pairs: Sequence[tuple[np.ndarray, PinholeCamera]], sphere: Sphere) -> int:
-    """The least number of votes with which the hull covers nearly as much of the masks as with the most."""
+def _votes(judged: _Judged, pairs: Sequence[tuple[np.ndarray, PinholeCamera]]) -> int:
+    """The number of votes with which hull and masks agree best; the least of those that are about as good."""
     most = max(1, int(MOST_VOTES * len(pairs)))
-    chosen = pairs[:: max(1, len(pairs) // 12)]
-
-    def covered(votes: int) -> float:
-        hull = Occupancy(candidate & (counts < votes), sphere)
+    chosen = [pair for pair in pairs[:: max(1, len(pairs) // 16)] if pair[0].any()]
+    if most == 1 or not chosen:
+        return 1
+    agreement = []
+    for votes in range(1, most + 1):
+        hull = judged.hull(votes)
         points = hull.centres()
-        parts = []
-        for mask, one in chosen:
-            if mask.any():
-                seen = silhouettes(points, hull, one)[0].numpy()
-                parts.append((seen & mask).sum() / mask.sum())
-        return float(np.mean(parts)) if parts else 0.0
+        found = [(silhouettes(points, hull, one)[0].numpy(), mask) for mask, one in chosen]
+        agreement.append(float(np.median([(seen & mask).sum() / (seen | mask).sum() for seen, mask in found])))
+    return 1 + next(index for index, value in enumerate(agreement) if value >= max(agreement) - SETTLED)
 
-    best = covered(most)
-    return next((votes for votes in range(1, most) if covered(votes) >= best - SETTLED), most)
+
+def _ball(hull: Occupancy) -> Sphere | None:
+    """The sphere around the voxels of a hull that lie within its bounds, None where there are none."""
+    points = hull.surface().centres()
+    points = points[hull.bounds.normalise(points).norm(dim=-1) <= 1]
+    if not len(points):
+        return None
+    ball = smallest_ball(points)
+    return Sphere(ball.centre, min(ball.radius + hull.voxel, hull.bounds.radius))
 
 
 def _differences(mask: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
