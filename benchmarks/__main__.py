@@ -1,12 +1,18 @@
-"""`python -m benchmarks NAME [--quick] [--json FILE]`: measure one thing against its reference, in one run."""
+"""`python -m benchmarks [--under-load] NAME [--quick] [--json FILE]`: one thing against its reference, in one run.
+
+`all` makes every row and figure. A benchmark of speed refuses to write rows while other processes keep more than
+`load.LIMIT` cores busy, unless `--under-load` is given; the load stands beside the rows.
+"""
 
 import sys
 from importlib import import_module
 
+from benchmarks.load import LIMIT, load_at_start
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.files import DataError
 
 NAMES = (
+    "all",
     "any_order",
     "busy",
     "captures",
@@ -18,6 +24,8 @@ NAMES = (
     "views",
     "visibility",
 )
+OF_SPEED = ("generation", "lookup", "rendering", "training", "visibility")  # "busy" measures beside a load of its own
+UNDER_LOAD = "--under-load"
 
 
 def main(arguments: list[str]) -> int:
@@ -26,11 +34,21 @@ def main(arguments: list[str]) -> int:
     Args:
         arguments: the name, and what its `main` reads.
     """
+    whatever = arguments[:1] == [UNDER_LOAD]
+    arguments = arguments[whatever:]
     if not arguments or arguments[0] not in NAMES:
         asked = f"found {arguments[0]!r}" if arguments else "found none"
         wanted = not arguments or arguments[0] not in ("-h", "--help")
         print(f"benchmarks: expected one of {', '.join(NAMES)}, {asked}", file=sys.stderr if wanted else sys.stdout)
         return 2 if wanted else 0
+    load = load_at_start()
+    if arguments[0] in OF_SPEED and "--json" in arguments and load > LIMIT and not whatever:
+        print(
+            f"benchmarks {arguments[0]}: expected an idle machine for rows that are kept, found {load:.1f} cores busy; "
+            f"wait, or measure all the same: python -m benchmarks {UNDER_LOAD} {arguments[0]}",
+            file=sys.stderr,
+        )
+        return 2
     try:
         return int(import_module(f"benchmarks.{arguments[0]}").main(arguments[1:]) or 0)
     except (DataError, CheckpointError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from benchmarks.load import load_at_start
 from hyperplanes.utilities.environment import environment
 
 __all__ = ["Row", "finish"]
@@ -28,6 +29,6 @@ def finish(name: str, rows: list[Row], json_file: Path | None) -> int:
         print("  ".join(numbers).removeprefix("name "))
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
-        content = {"benchmark": name, **environment(), "rows": rows}
+        content = {"benchmark": name, **environment(), "load": round(load_at_start(), 2), "rows": rows}
         json_file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return 0

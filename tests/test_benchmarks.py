@@ -1,12 +1,16 @@
 """Benchmarks of quality. Source of truth: the same figure computed beside them, and gradients of every weight."""
 
 import json
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import pytest
 import torch
 from small_demo import demo_folder
 
+from benchmarks import __main__ as benchmarks_main
 from benchmarks import any_order, views
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data import open_dataset
@@ -74,3 +78,24 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     assert views.main([*options, "--json", str(tmp_path / "rows.json")]) == 0
     rows = [(row["views"], row["name"]) for row in json.loads((tmp_path / "rows.json").read_text())["rows"]]
     assert rows == [(1, "one_step"), (2, "one_step"), (2, "1_steps"), (2, "scratch_1")]
+
+
+def test_rows_of_speed_are_not_kept_beside_other_work(tmp_path, monkeypatch, capsys):
+    """Property: with more than 0.3 cores busy nothing is measured or written; the message says how to do it anyway."""
+    monkeypatch.setattr(benchmarks_main, "load_at_start", lambda: 1.4)
+    kept = tmp_path / "lookup.json"
+    assert benchmarks_main.main(["lookup", "--quick", "--json", str(kept)]) == 2
+    assert not kept.exists()
+    assert "1.4 cores busy" in capsys.readouterr().err
+
+
+def test_a_process_that_spins_is_a_load():
+    """Property: one spinning process keeps about one core busy, less where others run beside it."""
+    from benchmarks.load import measure_load
+
+    before = measure_load(0.2)
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as other:
+        time.sleep(0.3)
+        during = measure_load(0.5)
+        other.kill()
+    assert during > min(before + 0.3, 0.8)

@@ -1,4 +1,4 @@
-"""Sources of truth: torch.optim's own steps, singular values of an orthogonalised matrix, the minimum of a quadratic."""
+"""Sources of truth: torch.optim's own steps, singular values of orthogonalised matrices, the minimum of a quadratic."""
 
 import pytest
 import torch

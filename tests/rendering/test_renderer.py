@@ -1,5 +1,5 @@
-"""Sources of truth: fog in a sphere in closed form, loops over single samples, gradcheck, and properties (chunks, company
-and background change no ray).
+"""Sources of truth: fog in a sphere in closed form, loops over single samples, gradcheck, and properties (chunks,
+company and background change no ray).
 """
 
 import math

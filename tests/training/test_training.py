@@ -1,5 +1,5 @@
-"""Sources of truth: the uninterrupted training that an interrupted one must equal to the bit, the steps of the optimisers
-by hand, and properties of what is drawn.
+"""Sources of truth: the uninterrupted training that an interrupted one must equal to the bit, the steps of the
+optimisers by hand, and properties of what is drawn.
 """
 
 import csv
