@@ -1,7 +1,8 @@
 """Turn one adapted object into a sparse voxel grid: one small file that renders at once, without any network.
 
 Density and view-dependent colour (spherical harmonics) are kept for the voxels that can be seen. What it costs is said:
-the baked pictures are compared with the field's own and with the true query views.
+the baked pictures are compared with the field's own and with the true query views. The voxels are fitted to the shown
+views, which brings back what baking loses, and more.
 
 Example:
     hyperplanes bake --checkpoint runs/demo --views photos/ --out chair.safetensors
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
+from hyperplanes.commands.fields import adapt_to, bake_field, load_adaptable, refuse_baked
 from hyperplanes.commands.options import OptionalInt, Steps, ViewsUp, check_orbit, optional
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.commands.writing import writes_to
@@ -38,6 +39,7 @@ class Arguments:
         views: The posed images of the object; example-car comes with the package.
         out: The file to write, with a name that ends in .safetensors.
         voxels: Along each side of the grid; two for every pixel that the object is wide lose little.
+        fit: Gradient steps that fit the voxels to the shown views; 0 keeps what the field shows.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best.
         orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
         size: Pixels along the longer side of the turntable; as the images when not given.
@@ -56,6 +58,7 @@ class Arguments:
     views: Path
     out: Path
     voxels: int = 256
+    fit: Annotated[int, range(10_000)] = 80
     steps: Steps = 0
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
@@ -78,7 +81,7 @@ def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.data.devices import choose_device
-    from hyperplanes.export.baking import BakedScene, bake, coarsening
+    from hyperplanes.export.baking import BakedScene, coarsening
     from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.utilities.errors import prefix_errors
@@ -105,14 +108,9 @@ def run(arguments: Arguments) -> int:
     shown, query = task.support.to(device), task.query
     field, _ = adapt_to(model, shown, task.name, console, steps=arguments.steps)
     assert isinstance(field, AdaptedField)
-    started = time.perf_counter()
-    baked = bake(field, side=arguments.voxels)
+    baked = bake_field(field, shown, arguments.voxels, arguments.fit, console)
     baked.save(arguments.out)
-    size = arguments.out.stat().st_size / 2**20
-    console.say(
-        f"{arguments.out}: {len(baked.values):,} voxels of {arguments.voxels}^3, {size:.1f} MiB, "
-        f"in {format_duration(time.perf_counter() - started)}"
-    )
+    console.say(f"{arguments.out}: {arguments.out.stat().st_size / 2**20:.1f} MiB")
     scene = BakedScene(baked)
     first = camera.select(query.cameras, [0])
     for each in (scene, field):

@@ -1,11 +1,13 @@
-"""One object as images, a turntable and a mesh with coloured vertices, from a few posed images of it.
+"""One object as images, a turntable, a mesh and a page to turn it on, from a few posed images of it.
 
 The mesh is the surface on which the density crosses a level (marching cubes). GLB opens in a browser or a slide show,
-PLY in MeshLab and Blender.
+PLY in MeshLab and Blender. The page is one HTML file that a browser opens without anything else: it draws baked voxels
+and turns them with the mouse or a finger.
 
 Example:
     hyperplanes export --checkpoint runs/demo --views photos/ --out chair
     hyperplanes export --checkpoint runs/demo --views photos/ --out chair --what mesh --mesh-format glb --voxels 192
+    hyperplanes export --checkpoint small --views photos/ --out chair --what page --all-views
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, load_source, render_views
+from hyperplanes.commands.fields import adapt_to, bake_field, load_source, render_views
 from hyperplanes.commands.options import OptionalInt, Steps, ViewsUp, optional
 from hyperplanes.commands.scene import read_scene, refuse_sources
 from hyperplanes.commands.writing import writes_to
@@ -32,7 +34,7 @@ class Arguments:
             small-paper, cars-64.
         views: The posed images of the object; example-car comes with the package.
         out: The folder to write to.
-        what: Any of the three.
+        what: Any of them.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best.
         frames: Of the turntable.
         size: Pixels along the longer side of the turntable; as the images when not given.
@@ -41,6 +43,9 @@ class Arguments:
         voxels: Along each side of the grid that the mesh is cut from.
         level: Density at the surface, and nothing else; when not given the one whose silhouettes and depth agree best
             with the rendered ones, and what no shown camera sees into is filled.
+        page_voxels: Along each side of the grid that the page shows; 1.3 a pixel of the images, and at most 256, when
+            not given.
+        fit: Gradient steps that fit the page's voxels to the shown views; 0 keeps what the field shows.
         second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
             visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
@@ -54,7 +59,7 @@ class Arguments:
     checkpoint: Path
     views: Path
     out: Path
-    what: tuple[Literal["images", "turntable", "mesh"], ...] = ("images", "turntable", "mesh")
+    what: tuple[Literal["images", "turntable", "mesh", "page"], ...] = ("images", "turntable", "mesh")
     steps: Steps = 0
     frames: int = 48
     size: OptionalInt = None
@@ -62,6 +67,8 @@ class Arguments:
     mesh_format: Literal["ply", "glb", "obj"] = "ply"
     voxels: int = 128
     level: Annotated[float | None, optional("DENSITY")] = None
+    page_voxels: OptionalInt = None
+    fit: Annotated[int, range(10_000)] = 80
     second_pass: bool = False
     all_views: bool = False
     up: ViewsUp = "auto"
@@ -78,11 +85,17 @@ def run(arguments: Arguments) -> int:
     """Adapt and write what was asked for."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.data.devices import choose_device
+    from hyperplanes.export.baking import coarsening, default_side
     from hyperplanes.export.images import save_images, save_turntable
     from hyperplanes.export.mesh import agreement, choose_level, density_grid, extract_mesh, fill_hidden, save_mesh
+    from hyperplanes.export.page import page_of, save_page, turning_picture
+    from hyperplanes.utilities.errors import prefix_errors
 
     if arguments.level is not None and not arguments.level > 0:
         raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")
+    if arguments.page_voxels is not None:
+        with prefix_errors("--page-voxels"):
+            coarsening(arguments.page_voxels)
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, _ = read_scene(
@@ -122,4 +135,13 @@ def run(arguments: Arguments) -> int:
             console.warn(f"{path}: parts are missing or too large; more --voxels, another --level, or --steps 100")
         elif found.depth < GOOD_DEPTH:
             console.warn(f"{path}: walls are missing or lie too far out; another --level, or --steps 100")
+    if "page" in arguments.what:
+        if isinstance(field, AdaptedField):
+            side = arguments.page_voxels or default_side(shown.size)
+            baked = bake_field(field, shown, side, arguments.fit, console)
+        else:
+            baked = field.field
+        page = page_of(baked, shown, picture=turning_picture(baked, shown))
+        path = save_page(page, out / "page.html", task.name)
+        console.say(f"{path}: {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
     return 0

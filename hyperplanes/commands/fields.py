@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     from hyperplanes.commands.console import Console
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene
+    from hyperplanes.fields.baked import BakedField
     from hyperplanes.rendering.renderer import Sampler
     from hyperplanes.views import Views
 
-__all__ = ["adapt_to", "load_adaptable", "load_source", "refuse_baked", "render_views"]
+__all__ = ["adapt_to", "bake_field", "load_adaptable", "load_source", "refuse_baked", "render_views"]
 
 
 def load_source(path: Path, device: torch.device, *, second_pass: bool = False) -> HyperPlanes | BakedScene:
@@ -166,3 +167,29 @@ def render_views(
         torch.cat([part.depth for part in parts]),
         sum(part.samples for part in parts),
     )
+
+
+def bake_field(field: AdaptedField, shown: Views, side: int, fit: int, console: Console) -> BakedField:
+    """The voxels of a field, fitted to the views that it was adapted to, with progress lines.
+
+    Args:
+        field: what is baked.
+        shown: its support views.
+        side: voxels an axis.
+        fit: gradient steps on the views; 0 keeps the field's own colours and densities.
+        console: where the progress is shown, and at the end what it cost.
+    """
+    from hyperplanes.export.baking import bake
+    from hyperplanes.export.voxel_fitting import fit_voxels
+
+    started = time.perf_counter()
+    with console.bar("baking") as bar:
+        baked = bake(field, side=side, on_part=lambda done, total: bar.show(done, total, "voxels"))
+    between = time.perf_counter()
+    how = f"{len(baked.values):,} voxels of {side}^3 baked in {format_duration(between - started)}"
+    if fit:
+        with console.bar("fitting voxels") as bar:
+            baked = fit_voxels(baked, shown, steps=fit, on_step=lambda done: bar.show(done, fit, "steps"))
+        how += f", fitted to {len(shown)} views in {format_duration(time.perf_counter() - between)}"
+    console.say(how)
+    return baked

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,17 +18,19 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.images import render_images
 from hyperplanes.rendering.renderer import Marched
 from hyperplanes.rendering.transmittance import compiled_transmittance, transmittance
 from hyperplanes.rendering.voxels import compiled_caster, distance_to_filled, render_voxels
 
-__all__ = ["BakedScene", "bake", "coarsening"]
+__all__ = ["BakedScene", "bake", "coarsening", "default_side"]
 
 CHUNK = 1 << 12
 SIDE = 128  # voxels an axis of the grid of transmittances; half of that where they are not computed by numba
 MIN_TRANSMITTANCE = 0.02  # a voxel is left out where no viewing direction reaches it with more than this
 MIN_OPACITY = 0.005  # over 1/128 of the scene's diameter; voxels below it are left out
+MIN_WEIGHT = 0.01  # of a voxel in the pixel from which it is seen best; voxels below it are left out
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,9 @@ class BakedScene:
 
         def render_rays(rays: Rays) -> Rendered:
             basis = spherical_harmonics(rays.directions)
-            return render_voxels(self.field.index, self.field.values, bounds, rays, basis, step=step, empty=self._empty)
+            return render_voxels(
+                self.field.index, self.field.values, bounds, rays, basis, step=step, empty=self.distances
+            )
 
         return render_images(cameras, bounds, render_rays, occupancy=self._coarse_occupancy)
 
@@ -62,9 +67,13 @@ class BakedScene:
         return AdaptedField(self.field, self.field.occupancy, Marched(self.steps, 1e-3))
 
     @cached_property
-    def _empty(self) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
-        """Distances for empty-space skipping."""
+    def distances(self) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
+        """From every cell to the nearest that is not empty, for empty-space skipping; see `distance_to_filled`."""
         return distance_to_filled(self.field.index)
+
+    def footprint(self, cameras: PinholeCamera) -> Bool[Tensor, "view height width"]:
+        """The pixels whose rays may meet a voxel."""
+        return footprint(self._coarse_occupancy, cameras)
 
     @cached_property
     def _coarse_occupancy(self) -> Occupancy:
@@ -73,7 +82,13 @@ class BakedScene:
 
 
 @torch.no_grad()
-def bake(adapted: AdaptedField, *, side: int = 256, directions: int = 24) -> BakedField:
+def bake(
+    adapted: AdaptedField,
+    *,
+    side: int = 256,
+    directions: int = 12,
+    on_part: Callable[[int, int], None] | None = None,
+) -> BakedField:
     """Density and view-dependent colour of a field, at the voxels that are visible from outside.
 
     Colour is fitted by least squares over a sphere of viewing directions, each weighted by the transmittance from
@@ -83,6 +98,7 @@ def bake(adapted: AdaptedField, *, side: int = 256, directions: int = 24) -> Bak
         adapted: the field of one object.
         side: voxels an axis; two for every pixel that the object is wide lose little.
         directions: viewing directions at which colour is evaluated.
+        on_part: told how many of how many voxels are done.
 
     Returns:
         The voxels, on the CPU.
@@ -104,11 +120,15 @@ def bake(adapted: AdaptedField, *, side: int = 256, directions: int = 24) -> Bak
     row[coarse.occupied.flatten()] = torch.arange(len(arriving), device=view.device)
     fine = _resampled(Occupancy(visible, coarse.bounds), side)
     cells, rows = [], []
-    for points in fine.centres().split(CHUNK):
+    centres, done = fine.centres(), 0
+    for points in centres.split(CHUNK):
         cell = fine.index(points)
-        found = _voxels(adapted, points, view, arriving[row[coarse.index(points)]])
+        found = _voxels(adapted, points, view, arriving[row[coarse.index(points)]], fine.voxel)
         cells.append(cell[found[0]])
         rows.append(found[1])
+        done += len(points)
+        if on_part:
+            on_part(done, len(centres))
     if not sum(len(part) for part in cells):
         raise ValueError("bake: expected a field with something in it, got one that is empty everywhere")
     filled, values = torch.cat(cells), torch.cat(rows)
@@ -132,14 +152,24 @@ def coarsening(side: int) -> int:
     return coarser
 
 
+def default_side(size: tuple[int, int]) -> int:
+    """Voxels an axis that suit pictures of (height, width) once they are fitted: 1.3 a pixel, and at most 256.
+
+    >>> default_side((100, 80)), default_side((400, 400))
+    (128, 256)
+    """
+    return min(256, max(64, 64 * round(1.3 * max(size) / 64)))
+
+
 def _voxels(
-    adapted: AdaptedField, points: Tensor, view: Tensor, arriving: Tensor
+    adapted: AdaptedField, points: Tensor, view: Tensor, arriving: Tensor, voxel: float
 ) -> tuple[Bool[Tensor, " point"], Float[Tensor, "filled 28"]]:
     """Which points have density, and the density and coefficients of those."""
     field, length = adapted.field, adapted.occupancy.bounds.radius / 64
     hidden = field.hidden(points) if isinstance(field, MLPField) else points
     density = field.density_of(hidden) if isinstance(field, MLPField) else adapted.density(points)
     some = 1 - torch.exp(-density * length) > MIN_OPACITY
+    some &= arriving.amax(1) * (1 - torch.exp(-density * voxel)) > MIN_WEIGHT
     hidden, density, arriving = hidden[some], density[some], arriving[some]
     if isinstance(field, MLPField):
         colours = field.colours_along(hidden, view)

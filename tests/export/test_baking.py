@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.export import voxel_fitting
 from hyperplanes.export.baking import BakedScene, bake
+from hyperplanes.export.voxel_fitting import fit_voxels
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
@@ -18,6 +20,7 @@ from hyperplanes.rendering.transmittance import compiled_transmittance, transmit
 from hyperplanes.rendering.voxels import compiled_caster, distance_to_filled, render_voxels
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.metrics import psnr
+from hyperplanes.views import Views
 
 CAMERAS = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(6, 3.0), 48, 48)
 
@@ -167,3 +170,29 @@ def test_compiled_transmittance_is_that_of_plain_torch(monkeypatch):
     compiled = transmittance(optical_depth, cells, directions)
     monkeypatch.setattr(module, "compiled_transmittance", lambda: None)
     torch.testing.assert_close(transmittance(optical_depth, cells, directions), compiled)
+
+
+def test_fitting_brings_back_what_coarse_voxels_lose(adapted):
+    # Source of truth: the field's own pictures, of cameras that are fitted to and of others.
+    coarse = bake(adapted, side=32)
+    shown = adapted.render(CAMERAS).images
+    others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
+    steps = []
+    fitted = fit_voxels(coarse, Views(shown, CAMERAS), steps=30, rays=1024, on_step=steps.append)
+    truth = adapted.render(others).images
+    before, after = (float(psnr(BakedScene(each).render(others).images, truth).mean()) for each in (coarse, fitted))
+    assert after > before + 1
+    assert steps == list(range(1, 31))
+    assert torch.equal(fitted.index, coarse.index)
+
+
+@pytest.mark.skipif(compiled_caster() is None, reason="numba, whose kernel is compared, is not installed")
+def test_fitting_without_numba_does_the_same(adapted, monkeypatch):
+    # Source of truth: the compiled gradient.
+    coarse, views = bake(adapted, side=16), Views(adapted.render(CAMERAS).images, CAMERAS)
+    with_numba = fit_voxels(coarse, views, steps=2, rays=256)
+    monkeypatch.setattr(voxel_fitting, "compiled_gradients", lambda: None)
+    without = fit_voxels(coarse, views, steps=2, rays=256)
+    assert not torch.allclose(with_numba.values, coarse.values, atol=1e-3)
+    close = (with_numba.values - without.values).abs() <= 1e-3 + 1e-3 * without.values.abs()
+    assert float(close.float().mean()) > 0.995  # Adam's first step is the sign of a gradient, which may be nothing

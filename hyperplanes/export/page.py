@@ -1,0 +1,206 @@
+"""Baked voxels as HTML: one file, or a part of a page, on which the object is turned with the mouse or a finger."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+import zlib
+from importlib import resources
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels, upward
+from hyperplanes.fields.baked import HARMONICS, BakedField
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.files import write_whole
+from hyperplanes.views import Views
+
+__all__ = ["LARGEST", "address_of", "page_of", "save_page", "turning_picture"]
+
+LARGEST = 8_000_000
+"""Bytes of the voxels in a page. Beyond it coefficients get fewer bits, the second-order ones first."""
+
+BITS = ((8, 8, 8), (8, 7, 6), (8, 6, 5), (8, 6, 4), (7, 5, 3), (7, 5, 0))
+"""Of the mean colour, the first and the second order; 0 leaves an order out. Tried in turn until the page is small."""
+
+OWN = 8.0  # how much a voxel's own colour counts, and each neighbour's 1, when colours are prepared for the page
+CLAMP = 1e-3  # of the values of a coefficient that may lie beyond its range, at either end
+STYLE = """<style>
+.voxels { position: relative; aspect-ratio: 1; width: 100%; overflow: hidden; background: #fff; }
+.voxels canvas, .voxels img { position: absolute; inset: 0; width: 100%; height: 100%; object-fit: contain; }
+.voxels canvas { touch-action: none; cursor: grab; outline-offset: -2px; }
+.voxels canvas:active { cursor: grabbing; }
+</style>"""
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+html, body {{ margin: 0; height: 100%; background: #fff; font: 14px/1.4 system-ui, sans-serif; color: #555; }}
+body > .voxels {{ height: 100%; aspect-ratio: auto; }}
+body > p {{ position: fixed; left: 1em; bottom: 0; pointer-events: none; }}
+</style>
+</head>
+<body>
+{fragment}
+<p>{title}: drag to turn, wheel or two fingers to zoom, double click to begin again</p>
+</body>
+</html>
+"""
+
+
+def page_of(baked: BakedField, views: Views, *, steps: int = 192, picture: bytes = b"", largest: int = LARGEST) -> str:
+    """A part of an HTML page that draws baked voxels by WebGL2; any number of them may stand in one page.
+
+    Args:
+        baked: what is shown.
+        views: whose up, distance and lens the viewer begins with.
+        steps: samples along a diameter of the scene's sphere, as of `BakedScene`.
+        picture: a WebP file, animated or not, that stands there until the voxels are shown, and where they cannot be.
+        largest: bytes of the voxels in the page.
+
+    Returns:
+        A `<div class="voxels">` with all that it needs, as wide as what it stands in and square unless styled
+        otherwise. `address_of` gives the fragment of an address that asks for one camera.
+
+    Raises:
+        ValueError: voxels that do not get small enough.
+    """
+    for bits in BITS:
+        low, span, text = _encoded(baked, bits)
+        if len(text) <= largest:
+            break
+    else:
+        raise ValueError(
+            f"page: expected at most {largest / 1e6:g} MB, got {len(text) / 1e6:.1f} MB of {len(baked.values):,} "
+            f"voxels; bake fewer than {baked.side} along an axis"
+        )
+    start = orbit_cameras(views, 1)
+    scene = {
+        "side": baked.side,
+        "rows": len(baked.values),
+        "centre": baked.bounds.centre,
+        "radius": baked.bounds.radius,
+        "steps": steps,
+        "low": low,
+        "range": span,
+        "up": upward(views.cameras),
+        "eye": camera.centres(start)[0].tolist(),
+        "focal": float(camera.intrinsics(start)[0, 0, 0]) / min(camera.image_size(start)),
+    }
+    still = f'<img alt="" src="data:image/webp;base64,{base64.b64encode(picture).decode()}">' if picture else ""
+    viewer = resources.files("hyperplanes.export").joinpath("viewer.js").read_text("utf-8")
+    return (
+        f'{STYLE}\n<div class="voxels">{still}<script type="application/json">{json.dumps(scene)}</script>'
+        f'<script type="text/plain">{text}</script></div>\n'
+        f"<script>\n{viewer}showVoxels(document.currentScript.previousElementSibling);\n</script>"
+    )
+
+
+def save_page(fragment: str, path: str | Path, title: str) -> Path:
+    """Write a part of a page as one HTML file that needs nothing else.
+
+    Args:
+        fragment: of `page_of`.
+        path: of the file.
+        title: of the page.
+
+    Returns:
+        The file.
+    """
+    path = Path(path)
+    write_whole(path, PAGE.format(fragment=fragment, title=html.escape(title)).encode())
+    return path
+
+
+def address_of(cameras: PinholeCamera) -> str:
+    """The fragment of an address by which a page shows what one camera sees, at its size in the upper left corner.
+
+    Args:
+        cameras: a batch of one.
+
+    Returns:
+        `#camera=` and 18 numbers: camera_from_world row by row without its last row, fx, fy, cx and cy with integer
+        pixel centres, width and height.
+
+    >>> address_of(camera.pinhole(torch.eye(3), torch.eye(4)[None], 4, 6))
+    '#camera=1,0,0,0,0,1,0,0,0,0,1,0,1,1,0,0,6,4'
+    """
+    matrix = camera.intrinsics(cameras)[0]
+    height, width = camera.image_size(cameras)
+    numbers = camera.camera_from_world(cameras)[0, :3].flatten().tolist()
+    numbers += [matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item(), matrix[1, 2].item(), width, height]
+    return "#camera=" + ",".join(f"{number:.9g}" for number in numbers)
+
+
+def turning_picture(baked: BakedField, views: Views, *, frames: int = 24, size: int = 256) -> bytes:
+    """A turntable as an animated WebP, for `page_of` to fall back to.
+
+    Args:
+        baked: what is seen.
+        views: whose lens, distance and up are taken.
+        frames: of one round.
+        size: pixels along the longer side.
+    """
+    from hyperplanes.export.baking import BakedScene
+
+    images = BakedScene(baked).render(orbit_cameras(views, frames, size=size)).images
+    return encode_animation(to_pixels(images), "webp")
+
+
+def _encoded(baked: BakedField, bits: tuple[int, int, int]) -> tuple[list[float], list[float], str]:
+    """Lowest value and range of every coefficient, and the voxels in base 64.
+
+    They are a bit a voxel, the upper and lower bytes of the optical depth of a voxel in half precision, and a byte a
+    coefficient, one coefficient after the other, compressed by deflate.
+    """
+    filled = baked.index.flatten() >= 0
+    order = baked.index.flatten()[filled].long()
+    packed = (filled.reshape(-1, 8) * 2 ** torch.arange(8)).sum(1).byte()
+    voxel = 2 * baked.bounds.radius / baked.side
+    halves = (baked.values[order, 0] * voxel).clamp(0, 100).half().view(torch.int16).int()
+    depth = torch.stack([halves >> 8 & 255, halves & 255]).byte()
+    values = _smoothed(baked)[order]
+    edges = torch.stack([_quantile(values, CLAMP), _quantile(values, 1 - CLAMP)])
+    low, span = edges[0], (edges[1] - edges[0]).clamp_min(1e-6)
+    orders = torch.tensor([bits[0], *[bits[1]] * 3, *[bits[2]] * 5] * 3)
+    levels = (2.0**orders - 1).clamp_min(1)
+    low, span = torch.where(orders > 0, low, 0.0), torch.where(orders > 0, span, 0.0)
+    scaled = ((values - low) / span.clamp_min(1e-6)).clamp(0, 1)
+    coefficients = ((scaled * levels).round() / levels * 255).round().byte().T * (orders > 0)[:, None]
+    content = b"".join(part.contiguous().numpy().tobytes() for part in (packed, depth, coefficients))
+    return low.tolist(), span.tolist(), base64.b64encode(zlib.compress(content, 9)).decode()
+
+
+def _quantile(values: Float[Tensor, "row number"], share: float) -> Float[Tensor, " number"]:
+    place = min(len(values), max(1, math.ceil(share * len(values))))
+    return values.kthvalue(place, dim=0).values
+
+
+def _smoothed(baked: BakedField) -> Float[Tensor, "row 27"]:
+    """Colours for interpolation without regard to density: where a voxel has little, those of denser neighbours."""
+    padded = torch.nn.functional.pad(baked.index, (1,) * 6, value=-1)
+    place = (baked.index >= 0).nonzero() + 1
+    row = baked.index[baked.index >= 0].long()
+    density = baked.values[:, :1]
+    colour = torch.cat([density * baked.values[:, 1:], density], 1)
+    total = OWN * colour
+    for axis in range(3):
+        for step in (-1, 1):
+            there = place.clone()
+            there[:, axis] += step
+            beside = padded[there[:, 0], there[:, 1], there[:, 2]].long()
+            found = beside >= 0
+            total[row[found]] += colour[beside[found]]
+    return torch.where(total[:, -1:] > 0, total[:, :-1] / total[:, -1:].clamp_min(1e-20), baked.values[:, 1:])
+
+
+assert HARMONICS == 9  # the viewer's shader has as many

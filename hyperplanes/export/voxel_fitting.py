@@ -1,0 +1,92 @@
+"""Baked voxels fitted to posed images by gradient descent on their densities and coefficients of colour."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hyperplanes.export.baking import BakedScene
+from hyperplanes.fields.baked import BakedField, spherical_harmonics
+from hyperplanes.geometry.rays import Rays
+from hyperplanes.rendering.renderer import render
+from hyperplanes.rendering.voxel_gradients import compiled_gradients, voxel_gradients
+from hyperplanes.views import Views
+
+__all__ = ["STEPS", "fit_voxels"]
+
+STEPS = 80
+RAYS = 8192
+DENSITY_RATE = 0.05  # of optical depth through a voxel
+COLOUR_RATE = 0.01
+DECAY = 0.1  # of both rates, from the first step to the last
+STEPS_A_DIAMETER = 256
+SMALLEST_DEPTH = 1e-4  # of a voxel: colour has no gradient where density is zero
+
+
+def fit_voxels(
+    baked: BakedField,
+    views: Views,
+    *,
+    steps: int = STEPS,
+    rays: int = RAYS,
+    seed: int = 0,
+    on_step: Callable[[int], None] | None = None,
+) -> BakedField:
+    """The voxels after gradient steps (Adam) on the squared error of rays of the views.
+
+    A field loses 1 to 3 dB by being baked, since voxels interpolate what a network and lookups computed; fitting the
+    voxels brings them back, and more with 25 views. No voxel is added or taken away.
+
+    Args:
+        baked: where it starts; on the CPU.
+        views: posed images of the object, on any device.
+        steps: gradient steps.
+        rays: of each step, drawn from all views.
+        seed: of the rays.
+        on_step: told the number of steps done.
+
+    Returns:
+        Voxels at the same places.
+    """
+    views = views.to("cpu", torch.float32)
+    scene, voxel = BakedScene(baked, STEPS_A_DIAMETER), 2 * baked.bounds.radius / baked.side
+    views = replace(views, bounds=baked.bounds)
+    live = scene.footprint(views.cameras).flatten().nonzero()[:, 0]
+    if not len(live):
+        return baked
+    depth, colour = (baked.values[:, :1] * voxel).clamp_min(SMALLEST_DEPTH), baked.values[:, 1:].clone()
+    groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
+    descent = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(descent, DECAY ** (1 / max(1, steps)))
+    generator = torch.Generator().manual_seed(seed)
+    for step in range(steps):
+        drawn, truth = views.sample_rays(rays, generator=generator, among=live)
+        now = BakedScene(replace(baked, values=torch.cat([depth / voxel, colour], 1)), STEPS_A_DIAMETER)
+        gradient = _gradient(now, drawn, truth, scene)
+        depth.grad, colour.grad = gradient[:, :1] / voxel, gradient[:, 1:].contiguous()
+        descent.step()
+        schedule.step()
+        depth.clamp_(min=SMALLEST_DEPTH)
+        if on_step:
+            on_step(step + 1)
+    return replace(baked, values=torch.cat([depth / voxel, colour], 1))
+
+
+def _gradient(now: BakedScene, rays: Rays, truth: Float[Tensor, "ray 3"], first: BakedScene) -> Tensor:
+    """The gradient of the mean squared error, by the compiled kernel where numba is there, by autograd elsewhere."""
+    field, step = now.field, 2 * now.field.bounds.radius / now.steps
+    if compiled_gradients() is not None:
+        basis = spherical_harmonics(rays.directions)
+        return voxel_gradients(
+            field.index, field.values, field.bounds, rays, basis, truth, step=step, empty=first.distances
+        )[1]
+    values = field.values.clone().requires_grad_()
+    adapted = first.adapted
+    seen = render(replace(field, values=values), rays, adapted.sampling, occupancy=adapted.occupancy)
+    (seen.colour - truth).square().mean().backward()
+    assert values.grad is not None
+    return values.grad

@@ -1,0 +1,43 @@
+"""Source of truth: autograd through the voxels as a callable, rendered by the generic renderer at the same samples."""
+
+import pytest
+import torch
+
+from hyperplanes.fields.baked import BakedField, spherical_harmonics
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
+from hyperplanes.rendering.renderer import Marched, render
+from hyperplanes.rendering.voxel_gradients import compiled_gradients, voxel_gradients
+from hyperplanes.rendering.voxels import distance_to_filled
+
+
+@pytest.mark.skipif(compiled_gradients() is None, reason="numba, which compiles the kernel, is not installed")
+def test_the_compiled_gradient_is_that_of_autograd():
+    generator = torch.Generator().manual_seed(0)
+    filled = torch.rand(8, 8, 8, generator=generator) < 0.4
+    index = torch.full((8, 8, 8), -1, dtype=torch.int32)
+    index[filled] = torch.arange(int(filled.sum()), dtype=torch.int32)
+    values = 0.3 * torch.randn(int(filled.sum()), 28, generator=generator)
+    values[:, 0] = 4 * values[:, 0].abs()
+    values[:, [1, 10, 19]] += 1.5
+    cameras = camera.pinhole(camera.symmetric_intrinsics(8, 8, 0.9), camera.fibonacci_sphere(2, 3.0), 8, 8)
+    pixels = pixel_grid(8, 8)
+    rays = cast(cameras, torch.arange(2).repeat_interleave(64), pixels.repeat(2, 1))
+    truth = torch.rand(128, 3, generator=generator)
+    error, found = voxel_gradients(
+        index,
+        values,
+        Sphere(),
+        rays,
+        spherical_harmonics(rays.directions),
+        truth,
+        step=2 / 24,
+        empty=distance_to_filled(index),
+    )
+    wanted = values.clone().requires_grad_()
+    field = BakedField(index, wanted, Sphere())
+    expected = (render(field, rays, Marched(24, 1e-3), occupancy=field.occupancy).colour - truth).square().mean()
+    expected.backward()
+    assert error == pytest.approx(float(expected.detach()), rel=1e-4)
+    assert wanted.grad is not None
+    torch.testing.assert_close(found, wanted.grad, rtol=1e-3, atol=2e-6)
