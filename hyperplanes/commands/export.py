@@ -1,26 +1,30 @@
 """One object as images, a turntable, a mesh and a page to turn it on, from a few posed images of it.
 
-The mesh is the surface on which the density crosses a level (marching cubes). GLB opens in a browser or a slide show,
-PLY in MeshLab and Blender. The page is one HTML file that a browser opens without anything else: it draws baked voxels
-and turns them with the mouse or a finger.
+The mesh is the surface on which the density crosses a level (marching cubes), as GLB with a texture: Blender, Windows,
+slide shows and three.js open it. The page is one HTML file that a browser opens without anything else: it draws baked
+voxels and turns them with the mouse or a finger.
 
 Example:
     hyperplanes export --checkpoint runs/demo --views photos/ --out chair
-    hyperplanes export --checkpoint runs/demo --views photos/ --out chair --what mesh --mesh-format glb --voxels 192
+    hyperplanes export --checkpoint runs/demo --views photos/ --out chair --what mesh --voxels 192
     hyperplanes export --checkpoint small --views photos/ --out chair --what page --all-views
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, bake_field, load_source, render_views
 from hyperplanes.commands.options import OptionalInt, Steps, ViewsUp, optional
 from hyperplanes.commands.scene import read_scene, refuse_sources
 from hyperplanes.commands.writing import writes_to
+
+if TYPE_CHECKING:
+    from hyperplanes.adaptation.base import AdaptedField
+    from hyperplanes.views import Views
 
 __all__ = ["Arguments", "run"]
 
@@ -39,7 +43,9 @@ class Arguments:
         frames: Of the turntable.
         size: Pixels along the longer side of the turntable; as the images when not given.
         turntable: The format of the turntable.
-        mesh_format: The format of the mesh.
+        mesh_format: The format of the mesh: glb has a texture and normals, ply and obj a colour a vertex.
+        faces: Of a mesh with a texture, at most.
+        texture: Pixels along the longer side of the texture, about.
         voxels: Along each side of the grid that the mesh is cut from.
         level: Density at the surface, and nothing else; when not given the one whose silhouettes and depth agree best
             with the rendered ones, and what no shown camera sees into is filled.
@@ -64,7 +70,9 @@ class Arguments:
     frames: int = 48
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"
-    mesh_format: Literal["ply", "glb", "obj"] = "ply"
+    mesh_format: Literal["ply", "glb", "obj"] = "glb"
+    faces: Annotated[int, range(100, 10_000_000)] = 10_000
+    texture: Annotated[int, range(16, 8193)] = 1024
     voxels: int = 128
     level: Annotated[float | None, optional("DENSITY")] = None
     page_voxels: OptionalInt = None
@@ -87,7 +95,6 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.baking import coarsening, default_side
     from hyperplanes.export.images import save_images, save_turntable
-    from hyperplanes.export.mesh import agreement, choose_level, density_grid, extract_mesh, fill_hidden, save_mesh
     from hyperplanes.export.page import page_of, save_page, turning_picture
     from hyperplanes.utilities.errors import prefix_errors
 
@@ -117,24 +124,7 @@ def run(arguments: Arguments) -> int:
         console.say(f"{path}: {arguments.frames} frames")
     if "mesh" in arguments.what:
         solid = field if isinstance(field, AdaptedField) else field.adapted
-        density = density_grid(solid, arguments.voxels)
-        level = arguments.level
-        if level is None:
-            level = choose_level(solid, density, shown.cameras)
-            density = fill_hidden(density, level, solid.occupancy.bounds, shown.cameras)
-        surface = extract_mesh(solid, level=level, density=density)
-        found = agreement(surface, solid, query.cameras)
-        path = save_mesh(surface, out / f"mesh.{arguments.mesh_format}")
-        console.say(f"{path}: {len(surface.vertices):,} vertices, {len(surface.faces):,} faces")
-        console.say(
-            f"{path}: its silhouettes overlap the rendered ones of {len(query)} query views by {found.overlap:.1%} "
-            f"(intersection over union), and {found.depth:.1%} of what both cover is as far away; cut at density "
-            f"{level:.3g}"
-        )
-        if found.overlap < GOOD_OVERLAP:
-            console.warn(f"{path}: parts are missing or too large; more --voxels, another --level, or --steps 100")
-        elif found.depth < GOOD_DEPTH:
-            console.warn(f"{path}: walls are missing or lie too far out; another --level, or --steps 100")
+        _write_mesh(solid, shown, query, arguments, console)
     if "page" in arguments.what:
         if isinstance(field, AdaptedField):
             side = arguments.page_voxels or default_side(shown.size)
@@ -145,3 +135,35 @@ def run(arguments: Arguments) -> int:
         path = save_page(page, out / "page.html", task.name)
         console.say(f"{path}: {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
     return 0
+
+
+def _write_mesh(solid: AdaptedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:
+    """The mesh, with a line on how it agrees with the field's pictures, and a warning where it does not."""
+    from hyperplanes.export.mesh import agreement, choose_level, density_grid, extract_mesh, fill_hidden, save_mesh
+    from hyperplanes.export.texture import save_textured, texture_surface
+
+    density, level = density_grid(solid, arguments.voxels), arguments.level
+    if level is None:
+        level = choose_level(solid, density, shown.cameras)
+        density = fill_hidden(density, level, solid.occupancy.bounds, shown.cameras)
+    surface = extract_mesh(solid, level=level, density=density)
+    path = arguments.out / f"mesh.{arguments.mesh_format}"
+    if arguments.mesh_format == "glb":
+        textured = texture_surface(surface, solid, shown, faces=arguments.faces, size=arguments.texture)
+        surface = replace(surface, vertices=textured.vertices, faces=textured.faces)
+        save_textured(textured, path)
+        height, width = textured.texture.shape[:2]
+        console.say(f"{path}: {len(textured.faces):,} faces, a texture of {width}x{height}")
+    else:
+        save_mesh(surface, path)
+        console.say(f"{path}: {len(surface.vertices):,} vertices, {len(surface.faces):,} faces")
+    found = agreement(surface, solid, query.cameras)
+    console.say(
+        f"{path}: its silhouettes overlap the rendered ones of {len(query)} views by {found.overlap:.1%} "
+        f"(intersection over union), and {found.depth:.1%} of what both cover is as far away; cut at density "
+        f"{level:.3g}"
+    )
+    if found.overlap < GOOD_OVERLAP:
+        console.warn(f"{path}: parts are missing or too large; more --voxels, another --level, or --steps 100")
+    elif found.depth < GOOD_DEPTH:
+        console.warn(f"{path}: walls are missing or lie too far out; another --level, or --steps 100")

@@ -60,7 +60,7 @@ def fit_voxels(
         return baked
     depth, colour = (baked.values[:, :1] * voxel).clamp_min(SMALLEST_DEPTH), baked.values[:, 1:].clone()
     groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
-    descent = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
+    descent = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, DECAY ** (1 / max(1, steps)))
     generator = torch.Generator().manual_seed(seed)
     for step in range(steps):

@@ -1,0 +1,259 @@
+"""A surface with a texture: fewer triangles, unwrapped by xatlas, coloured by the support views and by the field."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+from torch.nn.functional import grid_sample, max_pool2d, normalize
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.export.mesh import Surface
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.utilities.files import write_whole
+from hyperplanes.views import Views
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["TexturedSurface", "render_surface", "save_textured", "texture_surface"]
+
+FACES = 10_000
+SIZE = 1024
+TOLERANCE = 1.5  # pixels, on the surface, between a texel and what a view sees, for the view to count
+OBLIQUE = 0.2  # least cosine that the tolerance is divided by
+SHARPNESS = 4  # power of the cosine between normal and view by which views are weighted
+OF_FIELD = 0.02  # weight of the field's own colour beside that of one view straight from above
+CHUNK = 1 << 15
+
+
+@dataclass(frozen=True)
+class TexturedSurface:
+    """A triangle mesh in world units with a texture, faces anticlockwise seen from outside.
+
+    Attributes:
+        vertices: (vertex, 3); those at seams of the texture are there several times.
+        faces: (face, 3) vertex indices.
+        normals: (vertex, 3) unit vectors that point outwards.
+        places: (vertex, 2) in the texture from 0 to 1: right, and up from its lowest row.
+        texture: (height, width, 3) sRGB.
+    """
+
+    vertices: npt.NDArray[np.float32]
+    faces: npt.NDArray[np.int64]
+    normals: npt.NDArray[np.float32]
+    places: npt.NDArray[np.float32]
+    texture: npt.NDArray[np.uint8]
+
+
+@torch.no_grad()
+def texture_surface(
+    surface: Surface, field: AdaptedField, views: Views, *, faces: int = FACES, size: int = SIZE
+) -> TexturedSurface:
+    """The surface with a texture in place of colours a vertex.
+
+    A texel takes its colour from the views that see its place, those that look straight at it most; where none does,
+    it is the field's as seen from straight above.
+
+    Args:
+        surface: of `extract_mesh`; simplified by quadric error where it has more faces.
+        field: that it was cut from.
+        views: the support views.
+        faces: at most so many triangles.
+        size: pixels along the longer side of the texture, about.
+
+    Returns:
+        The mesh.
+    """
+    solid = _simplified(surface, faces)
+    vertices, normals = (np.array(part, np.float32) for part in (solid.vertices, solid.vertex_normals))
+    origin, indices, places, height, width = _unwrapped(vertices, np.array(solid.faces, np.uint32), size)
+    blank = np.zeros((height, width, 3), np.uint8)
+    mesh = TexturedSurface(vertices[origin], indices.astype(np.int64), normals[origin], places, blank)
+    row, column, face, shares = _texels(mesh)
+    corners = mesh.faces[face]
+    points = torch.from_numpy((mesh.vertices[corners] * shares[..., None]).sum(1))
+    outward = normalize(torch.from_numpy((mesh.normals[corners] * shares[..., None]).sum(1)), dim=-1)
+    device = field.occupancy.occupied.device
+    parts = zip(points.to(device).split(CHUNK), (-outward).to(device).split(CHUNK), strict=True)
+    total = OF_FIELD * torch.cat([field(here, along)[0].cpu() for here, along in parts])
+    weight = torch.full((len(points), 1), OF_FIELD)
+    for seen, share in _seen(solid, points, outward, views.to("cpu", torch.float32)):
+        total += share * seen
+        weight += share
+    texture = np.zeros((height, width, 3), np.float32)
+    texture[row, column] = (total / weight).clamp(0, 1).numpy()
+    return replace(mesh, texture=_spread(texture, row, column))
+
+
+def _simplified(surface: Surface, faces: int) -> trimesh.Trimesh:
+    import fast_simplification
+    import trimesh
+
+    vertices, triangles = surface.vertices, surface.faces
+    if len(triangles) > faces:
+        vertices, triangles = fast_simplification.simplify(vertices, triangles, target_count=faces)
+    return trimesh.Trimesh(vertices, triangles, process=True)
+
+
+def _unwrapped(
+    vertices: npt.NDArray[np.float32], faces: npt.NDArray[np.uint32], size: int
+) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint32], npt.NDArray[np.float32], int, int]:
+    """The vertex that each new one was, faces of new ones, their places, and height and width of the texture."""
+    import xatlas
+
+    atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
+    packing.resolution, packing.padding, packing.bilinear = size, 2, True
+    atlas.add_mesh(vertices, faces)
+    atlas.generate(pack_options=packing)
+    origin, indices, places = atlas[0]
+    return origin, indices, places.astype(np.float32), atlas.height, atlas.width
+
+
+def _texels(mesh: TexturedSurface) -> tuple[npt.NDArray[np.int64], ...]:
+    """The texels whose centres lie in a triangle, or beside one: row, column, face and barycentric coordinates."""
+    height, width = mesh.texture.shape[:2]
+    corners = mesh.places[mesh.faces].astype(np.float64) * [width, height] - 0.5  # (face, corner, 2), texel centres
+    low = np.maximum(np.floor(corners.min(1)).astype(np.int64), 0)
+    high = np.minimum(np.ceil(corners.max(1)).astype(np.int64), [width - 1, height - 1])
+    sides = np.maximum(high - low + 1, 0)
+    number = sides.prod(1)
+    face = np.repeat(np.arange(len(corners)), number)
+    within = np.arange(len(face)) - np.repeat(number.cumsum() - number, number)
+    column = low[face, 0] + within % sides[face, 0]
+    up = low[face, 1] + within // sides[face, 0]
+    a, b, c = (corners[face, corner] for corner in range(3))
+    here = np.stack([column, up], 1)
+
+    def area(p: npt.NDArray[Any], q: npt.NDArray[Any], r: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return (q[:, 0] - p[:, 0]) * (r[:, 1] - p[:, 1]) - (q[:, 1] - p[:, 1]) * (r[:, 0] - p[:, 0])
+
+    whole = area(a, b, c)
+    flat = np.abs(whole) < 1e-9
+    shares = np.stack([area(here, b, c), area(a, here, c), area(a, b, here)], 1) / np.where(flat, 1, whole)[:, None]
+    inside = (shares.min(1) >= -1e-6) & ~flat
+    shares = shares[inside].astype(np.float32)
+    return height - 1 - up[inside], column[inside], face[inside], shares
+
+
+def _hits(
+    solid: trimesh.Trimesh, cameras: PinholeCamera, view: int, pixels: Float[Tensor, "pixel 2"]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.float32]]:
+    """Which pixels meet the surface: their numbers, faces and points; and distances of all, infinite beside it."""
+    rays = cast(cameras, torch.full((len(pixels),), view), pixels)
+    origins, directions = rays.origins.numpy(), rays.directions.numpy()
+    face, ray, place = solid.ray.intersects_id(origins, directions, multiple_hits=False, return_locations=True)
+    distances = np.full(len(pixels), np.inf, np.float32)
+    distances[ray] = np.linalg.norm(place - origins[ray], axis=1)
+    return ray, face, place, distances
+
+
+def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views) -> Any:  # noqa: ANN401
+    """Yields for every view the colours (texel, 3) that it shows at points, and their weights (texel, 1)."""
+    height, width = views.size
+    pixels = pixel_grid(height, width)
+    for view in range(len(views)):
+        one = camera.select(views.cameras, [view])
+        depth = torch.from_numpy(_hits(solid, views.cameras, view, pixels)[3]).reshape(1, 1, height, width)
+        edge = max_pool2d(depth, 3, 1, 1) + max_pool2d(-depth, 3, 1, 1)  # range of a pixel and its neighbours
+        maps = torch.cat([depth, edge], 1).nan_to_num(nan=1e9, posinf=1e9)
+        pixel = 1 / float(camera.intrinsics(one)[0, 0, 0])  # its side, one unit away
+        offsets = camera.centres(one) - points
+        distance = offsets.norm(dim=-1)
+        facing = (offsets / distance[:, None] * outward).sum(-1)
+        local = points @ camera.camera_from_world(one)[0, 2, :3] + camera.camera_from_world(one)[0, 2, 3]
+        at = one.project(points[None])[0] / torch.tensor([width - 1, height - 1]) * 2 - 1
+        at = torch.where((local > 1e-6)[:, None], at, 2.0)[None, None]
+        first, span = grid_sample(maps, at, mode="nearest", align_corners=True)[0, :, 0]
+        tolerance = TOLERANCE * pixel * distance / facing.clamp_min(OBLIQUE)
+        visible = ((first - distance).abs() < tolerance) & (span < 3 * tolerance)  # and no edge beside it
+        colour = grid_sample(views.images[view : view + 1], at, padding_mode="border", align_corners=True)[0, :, 0].T
+        yield colour, (facing.clamp_min(0) ** SHARPNESS * visible)[:, None]
+
+
+def _spread(
+    texture: npt.NDArray[np.float32], row: npt.NDArray[np.int64], column: npt.NDArray[np.int64]
+) -> npt.NDArray[np.uint8]:
+    """Texels that no triangle covers take the nearest colour, so that interpolation at seams meets no black."""
+    from scipy.ndimage import distance_transform_edt
+
+    empty = np.ones(texture.shape[:2], bool)
+    empty[row, column] = False
+    nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return np.round(texture[tuple(np.asarray(nearest))] * 255).astype(np.uint8)
+
+
+@torch.no_grad()
+def render_surface(mesh: TexturedSurface, cameras: PinholeCamera, *, samples: int = 2) -> Float[Tensor, "view 4 h w"]:
+    """Pictures of a textured surface over white, and what they cover, by casting rays at its triangles.
+
+    Args:
+        mesh: what is seen, without light.
+        cameras: any number, on the CPU.
+        samples: along each side of a pixel.
+
+    Returns:
+        RGB and opacity in [0, 1].
+    """
+    import trimesh
+
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    height, width = camera.image_size(cameras)
+    offsets = (torch.arange(samples) + 0.5) / samples - 0.5
+    pixels = pixel_grid(height, width)[:, None] + torch.cartesian_prod(offsets, offsets).reshape(-1, 2)
+    texture = torch.from_numpy(mesh.texture).permute(2, 0, 1)[None].float() / 255
+    pictures = []
+    for view in range(cameras.batch_size):
+        ray, face, place, _ = _hits(solid, cameras, view, pixels.reshape(-1, 2))
+        triangles = solid.triangles[face]
+        shares = trimesh.triangles.points_to_barycentric(triangles, place) if len(face) else np.zeros((0, 3))
+        at = torch.from_numpy((mesh.places[mesh.faces[face]] * shares[..., None]).sum(1)).float() * 2 - 1
+        values = torch.tensor([1.0, 1.0, 1.0, 0.0]).repeat(pixels.shape[0] * pixels.shape[1], 1)
+        found = grid_sample(texture, at[None, None] * torch.tensor([1.0, -1.0]), align_corners=False)[0, :, 0].T
+        values[torch.from_numpy(ray)] = torch.cat([found, torch.ones(len(found), 1)], 1)
+        pictures.append(values.reshape(height, width, -1, 4).mean(2).permute(2, 0, 1))
+    return torch.stack(pictures)
+
+
+def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
+    """Write a textured surface as GLB with normals and an unlit material, which every viewer shows as photographed.
+
+    Viewers that do not know unlit materials see one without metal and gloss.
+
+    Args:
+        mesh: what to write.
+        path: of the file.
+
+    Returns:
+        The file.
+    """
+    import trimesh
+    from PIL import Image
+
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0
+    )
+    visual = trimesh.visual.TextureVisuals(uv=mesh.places, material=material)
+    solid = trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_normals=mesh.normals, visual=visual, process=False, validate=False
+    )
+
+    def unlit(tree: dict[str, Any]) -> None:
+        tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
+        tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), "KHR_materials_unlit"})
+
+    buffer = io.BytesIO()
+    scene = trimesh.Scene(solid)
+    buffer.write(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=unlit))
+    path = Path(path)
+    write_whole(path, buffer.getvalue())
+    return path

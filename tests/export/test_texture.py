@@ -1,0 +1,84 @@
+"""Source of truth: a ball of known colours, painted as the support views show it, and its own pictures."""
+
+import json
+import math
+import struct
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.export.mesh import extract_mesh
+from hyperplanes.export.texture import render_surface, save_textured, texture_surface
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering.renderer import Marched
+from hyperplanes.utilities.metrics import psnr
+from hyperplanes.views import Views
+
+SIZE = 48
+
+
+def striped(points, directions):
+    """A hard ball with red stripes across and green ones along."""
+    density = 300 * torch.sigmoid((0.7 - points.norm(dim=-1)) * 80)
+    red, green = (torch.sigmoid(8 * torch.sin(5 * points[:, axis])) for axis in (0, 1))
+    return torch.stack([red, green, torch.full_like(red, 0.3)], -1), density
+
+
+@pytest.fixture(scope="module")
+def field():
+    return AdaptedField(striped, full(Sphere(), 24), Marched(160))
+
+
+@pytest.fixture(scope="module")
+def views(field):
+    cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), camera.fibonacci_sphere(10, 3.0), SIZE, SIZE)
+    seen = field.render(cameras)
+    return Views(seen.images, cameras, seen.opacity)
+
+
+@pytest.fixture(scope="module")
+def mesh(field, views):
+    surface = extract_mesh(field, voxels=40, level=6.0)
+    return texture_surface(surface, field, views, faces=1200, size=128)
+
+
+def test_pictures_of_the_mesh_are_those_of_the_field(mesh, field):
+    around = camera.look_at(torch.tensor([[1.0, 2.0, 2.0], [-2.4, 0.6, -1.5]]), (0.0, 0.0, 0.0))
+    cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), around, SIZE, SIZE)
+    truth, found = field.render(cameras), render_surface(mesh, cameras)
+    covered, wanted = found[:, 3] > 0.5, truth.opacity[:, 0] > 0.5
+    assert int((covered & wanted).sum()) / int((covered | wanted).sum()) > 0.97
+    assert float(psnr(found[:, :3], truth.images).min()) > 24
+
+
+def test_colours_come_from_the_views_where_they_see(mesh, field, views):
+    # The same views painted blue: nearly all of the surface is seen, and is blue then.
+    blue = torch.zeros_like(views.images)
+    blue[:, 2] = 1.0
+    surface = extract_mesh(field, voxels=24, level=6.0)
+    painted = texture_surface(surface, field, Views(blue, views.cameras), faces=400, size=64).texture
+    assert float((painted[..., 2] > 230).mean()) > 0.95
+    assert mesh.texture[..., 0].std() > 50
+
+
+def test_the_file_opens_with_normals_texture_and_an_unlit_material(mesh, tmp_path):
+    # Source of truth: trimesh's reader, and the JSON part of the file as glTF 2.0 defines it.
+    path = save_textured(mesh, tmp_path / "ball.glb")
+    loaded = next(iter(trimesh.load_scene(path).geometry.values()))
+    assert np.allclose(loaded.vertices, mesh.vertices, atol=1e-5)
+    assert np.allclose(loaded.visual.uv, mesh.places, atol=1e-5)
+    assert np.array(loaded.visual.material.baseColorTexture.convert("RGB")).shape == mesh.texture.shape
+    content = path.read_bytes()
+    tree = json.loads(content[20 : 20 + struct.unpack("<I", content[12:16])[0]])
+    material = tree["materials"][0]
+    assert "KHR_materials_unlit" in material["extensions"]
+    assert "KHR_materials_unlit" in tree["extensionsUsed"]
+    assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
+    assert "NORMAL" in tree["meshes"][0]["primitives"][0]["attributes"]
+    outward = (mesh.normals * mesh.vertices).sum(1) / np.linalg.norm(mesh.vertices, axis=1)
+    assert outward.min() > math.cos(math.radians(30))
