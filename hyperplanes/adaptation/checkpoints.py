@@ -9,6 +9,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
+from hyperplanes.adaptation.hub import download_checkpoint, is_repository
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.utilities.files import write_json
@@ -72,12 +73,14 @@ def packaged_folder(name: str) -> Path:
 
 
 def checkpoint_folder(name: Path | str) -> Path:
-    """The folder of a checkpoint, or of a packaged one by its name.
+    """The folder of a checkpoint, of a packaged one by its name, or of one that is downloaded from the hub.
 
     Raises:
         CheckpointError: a bare name that is neither a folder here nor a packaged model.
     """
     folder = Path(name)
+    if is_repository(str(name)):
+        return download_checkpoint(str(name))
     if folder.exists() or len(folder.parts) != 1:
         return folder
     packaged = sorted(path.parent.name for path in PACKAGED.glob("*/model.json"))

@@ -14,6 +14,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.checkpoints import read_checkpoint, write_checkpoint
 from hyperplanes.adaptation.context import SupportContext, arrange, live_pixels, observe, prepare_context
 from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
+from hyperplanes.adaptation.hub import upload_checkpoint
 from hyperplanes.adaptation.judging import judge_strength
 from hyperplanes.configuration.compatibility import check_fine_tuning, check_model
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
@@ -348,12 +349,28 @@ class HyperPlanes(nn.Module):
             weights |= {name: value.to(dtype) for name, value in self.named_parameters()}
         write_checkpoint(folder, self.config, weights)
 
+    save_pretrained = save
+
+    def push_to_hub(self, repository: str, *, private: bool = False, message: str = "Upload of a model") -> str:
+        """Write the model to a repository of the Hugging Face hub, from which `from_pretrained` reads it.
+
+        Args:
+            repository: user/model; made where absent.
+            private: for a repository that is made.
+            message: of the commit.
+
+        Returns:
+            The address of the commit. A name of another form raises ValueError, a missing huggingface_hub RuntimeError.
+        """
+        return upload_checkpoint(self.save, repository, private=private, message=message)
+
     @classmethod
     def from_pretrained(cls, name: Path | str) -> HyperPlanes:
         """The model that `save` wrote.
 
         Args:
-            name: its folder, or the name of a model that comes with the package; a folder of that name goes first.
+            name: its folder, the name of a model that comes with the package, or user/model on the Hugging Face hub
+                where huggingface_hub is installed; a folder of that name goes first.
 
         Returns:
             The model, ready for use. What is missing, damaged or does not fit is a CheckpointError.
