@@ -34,6 +34,7 @@ LAYERS = {
     "hyperplanes.export.baking": 3,
     "hyperplanes.export.images": 3,
     "hyperplanes.export.mesh": 3,
+    "hyperplanes.export.texture": 3,
     "hyperplanes.fields": 2,
     "hyperplanes.rendering": 2,
     "hyperplanes.views": 2,
