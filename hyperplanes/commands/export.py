@@ -24,6 +24,7 @@ from hyperplanes.commands.writing import writes_to
 
 if TYPE_CHECKING:
     from hyperplanes.adaptation.base import AdaptedField
+    from hyperplanes.fields.baked import BakedField
     from hyperplanes.views import Views
 
 __all__ = ["Arguments", "run"]
@@ -49,9 +50,10 @@ class Arguments:
         voxels: Along each side of the grid that the mesh is cut from.
         level: Density at the surface, and nothing else; when not given the one whose silhouettes and depth agree best
             with the rendered ones, and what no shown camera sees into is filled.
-        page_voxels: Along each side of the grid that the page shows; 1.3 a pixel of the images, and at most 256, when
-            not given.
-        fit: Gradient steps that fit the page's voxels to the shown views; 0 keeps what the field shows.
+        page_voxels: Along each side of the grid that the page shows and splats are made of; 1.3 a pixel of the images,
+            and at most 256, when not given.
+        fit: Gradient steps that fit these voxels, and splats, to the shown views; 0 keeps what the field shows.
+        splat_format: ply, which viewers of Gaussian splats read, or the smaller splat without colour by direction.
         second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
             visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
@@ -65,7 +67,7 @@ class Arguments:
     checkpoint: Path
     views: Path
     out: Path
-    what: tuple[Literal["images", "turntable", "mesh", "page"], ...] = ("images", "turntable", "mesh")
+    what: tuple[Literal["images", "turntable", "mesh", "page", "splats"], ...] = ("images", "turntable", "mesh")
     steps: Steps = 0
     frames: int = 48
     size: OptionalInt = None
@@ -77,6 +79,7 @@ class Arguments:
     level: Annotated[float | None, optional("DENSITY")] = None
     page_voxels: OptionalInt = None
     fit: Annotated[int, range(10_000)] = 80
+    splat_format: Literal["ply", "splat"] = "ply"
     second_pass: bool = False
     all_views: bool = False
     up: ViewsUp = "auto"
@@ -117,7 +120,8 @@ def run(arguments: Arguments) -> int:
     field, _ = adapt_to(source, shown, task.name, console, steps=arguments.steps)
     if "images" in arguments.what:
         paths = save_images(render_views(field, query.cameras, console).images, out / "images", query.names)
-        console.say(f"{out / 'images'}: {len(paths)} pictures of the query poses")
+        poses = "shown" if arguments.all_views else "query"
+        console.say(f"{out / 'images'}: {len(paths)} pictures of the {poses} poses")
     if "turntable" in arguments.what:
         path = out / f"turntable.{arguments.turntable}"
         save_turntable(field, shown, path, frames=arguments.frames, size=arguments.size)
@@ -125,16 +129,42 @@ def run(arguments: Arguments) -> int:
     if "mesh" in arguments.what:
         solid = field if isinstance(field, AdaptedField) else field.adapted
         _write_mesh(solid, shown, query, arguments, console)
-    if "page" in arguments.what:
+    if {"page", "splats"} & set(arguments.what):
         if isinstance(field, AdaptedField):
             side = arguments.page_voxels or default_side(shown.size)
             baked = bake_field(field, shown, side, arguments.fit, console)
         else:
             baked = field.field
-        page = page_of(baked, shown, picture=turning_picture(baked, shown))
-        path = save_page(page, out / "page.html", task.name)
-        console.say(f"{path}: {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
+        if "page" in arguments.what:
+            page = page_of(baked, shown, picture=turning_picture(baked, shown))
+            path = save_page(page, out / "page.html", task.name)
+            console.say(f"{path}: {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
+        if "splats" in arguments.what:
+            _write_splats(baked, shown, query, arguments, console)
     return 0
+
+
+def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:
+    """The splats of voxels, with a line on how they look beside them."""
+    from hyperplanes.export.baking import BakedScene
+    from hyperplanes.export.splats import fit_splats, save_splats, splats_of
+    from hyperplanes.geometry.distortion import DistortedCamera
+    from hyperplanes.utilities.metrics import psnr
+
+    splats, quality = splats_of(baked), ""
+    straight = not isinstance(shown.cameras, DistortedCamera)
+    if straight and arguments.fit:
+        with console.bar("fitting splats") as bar:
+            splats = fit_splats(
+                splats, shown, steps=arguments.fit, on_step=lambda done: bar.show(done, arguments.fit, "steps")
+            )
+    if straight:
+        asked = query[:8].to("cpu")
+        pictures = splats.render(asked.cameras), BakedScene(baked).render(asked.cameras).images
+        ours, voxels = (float(psnr(part.clamp(0, 1), asked.images).mean()) for part in pictures)
+        quality = f"; {ours:.2f} dB PSNR on {len(asked)} views, the voxels {voxels:.2f} dB"
+    path = save_splats(splats, arguments.out / f"splats.{arguments.splat_format}")
+    console.say(f"{path}: {len(splats.means):,} splats, {path.stat().st_size / 1e6:.1f} MB{quality}")
 
 
 def _write_mesh(solid: AdaptedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:
