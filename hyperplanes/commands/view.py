@@ -1,0 +1,126 @@
+"""Show an object in the browser: turn it, see the photographs where they were taken, and watch it get sharper.
+
+Given posed images, a model adapts to them and the page shows the field at once, after every few fine-tuning steps, and
+in the end as baked voxels, which turn without delay. Given a file that `bake` wrote, the page shows that. Ctrl-C ends
+it.
+
+Example:
+    hyperplanes view example-car
+    hyperplanes view photos/ --steps 100
+    hyperplanes view photos/ --checkpoint chair.safetensors
+"""
+
+from __future__ import annotations
+
+import queue
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.fields import bake_field, load_source
+from hyperplanes.commands.options import OptionalInt, ViewsUp
+from hyperplanes.commands.scene import read_scene
+
+if TYPE_CHECKING:
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+    from hyperplanes.export.live import LiveViewer
+    from hyperplanes.views import Views
+
+__all__ = ["Arguments", "run"]
+
+EVERY = 5  # fine-tuning steps between two pictures
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to show.
+
+    Attributes:
+        views: The posed images of the object; example-car comes with the package.
+        checkpoint: What adapts to them, or a file that `bake` wrote, which is shown as it is.
+        steps: Fine-tuning steps on the views.
+        fit: Gradient steps that fit the baked voxels to the views; 0 shows the field itself and bakes nothing.
+        port: Of the page on this machine.
+        second_pass: Render the views first, and take colours from those that see the surface found there.
+        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
+            0,0.1,1, or auto: as the cameras are held.
+        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
+            leave one at most when not given.
+        device: auto, cpu or cuda.
+    """
+
+    views: tyro.conf.Positional[Path]
+    checkpoint: Path = Path("small")
+    steps: Annotated[int, range(100_000)] = 0
+    fit: Annotated[int, range(10_000)] = 80
+    port: Annotated[int, range(65_536)] = 8080
+    second_pass: bool = False
+    up: ViewsUp = "auto"
+    downscale: OptionalInt = None
+    device: str = "auto"
+
+
+def run(arguments: Arguments) -> int:
+    """Serve the page until Ctrl-C."""
+    from hyperplanes.data.devices import choose_device
+    from hyperplanes.export.baking import BakedScene
+    from hyperplanes.export.live import LiveViewer
+
+    console, device = Console(), choose_device(arguments.device)
+    source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
+    task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
+    shown = task.support.to(device)
+    wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
+    baked = isinstance(source, BakedScene)
+    viewer = LiveViewer(shown, arguments.port, None if baked else wanted.put)
+    console.say(f"{viewer.address}: open it in a browser; Ctrl-C ends it")
+    try:
+        if isinstance(source, BakedScene):
+            viewer.show(source, f"{len(source.field.values):,} baked voxels")
+            wanted.get()  # until Ctrl-C
+            return 0
+        number = len(shown)
+        while True:
+            _adapt(source, shown[:number], arguments, viewer, wanted, console)
+            number = wanted.get()
+            while not wanted.empty():
+                number = wanted.get()
+    except KeyboardInterrupt:
+        console.say("ended")
+    finally:
+        viewer.stop()
+    return 0
+
+
+def _adapt(
+    model: HyperPlanes,
+    shown: Views,
+    arguments: Arguments,
+    viewer: LiveViewer,
+    wanted: queue.SimpleQueue[int],
+    console: Console,
+) -> None:
+    """Shows the field as it is adapted, fine-tuned and baked; ends early where another number of views is wanted."""
+    import torch
+
+    from hyperplanes.configuration.fine_tuning import FineTuning
+    from hyperplanes.export.baking import BakedScene, default_side
+
+    console.say(f"adapting to {len(shown)} views")
+    context, steps = model.prepare(shown), arguments.steps if len(shown) > 1 else 0
+    descent, variables = model.descent(context, FineTuning(), shown)
+    field = None
+    for done in descent.run(steps):
+        if done % EVERY == 0 or done == steps:
+            with torch.no_grad():
+                weights = variables.weights().detach()
+            field = model.rendering_field(context, weights)
+            viewer.show(field, f"{len(shown)} support views, {done} of {steps} fine-tuning steps")
+        if not wanted.empty():
+            return
+    if arguments.fit and field is not None:
+        baked = bake_field(field, shown, default_side(shown.size), arguments.fit, console)
+        viewer.show(BakedScene(baked), f"{len(shown)} support views, {steps} steps, {len(baked.values):,} baked voxels")

@@ -1,0 +1,196 @@
+"""A field shown in the browser while it changes, by viser: the extra `viz`."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
+from torch import Tensor
+
+from hyperplanes.export.images import orbit_cameras, to_pixels, upward
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.rendering.images import Pictures
+from hyperplanes.views import Views
+
+__all__ = ["LiveViewer", "viewed_camera"]
+
+SECONDS = 0.15  # that a picture may take while the camera moves
+IDLE = 0.4  # seconds after which a camera that stands still gets a larger picture
+SHARPER = 2.5  # times as large
+SMALLEST, LARGEST = 48, 1024  # pixels of height
+THUMBNAIL = 128  # pixels of a photograph in its frustum
+
+
+class Shown(Protocol):
+    """What renders new views."""
+
+    def render(self, cameras: PinholeCamera) -> Pictures:
+        """The pictures of the cameras."""
+        ...
+
+
+def viewed_camera(
+    rotation: Sequence[float], position: Sequence[float], fov: float, aspect: float, height: int
+) -> PinholeCamera:
+    """The camera of a visitor.
+
+    Args:
+        rotation: world_from_camera as a unit quaternion, w first; OpenCV's axes.
+        position: in the world.
+        fov: vertical field of view in radians.
+        aspect: width over height.
+        height: pixels.
+    """
+    pose = torch.eye(4)
+    pose[:3, :3] = quaternion_to_rotation_matrix(torch.tensor([float(part) for part in rotation])).T
+    pose[:3, 3] = -pose[:3, :3] @ torch.tensor([float(part) for part in position])
+    width = max(1, round(height * aspect))
+    focal = height / 2 / math.tan(fov / 2)
+    intrinsics = torch.tensor([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+    return camera.pinhole(intrinsics, pose[None], height, width)
+
+
+class LiveViewer:
+    """A page on this machine that shows a field from where each visitor looks.
+
+    Args:
+        views: the support views, whose cameras are drawn as frusta with their photographs.
+        port: of the page.
+        on_number: told how many of the views are wanted when somebody moves the slider; no slider where absent.
+
+    Raises:
+        RuntimeError: viser is not installed.
+    """
+
+    def __init__(self, views: Views, port: int = 8080, on_number: Callable[[int], None] | None = None) -> None:
+        try:
+            import viser
+        except ImportError:
+            raise RuntimeError("view: expected the package viser, found none; pip install hyperplanes[viz]") from None
+        self._shown: Shown | None = None
+        self._changed, self._stopped = threading.Condition(), False
+        self._versions: dict[int, tuple[float, float]] = {}  # of each visitor: last change, and what was drawn of it
+        self._height = 96
+        self._views = views.to("cpu", torch.float32)
+        self._server = viser.ViserServer("127.0.0.1", port, label="HyperPlanes", verbose=False)
+        self._server.scene.set_up_direction(upward(self._views.cameras))
+        self._note = self._server.gui.add_markdown("")
+        self._add_frusta()
+        if on_number is not None:
+            slider = self._server.gui.add_slider("support views", 1, len(views), 1, len(views))
+            slider.on_update(lambda _: on_number(int(slider.value)))
+        self._server.on_client_connect(self._welcome)
+        self._worker = threading.Thread(target=self._draw, daemon=True)
+        self._worker.start()
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        return f"http://127.0.0.1:{self._server.get_port()}"
+
+    def show(self, shown: Shown, note: str) -> None:
+        """Show another field, or the same one after it changed.
+
+        Args:
+            shown: the field.
+            note: about it, beside the picture.
+        """
+        with self._changed:
+            self._shown = shown
+            self._note.content = note
+            now = time.monotonic()
+            self._versions = {visitor: (now, 0.0) for visitor in self._versions}
+            self._changed.notify()
+
+    def stop(self) -> None:
+        """Close the page."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify()
+        self._worker.join(10)
+        self._server.stop()
+
+    def _add_frusta(self) -> None:
+        cameras = self._views.cameras
+        height, width = camera.image_size(cameras)
+        every = max(1, max(height, width) // THUMBNAIL)
+        pictures = to_pixels(self._views.images[..., ::every, ::every])
+        rotations = camera.camera_from_world(cameras)[:, :3, :3].mT
+        frusta = []
+        for view, (picture, place) in enumerate(zip(pictures, camera.centres(cameras).tolist(), strict=True)):
+            focal = float(camera.intrinsics(cameras)[view, 1, 1])
+            frusta.append(
+                self._server.scene.add_camera_frustum(
+                    f"/photographs/{view}",
+                    2 * math.atan(height / 2 / focal),
+                    width / height,
+                    scale=0.1 * self._views.bounds.radius,
+                    image=picture,
+                    wxyz=_quaternion(rotations[view]),
+                    position=tuple(place),
+                )
+            )
+        switch = self._server.gui.add_checkbox("photographs", True)
+
+        @switch.on_update
+        def _(_: object) -> None:
+            for frustum in frusta:
+                frustum.visible = switch.value
+
+    def _welcome(self, client: object) -> None:
+        start = orbit_cameras(self._views, 1)
+        x, y, z = camera.centres(start)[0].tolist()
+        client.camera.up_direction = upward(self._views.cameras)  # pyright: ignore
+        client.camera.position = (x, y, z)  # pyright: ignore
+        client.camera.look_at = self._views.bounds.centre  # pyright: ignore
+
+        def moved(_: object) -> None:
+            with self._changed:
+                self._versions[client.client_id] = (time.monotonic(), 0.0)  # pyright: ignore
+                self._changed.notify()
+
+        client.camera.on_update(moved)  # pyright: ignore
+        moved(None)
+
+    def _draw(self) -> None:
+        """Draws for each visitor whose camera moved, and once more, larger, when it stands still."""
+        while True:
+            with self._changed:
+                waiting = [(visitor, *times) for visitor, times in self._versions.items() if times[1] < math.inf]
+                if self._stopped:
+                    return
+                if self._shown is None or not waiting:
+                    self._changed.wait()
+                    continue
+                shown, now = self._shown, time.monotonic()
+                visitor, moved, drawn = min(waiting, key=lambda each: each[2])
+                still = drawn >= moved
+                if still and now - moved < IDLE:
+                    self._changed.wait(IDLE - (now - moved))
+                    continue
+                self._versions[visitor] = (moved, math.inf if still else now)
+            client = self._server.get_clients().get(visitor)
+            if client is None:
+                self._versions.pop(visitor, None)
+                continue
+            height = min(LARGEST, round(self._height * (SHARPER if still else 1)))
+            eye = client.camera
+            seen = viewed_camera(eye.wxyz, eye.position, eye.fov, eye.aspect, height)
+            started = time.perf_counter()
+            picture = to_pixels(shown.render(seen).images)[0]
+            if not still:
+                ratio = (SECONDS / max(1e-3, time.perf_counter() - started)) ** 0.5
+                self._height = round(min(LARGEST / SHARPER, max(SMALLEST, self._height * min(1.5, max(0.5, ratio)))))
+            client.scene.set_background_image(picture, "jpeg", jpeg_quality=90)
+
+
+def _quaternion(matrix: Float[Tensor, "3 3"]) -> tuple[float, float, float, float]:
+    w, x, y, z = rotation_matrix_to_quaternion(matrix.contiguous()).tolist()
+    return w, x, y, z
