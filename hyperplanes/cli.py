@@ -10,6 +10,7 @@ import inspect
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -30,7 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: what stands after `hyperplanes` on the command line; that of this process where absent.
 
     Returns:
-        The exit code: 0 done, 1 done but something is wrong, 2 wrong input, 130 interrupted, 143 terminated.
+        The exit code: 0 done, 1 done but something is wrong, 2 wrong input, 130 interrupted, 143 terminated,
+        129 its terminal closed.
 
     Raises:
         ValueError: wrong input, only where a traceback was asked for.
@@ -57,9 +59,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _run(verb, module, rest)
     except KeyboardInterrupt as interrupt:
         advice = str(interrupt) or "the same command goes on where it can"
-        terminated = isinstance(interrupt, Terminated)
-        _complain(f"hyperplanes {verb}: {'terminated' if terminated else 'interrupted'}; {advice}")
-        return 143 if terminated else 130
+        code = interrupt.code if isinstance(interrupt, Terminated) else 130
+        with suppress(OSError):  # of a terminal that was closed
+            _complain(f"hyperplanes {verb}: {'interrupted' if code == 130 else 'terminated'}; {advice}")
+        return code
     except BrokenPipeError:
         sys.stdout = None  # whoever read our output has gone; nothing is left to be flushed to
         return 0

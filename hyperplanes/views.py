@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -17,6 +17,38 @@ from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 
 __all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views"]
+
+
+MOST = 1.5
+"""Above which numbers of a picture cannot be meant to lie in [0, 1]; what is rendered may lie a little outside."""
+
+
+def kind_of(value: object) -> str:
+    """What a value is, for a message."""
+    if isinstance(value, Tensor):
+        return f"a tensor of {str(value.dtype).removeprefix('torch.')}, shape {tuple(value.shape)}"
+    return "None" if value is None else f"a {type(value).__module__}.{type(value).__name__}".replace("builtins.", "")
+
+
+def check_values(name: str, values: object) -> None:
+    """Nothing, where pictures or masks are floating-point numbers in [0, 1].
+
+    Args:
+        name: of the argument.
+        values: which should be a tensor.
+
+    Raises:
+        ValueError: something else; 0 to 255 and NaN among it.
+    """
+    if not isinstance(values, Tensor) or not values.is_floating_point():
+        found, hint = kind_of(values), "; torch.from_numpy(x).float() / 255 makes them of 8-bit pixels"
+        raise ValueError(f"{name}: expected a tensor of floating-point numbers in [0, 1], got {found}{hint}")
+    if not values.numel() or values.is_meta:
+        return
+    low, high = (float(value) for value in values.detach().aminmax())
+    if not (1 - MOST <= low and high <= MOST):
+        hint = "divide 8-bit pixels by 255"
+        raise ValueError(f"{name}: expected finite numbers in [0, 1], got {low:g} to {high:g}; {hint}")
 
 
 @dataclass(frozen=True)
@@ -40,6 +72,11 @@ class Views:
     up: str | None = None
 
     def __post_init__(self) -> None:
+        check_values("images", self.images)
+        if not isinstance(self.cameras, PinholeCamera):
+            raise ValueError(f"cameras: expected a PinholeCamera of Kornia, got {kind_of(self.cameras)}")
+        if self.masks is not None:
+            check_values("masks", self.masks)
         if self.images.ndim != 4 or self.images.shape[1] != 3:
             raise ValueError(f"images: expected shape (view, 3, height, width), got {tuple(self.images.shape)}")
         if len(self.images) != self.cameras.batch_size:
@@ -66,12 +103,13 @@ class Views:
         return show_views(repr(self), self.images, self.cameras, self.bounds)
 
     def __getitem__(self, index: slice | list[int] | Int[Tensor, " chosen"]) -> Views:
+        if isinstance(index, int):
+            raise ValueError(f"views: expected a slice, a list or a tensor of indices, got {index}; use [[{index}]]")
         names = self.names
         if names:
             chosen = torch.arange(len(self))[index.cpu() if isinstance(index, Tensor) else index]
             names = tuple(names[i] for i in chosen.reshape(-1).tolist())
-        return replace(
-            self,
+        return self._derived(
             images=self.images[index],
             cameras=camera.select(self.cameras, index),
             masks=None if self.masks is None else self.masks[index],
@@ -90,12 +128,17 @@ class Views:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Views:
         """The views on another device or in another precision, cameras included."""
-        return replace(
-            self,
+        return self._derived(
             images=self.images.to(device=device, dtype=dtype),
             cameras=camera.to(self.cameras, device, dtype),
             masks=None if self.masks is None else self.masks.to(device=device, dtype=dtype),
         )
+
+    def _derived(self, **changes: Any) -> Views:
+        """The same views with some of their parts changed together, which need not be looked at again."""
+        views = object.__new__(type(self))
+        views.__dict__.update({**self.__dict__, **changes})
+        return views
 
     def rays(self, view: int, *, span: str = "sphere") -> Rays:
         """The rays through all pixels of one view, row by row."""
@@ -133,6 +176,8 @@ class Views:
         span: str = "sphere",
     ) -> tuple[Rays, Float[Tensor, "ray 3"], Float[Tensor, "ray 1"]]:
         """As `sample_rays`, with the opacity of the masks there; 1 without masks."""
+        if not isinstance(count, int) or count < 1:
+            raise ValueError(f"count: expected at least 1 ray, got {count!r}")
         height, width = self.size
         total = len(self) * height * width if among is None else len(among)
         if not total:

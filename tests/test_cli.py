@@ -247,6 +247,10 @@ def test_presets_and_inspect(capsys, tmp_path):
     demo = demo_folder()
     assert main(["inspect", str(demo / "hyperplanes")]) == 0
     assert "20 of 20 steps" in capsys.readouterr().out
+    assert main(["inspect", str(demo), "--out", str(tmp_path / "all")]) in (0, 1)
+    shown = capsys.readouterr().out
+    assert all(f"{demo / part}:" in shown for part in ("hyperplanes", "point_multiplane", "data"))
+    assert "20 of 20 steps" in shown
     assert main(["inspect", str(demo / "data"), "--out", str(tmp_path)]) in (0, 1)
     assert "4 (2 train, 2 test)" in capsys.readouterr().out
     assert (tmp_path / "contact_sheet.png").exists()

@@ -149,3 +149,33 @@ def test_what_does_not_fit_together_is_refused(change, message):
 
 def test_a_task_names_its_object():
     assert Task(views(), views(), "car").name == "car"
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("images", "found"),
+    [
+        (
+            lambda images: images * 255,
+            "expected finite numbers in .0, 1., got 0 to 255; divide 8-bit pixels",
+        ),
+        (lambda images: (images * 255).to(torch.uint8), "got a tensor of uint8, shape .*/ 255 makes them of 8-bit"),
+        (lambda images: images * float("nan"), "expected finite numbers in .0, 1., got nan"),
+        (lambda images: images.numpy(), "got a numpy.ndarray; torch.from_numpy"),
+        (lambda images: None, "got None"),
+    ],
+)
+def test_pictures_that_are_none_are_refused_where_they_enter(images, found):
+    """Property: what would have been drawn as white pictures never gets to the model."""
+    picture = torch.linspace(0, 1, 2 * 3 * 4 * 4).reshape(2, 3, 4, 4)
+    cameras = ring(2, (4, 4))
+    with pytest.raises(ValueError, match=f"^images: .*{found}"):
+        Views(images(picture), cameras)
+    with pytest.raises(ValueError, match="^cameras: expected a PinholeCamera of Kornia, got a list"):
+        Views(picture, [cameras])
+    views = Views(picture, cameras)
+    with pytest.raises(ValueError, match=r"got 0; use \[\[0\]\]"):
+        views[0]
+    for count in (-1, 0, None, 2.5):
+        with pytest.raises(ValueError, match="^count: expected at least 1 ray"):
+            views.sample_rays(count)

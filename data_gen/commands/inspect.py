@@ -12,9 +12,9 @@ Example:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -32,8 +32,8 @@ class Arguments:
     """What to look at.
 
     Attributes:
-        path: A data set in any layout, a folder of posed images, a checkpoint, a baked file, or what comes with the
-            package: small, small-paper, cars-64, example-car.
+        path: A data set in any layout, a folder of posed images, a checkpoint, a folder of these such as `demo` writes,
+            a baked file, or what comes with the package: small, small-paper, cars-64, example-car.
         out: Where the pictures go; runs/inspect/NAME when not given.
         objects: How many objects to look at closely.
         checksums: Compare every file with its checksum in the manifest, too.
@@ -51,6 +51,7 @@ def checkpoint_lines(folder: Path) -> list[str]:
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.hypernetwork import ImageHyperNetworkConfig
     from hyperplanes.utilities.checkpoints import read_json
+    from hyperplanes.utilities.files import malformed
 
     folder = checkpoint_folder(folder)
     model = HyperPlanes.from_pretrained(folder)
@@ -75,11 +76,15 @@ def checkpoint_lines(folder: Path) -> list[str]:
     else:
         lines.append("hypernetwork: none, the same weights for every object")
     if (folder / "training.json").exists():
-        state = read_json(folder / "training.json")
-        looked = [entry["psnr"] for entry in state["curve"] if "psnr" in entry]
-        quality = f", {looked[-1]:.2f} dB on held-out objects when last looked at" if looked else ""
-        lines.append(f"training: {state['step']:,} of {state['config']['steps']:,} steps{quality}")
+        with malformed(folder / "training.json", "the state of a training"):
+            lines.append(_training_line(read_json(folder / "training.json")))
     return lines
+
+
+def _training_line(state: dict[str, Any]) -> str:
+    looked = [entry["psnr"] for entry in state["curve"] if "psnr" in entry]
+    quality = f", {looked[-1]:.2f} dB on held-out objects when last looked at" if looked else ""
+    return f"training: {state['step']:,} of {state['config']['steps']:,} steps{quality}"
 
 
 def baked_lines(path: Path) -> list[str]:
@@ -120,9 +125,28 @@ def _is_checkpoint(path: Path) -> bool:
         return False
 
 
+def _parts(folder: Path) -> list[Path]:
+    """The checkpoints and data sets in a folder such as `demo` writes; none of a folder that is a data set itself."""
+    if not folder.is_dir() or (folder / "manifest.json").exists():
+        return []
+    names = ("*/model.json", "*/manifest.json", "first/*/manifest.json")
+    return sorted({path.parent for name in names for path in folder.glob(name)})
+
+
 def run(arguments: Arguments) -> int:
     """Describe it; 1 when a data set is not as it should be."""
     console = Console()
+    if not _is_checkpoint(arguments.path) and (parts := _parts(arguments.path)):
+        out, codes = arguments.out or Path("runs/inspect") / arguments.path.resolve().name, []
+        for part in parts:
+            console.say(f"{part}:")
+            inner = part.relative_to(arguments.path)
+            codes.append(_inspect(replace(arguments, path=part, out=out / inner), console))
+        return max(codes)
+    return _inspect(arguments, console)
+
+
+def _inspect(arguments: Arguments, console: Console) -> int:
     if arguments.path.suffix == ".safetensors" and arguments.path.is_file():
         for line in baked_lines(arguments.path):
             console.say(line)
@@ -132,6 +156,7 @@ def run(arguments: Arguments) -> int:
             console.say(line)
         return 0
     from data_gen.datasets.inspect import inspect
+    from hyperplanes.commands.scene import refuse_sources
     from hyperplanes.data.dataset import locate_scene
     from hyperplanes.utilities.files import DataError
 
@@ -144,6 +169,7 @@ def run(arguments: Arguments) -> int:
             "check the path",
         )
     out = arguments.out or Path("runs/inspect") / arguments.path.resolve().name
+    refuse_sources(out, arguments.path)
     found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums)
     for line in found.lines():
         console.say(line)

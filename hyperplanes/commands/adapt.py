@@ -16,8 +16,8 @@ from pathlib import Path
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
 from hyperplanes.commands.options import Free, OptionalInt, Steps, ViewsUp
-from hyperplanes.commands.scene import read_scene
-from hyperplanes.commands.writing import writes_to
+from hyperplanes.commands.scene import read_scene, refuse_sources
+from hyperplanes.commands.writing import refuse_checkpoint, writes_to
 
 __all__ = ["Arguments", "run"]
 
@@ -55,7 +55,7 @@ class Arguments:
     device: str = "auto"
 
 
-@writes_to(lambda arguments: arguments.out)
+@writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt and write the weights."""
     from hyperplanes.adaptation.base import AdaptedField
@@ -64,6 +64,7 @@ def run(arguments: Arguments) -> int:
 
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "adapt")
+    refuse_checkpoint(arguments.out, arguments.checkpoint)
     model = load_adaptable(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, up = read_scene(
         arguments.views,

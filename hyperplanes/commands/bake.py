@@ -21,7 +21,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, bake_field, load_adaptable, refuse_baked
 from hyperplanes.commands.options import OptionalInt, Steps, ViewsUp, check_orbit, optional
 from hyperplanes.commands.scene import read_scene
-from hyperplanes.commands.writing import writes_to
+from hyperplanes.commands.writing import refuse_checkpoint, writes_to
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
@@ -92,6 +92,7 @@ def run(arguments: Arguments) -> int:
         raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")
     if arguments.out.suffix != ".safetensors":
         raise ValueError(f"--out: expected a name that ends in .safetensors, got {arguments.out}; add the ending")
+    refuse_checkpoint(arguments.out, arguments.checkpoint)
     check_orbit(arguments.orbit, arguments.size)
     with prefix_errors("--voxels"):
         coarsening(arguments.voxels)

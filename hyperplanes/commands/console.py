@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 import time
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from typing import Any, TextIO, cast
 
 from rich.console import Console as RichConsole
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
@@ -47,6 +49,37 @@ class Bar:
         _show(self._errors, line)
 
 
+class _Terminal:
+    """Standard output or error; what is written after its terminal was closed is dropped, as to nobody.
+
+    A training whose terminal is closed is about to write its checkpoint, and is not to fail at a line of progress.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with _unless_closed():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with _unless_closed():
+            self._stream.flush()
+
+
+@contextmanager
+def _unless_closed() -> Generator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+
+
 class _Stream(RichConsole):
     """Rich's console, which leaves it to the caller what a reader who has gone means; its own exit code is 1."""
 
@@ -62,8 +95,8 @@ class Console:
     """
 
     def __init__(self, *, silent: bool = False) -> None:
-        self._out = _Stream(file=sys.stdout, quiet=silent)
-        self._errors = _Stream(file=sys.stderr, quiet=silent)
+        self._out = _Stream(file=cast(TextIO, _Terminal(sys.stdout)), quiet=silent)
+        self._errors = _Stream(file=cast(TextIO, _Terminal(sys.stderr)), quiet=silent)
         self._live = self._out.is_terminal and not silent
 
     def say(self, line: str) -> None:

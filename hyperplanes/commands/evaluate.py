@@ -10,6 +10,9 @@ With --seeds N everything is done N times with the seeds 0 to N - 1, and the tab
 over them. A seed is that of gradient steps on the support views and of random weights; where a --checkpoint has {seed}
 in its name, it is that of the training, too. Methods are compared in pairs over the objects, by a paired t-test.
 
+Objects that cannot be read or adapted to are named and left out, for all methods, and the exit code is 1. What has been
+measured stands in FILE.partial.json until the FILE of --json is whole.
+
 Example:
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method nearest_view hyperplanes hyperplanes_swapped
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method hyperplanes scratch --steps 10 100
@@ -20,21 +23,25 @@ Example:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, ViewsUp, optional
+from hyperplanes.commands.writing import check_output
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     import numpy as np
 
     from hyperplanes.data import Dataset
-    from hyperplanes.evaluation import Score
+    from hyperplanes.evaluation import ObjectScore, Score
     from hyperplanes.evaluation.comparison import Comparison
+    from hyperplanes.views import Tasks, Views
 
 __all__ = ["Arguments", "as_json", "compared_rows", "headings", "rows", "run", "with_seed"]
 
@@ -102,6 +109,9 @@ class Arguments:
     device: str = "auto"
 
 
+OUTPUTS = ("curve", "boxes", "grid", "csv", "markdown", "json")
+"""Options that name files to write."""
+
 COLUMNS = {"psnr": "PSNR", "psnr_foreground": "inside mask", "psnr_pooled": "pooled", "ssim": "SSIM", "lpips": "LPIPS"}
 
 
@@ -162,6 +172,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data import open_dataset
     from hyperplanes.data.devices import TasksOnDevice, choose_device
+    from hyperplanes.data.pictures.frames import listed
     from hyperplanes.data.support import WithSupport
     from hyperplanes.evaluation import evaluate_all
     from hyperplanes.evaluation.comparison import compare_all
@@ -174,6 +185,8 @@ def run(arguments: Arguments) -> int:
     for figure in (arguments.curve, arguments.boxes, arguments.grid):
         if figure is not None:
             figure_kind(figure)  # a wrong name is found before anything is evaluated
+    for option in OUTPUTS:
+        check_output(option, getattr(arguments, option))
     if arguments.seeds < 1:
         raise ValueError(f"--seeds: expected at least 1, got {arguments.seeds}")
     console, device = Console(), choose_device(arguments.device)
@@ -192,7 +205,7 @@ def run(arguments: Arguments) -> int:
     lpips = None if arguments.lpips is None else LPIPS(arguments.lpips, device)
 
     def make(name: str, seed: int) -> WithSampler:
-        objects = (data.task(each).support for each in names)
+        objects = _supports(data, names)
         made = make_method(
             name,
             checkpoints[seed],
@@ -206,7 +219,12 @@ def run(arguments: Arguments) -> int:
 
     chosen = list(dict.fromkeys(each for name in arguments.method for each in at_steps(name, arguments.steps)))
     first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to
-    pictures = _Pictures()
+    pictures, failures, kept = _Pictures(), {}, _Kept(arguments.json)
+
+    def failed(method: str, seed: int, name: str, error: Exception) -> None:
+        failures[name] = f"{method}: {error}"
+        bar.warn(f"{name} is left out, {method} failed: {error}")
+
     with console.bar("evaluating") as bar:
         scores = evaluate_all(
             {name: lambda seed, name=name: make(name, seed) if seed else first[name] for name in chosen},
@@ -215,20 +233,38 @@ def run(arguments: Arguments) -> int:
             bar.show,
             seeds=arguments.seeds,
             on_object=pictures.keep if arguments.grid is not None else None,
+            on_score=kept.add,
+            on_failure=failed if len(names) > 1 else None,
             lpips=lpips,
         )
-    pairs = compare_all(scores)
+    pairs, count = compare_all(scores), len(scores[0].objects)
+    console.table(headings(scores), rows(scores))
+    if count > 1 and pairs:
+        console.table(PAIR_HEADINGS, compared_rows(pairs[:LARGEST_TABLE]))
+    console.say(f"{count} objects of {arguments.data}{_of_seeds(arguments)}")
     _write(arguments, scores, pairs)
     if arguments.grid is not None:
         pictures.draw(arguments.grid)
-    for path in (arguments.curve, arguments.boxes, arguments.grid, arguments.csv, arguments.markdown, arguments.json):
-        if path is not None:
+    kept.remove()
+    for option in OUTPUTS:
+        if (path := getattr(arguments, option)) is not None:
             console.say(f"written: {path}")
-    console.table(headings(scores), rows(scores))
-    if len(names) > 1 and pairs:
-        console.table(PAIR_HEADINGS, compared_rows(pairs[:LARGEST_TABLE]))
-    console.say(f"{len(names)} objects of {arguments.data}{_of_seeds(arguments)}")
-    return 0
+    missing = [name for name in chosen if name not in {score.method for score in scores}]
+    if missing:
+        console.warn(f"methods that failed on every object and are not in the table: {', '.join(missing)}")
+    if len(names) > count:
+        shown = {each.name for each in scores[0].objects}
+        console.warn(
+            f"{len(names) - count} of {len(names)} objects are left out: {listed([n for n in names if n not in shown])}"
+        )
+    return int(bool(failures))
+
+
+def _supports(data: Tasks, names: Sequence[str]) -> Iterator[Views]:
+    """The support views of the objects that can be read; the others are named when they are evaluated."""
+    for name in names:
+        with suppress(ValueError, OSError):
+            yield data.task(name).support
 
 
 def _up(arguments: Arguments, data: Dataset, console: Console) -> str:
@@ -320,6 +356,30 @@ def _draw_curve(scores: Sequence[Score], methods: Sequence[str], steps: Sequence
     set_counts(axes, steps)
     axes.set(xlabel="fine-tuning steps", ylabel="PSNR (dB)")
     save_figure(figure, path)
+
+
+class _Kept:
+    """What has been measured so far, in a file beside the one of `--json` until that is written."""
+
+    seconds = 10.0
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = None if path is None else path.with_name(f"{path.stem}.partial.json")
+        self._found: dict[str, dict[str, object]] = {}
+        self._written = 0.0
+
+    def add(self, method: str, seed: int, score: ObjectScore) -> None:
+        from hyperplanes.utilities.files import write_json
+
+        row = f"{method}, seed {seed}" if seed else method
+        self._found.setdefault(row, {})[score.name] = score.as_json()
+        if self.path is not None and time.monotonic() - self._written > self.seconds:
+            write_json(self.path, {row: {"objects": objects} for row, objects in self._found.items()})
+            self._written = time.monotonic()
+
+    def remove(self) -> None:
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
 
 
 class _Pictures:

@@ -91,7 +91,10 @@ GOOD_OVERLAP = 0.9
 GOOD_DEPTH = 0.9
 
 
-@writes_to(lambda arguments: arguments.out)
+@writes_to(
+    lambda arguments: arguments.out,
+    check=lambda arguments: refuse_sources(arguments.out / "images", arguments.views),
+)
 def run(arguments: Arguments) -> int:
     """Adapt and write what was asked for."""
     from hyperplanes.adaptation.base import AdaptedField

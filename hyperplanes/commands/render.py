@@ -69,7 +69,7 @@ class Arguments:
     device: str = "auto"
 
 
-@writes_to(lambda arguments: arguments.out)
+@writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
     from hyperplanes.adaptation.nearest_view import NearestView

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -73,22 +74,33 @@ def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
     return guessed or "y"
 
 
-def refuse_sources(folder: Path, path: Path, names: Sequence[str]) -> None:
-    """One line where pictures would be written over those that were read.
+INPUT = re.compile(r"images(_\d+)?|image|input|rgb|masks?|pose|sparse|dense|distorted|colmap")
+"""Names of the folders of a scene that readers look into."""
+
+
+def refuse_sources(folder: Path, path: Path, names: Sequence[str] = ()) -> None:
+    """One line where pictures would be written over those that are read, or to where they are read next time.
 
     Args:
         folder: to write into.
-        path: of the posed images that were read.
-        names: of their pictures, relative to it or to its folder images/.
+        path: of the posed images that are read, or of a data set.
+        names: of their pictures, relative to it.
 
     Raises:
-        ValueError: a folder that holds one of them.
+        ValueError: a folder that holds one of them, or one of a scene that readers look into.
     """
     from hyperplanes.data.dataset import locate_scene
+    from hyperplanes.data.formats.recognise import is_scene
 
     path = locate_scene(path)
-    root = path if path.is_dir() else path.parent
-    if folder.resolve() in {(root / name).parent.resolve() for name in (*names, "images/any")}:
+    root = (path if path.is_dir() else path.parent).resolve()
+    target = folder.resolve()
+    sources = {(root / name).parent.resolve() for name in names}
+    inner = target.relative_to(root).parts if target.is_relative_to(root) else ()
+    scenes = [root] if len(inner) < 2 or not is_scene(root / inner[0]) else [root, root / inner[0]]
+    read = any(INPUT.fullmatch(part) for part, _ in zip(inner, scenes, strict=False))
+    if target in sources or read:
         raise ValueError(
-            f"--out: expected a folder without the pictures that are read, got {folder}, where they are; name another"
+            f"--out: expected a folder that no pictures or poses are read from, got {folder}, which is one of {path}; "
+            "name another"
         )

@@ -42,7 +42,7 @@ from hyperplanes.commands.options import (
 )
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration, format_rate
-from hyperplanes.utilities.interrupts import Terminated
+from hyperplanes.utilities.interrupts import SIGNALS, HungUp, listened_to
 from hyperplanes.utilities.processes import is_first_process
 
 if TYPE_CHECKING:
@@ -127,17 +127,25 @@ def progress_line(progress: Progress, best: float | None = None) -> str:
 
 @contextmanager
 def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[list[type[KeyboardInterrupt]]]:
-    """The first Ctrl-C or SIGTERM ends the training after its step, the second one at once; yields what was heard."""
+    """The first Ctrl-C, SIGTERM or SIGHUP ends the training after its step, the second one at once.
+
+    A terminal that is closed sends SIGHUP more than once, which counts as one.
+
+    Yields:
+        What was heard.
+    """
     heard: list[type[KeyboardInterrupt]] = []
 
     def note(number: int, _: object) -> None:
-        heard.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
+        if number == signal.SIGHUP and HungUp in heard:
+            return
+        heard.append(SIGNALS[number])
         if len(heard) > 1:
             raise heard[-1]
         trainer.stopping = True
         bar.warn(f"{signal.Signals(number).name}: stopping after this step; once more to stop at once")
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, note) for number in listened_to()}
     try:
         yield heard
     finally:
@@ -153,9 +161,8 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
         bar: where a line a report is shown.
         board: where every report goes as well.
 
-    Raises:
-        KeyboardInterrupt: after Ctrl-C, with a checkpoint written and advice as its text.
-        Terminated: after SIGTERM, likewise.
+    After Ctrl-C it ends in a KeyboardInterrupt with a checkpoint written and advice as its text, after SIGTERM in
+    `Terminated` and after SIGHUP in `HungUp`, likewise.
     """
     from hyperplanes.adaptation.diagnostics import SMALLEST_SPREAD
 
@@ -179,9 +186,7 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
     if trainer.stopping and trainer.processes.first:
         advice = f"step {trainer.step} is saved, the same command goes on from there"
-        if Terminated in heard:
-            raise Terminated(advice)
-        raise KeyboardInterrupt(advice)
+        raise heard[0](advice) if heard else KeyboardInterrupt(advice)
 
 
 def resolve(arguments: Arguments) -> tuple[str, Preset]:

@@ -2,17 +2,73 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any
 
-__all__ = ["writes_to"]
+__all__ = ["check_output", "refuse_checkpoint", "writes_to"]
+
+READ = re.compile(
+    r"(manifest|model|training|transforms|diagnostics|initial)([-_]\w+)?\.json|.*_splits\.json|config\.yaml"
+)
+"""Names of files that this program reads as a model, a training or a data set."""
+
+WEIGHTS = re.compile(r"(model|training-\d+)\.safetensors")
+
+
+def refuse_checkpoint(out: Path, checkpoint: Path) -> None:
+    """One line where what is made of a model would take the place of a model.
+
+    Args:
+        out: a folder for a checkpoint, or a file of weights.
+        checkpoint: the model that is read.
+
+    Raises:
+        ValueError: the folder of the model that is read or of a training, or a file of a checkpoint.
+    """
+    from hyperplanes.adaptation.checkpoints import checkpoint_folder
+    from hyperplanes.adaptation.pretrained import find_checkpoints
+
+    if out.suffix == ".safetensors":
+        taken = WEIGHTS.fullmatch(out.name) is not None and (out.parent / "model.json").exists()
+    else:
+        models = (checkpoint_folder(checkpoint), *find_checkpoints([checkpoint]).values())
+        taken = out.resolve() in {path.resolve() for path in models} or (out / "training.json").exists()
+    if taken:
+        raise ValueError(f"--out: expected a place of its own, got {out}, where a trained model is; name another")
+
+
+def check_output(option: str, path: Path | None) -> None:
+    """One line, before anything is computed, where a file cannot be written or is one that this program reads.
+
+    Args:
+        option: the name of the option.
+        path: the file, or None.
+
+    Raises:
+        ValueError: a folder, a file where its folder should be, or a file of a model, a training or a data set.
+    """
+    if path is None:
+        return
+    if path.is_dir():
+        raise ValueError(f"--{option}: expected the name of a file to write, got {path}, a folder; name a file in it")
+    above = next(each for each in path.absolute().parents if each.exists())
+    if not above.is_dir():
+        raise ValueError(f"--{option}: expected a file in a folder, got {path}, and {above} is a file; name another")
+    if path.exists() and READ.fullmatch(path.name):
+        raise ValueError(
+            f"--{option}: expected a file of its own, got {path}, which is read as a model, a training or a data set; "
+            "name another"
+        )
 
 
 def writes_to(
-    folder: Callable[[Any], Path], when: Callable[[Any], bool] = lambda arguments: True
+    folder: Callable[[Any], Path],
+    when: Callable[[Any], bool] = lambda arguments: True,
+    check: Callable[[Any], None] = lambda arguments: None,
 ) -> Callable[[Callable[[Any], int]], Callable[[Any], int]]:
     """A decorator of a verb's `run`: it fails at once where another process writes into the same folder.
 
@@ -21,6 +77,7 @@ def writes_to(
     Args:
         folder: from a verb's arguments the folder that it writes into, as in `files.one_writer`.
         when: whether this process writes there at all; of the processes of one training, the first one alone does.
+        check: what raises where the folder may not be written into, before it is made.
 
     Returns:
         The decorator.
@@ -31,6 +88,7 @@ def writes_to(
         def locked(arguments: Any) -> int:
             from hyperplanes.utilities.files import one_writer
 
+            check(arguments)
             if not when(arguments):
                 return run(arguments)
             place = folder(arguments)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from statistics import fmean, pstdev, stdev
 from typing import Any
 
@@ -149,6 +150,7 @@ def evaluate(
     names: Sequence[str],
     on_object: Callable[[ObjectScore, Task, Pictures], None] | None = None,
     lpips: Perceptual | None = None,
+    on_failure: Callable[[str, Exception], None] | None = None,
 ) -> Score:
     """Adapt to the support views of each object and compare all its query views.
 
@@ -161,41 +163,57 @@ def evaluate(
         names: the objects, never trained on.
         on_object: called after each, with its score, task and pictures.
         lpips: where the perceptual distance is asked for, too.
+        on_failure: called with an object that cannot be evaluated and the reason, and the next one follows; where
+            absent, the first failure ends it.
 
     Returns:
-        The row.
+        The row, of the objects that did not fail.
 
     Raises:
         ValueError: no object, or one without query views or with views that cannot be used; it is named.
+        OSError: an object whose files cannot be read.
     """
     if not names:
         raise ValueError("names: expected at least one object to evaluate on, got none")
     scores = []
     for name in names:
-        task = data.task(name)
-        if not len(task.query):
-            raise ValueError(f"{name}: expected at least one query view to compare with, got none")
-        start = time.perf_counter()
-        with prefix_errors(name):
-            adapted = adapter.adapt(task.support)
-        adapted_at = time.perf_counter()
-        pictures = adapted.render(task.query.cameras)
-        rendered_at = time.perf_counter()
-        images, truth, masks = pictures.images.to(task.query.images).clamp(0, 1), task.query.images, task.query.masks
-        score = ObjectScore(
-            name,
-            float(psnr(images, truth).mean()),
-            float(ssim(images, truth).mean()),
-            adapted_at - start,
-            (rendered_at - adapted_at) / len(task.query),
-            float(pooled_psnr(images, truth)),
-            None if masks is None else _number(float(foreground_psnr(images, truth, masks).nanmean())),
-            None if lpips is None else float(lpips(images, truth).mean()),
-        )
+        try:
+            score, task, pictures = _evaluate_one(name, adapter, data, lpips)
+        except (ValueError, OSError) as error:
+            if on_failure is None:
+                raise
+            on_failure(name, error)
+            continue
         scores.append(score)
         if on_object is not None:
             on_object(score, task, pictures)
     return Score(method, tuple(scores))
+
+
+def _evaluate_one(
+    name: str, adapter: Adapter, data: Tasks, lpips: Perceptual | None
+) -> tuple[ObjectScore, Task, Pictures]:
+    task = data.task(name)
+    if not len(task.query):
+        raise ValueError(f"{name}: expected at least one query view to compare with, got none")
+    start = time.perf_counter()
+    with prefix_errors(name):
+        adapted = adapter.adapt(task.support)
+    adapted_at = time.perf_counter()
+    pictures = adapted.render(task.query.cameras)
+    rendered_at = time.perf_counter()
+    images, truth, masks = pictures.images.to(task.query.images).clamp(0, 1), task.query.images, task.query.masks
+    score = ObjectScore(
+        name,
+        float(psnr(images, truth).mean()),
+        float(ssim(images, truth).mean()),
+        adapted_at - start,
+        (rendered_at - adapted_at) / len(task.query),
+        float(pooled_psnr(images, truth)),
+        None if masks is None else _number(float(foreground_psnr(images, truth, masks).nanmean())),
+        None if lpips is None else float(lpips(images, truth).mean()),
+    )
+    return score, task, pictures
 
 
 def evaluate_all(
@@ -206,6 +224,8 @@ def evaluate_all(
     *,
     seeds: int = 1,
     on_object: Callable[[str, int, Task, Pictures], None] | None = None,
+    on_score: Callable[[str, int, ObjectScore], None] | None = None,
+    on_failure: Callable[[str, int, str, Exception], None] | None = None,
     lpips: Perceptual | None = None,
 ) -> list[Score]:
     """Every method on every object, by every seed.
@@ -217,12 +237,24 @@ def evaluate_all(
         report: called with (evaluations done, evaluations in all, what has just been found) after each.
         seeds: how many, from 0.
         on_object: called with a method, a seed, a task and its pictures.
+        on_score: called with a method, a seed and what has just been measured.
+        on_failure: called with a method, a seed, an object that cannot be evaluated and the reason; where absent, the
+            first failure ends it.
         lpips: as in `evaluate`.
 
     Returns:
-        The rows in the order of the methods.
+        The rows in the order of the methods, of the objects that none of them failed on; methods that failed on every
+        object have none. Where no object is left for all methods, it is a ValueError, the first failure where
+        everything failed.
     """
-    done, scores = 0, []
+    done, found, errors = 0, {}, []
+
+    def failed(method: str, seed: int, name: str, error: Exception) -> None:
+        nonlocal done
+        done += 1
+        errors.append(error)
+        assert on_failure is not None
+        on_failure(method, seed, name, error)
 
     def seen(method: str, seed: int, score: ObjectScore, task: Task, pictures: Pictures) -> None:
         nonlocal done
@@ -230,14 +262,33 @@ def evaluate_all(
         report(done, len(methods) * len(names) * seeds, f"{method} on {score.name}: {score.psnr:.2f} dB")
         if on_object is not None:
             on_object(method, seed, task, pictures)
+        if on_score is not None:
+            on_score(method, seed, score)
 
     for method, make in methods.items():
         runs = []
         for seed in range(seeds):
-            look = lambda *found, method=method, seed=seed: seen(method, seed, *found)  # noqa: E731
-            runs.append(evaluate(method, make(seed), data, names, look, lpips))
-        scores.append(merge_seeds(runs))
-    return scores
+            look, fail = partial(seen, method, seed), partial(failed, method, seed)
+            runs.append(evaluate(method, make(seed), data, names, look, lpips, fail if on_failure else None))
+        found[method] = runs
+    if len(errors) == done:
+        raise errors[0]
+    return [merge_seeds(runs) for runs in _of_common_objects(found).values()]
+
+
+def _of_common_objects(found: Mapping[str, Sequence[Score]]) -> dict[str, list[Score]]:
+    """The rows of the methods that did not fail on every object, of the objects that none of these failed on."""
+    whole = {method: runs for method, runs in found.items() if all(run.objects for run in runs)}
+    done = [{each.name for each in run.objects} for runs in whole.values() for run in runs]
+    common = set.intersection(*done) if done else set()
+    if not common:
+        raise ValueError(
+            f"evaluate: expected an object that {', '.join(whole or found)} can all be evaluated on, found none"
+        )
+    return {
+        method: [replace(run, objects=tuple(each for each in run.objects if each.name in common)) for run in runs]
+        for method, runs in whole.items()
+    }
 
 
 def _number(value: float) -> float | None:

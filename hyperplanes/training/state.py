@@ -26,7 +26,7 @@ from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, lo
 from hyperplanes.utilities.files import DataError, encode_json, malformed, write_json
 from hyperplanes.utilities.settings import SettingsError
 
-__all__ = ["Curve", "check_model", "load_state", "save_state"]
+__all__ = ["Curve", "check_model", "check_whole", "load_state", "save_state"]
 
 Curve: TypeAlias = list[dict[str, float]]
 
@@ -42,6 +42,7 @@ def save_state(
     step: int,
     curve: Curve,
     config: Mapping[str, Any],
+    data: Mapping[str, Any] | None = None,
 ) -> None:
     """Put a new state in the place of the last one, or beside the last ones where the configuration keeps several.
 
@@ -52,6 +53,7 @@ def save_state(
         step: steps done.
         curve: what was reported so far.
         config: of the training; its `keep_last` says how many states stay.
+        data: what tells the objects that are trained on from others, for `load_state` to compare.
     """
     name = f"training-{step:08d}.safetensors"
     tensors = {f"model.{key}": value for key, value in model.state_dict().items()}
@@ -59,15 +61,21 @@ def save_state(
         for place, entries in optimiser.state_dict()["state"].items():
             tensors |= {f"{index}.{place}.{key}": torch.as_tensor(value) for key, value in entries.items()}
     save_tensors(folder / name, tensors)
-    model.save(folder)
     document = {"step": step, "curve": curve, "config": dict(config), "state": name}
+    if data is not None:
+        document["data"] = dict(data)
     kept = config.get("keep_last", 1)
     beside = (folder / name).with_suffix(".json")
     if kept > 1:
         write_json(beside, document)
     else:
         beside.unlink(missing_ok=True)
-    write_json(folder / "training.json", document)
+    if (folder / "training.json").exists():
+        model.save(folder)
+        write_json(folder / "training.json", document)
+    else:  # a model without training.json beside it is one that lost it, see `check_whole`
+        write_json(folder / "training.json", document)
+        model.save(folder)
     _delete_old(folder, name, kept)
 
 
@@ -95,6 +103,7 @@ def load_state(
     config: Mapping[str, Any],
     free: Sequence[str],
     defaults: Mapping[str, Any],
+    data: Mapping[str, Any] | None = None,
 ) -> tuple[int, Curve]:
     """Continue where `save_state` stopped: weights and moments are set.
 
@@ -105,20 +114,35 @@ def load_state(
         config: of the training that is to go on.
         free: entries of it that may differ.
         defaults: what entries are that a training of an earlier version has not.
+        data: as in `save_state`; trainings of earlier versions have noted none.
 
     Returns:
         The steps done, and the curve.
 
     Raises:
-        CheckpointError: another training, or files that are damaged, missing or do not belong together.
+        CheckpointError: another training, other data, or files that are damaged, missing or do not belong together.
     """
     path = folder / "training.json"
     saved = read_json(path)
+    _compare_data(path, saved.get("data"), data)
     try:
         with malformed(path, "the state of a training"):
             return _load(path, saved, model, optimisers, config, free, defaults)
     except DataError as error:
         raise CheckpointError(str(error)) from error
+
+
+def _compare_data(path: Path, before: object, now: Mapping[str, Any] | None) -> None:
+    if before is None or now is None or before == now:
+        return
+    before = before if isinstance(before, dict) else {}
+    counts = before.get("objects"), now.get("objects")
+    differing = [name for name in now if before.get(name) != now[name]]
+    found = f"{counts[1]} with other {' and '.join(differing)}"
+    raise CheckpointError(
+        f"{path}: expected the {counts[0]} objects that the training began with, found {found}; give the same --data, "
+        f"or another --out with --checkpoint {path.parent} to begin with these weights"
+    )
 
 
 def _load(
@@ -174,6 +198,21 @@ def _upgraded(path: Path, config: Mapping[str, Any]) -> Mapping[str, Any]:
         return upgraded(config)
     except SettingsError as error:
         raise CheckpointError(f"{path}: {error}; {REMEDY}") from None
+
+
+def check_whole(folder: Path) -> None:
+    """Nothing, where a new training may begin in a folder.
+
+    Raises:
+        CheckpointError: weights are there, but not training.json, which says how they were trained.
+    """
+    if not (folder / "training.json").exists() and (folder / "model.safetensors").exists():
+        kept = sorted(path.name for path in folder.glob("training-*.json"))
+        remedy = f"copy {kept[-1]} over it to go on from there" if kept else "give another --out folder"
+        raise CheckpointError(
+            f"{folder / 'training.json'}: expected the state of the training beside its weights, found none, and a new "
+            f"training would replace them; {remedy}, or --out elsewhere with --checkpoint {folder} to begin with them"
+        )
 
 
 def check_model(folder: Path, config: ModelConfig) -> None:

@@ -7,7 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,10 +31,10 @@ from hyperplanes.training.episodes import Episode, prepare_episode, prepare_subs
 from hyperplanes.training.prefetching import Prefetcher
 from hyperplanes.training.requirements import check_requirements
 from hyperplanes.training.rotation import draw_rotation
-from hyperplanes.training.state import Curve, check_model, load_state, save_state
+from hyperplanes.training.state import Curve, check_model, check_whole, load_state, save_state
 from hyperplanes.training.watching import Samples, write_curve
 from hyperplanes.utilities.errors import prefix_errors
-from hyperplanes.utilities.files import encode_png, write_json, write_whole
+from hyperplanes.utilities.files import encode_png, sha256, write_json, write_whole
 from hyperplanes.utilities.lru_cache import LRUCache
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task, Tasks, class_of
@@ -98,14 +100,17 @@ class Trainer:
         self.rates = [optimiser.param_groups[0]["lr"] for optimiser in self.optimisers]
         if folder is not None:
             check_model(folder, model.config)
+            check_whole(folder)
         resumed = folder is not None and (folder / "training.json").exists()
         if not (resumed or model.rig.any()) and self.processes.first:  # the others get it with the weights
             with prefix_errors(self.names[0]):
                 model.set_rig(data.task(self.names[0]).support)
         if folder is not None and resumed:
             defaults = asdict(TrainingConfig())
-            loaded = load_state(folder, model, self.optimisers, asdict(config), FREE, defaults)
+            loaded = load_state(folder, model, self.optimisers, asdict(config), FREE, defaults, self._data)
             self.step, self.curve = loaded
+            if self.folder is not None and not (self.folder / "model.safetensors").exists():
+                self.model.save(self.folder)  # of a first checkpoint that was killed before it
         with other_processes():
             self.processes.agree(model, self.step)
 
@@ -350,7 +355,17 @@ class Trainer:
             if self.diagnostics is not None:
                 write_json(self.folder / "diagnostics.json", self.diagnostics.as_json())
             config = asdict(self.config)
-            save_state(self.folder, self.model, self.optimisers, self.step, self.curve, config)
+            save_state(self.folder, self.model, self.optimisers, self.step, self.curve, config, self._data)
+
+    @cached_property
+    def _data(self) -> dict[str, Any]:
+        """What tells the objects that are trained on from others: their names, and the pictures of the first."""
+        first = (self.data.task(self.names[0]).support.images * 255).round().to(torch.uint8).cpu().contiguous()
+        return {
+            "objects": len(self.names),
+            "names": sha256("\n".join(self.names).encode()),
+            "pictures": sha256(first.numpy().tobytes()),
+        }
 
     def _schedule(self) -> float:
         config = self.config

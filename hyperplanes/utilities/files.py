@@ -9,6 +9,7 @@ import itertools
 import json
 import math
 import os
+import re
 import shutil
 import stat
 import struct
@@ -46,6 +47,9 @@ __all__ = [
 
 _COLOUR_TYPES = {1: 0, 3: 2, 4: 6}  # PNG's numbers, by channels
 _unfinished = itertools.count()
+
+UNFINISHED = re.compile(r"\..+\.(\d+)-\d+\.part")
+"""Names of files that are being written, with the number of the process."""
 
 LARGEST_JSON = 256 * 2**20
 """Bytes above which a JSON file is refused unread."""
@@ -337,11 +341,34 @@ def one_writer(folder: str | Path) -> Generator[None]:
         found = error.strerror or str(error)
         raise DataError(folder, "a folder to write into", found, "name another one") from error
     try:
+        _delete_unfinished(folder)
         yield
     finally:
         with suppress(OSError):
             path.unlink()
         lock.close()
+
+
+def _delete_unfinished(folder: Path) -> None:
+    """Delete what killed processes have left half written in a folder, and in those in it that nobody has locked."""
+    for place in (folder, *(child for child in folder.iterdir() if child.is_dir() and not child.is_symlink())):
+        if place != folder and (place / ".lock").exists():
+            continue
+        for path in place.glob(".*.part"):
+            owner = UNFINISHED.fullmatch(path.name)
+            if owner is not None and not _is_running(int(owner[1])):
+                with suppress(OSError):
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
 
 
 def write_json(path: str | Path, value: object) -> None:

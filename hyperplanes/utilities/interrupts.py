@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as exceptions that end a command, wherever it is."""
+"""Ctrl-C, SIGTERM and SIGHUP as exceptions that end a command, wherever it is."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["Terminated", "interruptible"]
+__all__ = ["SIGNALS", "HungUp", "Terminated", "interruptible", "listened_to"]
 
 AGAIN_SECONDS = 0.2
 """After which an interrupt that was swallowed is raised again."""
@@ -18,10 +18,31 @@ AGAIN_SECONDS = 0.2
 class Terminated(KeyboardInterrupt):
     """SIGTERM, as `kill` and clusters send it: ends a verb as Ctrl-C does, with another exit code."""
 
+    code = 128 + signal.SIGTERM
+
+
+class HungUp(Terminated):
+    """SIGHUP, as a terminal sends it that is closed: likewise."""
+
+    code = 128 + signal.SIGHUP
+
+
+SIGNALS: dict[int, type[KeyboardInterrupt]] = {
+    signal.SIGINT: KeyboardInterrupt,
+    signal.SIGTERM: Terminated,
+    signal.SIGHUP: HungUp,
+}
+"""What each signal raises."""
+
+
+def listened_to() -> list[int]:
+    """Those of SIGNALS that are not ignored, as `nohup` ignores one and a shell without job control another."""
+    return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+
 
 @contextmanager
 def interruptible() -> Generator[None]:
-    """SIGINT raises KeyboardInterrupt and SIGTERM `Terminated` within, until the exception leaves it.
+    """SIGINT raises KeyboardInterrupt, SIGTERM `Terminated` and SIGHUP `HungUp` within, until the exception leaves it.
 
     Once is not enough: where native code calls Python (the compiler, the garbage collector), what is raised there is
     printed and lost. So a timer raises it again, except while it is being passed on through cleaning up. In threads
@@ -33,7 +54,7 @@ def interruptible() -> Generator[None]:
     heard: list[type[KeyboardInterrupt]] = []
 
     def note(number: int, _: object) -> None:
-        heard.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
+        heard.append(SIGNALS[number])
         before.setdefault(signal.SIGALRM, signal.signal(signal.SIGALRM, again))
         signal.setitimer(signal.ITIMER_REAL, AGAIN_SECONDS, AGAIN_SECONDS)
         raise heard[-1]
@@ -48,9 +69,8 @@ def interruptible() -> Generator[None]:
 
     hook = sys.unraisablehook
     before: dict[int, Any] = {}
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell without job control starts what ends with &
-            before[number] = signal.signal(number, note)
+    for number in listened_to():
+        before[number] = signal.signal(number, note)
     sys.unraisablehook = report
     try:
         yield

@@ -23,7 +23,7 @@ from hyperplanes.training import Trainer, TrainingConfig, train
 from hyperplanes.training.watching import TensorBoard
 from hyperplanes.utilities import checkpoints, files
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
-from hyperplanes.utilities.interrupts import Terminated
+from hyperplanes.utilities.interrupts import HungUp, Terminated
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, awaken, small_model
 
@@ -517,8 +517,11 @@ def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stay
 
         def task(self, name):
             task = super().task(name)
-            images = torch.full_like(task.query.images, float("nan")) if self.broken else task.query.images
-            return replace(task, query=replace(task.query, images=images))
+            if not self.broken:
+                return task
+            query = replace(task.query, images=task.query.images.clone())
+            query.images.fill_(float("nan"))  # past the check of Views
+            return replace(task, query=query)
 
     data = Poisoned(test=0)
     trainer = Trainer(small_model(), data, with_(steps=4, checkpoint_every=2, memory=0), tmp_path)
@@ -533,20 +536,78 @@ def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stay
     assert all(value.isfinite().all() for value in trainer.model.parameters())
 
 
-def test_sigterm_ends_a_training_after_its_step_with_a_checkpoint(tmp_path):
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, Terminated), (signal.SIGHUP, HungUp)])
+def test_a_signal_ends_a_training_after_its_step_with_a_checkpoint(tmp_path, number, error):
+    """SIGHUP is what a terminal sends that is closed, to the shell and by the shell: more than once."""
+
     class Signalled(Trainer):
         def take_step(self):
             loss = super().take_step()
             if self.step == 2:
-                signal.raise_signal(signal.SIGTERM)
+                signal.raise_signal(number)
+                if number == signal.SIGHUP:
+                    signal.raise_signal(number)
             return loss
 
-    before = signal.getsignal(signal.SIGTERM)
+    before = signal.getsignal(number)
     trainer = Signalled(small_model(), Balls(test=0), with_(steps=9, checkpoint_every=9), tmp_path)
-    with Console().bar("training") as bar, pytest.raises(Terminated, match="step 2 is saved, the same command"):
+    with Console().bar("training") as bar, pytest.raises(error, match="step 2 is saved, the same command"):
         follow(trainer, bar)
     assert json.loads((tmp_path / "training.json").read_text())["step"] == 2
-    assert signal.getsignal(signal.SIGTERM) is before
+    assert signal.getsignal(number) is before
+
+
+def test_a_training_under_nohup_goes_on_when_its_terminal_is_closed(tmp_path):
+    class Signalled(Trainer):
+        def take_step(self):
+            signal.raise_signal(signal.SIGHUP)
+            return super().take_step()
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Console().bar("training") as bar:
+            follow(Signalled(small_model(), Balls(test=0), with_(steps=2), tmp_path), bar)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert json.loads((tmp_path / "training.json").read_text())["step"] == 2
+
+
+def test_a_training_does_not_go_on_with_other_data(tmp_path):
+    """By hand: another object more, and the same names with other pictures."""
+    Trainer(small_model(), Balls(test=0), with_(steps=2), tmp_path).save()
+
+    class Darker(Balls):
+        def task(self, name):
+            task = super().task(name)
+            return replace(task, support=replace(task.support, images=task.support.images / 2))
+
+    assert Trainer(small_model(), Balls(test=0), with_(steps=2), tmp_path).step == 0
+    for data, found in ((Balls(train=4, test=0), "4 with other objects and names"), (Darker(test=0), "other pictures")):
+        with pytest.raises(ValueError, match=f"objects that the training began with, found .*{found}.*--checkpoint"):
+            Trainer(small_model(), data, with_(steps=2), tmp_path)
+
+
+def test_weights_whose_training_json_is_lost_are_not_trained_over(tmp_path):
+    trainer = Trainer(small_model(), Balls(test=0), with_(steps=2, keep_last=2), tmp_path)
+    trainer.take_step()
+    trainer.save()
+    (tmp_path / "training.json").unlink()
+    with pytest.raises(
+        ValueError, match=r"training.json: expected .* beside its weights, .*copy training-00000001.json"
+    ):
+        Trainer(small_model(), Balls(test=0), with_(steps=2, keep_last=2), tmp_path)
+    (tmp_path / "training-00000001.json").rename(tmp_path / "training.json")
+    assert Trainer(small_model(), Balls(test=0), with_(steps=2, keep_last=2), tmp_path).step == 1
+
+
+def test_a_first_checkpoint_that_was_killed_before_its_model_is_made_whole(tmp_path):
+    trainer = Trainer(small_model(), Balls(test=0), with_(steps=2), tmp_path)
+    trainer.take_step()
+    trainer.save()
+    model = (tmp_path / "model.safetensors").read_bytes()
+    (tmp_path / "model.safetensors").unlink()
+    Trainer(small_model(), Balls(test=0), with_(steps=2), tmp_path)
+    assert (tmp_path / "model.safetensors").read_bytes() == model
 
 
 def test_weights_that_are_not_finite_are_not_saved(tmp_path):

@@ -80,7 +80,9 @@ class Poisoned(Balls):
 
     def task(self, name):
         task = super().task(name)
-        return replace(task, query=replace(task.query, images=torch.full_like(task.query.images, float("nan"))))
+        query = replace(task.query, images=task.query.images.clone())
+        query.images.fill_(float("nan"))  # past the check of Views
+        return replace(task, query=query)
 
 
 def weights_of(trainer):

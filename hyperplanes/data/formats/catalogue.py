@@ -24,7 +24,8 @@ class Catalogue:
     """The objects of a data set.
 
     Attributes:
-        layout: "native", "posed", "srn", "learnit-128" or "hyperplanes-200".
+        layout: "native", "posed", "srn", "learnit-128", "hyperplanes-200", "nmr", "co3d", "objaverse" or
+            "omniobject3d".
         splits: the names of each of SPLITS, in their order.
         read: from a name to its pictures.
         manifest: what manifest.json says, empty without one.

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hyperplanes.data.formats import colmap, idr, llff, npz, nsvf, srn
+from hyperplanes.data.formats import co3d, colmap, idr, llff, nmr, npz, nsvf, objaverse, srn
 from hyperplanes.data.formats.catalogue import FORMAT, Catalogue, native
 from hyperplanes.data.formats.transforms_json import find_transforms, read_transforms, read_transforms_task
 from hyperplanes.data.formats.unposed import refuse_unposed
@@ -14,7 +14,7 @@ from hyperplanes.data.pictures.posed import Posed, PosedTask
 from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.files import DataError, read_json
 
-__all__ = ["LAYOUTS", "Layout", "find_catalogue", "find_layouts", "read_posed", "read_posed_task"]
+__all__ = ["LAYOUTS", "Layout", "find_catalogue", "find_layouts", "is_scene", "read_posed", "read_posed_task"]
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,21 @@ LAYOUTS = (
         lambda folder, downscale, root: colmap.read_colmap(folder, downscale=downscale, root=root),
     ),
     Layout(llff.is_llff, lambda folder, downscale, root: llff.read_llff(folder, downscale=downscale, root=root)),
+    Layout(nmr.is_nmr, lambda folder, downscale, root: nmr.read_nmr(folder, downscale=downscale, root=root)),
     Layout(
         lambda folder: idr.camera_file(folder) is not None,
         lambda folder, downscale, root: idr.read_idr(folder, downscale=downscale, root=root),
+    ),
+    Layout(
+        objaverse.is_omniobject,
+        lambda folder, downscale, root: objaverse.read_omniobject(folder, downscale=downscale, root=root),
+    ),
+    Layout(
+        objaverse.is_rendered,
+        lambda folder, downscale, root: objaverse.read_rendered(folder, downscale=downscale, root=root),
+    ),
+    Layout(
+        co3d.is_sequence, lambda folder, downscale, root: co3d.read_sequence(folder, downscale=downscale, root=root)
     ),
 )
 
@@ -71,8 +83,8 @@ def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
     """The catalogue of whatever lies at a path.
 
     A manifest.json that names its layout decides; else the folder's content does: a posed scene (one object, in the
-    test split), SRN's, learnit's or the HyperPlanes authors' layout, or a folder of posed scenes (all in the test
-    split).
+    test split), SRN's, learnit's, the HyperPlanes authors', NMR's, CO3D's, Objaverse's or OmniObject3D's layout, or a
+    folder of posed scenes (all in the test split).
 
     Args:
         path: a folder, or a transforms file.
@@ -100,6 +112,9 @@ def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
         return found
     if _find_format(path) is not None:
         return _one_scene(path, path.resolve().name)
+    for published in (nmr.catalogue, co3d.catalogue, objaverse.objaverse, objaverse.omniobject):
+        if (found := published(path)) is not None:
+            return found
     children = {child.name: child for child in sorted(path.iterdir()) if child.is_dir() and _find_format(child)}
     if children:
         splits = {"train": (), "val": (), "test": tuple(children)}
@@ -152,6 +167,11 @@ def _one_scene(path: Path, name: str) -> Catalogue:
 def _read_child(root: Path, name: str) -> PosedTask:
     """A scene of a folder of scenes; its links may lead to other places in that folder."""
     return _format(root / name).task(root / name, name, None, root)
+
+
+def is_scene(folder: str | Path) -> bool:
+    """Whether a folder holds one posed scene in a layout that is read."""
+    return _find_format(Path(folder)) is not None
 
 
 def _find_format(folder: Path) -> Layout | None:

@@ -15,7 +15,7 @@ from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
 from hyperplanes.data.pictures.undistort import distortion
 from hyperplanes.data.upright import stated_up
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError, inside, read_json
+from hyperplanes.utilities.files import DataError, check_link, inside, read_json
 
 __all__ = ["find_transforms", "read_transforms", "read_transforms_task"]
 
@@ -171,7 +171,9 @@ def _frame(path: Path, fields: dict[str, Any], legacy: bool, flat: bool, root: P
     located = _located(path, name, root)
     if not located.is_file():
         with_suffix = [located.with_name(located.name + suffix) for suffix in _SUFFIXES]
+        with_suffix += [located.parent / "images" / each.name for each in (located, *with_suffix)]  # OmniObject3D
         located = next((candidate for candidate in with_suffix if candidate.is_file()), located)
+        check_link(located, root)
     pose = check_pose(fields.get("transform_matrix"), path, written)
     mask = fields.get("mask_path")
     return Frame(

@@ -133,8 +133,15 @@ def describe(path: str | Path | Dataset, objects: int = 8) -> Description:
         except DataError as error:
             broken.append((name, str(error)))
     splits = {split: len(data.names(split)) for split in ("train", "val", "test")}
-    skipped = tuple((str(one.get("name")), str(one.get("reason"))) for one in data.manifest.get("skipped", []))
-    unlisted = int(data.manifest.get("not_in_split_file", {}).get("count", 0))
+    stated = data.manifest.get("skipped", [])
+    skipped = tuple(
+        (str(one.get("name")), str(one.get("reason")))
+        for one in (stated if isinstance(stated, list) else [])
+        if isinstance(one, dict)
+    )
+    absent = data.manifest.get("not_in_split_file", {})
+    count = absent.get("count", 0) if isinstance(absent, dict) else 0
+    unlisted = count if isinstance(count, int) else 0
     return Description(data.layout, splits, tuple(found), skipped, tuple(broken), unlisted)
 
 

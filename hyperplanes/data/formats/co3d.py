@@ -1,0 +1,178 @@
+"""CO3D, version 2: frame_annotations.jgz beside the sequences of a category (Reizenstein et al., 2021).
+
+Poses are PyTorch3D's: x_camera = x_world R + T, x left, y up, z forward. Calibrations are in normalised coordinates:
+`ndc_isotropic` counts in halves of the shorter side, `ndc_norm_image_bounds` in halves of each side; the principal
+point is measured from the middle of the picture, to the left and up. Paths are relative to the folder of categories.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import zlib
+from collections import defaultdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.data.formats.catalogue import SPLITS, Catalogue, is_plain
+from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
+from hyperplanes.utilities.files import MALFORMED, DataError, check_link, check_regular, inside, read_json
+
+__all__ = ["ANNOTATIONS", "catalogue", "is_sequence", "read_sequence"]
+
+ANNOTATIONS = "frame_annotations.jgz"
+SET_LISTS = "set_lists/set_lists_fewview_dev.json"
+LARGEST = 2**30
+"""Bytes of annotations, unpacked, above which they are refused."""
+
+_FLIP = np.diag([-1.0, -1.0, 1.0])  # x left, y up, z forward to x right, y down, z forward
+_REMEDY = "download the category again"
+
+
+def is_sequence(folder: Path) -> bool:
+    """Whether a folder holds one sequence, its category's annotations beside it."""
+    return (folder / "images").is_dir() and (folder.resolve().parent / ANNOTATIONS).is_file()
+
+
+def read_sequence(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+    """The posed pictures of one sequence.
+
+    Args:
+        folder: CATEGORY/SEQUENCE.
+        downscale: as in `assemble`.
+        root: no picture may lie outside of it, symbolic links followed; the folder when None.
+
+    Returns:
+        The pictures in the order of their frames, with the published masks. Anything wrong with a file is a DataError.
+    """
+    folder = Path(folder)
+    whole = folder.resolve()
+    frames = _annotations(whole.parent / ANNOTATIONS).get(whole.name, [])
+    return _read(whole, frames, downscale, folder if root is None else root)
+
+
+def catalogue(folder: Path) -> Catalogue | None:
+    """The catalogue of a folder of categories, or of one; None where no annotations lie there.
+
+    Args:
+        folder: what may be in this layout.
+
+    Returns:
+        The sequences that have a folder: those of the frames to train on in set_lists_fewview_dev.json, those of the
+        frames to test on and those to validate with, all to test on without such a list; views alternate between
+        support and query.
+
+    Raises:
+        DataError: files that are broken, a sequence in two categories, or no folder of any sequence.
+    """
+    homes = [folder] if (folder / ANNOTATIONS).is_file() else []
+    homes = homes or sorted(path.parent for path in folder.glob(f"*/{ANNOTATIONS}"))
+    if not homes:
+        return None
+    splits: dict[str, list[str]] = {split: [] for split in SPLITS}
+    known: dict[str, tuple[Path, list[dict[str, Any]]]] = {}
+    skipped = []
+    for home in homes:
+        check_link(home / ANNOTATIONS, folder)
+        sequences = _annotations(home / ANNOTATIONS)
+        present = [name for name in sorted(sequences) if is_plain(name) and (home / name).is_dir()]
+        if len(present) < len(sequences):
+            skipped.append(f"{home}: skipped {len(sequences) - len(present)} of {len(sequences)} sequences, no folder")
+        split_of = _splits(home / SET_LISTS)
+        for name in present:
+            if name in known:
+                raise DataError(home, "every sequence in one category", f"{name} in two", "give one category")
+            known[name] = home, sequences[name]
+            splits[split_of.get(name, "test")].append(name)
+    if not known:
+        raise DataError(folder, "the sequences that its annotations name", "none of their folders", _REMEDY)
+
+    def read(name: str) -> PosedTask:
+        home, frames = known[name]
+        return PosedTask.alternating(_read(home.resolve() / name, frames, None, folder), name)
+
+    classes = {name: {"class": home.resolve().name} for name, (home, _) in known.items()}
+    return Catalogue(
+        "co3d", {split: tuple(names) for split, names in splits.items()}, read, {"objects": classes}, tuple(skipped)
+    )
+
+
+def _splits(path: Path) -> dict[str, str]:
+    """The split of each sequence, that of its frames to train on first; empty without a list."""
+    if not path.is_file():
+        return {}
+    document, result = read_json(path), {}
+    for split in ("val", "test", "train"):
+        for entry in document.get(split) or ():
+            if not (isinstance(entry, list) and entry and isinstance(entry[0], str)):
+                raise DataError(path, f"(sequence, frame, picture) in {split}", repr(entry)[:60], _REMEDY)
+            result[entry[0]] = split
+    return result
+
+
+def _annotations(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """The frames of each sequence, in the order of their numbers."""
+    check_regular(path)
+    try:
+        with gzip.open(path, "rb") as file:
+            text = file.read(LARGEST + 1)
+        if len(text) > LARGEST:
+            raise DataError(path, f"at most {LARGEST} bytes, unpacked", "more", "give a smaller category")
+        listed = json.loads(text)
+        sequences: dict[str, list[dict[str, Any]]] = defaultdict(list)
+        for frame in listed:
+            sequences[frame["sequence_name"]].append(frame)
+        for frames in sequences.values():
+            frames.sort(key=lambda frame: frame["frame_number"])
+    except DataError:
+        raise
+    except (*MALFORMED, OSError, zlib.error) as error:
+        raise DataError(path, "a list of frames, compressed by gzip", f"{error}"[:200], _REMEDY) from error
+    return dict(sequences)
+
+
+def _read(folder: Path, listed: list[dict[str, Any]], downscale: int | None, root: Path) -> Posed:
+    """The pictures of a sequence; paths are relative to the folder of categories."""
+    source, base = folder.parent / ANNOTATIONS, folder.parent.parent
+    if not listed:
+        raise DataError(source, f"frames of {folder.name}", "none", _REMEDY)
+    frames = []
+    for frame in listed:
+        view, name = frame["viewpoint"], frame["image"]["path"]
+        height, width = (int(value) for value in frame["image"]["size"])
+        pose = np.eye(4)
+        pose[:3, :3] = _FLIP @ np.array(view["R"], dtype=np.float64).T
+        pose[:3, 3] = _FLIP @ np.array(view["T"], dtype=np.float64)
+        mask = (frame.get("mask") or {}).get("path")
+        found = inside(base, mask, source) if mask else None
+        for path in (inside(base, name, source), found):
+            if path is not None:
+                check_link(path, root)
+        frames.append(
+            Frame(
+                inside(base, name, source),
+                Path(name).name,
+                check_pose(pose, source, name),
+                partial(_calibration, view, source),
+                (height, width),
+                mask=found if found is not None and found.exists() else None,
+            )
+        )
+    return assemble(frames, source, downscale=downscale)[0]
+
+
+def _calibration(view: dict[str, Any], source: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """The calibration of a picture of (height, width)."""
+    half = np.array([size[1], size[0]]) / 2
+    kind = view.get("intrinsics_format", "ndc_norm_image_bounds")
+    if kind not in ("ndc_norm_image_bounds", "ndc_isotropic"):
+        raise DataError(source, "ndc_isotropic or ndc_norm_image_bounds", repr(kind)[:40], _REMEDY)
+    unit = half if kind == "ndc_norm_image_bounds" else half.min()
+    x, y = np.array(view["focal_length"], dtype=np.float64) * unit
+    centre = half - np.array(view["principal_point"], dtype=np.float64) * unit - 0.5
+    return np.array([[x, 0.0, centre[0]], [0.0, y, centre[1]], [0.0, 0.0, 1.0]])

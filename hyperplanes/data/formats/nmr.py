@@ -1,0 +1,141 @@
+"""NMR's renderings of ShapeNet, 24 views an object, as DVR published them (Niemeyer et al., 2020; pixelNeRF).
+
+CLASS/softras_train.lst (_val, _test) list objects; CLASS/OBJECT/ holds image/0000.png, perhaps mask/0000.png, and
+cameras.npz: world_mat_i is camera_from_world in OpenCV axes, camera_mat_i projects to [-1, 1] across the picture.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.data.formats.catalogue import SPLITS, Catalogue, is_plain
+from hyperplanes.data.formats.npz import read_arrays
+from hyperplanes.data.formats.text_numbers import LARGEST_TEXT
+from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
+from hyperplanes.data.pictures.masks import find_masks
+from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files import DataError, list_files, read_text
+
+__all__ = ["catalogue", "is_nmr", "read_nmr"]
+
+LISTS = "softras_{split}.lst"
+RIGID = 1e-2  # by which R R^T may differ from the identity; IDR's world_mat holds focal lengths of hundreds of pixels
+
+
+def is_nmr(folder: Path) -> bool:
+    """Whether a folder holds one object of NMR's renderings: IDR's files, but poses and calibrations apart."""
+    path = folder / "cameras.npz"
+    if not (path.is_file() and (folder / "image").is_dir() and zipfile.is_zipfile(path)):
+        return False
+    try:
+        arrays = read_arrays(path, {"world_mat_0", "camera_mat_0", "scale_mat_0"})
+    except DataError:
+        return False
+    world = arrays.get("world_mat_0")
+    if world is None or "camera_mat_0" not in arrays or "scale_mat_0" in arrays or world.shape not in ((3, 4), (4, 4)):
+        return False
+    return bool(np.abs(world[:3, :3] @ world[:3, :3].T - np.eye(3)).max() < RIGID)
+
+
+def read_nmr(
+    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
+) -> Posed:
+    """The posed pictures of one object; the world is ShapeNet's, y up.
+
+    Args:
+        folder: with cameras.npz and image/.
+        bounds: of the scene; estimated when None.
+        downscale: as in `assemble`.
+        root: no file may lie outside of it, symbolic links followed; the folder when None.
+
+    Returns:
+        The pictures in the order of their names; the principal point is the middle of each.
+
+    Raises:
+        DataError: no picture, or cameras that are missing or none.
+    """
+    folder, root = Path(folder), root or Path(folder)
+    source = folder / "cameras.npz"
+    pictures = list_files(folder / "image", PICTURE_SUFFIXES, root)
+    if not pictures:
+        raise DataError(folder / "image", "pictures", "none", "download the object again")
+    wanted = {f"{kind}_{index}" for kind in ("world_mat", "camera_mat") for index in range(len(pictures))}
+    arrays = read_arrays(source, wanted, root)
+    masks = find_masks([folder / "mask"], pictures, root)
+    frames = []
+    for index, (path, mask) in enumerate(zip(pictures, masks, strict=True)):
+        pose = check_pose(_matrix(arrays, f"world_mat_{index}", source), source, path.name)
+        focal = np.abs(np.diagonal(_matrix(arrays, f"camera_mat_{index}", source))[:2]).astype(np.float64)
+        frames.append(Frame(path, f"image/{path.name}", pose, _Calibration(focal), mask=mask))
+    return assemble(frames, source, bounds=bounds, downscale=downscale)[0]
+
+
+def catalogue(folder: Path) -> Catalogue | None:
+    """The catalogue of a folder of classes, or of one class; None where no list of objects lies there.
+
+    Args:
+        folder: what may be in this layout.
+
+    Returns:
+        The splits of the lists, views alternating between support and query. Objects whose folder is missing are
+        skipped and counted.
+
+    Raises:
+        DataError: names in a list that are no plain ones, or no folder of any of them.
+    """
+    homes = [folder] if _lists(folder) else [child for child in sorted(folder.iterdir()) if _lists(child)]
+    if not homes:
+        return None
+    paths: dict[str, Path] = {}
+    splits: dict[str, tuple[str, ...]] = dict.fromkeys(SPLITS, ())
+    skipped, objects = [], {}
+    for home in homes:
+        for split, path in _lists(home).items():
+            names = [name.strip() for name in read_text(path, LARGEST_TEXT, folder).splitlines() if name.strip()]
+            if wrong := [name for name in names if not is_plain(name)]:
+                raise DataError(path, "a plain name of a folder in every line", repr(wrong[0])[:60], "correct the list")
+            found = {name: home / name for name in names if (home / name).is_dir()}
+            if len(found) < len(names):
+                skipped.append(f"{path}: skipped {len(names) - len(found)} of {len(names)} objects without a folder")
+            paths |= found
+            splits[split] += tuple(found)
+            objects |= {name: {"class": home.resolve().name} for name in found}
+    if not paths:
+        raise DataError(folder, "the objects that its lists name", "none of their folders", "download them again")
+
+    def read(name: str) -> PosedTask:
+        return PosedTask.alternating(read_nmr(paths[name], root=folder), name)
+
+    return Catalogue("nmr", splits, read, {"objects": objects}, tuple(skipped))
+
+
+def _lists(folder: Path) -> dict[str, Path]:
+    """The lists of objects in the folder of a class, by split."""
+    paths = {split: folder / LISTS.format(split=split) for split in SPLITS}
+    return {split: path for split, path in paths.items() if path.is_file()}
+
+
+class _Calibration:
+    """The calibration of a picture from focal lengths in halves of its width and of its height."""
+
+    def __init__(self, focal: npt.NDArray[np.float64]) -> None:
+        self.focal = focal
+
+    def __call__(self, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+        height, width = size
+        x, y = self.focal * [width / 2, height / 2]
+        return np.array([[x, 0.0, (width - 1) / 2], [0.0, y, (height - 1) / 2], [0.0, 0.0, 1.0]])
+
+
+def _matrix(arrays: dict[str, npt.NDArray[np.float64]], name: str, source: Path) -> npt.NDArray[np.float64]:
+    value = arrays.get(name)
+    if value is None or value.ndim != 2 or min(value.shape) < 2 or not np.issubdtype(value.dtype, np.number):
+        found = "nothing" if value is None else f"{value.dtype} {value.shape}"
+        raise DataError(source, f"a matrix {name}", found, "download the object again")
+    return value

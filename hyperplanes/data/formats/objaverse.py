@@ -1,0 +1,175 @@
+"""Folders of many objects rendered by Blender: Objaverse's views as Zero-1-to-3 publishes them, and OmniObject3D.
+
+Zero-1-to-3 (Liu et al., 2023): OBJECT/000.png, transparent, beside OBJECT/000.npy, camera_from_world (3, 4) in
+Blender's axes; a lens of 35 mm on 32 mm; objects fill a unit cube; valid_paths.json lists objects, of which the last
+hundredth is kept to test on. OmniObject3D (Wu et al., 2023): CATEGORY/OBJECT/render/transforms.json beside images/; the
+first three objects of a category are kept to test on, as in the authors' benchmarks.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from hyperplanes.data.formats.catalogue import Catalogue, is_plain
+from hyperplanes.data.formats.transforms_json import read_transforms
+from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.axes import flip_camera_axes
+from hyperplanes.utilities.files import MALFORMED, DataError, list_files, read_bytes, read_text
+
+__all__ = ["is_omniobject", "is_rendered", "objaverse", "omniobject", "read_omniobject", "read_rendered"]
+
+FOCAL = 35 / 32  # of the width
+CUBE = Sphere((0.0, 0.0, 0.0), math.sqrt(3) / 2)
+HELD_OUT = 3  # objects of a category of OmniObject3D
+VALID = "valid_paths.json"
+_LARGEST_ARRAY = 4096
+_REMEDY = "download the object again"
+
+
+def is_rendered(folder: Path) -> bool:
+    """Whether a folder holds one object as Zero-1-to-3's script renders it."""
+    return (folder / "000.png").is_file() and (folder / "000.npy").is_file()
+
+
+def read_rendered(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+    """The posed pictures of one object of Objaverse; the world is Blender's, z up.
+
+    Args:
+        folder: of the object.
+        downscale: as in `assemble`.
+        root: no file may lie outside of it, symbolic links followed; the folder when None.
+
+    Returns:
+        The pictures in the order of their numbers.
+
+    Raises:
+        DataError: a picture without its camera, or one that is none.
+    """
+    folder, root = Path(folder), root or Path(folder)
+    frames = []
+    for path in list_files(folder, {".png"}, root):
+        camera = path.with_suffix(".npy")
+        try:
+            matrix = np.load(io.BytesIO(read_bytes(camera, _LARGEST_ARRAY, root)), allow_pickle=False)
+        except DataError:
+            raise
+        except FileNotFoundError as error:
+            raise DataError(camera, f"the camera of {path.name}", "nothing", _REMEDY) from error
+        except (*MALFORMED, OSError) as error:
+            raise DataError(camera, "an array (3, 4)", str(error), _REMEDY) from error
+        pose = check_pose(matrix, camera, path.name)
+        frames.append(Frame(path, path.name, flip_camera_axes(pose.T).T, _calibration))
+    return assemble(frames, folder, bounds=CUBE, downscale=downscale)[0]
+
+
+def objaverse(folder: Path) -> Catalogue | None:
+    """The catalogue of a folder of such objects; None where it is something else.
+
+    Args:
+        folder: what may hold objects, and valid_paths.json.
+
+    Returns:
+        The objects, all of them to test on where no list says otherwise; views alternate between support and query.
+
+    Raises:
+        DataError: a list that is none of plain names.
+    """
+    names = [child.name for child in sorted(folder.iterdir()) if child.is_dir() and is_rendered(child)]
+    if not names:
+        return None
+    splits, skipped = {"train": (), "val": (), "test": tuple(names)}, ()
+    if (path := folder / VALID).is_file():
+        try:
+            listed = json.loads(read_text(path, root=folder))
+        except (ValueError, RecursionError) as error:
+            raise DataError(path, "a list of names", str(error), _REMEDY) from error
+        if not isinstance(listed, list) or not all(isinstance(name, str) and is_plain(name) for name in listed):
+            raise DataError(path, "a list of plain names of folders", repr(listed)[:60], "correct the list")
+        cut = math.floor(len(listed) / 100 * 99)
+        there = set(names)
+        train, test = (tuple(name for name in part if name in there) for part in (listed[:cut], listed[cut:]))
+        splits = {"train": train, "val": (), "test": test}
+        if missing := len(listed) - len(train) - len(test):
+            skipped = (f"{path}: skipped {missing} of {len(listed)} objects without a folder",)
+
+    def read(name: str) -> PosedTask:
+        return PosedTask.alternating(read_rendered(folder / name, root=folder), name)
+
+    return Catalogue("objaverse", splits, read, skipped=skipped)
+
+
+def is_omniobject(folder: Path) -> bool:
+    """Whether a folder holds one object of OmniObject3D's renderings."""
+    return (folder / "render" / "transforms.json").is_file() and (folder / "render" / "images").is_dir()
+
+
+def read_omniobject(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+    """The posed pictures of one object of OmniObject3D; the world is Blender's, z up.
+
+    Their background is black and there is no alpha: where every pixel of the border is black, what is not black is the
+    object.
+
+    Args:
+        folder: CATEGORY/OBJECT.
+        downscale: as in `assemble`.
+        root: no file may lie outside of it, symbolic links followed; the folder when None.
+
+    Returns:
+        The pictures in the order of the file. Anything wrong with a file is a DataError.
+    """
+    folder = Path(folder)
+    found = read_transforms(folder / "render" / "transforms.json", downscale=downscale, root=root or folder)
+    border = torch.cat([found.rgba[:, :3, [0, -1]].flatten(1), found.rgba[:, :3, :, [0, -1]].flatten(1)], 1)
+    if found.has_alpha or border.any():
+        return found
+    rgba = found.rgba.clone()
+    rgba[:, 3] = rgba[:, :3].amax(1).clamp_max(1) * 255
+    return replace(found, rgba=rgba, has_alpha=True)
+
+
+def omniobject(folder: Path) -> Catalogue | None:
+    """The catalogue of blender_renders/, of what holds it, or of one category; None where it is something else.
+
+    Args:
+        folder: what may be in this layout.
+
+    Returns:
+        The objects, of each category the first three to test on; views alternate between support and query.
+    """
+    top = folder / "blender_renders" if (folder / "blender_renders").is_dir() else folder
+    homes = {child.name: child for child in sorted(top.iterdir()) if child.is_dir() and is_omniobject(child)}
+    paths = {top.resolve().name: homes} if homes else {}
+    if not paths:
+        for category in (child for child in sorted(top.iterdir()) if child.is_dir()):
+            objects = {child.name: child for child in sorted(category.iterdir()) if child.is_dir()}
+            if found := {name: path for name, path in objects.items() if is_omniobject(path)}:
+                paths[category.name] = found
+    if not paths:
+        return None
+    splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
+    for found in paths.values():
+        splits["test"] += tuple(found)[:HELD_OUT]
+        splits["train"] += tuple(found)[HELD_OUT:]
+    where = {name: path for found in paths.values() for name, path in found.items()}
+    classes = {name: {"class": category} for category, found in paths.items() for name in found}
+
+    def read(name: str) -> PosedTask:
+        return PosedTask.alternating(read_omniobject(where[name], root=folder), name)
+
+    return Catalogue("omniobject3d", splits, read, {"objects": classes})
+
+
+def _calibration(size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    height, width = size
+    focal = FOCAL * width
+    return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
