@@ -15,19 +15,13 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
+from hyperplanes.utilities.arguments import kind_of
 
 __all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views"]
 
 
 MOST = 1.5
 """Above which numbers of a picture cannot be meant to lie in [0, 1]; what is rendered may lie a little outside."""
-
-
-def kind_of(value: object) -> str:
-    """What a value is, for a message."""
-    if isinstance(value, Tensor):
-        return f"a tensor of {str(value.dtype).removeprefix('torch.')}, shape {tuple(value.shape)}"
-    return "None" if value is None else f"a {type(value).__module__}.{type(value).__name__}".replace("builtins.", "")
 
 
 def check_values(name: str, values: object) -> None:

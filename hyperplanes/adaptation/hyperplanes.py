@@ -24,6 +24,7 @@ from hyperplanes.fields.rig import Rig, standpoints
 from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanes", "ModelConfig"]
@@ -106,6 +107,7 @@ class HyperPlanes(nn.Module):
         """
         return arrange(support, self.target, self.known_rig)
 
+    @checked
     def prepare(self, support: Views, *, carved: bool = True) -> SupportContext:
         """All that depends on the support views and not on weights.
 
@@ -192,6 +194,7 @@ class HyperPlanes(nn.Module):
         seen = self.field(context, weights).render(context.views.cameras)
         return replace(context, planes=self.target.with_surface(context.planes, seen.depth[:, 0], seen.opacity[:, 0]))
 
+    @checked
     def fine_tune(
         self,
         support: Views,

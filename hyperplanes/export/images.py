@@ -16,6 +16,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import Renderable
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.files import encode_png, write_whole
 from hyperplanes.views import Views
 
@@ -32,6 +33,7 @@ __all__ = [
 TURNTABLE_FORMATS = ("webp", "gif")
 
 
+@checked
 def to_pixels(images: Float[Tensor, "view 3 height width"]) -> npt.NDArray[np.uint8]:
     """Images in [0, 1] as 8-bit pixels (view, height, width, 3); what lies outside is clamped.
 
@@ -69,6 +71,7 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
     return buffer.getvalue()
 
 
+@checked
 def save_images(
     images: Float[Tensor, "view 3 height width"], folder: str | Path, names: Sequence[str] = ()
 ) -> list[Path]:
@@ -108,6 +111,7 @@ def upward(cameras: PinholeCamera) -> tuple[float, float, float]:
     return x, y, z
 
 
+@checked
 def orbit_cameras(
     views: Views, count: int, *, size: int | None = None, elevation: float = math.radians(20.0)
 ) -> PinholeCamera:
@@ -152,6 +156,7 @@ def orbit_cameras(
     return camera.resized(batch, max(1, round(height * scale)), max(1, round(width * scale)))
 
 
+@checked
 def save_turntable(
     field: Renderable, views: Views, path: str | Path, *, frames: int = 48, size: int | None = None
 ) -> Path:

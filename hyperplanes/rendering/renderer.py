@@ -18,6 +18,7 @@ from hyperplanes.rendering.integration import integrate
 from hyperplanes.rendering.marching import Marched
 from hyperplanes.rendering.samplers import Sampler
 from hyperplanes.rendering.scene import FieldFunction, Scene
+from hyperplanes.utilities.arguments import checked
 
 __all__ = ["FieldFunction", "Hierarchical", "Marched", "Sampler", "allow_tf32", "render"]
 
@@ -54,6 +55,7 @@ def render(
 ) -> Rendered: ...
 
 
+@checked
 def render(
     field: FieldFunction,
     target: PinholeCamera | Rays,

@@ -6,9 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hyperplanes.utilities.arguments import checked
+
 __all__ = ["foreground_psnr", "pooled_psnr", "psnr", "ssim"]
 
 
+@checked
 def psnr(
     predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
 ) -> Float[Tensor, " view"]:
@@ -55,6 +58,7 @@ def foreground_psnr(
     return -10 * torch.log10(error / inside.flatten(1).sum(1))
 
 
+@checked
 def ssim(
     predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
 ) -> Float[Tensor, " view"]:

@@ -1,0 +1,57 @@
+"""Source of truth: wrong calls of people who come from NumPy and other libraries; each is a line with the name."""
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+
+from hyperplanes.export.images import orbit_cameras, save_images
+from hyperplanes.rendering.renderer import render
+from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.metrics import psnr
+from tests.reference_rendering import ring
+
+PICTURES = torch.zeros(1, 3, 4, 4)
+
+
+@pytest.fixture
+def unchecked():
+    """Without the type checks of the tests, as users run it."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def field(points, directions):
+    return points, points[:, :1]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: save_images(PICTURES[0], "x"), r"images: expected a tensor \(view 3 height width\), got a tensor of"),
+        (lambda: save_images(PICTURES.numpy(), "x"), "images: expected a tensor .*, got a numpy.ndarray"),
+        (lambda: save_images(PICTURES, None), "folder: expected str or Path, got None"),
+        (lambda: psnr(PICTURES, None), "truth: expected a tensor .*, got None"),
+        (lambda: psnr(PICTURES, PICTURES.byte()), "truth: expected a tensor .*, got a tensor of uint8"),
+        (lambda: orbit_cameras(None, 3), "views: expected Views, got None"),
+        (lambda: orbit_cameras("example-car", 3), "views: expected Views, got 'example-car'"),
+        (lambda: render(field, None), "target: expected PinholeCamera or Rays, got None"),
+        (lambda: render(field, ring(1, (4, 4)), background="white"), "background: expected float, got 'white'"),
+    ],
+)
+def test_arguments_of_another_type_are_named(call, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        call()
+
+
+def test_right_arguments_pass():
+    @checked
+    def scaled(value: float, times: int = 1, name: str | None = None):
+        return value * times
+
+    assert scaled(2, np.int64(3), name="a") == 6
+    assert scaled(np.float32(2.0)) == 2
+    with pytest.raises(ValueError, match="times: expected int, got True"):
+        scaled(1.0, True)
