@@ -43,7 +43,7 @@ class _WithoutDepth(AnyOrderNeRF):
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> VisibilityPlanes:
         planes = super().planes_of(views, occupancy)
-        planes.guides[..., 0] = 1e3  # the first surface lies behind everything
+        planes.depth_opacity[..., 0] = 1e3  # the first surface lies behind everything
         return planes
 
 
@@ -52,7 +52,7 @@ class _WithoutCoverage(AnyOrderNeRF):
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> VisibilityPlanes:
         planes = super().planes_of(views, occupancy)
-        planes.guides[..., 1] = 1.0
+        planes.depth_opacity[..., 1] = 1.0
         return planes
 
 

@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
 
         def plain(planes: VisibilityPlanes = planes, at=points, along=directions) -> Visibility:
             with torch.no_grad():
-                return planes._choose_torch(at, along, BEST, NEAREST + 1, planes.guides)
+                return planes._choose_torch(at, along, BEST, NEAREST + 1, planes.depth_opacity)
 
         first, second = compiled(), plain()
         agreeing = float((first.best.penalty - second.best.penalty).abs().lt(1e-3).float().mean())

@@ -132,7 +132,7 @@ class Dataset:
 
 
 def _check_apart(folder: Path, splits: Mapping[str, Sequence[str]]) -> None:
-    """Nothing, where every object is in one split, once: what is trained on may not be judged by."""
+    """Check that every object is in one split, once: what is trained on may not be judged by."""
     seen: dict[str, str] = {}
     for split, names in splits.items():
         for name in names:

@@ -21,7 +21,7 @@ __all__ = ["COUNTS", "PACKAGED", "write_first_look"]
 
 PACKAGED = "small"
 COUNTS = (3, 10, 25)
-"""Numbers of views that are shown of each object."""
+"""ArrayLike of views that are shown of each object."""
 
 LOOKS = 2  # query views of each object on the page
 

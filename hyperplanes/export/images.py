@@ -80,7 +80,7 @@ def save_images(
     Args:
         images: RGB in [0, 1].
         folder: made where absent.
-        names: of the files, without ending; folders in them are dropped. Numbers where absent.
+        names: of the files, without ending; folders in them are dropped. ArrayLike where absent.
 
     Returns:
         The files.

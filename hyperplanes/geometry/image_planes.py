@@ -13,7 +13,7 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry import lookup_torch
 from hyperplanes.geometry.distortion import DistortedCamera, distorted_pixels
-from hyperplanes.geometry.inputs import Numbers, as_images, as_indices, as_points, check_indices
+from hyperplanes.geometry.inputs import ArrayLike, as_images, as_indices, as_points, check_indices
 from hyperplanes.geometry.lookup import Lookup, choose, lookup
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.notebooks import show_views
@@ -30,7 +30,7 @@ class ImagePlanes:
 
     def __init__(
         self,
-        images: Numbers,
+        images: ArrayLike,
         cameras: PinholeCamera,
         background: float = 1.0,
         *,
@@ -91,8 +91,8 @@ class ImagePlanes:
 
     def lookup(
         self,
-        points: Numbers,
-        views: Numbers | None = None,
+        points: ArrayLike,
+        views: ArrayLike | None = None,
         *,
         return_directions: bool = False,
     ) -> Lookup:

@@ -9,13 +9,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-__all__ = ["Numbers", "as_images", "as_indices", "as_matrices", "as_points", "as_tensor", "check_indices"]
+__all__ = ["ArrayLike", "as_images", "as_indices", "as_matrices", "as_points", "as_tensor", "check_indices"]
 
-Numbers: TypeAlias = Tensor | npt.NDArray[Any]
+ArrayLike: TypeAlias = Tensor | npt.NDArray[Any]
 """A tensor, or a NumPy array of the same shape."""
 
 
-def as_tensor(name: str, value: Numbers) -> Tensor:
+def as_tensor(name: str, value: ArrayLike) -> Tensor:
     """A tensor as it is, a NumPy array as a tensor on the CPU.
 
     Raises:
@@ -36,7 +36,7 @@ def _floating(value: Tensor) -> Tensor:
     return value if value.is_floating_point() else value.to(torch.get_default_dtype())
 
 
-def as_points(points: Numbers) -> Tensor:
+def as_points(points: ArrayLike) -> Tensor:
     """Points (point, 3) in a floating-point type; whole numbers take PyTorch's default one.
 
     Raises:
@@ -52,7 +52,7 @@ def as_points(points: Numbers) -> Tensor:
     return _floating(points)
 
 
-def as_matrices(matrices: Numbers, views: int) -> Tensor:
+def as_matrices(matrices: ArrayLike, views: int) -> Tensor:
     """Projection matrices (view, 3, 4), one a plane.
 
     Raises:
@@ -66,7 +66,7 @@ def as_matrices(matrices: Numbers, views: int) -> Tensor:
     return matrices
 
 
-def as_images(images: Numbers, name: str = "images") -> Tensor:
+def as_images(images: ArrayLike, name: str = "images") -> Tensor:
     """Images (view, channel, height, width) in a floating-point type; 8-bit ones are divided by 255.
 
     Args:
@@ -97,7 +97,7 @@ def as_images(images: Numbers, name: str = "images") -> Tensor:
     return _floating(images)
 
 
-def as_indices(views: Numbers, points: Tensor) -> Tensor:
+def as_indices(views: ArrayLike, points: Tensor) -> Tensor:
     """Indices of planes (point, chosen), on the points' device; `check_indices` looks at their values.
 
     Raises:
@@ -112,7 +112,7 @@ def as_indices(views: Numbers, points: Tensor) -> Tensor:
 
 
 def check_indices(views: Tensor, planes: int) -> None:
-    """Nothing, where all are indices of planes; under `torch.compile` and `torch.func` values cannot be looked at.
+    """Check that all are indices of planes; under `torch.compile` and `torch.func` values cannot be looked at.
 
     Called once a lookup, right before indexing: one pass over the indices is up to 2 % of its time.
 

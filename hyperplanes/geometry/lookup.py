@@ -10,7 +10,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hyperplanes.geometry import lookup_torch
-from hyperplanes.geometry.inputs import Numbers, as_images, as_indices, as_matrices, as_points, as_tensor, check_indices
+from hyperplanes.geometry.inputs import (
+    ArrayLike,
+    as_images,
+    as_indices,
+    as_matrices,
+    as_points,
+    as_tensor,
+    check_indices,
+)
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.packed_images import PackedImages
 
@@ -83,10 +91,10 @@ def choose(points: Tensor, images: Tensor) -> str:
 
 
 def lookup(
-    points: Numbers,
-    matrices: Numbers,
-    images: Numbers,
-    views: Numbers | None = None,
+    points: ArrayLike,
+    matrices: ArrayLike,
+    images: ArrayLike,
+    views: ArrayLike | None = None,
     *,
     background: float = 1.0,
     nearest: float = MIN_Z,
@@ -147,8 +155,8 @@ def lookup(
 
 
 def sample(
-    images: Numbers,
-    coordinates: Numbers,
+    images: ArrayLike,
+    coordinates: ArrayLike,
     *,
     background: float = 1.0,
     packed: PackedImages | None = None,

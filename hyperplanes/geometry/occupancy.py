@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool3d, pad
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
-from hyperplanes.geometry.inputs import Numbers, as_images
+from hyperplanes.geometry.inputs import ArrayLike, as_images
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
@@ -91,7 +91,7 @@ def full(bounds: Sphere, side: int = 64, device: torch.device | str | None = Non
 
 
 @torch.no_grad()
-def carve(masks: Numbers, cameras: PinholeCamera, bounds: Sphere, side: int = 64, votes: int = 1) -> Occupancy:
+def carve(masks: ArrayLike, cameras: PinholeCamera, bounds: Sphere, side: int = 64, votes: int = 1) -> Occupancy:
     """The visual hull: voxels that no mask rules out, or fewer masks than `votes`.
 
     A voxel is cleared where some image contains the whole projection of the voxel's bounding ball and no pixel of the

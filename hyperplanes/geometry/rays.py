@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera, undistorted_pixels
-from hyperplanes.geometry.inputs import Numbers, as_tensor
+from hyperplanes.geometry.inputs import ArrayLike, as_tensor
 
 __all__ = ["Rays", "Sphere", "cast", "pixel_grid"]
 
@@ -85,8 +85,8 @@ def pixel_grid(height: int, width: int, device: torch.device | str | None = None
 
 def cast(
     cameras: PinholeCamera,
-    view: Numbers,
-    pixels: Numbers,
+    view: ArrayLike,
+    pixels: ArrayLike,
     bounds: Sphere | None = None,
     *,
     span: str = "sphere",

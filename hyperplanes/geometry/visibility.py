@@ -15,7 +15,7 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.inputs import Numbers
+from hyperplanes.geometry.inputs import ArrayLike
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
@@ -109,7 +109,7 @@ class VisibilityPlanes:
         self.occupancy = occupancy
         depth = first_hits(occupancy, cameras, masks).to(images)
         opacity = torch.ones_like(images[:, 0]) if masks is None else masks[:, 0].to(images)
-        self.guides: Float[Tensor, "view height width 2"] = torch.stack([depth, opacity], -1)
+        self.depth_opacity: Float[Tensor, "view height width 2"] = torch.stack([depth, opacity], -1)
         matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
@@ -144,7 +144,7 @@ class VisibilityPlanes:
             opacity: where it is 0.5 or less, and where the surface lies before that of the hull, the hull's counts.
         """
         result = copy.copy(self)
-        hull, mask = self.guides.unbind(-1)
+        hull, mask = self.depth_opacity.unbind(-1)
         surface = torch.where(opacity > 0.5, torch.maximum(distances, hull), hull)
         result._surface = torch.stack([surface, mask], -1)
         return result
@@ -172,16 +172,16 @@ class VisibilityPlanes:
         """
         best, nearest = min(best, len(self)), min(nearest + 1, len(self)) if directions is not None else 0
         pinholes = not isinstance(self.colours.cameras, DistortedCamera)
-        compiled = find_spec("numba") and points.device.type == "cpu" and self.guides.numel() < 2**31
+        compiled = find_spec("numba") and points.device.type == "cpu" and self.depth_opacity.numel() < 2**31
         fast = compiled and points.dtype == torch.float32 and pinholes
         choose = self._choose_compiled if fast else self._choose_torch
         if self._surface is None or directions is None:
-            return choose(points, directions, best, nearest, self.guides)
+            return choose(points, directions, best, nearest, self.depth_opacity)
         near = choose(points, directions, 1, nearest, self._surface).nearest
-        return replace(choose(points, None, best, 0, self.guides), nearest=near)
+        return replace(choose(points, None, best, 0, self.depth_opacity), nearest=near)
 
     def _choose_compiled(
-        self, points: Tensor, directions: Tensor | None, best: int, nearest: int, guides: Tensor
+        self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
     ) -> Visibility:
         """As `choose`, by the compiled kernel."""
         count = len(points)
@@ -191,8 +191,8 @@ class VisibilityPlanes:
         overall = torch.empty(count, 2)
         along = points[:0] if directions is None else directions
         cameras = torch.cat([self._cameras, (~self._hidden).to(points)[None]])
-        fixed = [each.contiguous().flatten().numpy() for each in (points, along, cameras, guides)]
-        shape = (*guides.shape[:3], best, nearest, len(self))
+        fixed = [each.contiguous().flatten().numpy() for each in (points, along, cameras, depth_opacity)]
+        shape = (*depth_opacity.shape[:3], best, nearest, len(self))
         numbers = np.array([*limits, UNSEEN, ANGLE], np.float32)
         outputs = [each.flatten().numpy() for each in (views[0], values[0], views[1], values[1], overall)]
         kernel = compile_kernel("visibility.choose", torch.float32)
@@ -201,10 +201,10 @@ class VisibilityPlanes:
         return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
 
     def _choose_torch(
-        self, points: Tensor, directions: Tensor | None, best: int, nearest: int, guides: Tensor
+        self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
     ) -> Visibility:
         """As `choose`, in plain PyTorch."""
-        planes = ImagePlanes(guides.permute(0, 3, 1, 2), self.colours.cameras, exact=True)
+        planes = ImagePlanes(depth_opacity.permute(0, 3, 1, 2), self.colours.cameras, exact=True)
         found = planes.lookup(points, return_directions=True)
         assert found.directions is not None
         assert found.distances is not None
@@ -234,7 +234,7 @@ def _split(values: Float[Tensor, "point chosen 6"]) -> tuple[Tensor, Tensor, Ten
 
 @torch.no_grad()
 def first_hits(
-    occupancy: Occupancy, cameras: PinholeCamera, masks: Numbers | None = None
+    occupancy: Occupancy, cameras: PinholeCamera, masks: ArrayLike | None = None
 ) -> Float[Tensor, "view height width"]:
     """The distance from each camera to the first occupied voxel along the ray of each pixel.
 

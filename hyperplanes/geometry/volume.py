@@ -30,7 +30,7 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
         of these colours and the penalty of the best view brought nothing (docs/any_order.md).
     """
     occupancy = planes.occupancy
-    share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.guides), SIDE)[0, 0]
+    share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.depth_opacity), SIDE)[0, 0]
     cells = (share > 0).nonzero()
     unit = (cells.to(share) + 0.5) * (2 / SIDE) - 1
     points = unit * occupancy.bounds.radius + unit.new_tensor(occupancy.bounds.centre)

@@ -148,7 +148,7 @@ def check_regular(path: str | Path, largest: int = LARGEST_FILE, root: str | Pat
 
 
 def check_link(path: str | Path, root: str | Path) -> None:
-    """Nothing, where a path lies inside a folder, symbolic links followed.
+    """Check that a path lies inside a folder, symbolic links followed.
 
     Args:
         path: of a file or a folder, which need not be there.

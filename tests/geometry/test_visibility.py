@@ -82,7 +82,7 @@ def slow_penalties(shown, points, hidden=()):
                 continue
             u, v = min(max(u / w, 0), width - 1), min(max(v / w, 0), height - 1)
             column, row = min(int(u), width - 2), min(int(v), height - 2)
-            corners = shown.guides[view, row : row + 2, column : column + 2]
+            corners = shown.depth_opacity[view, row : row + 2, column : column + 2]
             top = corners[0, 0] * (1 - u + column) + corners[0, 1] * (u - column)
             low = corners[1, 0] * (1 - u + column) + corners[1, 1] * (u - column)
             depth, opacity = (top * (1 - v + row) + low * (v - row)).tolist()
@@ -149,7 +149,7 @@ def test_the_nearest_views_are_judged_by_the_surface_that_is_given_and_the_best_
     loose, tight = (
         VisibilityPlanes(views.images, views.cameras, views.masks, grid) for grid in (full(Sphere(), 64), ball())
     )
-    surface, everywhere = tight.guides[..., 0], torch.ones(len(views), *SIZE)
+    surface, everywhere = tight.depth_opacity[..., 0], torch.ones(len(views), *SIZE)
     hidden = torch.tensor([2])
     wanted = loose.with_surface(surface, everywhere).hiding(hidden).choose(points, directions, best=3, nearest=2)
     by_hull, by_ball = (each.hiding(hidden).choose(points, directions, best=3, nearest=2) for each in (loose, tight))

@@ -26,7 +26,7 @@ __all__ = [
     "place",
     "project",
     "scratch",
-    "start_pull",
+    "start_gradient",
     "unnormalize",
 ]
 
@@ -148,7 +148,7 @@ def unnormalize(s, count, values, at, by, height, width):
 
 @inner
 @no_type_check
-def start_pull(s, height, width):
+def start_gradient(s, height, width):
     """Gradients of coordinates in COLUMN, ROW -> GRAD_U, GRAD_V."""
     per_column = s.dtype.type(2) / s.dtype.type(max(width - 1, 1))
     per_row = s.dtype.type(2) / s.dtype.type(max(height - 1, 1))

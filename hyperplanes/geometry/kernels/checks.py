@@ -16,7 +16,7 @@ _MOST_PIXELS = 2**31  # the kernels count an image's pixels in 32 bits
 def check_lookup(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None
 ) -> None:
-    """Nothing, where a lookup's kernels stay inside these tensors.
+    """Check that a lookup's kernels stay inside these tensors.
 
     Raises:
         ValueError: a shape, type or index that they would leave them by.
@@ -40,7 +40,7 @@ def check_lookup(
 
 
 def check_sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bits: int) -> None:
-    """Nothing, where the kernels of sampling stay inside these tensors.
+    """Check that the kernels of sampling stay inside these tensors.
 
     Raises:
         ValueError: a shape or type that they would leave them by.
@@ -54,7 +54,7 @@ def check_sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bit
 
 
 def check_gradient(name: str, gradient: Tensor | None, shape: tuple[int, ...], like: Tensor) -> None:
-    """Nothing, where an incoming gradient is that of a result of this shape.
+    """Check that an incoming gradient is that of a result of this shape.
 
     Raises:
         ValueError: another shape or type.

@@ -25,7 +25,7 @@ from hyperplanes.geometry.kernels.blocks import (
     copy,
     inlined,
     scratch,
-    start_pull,
+    start_gradient,
 )
 from hyperplanes.geometry.kernels.interpolation import interleave, pull_packed, pull_pixels, pull_plane, room
 from hyperplanes.geometry.kernels.llvm import add_pixels, load, store
@@ -62,7 +62,7 @@ def backward(points, pitch, matrices, given, by, images, packed, bits, height, w
                 at = p * per_coordinate[0] + view * per_coordinate[1]
                 copy(s, COLUMN, count, grad_coordinates, at, per_coordinate[0])
                 copy(s, ROW, count, grad_coordinates, at + per_coordinate[2], per_coordinate[0])
-                start_pull(s, height, width)
+                start_gradient(s, height, width)
             if given is not None:
                 s[GRAD_U : GRAD_V + BLOCK] = 0
             if bits:
