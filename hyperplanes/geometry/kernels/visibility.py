@@ -82,7 +82,7 @@ def _place(s, pitch, total, x, y, z, cameras, shape, min_z):
 
 @inner
 @no_type_check
-def _judge(s, pitch, total, along_x, along_y, along_z, depth_opacity, shape, limits):
+def _judge(s, pitch, total, along_x, along_y, along_z, maps, shape, limits):
     """Reads depth and opacity where a point falls into each view, and computes the penalties and scores."""
     number = s.dtype.type
     zero, one = number(0), number(1)
@@ -93,11 +93,11 @@ def _judge(s, pitch, total, along_x, along_y, along_z, depth_opacity, shape, lim
         at, across, down = load_int(s, AT * pitch, k), load(s, ACROSS * pitch + k), load(s, DOWN * pitch + k)
         right, below = np.int32(at + across_next), np.int32(at + down_next)
         beyond = np.int32(below + across_next)
-        a, b = read(depth_opacity, 0, at), read(depth_opacity, 0, below)
-        a, b = a + across * (read(depth_opacity, 0, right) - a), b + across * (read(depth_opacity, 0, beyond) - b)
+        a, b = read(maps, 0, at), read(maps, 0, below)
+        a, b = a + across * (read(maps, 0, right) - a), b + across * (read(maps, 0, beyond) - b)
         depth = a + down * (b - a)
-        a, b = read(depth_opacity, 1, at), read(depth_opacity, 1, below)
-        a, b = a + across * (read(depth_opacity, 1, right) - a), b + across * (read(depth_opacity, 1, beyond) - b)
+        a, b = read(maps, 1, at), read(maps, 1, below)
+        a, b = a + across * (read(maps, 1, right) - a), b + across * (read(maps, 1, beyond) - b)
         opacity = a + down * (b - a)
         shown = load(s, SHOWN * pitch + k) > zero
         behind = (load(s, DISTANCE * pitch + k) - depth) * per_unit
@@ -134,24 +134,13 @@ def _keep(s, pitch, total, row, count, views, values, scores, start):
 
 @no_type_check
 def choose(
-    points,
-    directions,
-    cameras,
-    depth_opacity,
-    shape,
-    limits,
-    best,
-    best_values,
-    near,
-    near_values,
-    overall,
-    start,
-    stop,
+    points, directions, cameras, maps, shape, limits, best, best_values, near, near_values, overall, start, stop
 ):
     """Writes the chosen views of points start..stop. All arrays are flat.
 
     `cameras` holds 16 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
-    matrix, and 0 where it is hidden. `depth_opacity` is (view, row, column, 2). `shape` is the number of views, height, width, the numbers of chosen views, and the pitch; `limits` min_z, 1 / radius, the tolerance,
+    matrix, and 0 where it is hidden. `maps` (view, row, column, 2) hold depth and opacity. `shape` is the number of
+    views, height, width, the numbers of chosen views, and the pitch; `limits` min_z, 1 / radius, the tolerance,
     DEEPEST, PARTLY, WHOLE, UNSEEN and ANGLE. `best` and `near` (point, chosen) get indices of views, their values
     (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each, and `overall` (point, 2) the least
     opacity and the number of the views that show the point. Where there are no directions nothing is written to `near`.
@@ -165,7 +154,7 @@ def choose(
         _place(s, pitch, total, points[at], points[at + 1], points[at + 2], cameras, shape, limits[0])
         if near_count:
             along_x, along_y, along_z = directions[at], directions[at + 1], directions[at + 2]
-        _judge(s, pitch, total, along_x, along_y, along_z, depth_opacity, shape, limits)
+        _judge(s, pitch, total, along_x, along_y, along_z, maps, shape, limits)
         covered, seen = number(1), number(0)
         for k in range(total):
             covered = min(covered, load(s, OPACITY * pitch + k))
