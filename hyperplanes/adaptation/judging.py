@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 
-from hyperplanes.adaptation.context import live_pixels
+from hyperplanes.adaptation.context import SupportContext, live_pixels
+from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.fields.rig import standpoints
 from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-if TYPE_CHECKING:
-    from hyperplanes.adaptation.hyperplanes import HyperPlanes
-
-__all__ = ["FEWEST", "STRENGTHS", "judge_strength"]
+__all__ = ["FEWEST", "STRENGTHS", "judge_strength", "judged_weights"]
 
 STRENGTHS = (1.0, 0.5, 0.0)
 """What is compared: the trained field, halfway to the plain visual hull in blended colours, and that alone."""
@@ -25,7 +22,7 @@ RAYS = 2048  # of the views that are left out
 
 
 @torch.no_grad()
-def judge_strength(model: HyperPlanes, support: Views) -> float:
+def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
     """The strength, of STRENGTHS, with which views that are left out are shown best.
 
     A trained field has expectations of its objects, and an object of another kind may be shown worse with them than
@@ -34,7 +31,7 @@ def judge_strength(model: HyperPlanes, support: Views) -> float:
     weights likewise; here it is the outputs (`Target.attenuated`).
 
     Args:
-        model: of a field that takes any number of views.
+        network: of a field that takes any number of views.
         support: the views of an object, where the model is.
 
     Returns:
@@ -45,9 +42,9 @@ def judge_strength(model: HyperPlanes, support: Views) -> float:
     standing = standpoints(support).cpu()
     order = farthest_first(standing, int((standing @ standing.mean(0)).argmin()), len(support))
     shown, judged = support[sorted(order[:-LEFT_OUT])], support[order[-LEFT_OUT:]]
-    context = model.prepare(shown)
-    weights = model.theta + model.update(context)
-    fields = [model.field(context, model.attenuated(weights, strength)) for strength in STRENGTHS]
+    context = network.prepare(shown)
+    weights = network.theta + network.update(context)
+    fields = [network.field(context, network.attenuated(weights, strength)) for strength in STRENGTHS]
     rays, truth = judged.sample_rays(
         RAYS,
         generator=torch.Generator().manual_seed(0),
@@ -56,3 +53,18 @@ def judge_strength(model: HyperPlanes, support: Views) -> float:
     )
     errors = [float((field.trace(rays).colour - truth).square().mean()) for field in fields]
     return STRENGTHS[errors.index(min(errors))]
+
+
+@torch.no_grad()
+def judged_weights(network: HyperPlanesNetwork, context: SupportContext) -> Parameters:
+    """Theta + delta of an object, attenuated as its own views judge them where the model is configured so.
+
+    Args:
+        network: the model.
+        context: the object.
+    """
+    weights = network.adapted_weights(context)
+    if not network.config.judged:
+        return weights
+    with in_use(network):
+        return network.attenuated(weights, judge_strength(network, context.views))

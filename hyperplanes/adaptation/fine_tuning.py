@@ -1,0 +1,144 @@
+"""Fine-tuning: gradient steps from theta + delta on the support views of one object (HyperPlanes, section 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.context import SupportContext, observe
+from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
+from hyperplanes.adaptation.judging import judged_weights
+from hyperplanes.adaptation.network import HyperPlanesNetwork
+from hyperplanes.configuration.compatibility import check_fine_tuning
+from hyperplanes.configuration.fine_tuning import FineTuning, Steps
+from hyperplanes.parameters import Parameters
+from hyperplanes.views import Views
+
+__all__ = ["fine_tune", "fine_tune_to", "make_descent"]
+
+
+def fine_tune(
+    network: HyperPlanesNetwork,
+    support: Views,
+    steps: Steps,
+    settings: FineTuning | None = None,
+    *,
+    on_step: Callable[[int], None] | None = None,
+    on_trial: Callable[[int], None] | None = None,
+) -> AdaptedField:
+    """As `HyperPlanes.fine_tune`.
+
+    Args:
+        network: the model.
+        support: the views of the object.
+        steps: gradient steps, or "auto".
+        settings: what is optimised, rates, rays and seed.
+        on_step: called with the number of steps done.
+        on_trial: likewise, while "auto" finds how many they are to be.
+    """
+    support, settings = network.to_own(support), settings or FineTuning()
+    check_fine_tuning(settings, steps, len(support), network.config, network.target)
+    if steps != "auto":
+        return fine_tune_to(network, network.prepare(support), steps, settings, views=support, on_step=on_step)
+
+    # how many steps show some of the views best that the others were fine-tuned without
+    shown, holdout = split_holdout(support, settings)
+    context = network.prepare(shown)
+    trial, _ = make_descent(network, context, settings, shown)
+    stop = trial.best_stop(holdout, pixels=network.live_pixels_of(context, holdout), on_step=on_trial)
+
+    # as many steps on all of them, by the same schedule
+    context, schedule = network.prepare(support), settings.max_steps
+    return fine_tune_to(network, context, stop, settings, views=support, schedule=schedule, on_step=on_step)
+
+
+def fine_tune_to(
+    network: HyperPlanesNetwork,
+    context: SupportContext,
+    steps: int,
+    settings: FineTuning,
+    *,
+    views: Views | None = None,
+    schedule: int | None = None,
+    on_step: Callable[[int], None] | None = None,
+) -> AdaptedField:
+    """As `fine_tune`, of an object that is prepared.
+
+    Args:
+        network: the model.
+        context: the object.
+        steps: taken.
+        settings: as in `fine_tune`.
+        views: where rays come from; those of the planes where absent.
+        schedule: the number of steps in which the rates fall; `steps` where absent.
+        on_step: as in `fine_tune`.
+    """
+    check_fine_tuning(settings, steps, len(views or context.views), network.config, network.target)
+    if not steps:
+        if on_step is not None:
+            on_step(0)
+        with torch.no_grad():
+            return network.rendering_field(context, judged_weights(network, context))
+    descent, variables = make_descent(network, context, settings, views)
+    for done in descent.run(steps if schedule is None else schedule):
+        if on_step is not None:
+            on_step(done)
+        if done == steps:
+            break
+    with torch.no_grad():
+        return network.rendering_field(context, variables.weights())
+
+
+def make_descent(
+    network: HyperPlanesNetwork,
+    context: SupportContext,
+    settings: FineTuning,
+    views: Views | None = None,
+    start: Parameters | None = None,
+) -> tuple[Descent, Variables]:
+    """Gradient descent on rays of an object's views: what fine-tuning and learned initialisations do.
+
+    Args:
+        network: the model.
+        context: the object.
+        settings: what is optimised, rates, rays and seed.
+        views: where rays come from; those of the planes where absent.
+        start: the weights to begin with, and no second pass is taken; those of `adapt` where absent.
+    """
+    views = context.views if views is None else views
+    if settings.trainable == "weights":
+        settings = settings.with_rates(network.target.fine_tuning_rates)
+    variables = _variables(network, context, settings, start)
+    shown = network.second_pass(context, variables.weights()) if start is None else context
+
+    def field(masked: Tensor | None) -> AdaptedField:
+        return network.field(shown if masked is None else shown.hiding(masked), variables.weights())
+
+    pixels, masks_views = network.live_pixels_of(context, views), network.target.permutation_invariant
+    return Descent(field, variables.tensors, views, settings, pixels, masks_views), variables
+
+
+def _variables(
+    network: HyperPlanesNetwork, context: SupportContext, settings: FineTuning, start: Parameters | None
+) -> Variables:
+    """What a descent optimises: weights, or a copy of the hypernetwork."""
+    if settings.trainable == "hypernetwork" and network.hypernetwork is not None:
+        observed, theta = observe([context], network.hypernetwork.resolution), network.theta.detach()
+        return Variables.of_hypernetwork(network.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
+    if start is None:
+        start = _refreshed(network, network.adapted_weights(context), settings, len(context.views))
+    return Variables.of_weights(start)
+
+
+def _refreshed(network: HyperPlanesNetwork, weights: Parameters, settings: FineTuning, views: int) -> Parameters:
+    """Trained weights interpolated with random ones, where a hypernetwork writes a grid; others as they are."""
+    share = settings.fresh_share(views)
+    if not share or not network.reads_volume:
+        return weights
+    made = HyperPlanesNetwork(replace(network.config, hypernetwork=None, judged=False), settings.seed)
+    random = made.to(network.rig.device, network.rig.dtype).theta.detach()
+    return Parameters((name, torch.lerp(value, random[name], share)) for name, value in weights.items())

@@ -1,0 +1,185 @@
+"""The network behind HyperPlanes: theta, the hypernetwork that updates it, and the rig of views it was trained with."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.context import SupportContext, arrange, live_pixels, observe, prepare_context
+from hyperplanes.configuration.compatibility import check_model
+from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.fields import Target
+from hyperplanes.fields.rig import Rig, standpoints
+from hyperplanes.hypernetwork import HyperNetwork
+from hyperplanes.hypernetwork.making import make_hypernetwork
+from hyperplanes.parameters import Parameters
+from hyperplanes.utilities.arguments import checked
+from hyperplanes.views import Views
+
+__all__ = ["HyperPlanesNetwork", "in_use"]
+
+
+class HyperPlanesNetwork(nn.Module):
+    """Support views -> what is prepared of them -> an update of theta; weights -> a field.
+
+    Args:
+        config: what it is made of.
+        seed: of the weights; the global random state is left alone.
+
+    Raises:
+        ValueError: parts that do not go together (`configuration.compatibility`).
+    """
+
+    rig: Tensor
+
+    def __init__(self, config: ModelConfig, seed: int = 0) -> None:
+        super().__init__()
+        make = check_model(config)
+        self.config = config
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.targets: dict[str, Target] = {"fine": make(config.network)}
+            if config.coarse_network:
+                self.targets["coarse"] = make(config.network)
+            self.networks = nn.ModuleDict(self.targets)
+            self.hypernetwork: HyperNetwork | None = None
+            if (shape := config.hypernetwork or config.autoencoder) is not None:
+                shapes = {name: value.shape for name, value in self.networks.named_parameters()}
+                reading, volume = self.target.reading_layers, self.target.volume_size
+                self.hypernetwork = make_hypernetwork(shape, shapes, reading, volume)
+        self.register_buffer("rig", torch.zeros(self.target.rig_size, 3))
+
+    @property
+    def theta(self) -> Parameters:
+        """The universal weights, shared with the module."""
+        return Parameters.of(self.networks)
+
+    @property
+    def target(self) -> Target:
+        """The network that colours and densities come from."""
+        return self.targets["fine"]
+
+    @property
+    def any_order(self) -> bool:
+        """Whether it takes any number of views in any order."""
+        return self.target.permutation_invariant
+
+    @property
+    def reads_volume(self) -> bool:
+        """Whether its hypernetwork reads what all views show on a grid."""
+        return self.hypernetwork is not None and self.hypernetwork.reads_volume
+
+    @property
+    def known_rig(self) -> Rig:
+        """Where the views of the training stood, and how others are matched to them."""
+        return Rig(self.rig, self.config.order)
+
+    def set_rig(self, support: Views) -> None:
+        """Take the standpoints of these support views as the order of the planes; some fields have none.
+
+        Raises:
+            ValueError: fewer views than planes.
+        """
+        if len(support) < len(self.rig):
+            raise ValueError(f"support: expected at least {len(self.rig)} views, one a plane, got {len(support)}")
+        self.rig.copy_(standpoints(support)[: len(self.rig)])
+
+    def arrange(self, support: Views) -> Views:
+        """The support views as the field takes them: one a plane of the rig, or all as they are.
+
+        More views than planes: the best matching ones, none twice. Fewer: some stand for several planes. With order
+        "file" the views stay in their order: the first ones, and again from the first where there are too few.
+        No view, or a rig that was never set, is a ValueError.
+        """
+        return arrange(support, self.target, self.known_rig)
+
+    @checked
+    def prepare(self, support: Views, *, carved: bool = True) -> SupportContext:
+        """All that depends on the support views and not on weights.
+
+        Args:
+            support: the views of one object, on any device and in any precision.
+            carved: without, one voxel that may hold anything stands for the hull, for who never asks it. A hypernetwork
+                that reads the hull has it carved in any case.
+        """
+        return prepare_context(
+            self.to_own(support),
+            self.target,
+            self.known_rig,
+            self.hypernetwork,
+            self.config.hull_resolution,
+            carved=carved,
+            masks_repeated=self.config.plane_dropout > 0,
+        )
+
+    def to_own(self, support: Views) -> Views:
+        """The views where the weights are, in their precision or at least single."""
+        return support.to(self.rig.device, torch.promote_types(self.rig.dtype, torch.float32))
+
+    def update(self, context: SupportContext) -> Parameters:
+        """The update of theta, in one forward pass (HyperPlanes, Eq. 7); empty without a hypernetwork."""
+        return self.updates([context])[0]
+
+    def updates(self, contexts: Sequence[SupportContext]) -> list[Parameters]:
+        """The updates of several objects, which are read in one batch; as `update`."""
+        if self.hypernetwork is None:
+            return [Parameters() for _ in contexts]
+        return self.hypernetwork(observe(contexts, self.hypernetwork.resolution), self.theta)
+
+    def field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
+        """The field of given weights on the planes of an object (HyperPlanes, Eq. 5)."""
+        bound = {
+            name: network.bind(parameters.under(name), context.planes, context.occupancy.bounds)
+            for name, network in self.targets.items()
+        }
+        densities = tuple(field.density for field in bound.values())
+        return AdaptedField(bound["fine"], context.occupancy, self.config.sampling, bound.get("coarse"), densities)
+
+    def attenuated(self, parameters: Parameters, strength: float) -> Parameters:
+        """Weights of a field between that of given ones and one of which nothing is learned (`Target.attenuated`).
+
+        Args:
+            parameters: theta + delta.
+            strength: 1 leaves them as they are.
+        """
+        parts = {name: network.attenuated(parameters.under(name), strength) for name, network in self.targets.items()}
+        return Parameters((f"{name}.{key}", value) for name, part in parts.items() for key, value in part.items())
+
+    def rendering_field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
+        """As `field`, after a second pass where the model takes two."""
+        return self.field(self.second_pass(context, parameters), parameters)
+
+    @torch.no_grad()
+    def adapted_weights(self, context: SupportContext) -> Parameters:
+        """Theta + delta as they are in use, whatever mode the model is in."""
+        with in_use(self):
+            return self.theta + self.update(context)
+
+    @torch.no_grad()
+    def second_pass(self, context: SupportContext, weights: Parameters) -> SupportContext:
+        """The planes with the surface that these weights show to each of them, where the model takes two passes."""
+        if not self.config.second_pass:
+            return context
+        seen = self.field(context, weights).render(context.views.cameras)
+        return replace(context, planes=self.target.with_surface(context.planes, seen.depth[:, 0], seen.opacity[:, 0]))
+
+    def live_pixels_of(self, context: SupportContext, views: Views) -> Tensor | None:
+        """Flat indices of the pixels of views that look into the hull; None where all are drawn from."""
+        return live_pixels(context.occupancy, views) if self.config.sampling.needs_occupancy else None
+
+
+@contextmanager
+def in_use(module: nn.Module) -> Generator[None]:
+    """The module as it is used and not trained (batch statistics), and afterwards as it was."""
+    before = {part: part.training for part in module.modules()}
+    module.eval()
+    try:
+        yield
+    finally:
+        for part, training in before.items():
+            part.training = training
