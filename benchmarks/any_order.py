@@ -27,8 +27,8 @@ from hyperplanes.configuration.presets import ALL_LAYERS, Preset, preset
 from hyperplanes.data.dataset import Dataset, open_dataset, open_datasets
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
-from hyperplanes.fields import TARGETS, AnyOrderConfig, AnyOrderNeRF
-from hyperplanes.fields.any_order import READ, AnyOrderField
+from hyperplanes.fields import TARGETS, ImageBasedConfig, ImageBasedNeRF
+from hyperplanes.fields.image_based import READ, ImageBasedField
 from hyperplanes.geometry import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.visibility import ChosenViews, Visibility, VisibilityPlanes
@@ -38,7 +38,7 @@ from hyperplanes.views import Views
 __all__ = ["HYPERNETWORKS", "VARIANTS", "configured", "main", "trained"]
 
 
-class _WithoutDepth(AnyOrderNeRF):
+class _WithoutDepth(ImageBasedNeRF):
     """Every view that shows a point counts as seeing it."""
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> VisibilityPlanes:
@@ -47,7 +47,7 @@ class _WithoutDepth(AnyOrderNeRF):
         return planes
 
 
-class _WithoutCoverage(AnyOrderNeRF):
+class _WithoutCoverage(ImageBasedNeRF):
     """Nothing is known of the masks but the hull that is sampled."""
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> VisibilityPlanes:
@@ -70,26 +70,26 @@ class _Unsorted(VisibilityPlanes):
         return replace(found, best=views)
 
 
-class _WithoutOrder(AnyOrderNeRF):
+class _WithoutOrder(ImageBasedNeRF):
     def planes_of(self, views: Views, occupancy: Occupancy) -> VisibilityPlanes:
         return _Unsorted(views.images, views.cameras, views.masks, occupancy)
 
 
 @dataclass(frozen=True)
-class _PlainField(AnyOrderField):
+class _PlainField(ImageBasedField):
     """The colour is the network's alone."""
 
     def blended(self, weights: Tensor, colours: Tensor) -> Tensor:
         return torch.full_like(colours[:, 0], 0.5)
 
 
-class _WithoutBlending(AnyOrderNeRF):
-    def bind(self, *given: Any) -> AnyOrderField:
+class _WithoutBlending(ImageBasedNeRF):
+    def bind(self, *given: Any) -> ImageBasedField:
         made = super().bind(*given)
         return _PlainField(made.target, made.parameters, made.planes, made.bounds)
 
 
-class _RandomStart(AnyOrderNeRF):
+class _RandomStart(ImageBasedNeRF):
     """The density head begins as that of the other fields, not as the visual hull."""
 
     def __init__(self, *given: Any) -> None:
@@ -102,7 +102,7 @@ POOLED = 32  # features of a view that are pooled
 
 
 @dataclass(frozen=True)
-class _PooledField(AnyOrderField):
+class _PooledField(ImageBasedField):
     """The views of a point in no order: weighted mean and variance of learned features, as in IBRNet."""
 
     def joined(self, slots: Tensor) -> Tensor:
@@ -114,10 +114,10 @@ class _PooledField(AnyOrderField):
         return torch.cat([mean, (weights * (features - mean[:, None]).square()).sum(1)], 1)
 
 
-class _Pooled(AnyOrderNeRF):
-    field_type: ClassVar[type[AnyOrderField]] = _PooledField
+class _Pooled(ImageBasedNeRF):
+    field_type: ClassVar[type[ImageBasedField]] = _PooledField
 
-    def __init__(self, config: AnyOrderConfig) -> None:
+    def __init__(self, config: ImageBasedConfig) -> None:
         super().__init__(config)
         self.of_view, self.weight = nn.Linear(self.slot_size, POOLED), nn.Linear(POOLED, 1)
 
@@ -129,7 +129,7 @@ class _Pooled(AnyOrderNeRF):
     def views_size(self) -> int:
         return 2 * POOLED
 
-    def bind(self, *given: Any) -> AnyOrderField:
+    def bind(self, *given: Any) -> ImageBasedField:
         made = super().bind(*given)
         return self.field_type(made.target, made.parameters, made.planes, made.bounds)
 
@@ -137,7 +137,7 @@ class _Pooled(AnyOrderNeRF):
 CHANNELS = 8  # of an encoder of the views
 
 
-class _FeatureField(AnyOrderField):
+class _FeatureField(ImageBasedField):
     """Beside the colours, the features of a convolutional encoder are looked up."""
 
     def slots(self, points: Tensor, seen: ChosenViews, colours: Tensor) -> Tensor:
@@ -153,8 +153,8 @@ class _FeatureField(AnyOrderField):
         return ImagePlanes(value, planes.cameras)
 
 
-class _WithFeatures(AnyOrderNeRF):
-    def __init__(self, config: AnyOrderConfig) -> None:
+class _WithFeatures(ImageBasedNeRF):
+    def __init__(self, config: ImageBasedConfig) -> None:
         super().__init__(config)
         layers = (nn.Conv2d(3, 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, CHANNELS, 3, padding=2, dilation=2))
         self.encoder = nn.Sequential(*layers)
@@ -163,7 +163,7 @@ class _WithFeatures(AnyOrderNeRF):
     def views_size(self) -> int:
         return (READ + CHANNELS) * self.config.planes
 
-    def bind(self, *given: Any) -> AnyOrderField:
+    def bind(self, *given: Any) -> ImageBasedField:
         made = super().bind(*given)
         return _FeatureField(made.target, made.parameters, made.planes, made.bounds)
 
@@ -173,7 +173,7 @@ class _PooledFeatureField(_PooledField, _FeatureField):
 
 
 class _PooledWithFeatures(_Pooled, _WithFeatures):
-    field_type: ClassVar[type[AnyOrderField]] = _PooledFeatureField
+    field_type: ClassVar[type[ImageBasedField]] = _PooledFeatureField
 
     @property
     def slot_size(self) -> int:
@@ -197,8 +197,8 @@ HYPERNETWORKS = {
 }
 """What the hypernetwork of the field is worth, and what its parts are."""
 
-VARIANTS: dict[str, type[AnyOrderNeRF]] = {
-    "whole": AnyOrderNeRF,
+VARIANTS: dict[str, type[ImageBasedNeRF]] = {
+    "whole": ImageBasedNeRF,
     "without_depth": _WithoutDepth,
     "without_coverage": _WithoutCoverage,
     "without_order": _WithoutOrder,
@@ -260,7 +260,7 @@ def configured(name: str, steps: int, seed: int) -> Preset:
         steps: of training.
         seed: of weights and training.
     """
-    TARGETS[name] = VARIANTS.get(name, AnyOrderNeRF)
+    TARGETS[name] = VARIANTS.get(name, ImageBasedNeRF)
     made, wanted = preset("small"), HYPERNETWORKS.get(name)
     training = replace(
         made.training,
@@ -274,7 +274,7 @@ def configured(name: str, steps: int, seed: int) -> Preset:
         volume_loss=made.training.volume_loss if wanted and wanted.completed else 0.0,
     )
     network = made.model.network
-    assert isinstance(network, AnyOrderConfig)
+    assert isinstance(network, ImageBasedConfig)
     network = replace(network, depth=3, width=96, grid=network.grid if wanted and wanted.grid else 0)
     volume = made.model.hypernetwork
     reader = None if wanted is None or volume is None else replace(volume, **wanted.changes)

@@ -140,7 +140,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         (["generate", "--class", "car", "--split-file", "all.csv", "--out", "OUT"], ["split_file", "--meshes"]),
         (["train", "--data", "OUT/none", "--out", "OUT/run"], ["OUT/none", "hyperplanes generate"]),
         (["train", "--data", "DATA", "--preset", "huge", "--out", "OUT/run"], ["quick", "huge"]),
-        (["train", "--data", "DATA", "--field", "voxels", "--out", "OUT/run"], ["any_order", "voxels"]),
+        (["train", "--data", "DATA", "--field", "voxels", "--out", "OUT/run"], ["image_based", "voxels"]),
         (["train", "--data", "DATA", "--steps", "0", "--out", "OUT/run"], ["steps", "0"]),
         (["train", "--data", "DATA", "--device", "abacus", "--out", "OUT/run"], ["device", "abacus"]),
         (["train", "--data", "DATA", "--preset", "small", "--support", "5", "--out", "OUT/run"], ["--training.views"]),
@@ -549,7 +549,7 @@ def test_a_second_pass_is_taken_by_models_that_judge_what_views_see_and_refused_
     assert max(abs(one - two).max() for one, two in zip(*pictures[1:], strict=True)) <= 1
     capsys.readouterr()
     assert main(["render", "--checkpoint", str(demo_folder()), *views, "--out", once, "--second-pass"]) == 2
-    assert "expected a model of the field any_order, such as small" in complaint(capsys)
+    assert "expected a model of the field image_based, such as small" in complaint(capsys)
 
 
 def with_z_up(scene, folder):

@@ -58,7 +58,7 @@ class Arguments:
 
     Attributes:
         data: A data set or one posed scene; example-car comes with the package.
-        method: nearest_view and hull_blend (nothing is learned); nerf, multiplane, point_multiplane, any_order,
+        method: nearest_view and hull_blend (nothing is learned); nerf, multiplane, point_multiplane, image_based,
             hyperplanes, hyperplanes_swapped (each object with the update of another), autoencoder; scratch_N (the field
             of a checkpoint from random weights), nerf_scratch_N, multiplane_scratch_N, point_multiplane_scratch_N (no
             checkpoint is needed); standard, mv_matched, mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but

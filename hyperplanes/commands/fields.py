@@ -62,7 +62,7 @@ def load_adaptable(path: Path, device: torch.device, *, second_pass: bool = Fals
     if second_pass:
         if not model.any_order:
             found = f"{path}, a model of {model.config.target}"
-            raise ValueError(f"second_pass: expected a model of the field any_order, such as small, got {found}")
+            raise ValueError(f"second_pass: expected a model of the field image_based, such as small, got {found}")
         model.config = replace(model.config, second_pass=True)
     return model
 

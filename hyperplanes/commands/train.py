@@ -67,11 +67,11 @@ class Arguments:
         config: A YAML file of settings, such as the config.yaml of another run, whole or in part.
         preset: One of `hyperplanes presets`: what holds where nothing else is said; quick where no file says otherwise.
         method: hyperplanes; a target network alone with one set of weights for all objects: point_multiplane,
-            multiplane, nerf, any_order, or a field of another package; autoencoder; or a learned initialisation:
+            multiplane, nerf, image_based, or a field of another package; autoencoder; or a learned initialisation:
             mv_meta, sv_meta (Reptile from many views or a single one), maml, maml_first_order, mv_matched (random
             weights matched to mv_meta).
-        field: Which target network: nerf, multiplane, point_multiplane, any_order, or that of another package; when not
-            given the preset's, or for learned initialisations NeRF.
+        field: Which target network: nerf, multiplane, point_multiplane, image_based, or that of another package; when
+            not given the preset's, or for learned initialisations NeRF.
         support: Support views and ImagePlanes an object; more than there are go on with the query views.
         checkpoint: Weights to begin with instead of random ones: a checkpoint, or a packaged model such as small; for
             mv_matched the checkpoint of mv_meta that it is to match.

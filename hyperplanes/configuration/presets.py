@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 
 from hyperplanes.adaptation.hyperplanes import ModelConfig
 from hyperplanes.configuration.initialisation import LEARNED, InitialisationConfig
-from hyperplanes.fields import TARGETS, AnyOrderConfig, TargetConfig, find_targets
+from hyperplanes.configuration.upgrade import TARGETS as FORMER_TARGETS
+from hyperplanes.fields import TARGETS, ImageBasedConfig, TargetConfig, find_targets
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
 from hyperplanes.training import TrainingConfig
@@ -77,6 +78,7 @@ class Preset:
             ValueError: an unknown method or target, HyperPlanes of a configuration without a hypernetwork, or a target
                 beside a method that is another one.
         """
+        method, target = FORMER_TARGETS.get(method, method), FORMER_TARGETS.get(target or "", target)
         targets = find_targets()
         known = [*TRAINABLE, *(name for name in targets if name not in TRAINABLE)]
         if method not in known:
@@ -181,8 +183,10 @@ PRESETS: dict[str, Preset] = {
     ),
     "small": Preset(
         ModelConfig(
-            target="any_order",
-            network=AnyOrderConfig(depth=4, width=128, planes=8, grid=8, point_frequencies=6, direction_frequencies=2),
+            target="image_based",
+            network=ImageBasedConfig(
+                depth=4, width=128, planes=8, grid=8, point_frequencies=6, direction_frequencies=2
+            ),
             hypernetwork=VolumeHyperNetworkConfig(),
             sampling=Marched(steps=64),
             hull_resolution=96,

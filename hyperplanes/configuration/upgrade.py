@@ -9,13 +9,13 @@ from typing import Any
 from hyperplanes.hypernetwork.configuration import HeadConfig
 from hyperplanes.utilities.settings import SettingsError
 
-__all__ = ["upgrade_model"]
+__all__ = ["TARGETS", "upgrade_model"]
 
 MODEL = {"hull_side": "hull_resolution"}
 NETWORK = {"point_octaves": "point_frequencies", "direction_octaves": "direction_frequencies"}
 """Entries by their former names."""
 
-TARGETS: dict[str, str] = {}
+TARGETS = {"any_order": "image_based"}
 """Fields by their former names."""
 
 OF_IMAGE_BASED = ("blended", "grid")

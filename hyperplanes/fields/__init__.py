@@ -3,16 +3,16 @@
 Another package adds one by an entry point of the group `hyperplanes.fields` that names a subclass of `Target`.
 """
 
-from hyperplanes.fields.any_order import AnyOrderConfig, AnyOrderNeRF
 from hyperplanes.fields.base import Field, Target, TargetConfig
+from hyperplanes.fields.image_based import ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.fields.multiplane import MultiPlaneNeRF, PointMultiPlaneNeRF
 from hyperplanes.fields.nerf import NeRF
 from hyperplanes.utilities.entry_points import load_entries
 
 __all__ = [
     "TARGETS",
-    "AnyOrderConfig",
-    "AnyOrderNeRF",
+    "ImageBasedConfig",
+    "ImageBasedNeRF",
     "Field",
     "MultiPlaneNeRF",
     "NeRF",
@@ -26,7 +26,7 @@ TARGETS: dict[str, type[Target]] = {
     "nerf": NeRF,
     "multiplane": MultiPlaneNeRF,
     "point_multiplane": PointMultiPlaneNeRF,
-    "any_order": AnyOrderNeRF,
+    "image_based": ImageBasedNeRF,
 }
 
 

@@ -18,7 +18,7 @@ def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
     """
     if config.views and (not model.any_order or min(config.views) < 1):
         raise ValueError(
-            "training.views: expected numbers of at least 1, for the field any_order, which takes any of them, "
+            "training.views: expected numbers of at least 1, for the field image_based, which takes any of them, "
             f"got {list(config.views)} for {model.config.target}"
         )
     for name in ("random_background", "empty_points"):

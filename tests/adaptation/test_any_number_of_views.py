@@ -12,7 +12,7 @@ from hyperplanes.adaptation.descent import Descent
 from hyperplanes.adaptation.fine_tuned import FromScratch
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FRESH, FRESH_VIEWS, FineTuning
-from hyperplanes.fields import AnyOrderConfig, TargetConfig
+from hyperplanes.fields import ImageBasedConfig, TargetConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering import Marched
@@ -24,11 +24,11 @@ SHAPE = ImageHyperNetworkConfig(
     views=3, normalisation="group", code=8, depth=2, width=16, join="mean", layers=("all",), update="low_rank", rank=1
 )
 VOLUME = VolumeHyperNetworkConfig()
-NETWORK = AnyOrderConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=2, direction_frequencies=1)
+NETWORK = ImageBasedConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=2, direction_frequencies=1)
 PLACED = TargetConfig(depth=2, width=16, planes=4, point_frequencies=2, direction_frequencies=1)
 GRID = replace(NETWORK, grid=5)
 READERS = {"images": {}, "volume": {"network": GRID, "hypernetwork": VOLUME}}
-CONFIG = ModelConfig("any_order", NETWORK, SHAPE, sampling=Marched(24), hull_resolution=16)
+CONFIG = ModelConfig("image_based", NETWORK, SHAPE, sampling=Marched(24), hull_resolution=16)
 
 
 def model(**changes):

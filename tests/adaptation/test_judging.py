@@ -8,16 +8,16 @@ from torch.nn.functional import softplus
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.judging import FEWEST, STRENGTHS, judge_strength
-from hyperplanes.fields import AnyOrderConfig
-from hyperplanes.fields.any_order import EMPTY, SOLID
+from hyperplanes.fields import ImageBasedConfig
+from hyperplanes.fields.image_based import EMPTY, SOLID
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.rendering import Marched
 from tests.reference_rendering import awaken, ball_views, ring
 
-NETWORK = AnyOrderConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1)
+NETWORK = ImageBasedConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1)
 CONFIG = ModelConfig(
-    "any_order", NETWORK, VolumeHyperNetworkConfig(), sampling=Marched(24), hull_resolution=16, judged=True
+    "image_based", NETWORK, VolumeHyperNetworkConfig(), sampling=Marched(24), hull_resolution=16, judged=True
 )
 
 

@@ -103,9 +103,9 @@ def test_the_fast_protocol_leaves_a_fast_preset_as_it_is():
     assert isinstance(preset("paper-128-brief").model.sampling, Marched)  # what the benchmarks' weights were trained by
 
 
-@pytest.mark.parametrize("method", ["any_order", "mv_meta", "maml"])
+@pytest.mark.parametrize("method", ["image_based", "mv_meta", "maml"])
 def test_what_a_hypernetwork_learns_is_not_asked_of_a_method_without_one(method):
-    made = preset("small").by_method(method, None if method == "any_order" else "any_order")
+    made = preset("small").by_method(method, None if method == "image_based" else "image_based")
     Trainer(HyperPlanes(made.model), Balls(), replace(made.training, held_out=0))  # is refused otherwise
 
 

@@ -10,7 +10,7 @@ from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.presets import preset
 from hyperplanes.configuration.settings_file import changed, parse_options, read_experiment
 from hyperplanes.configuration.upgrade import upgrade_model
-from hyperplanes.fields import AnyOrderConfig
+from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.utilities.settings import SettingsError
 
@@ -20,6 +20,7 @@ FORMER = Path(__file__).parent / "former"
 @pytest.mark.parametrize("name", ["small", "small-paper", "cars-64"])
 def test_former_checkpoints_are_those_that_are_packaged(name):
     former = ModelConfig.of_json(json.loads((FORMER / f"{name}.json").read_text()))
+    assert former.target == ("image_based" if name == "small" else "point_multiplane")
     assert former.target == ModelConfig.load(packaged_folder(name)).target
     assert ModelConfig.of_json(json.loads(json.dumps(former.as_json()))) == former
     kind = VolumeHyperNetworkConfig if name == "small" else ImageHyperNetworkConfig
@@ -38,7 +39,7 @@ def test_another_kind_has_its_own_settings():
     made = changed(preset("small"), parse_options(["--model.hypernetwork.kind", "images"])).model.hypernetwork
     assert made == ImageHyperNetworkConfig()
     wanted = {"target": "point_multiplane", "hypernetwork": {"kind": "images"}}
-    assert not isinstance(changed(preset("small"), {"model": wanted}).model.network, AnyOrderConfig)
+    assert not isinstance(changed(preset("small"), {"model": wanted}).model.network, ImageBasedConfig)
 
 
 @pytest.mark.parametrize(
@@ -61,3 +62,7 @@ def test_what_is_of_this_version_stays_as_it_is():
     for name in ("quick", "small", "paper-128"):
         entries = preset(name).model.as_json()
         assert upgrade_model(entries) == entries
+
+
+def test_the_former_name_of_a_field_is_one_of_a_method():
+    assert preset("small").by_method("any_order").model == preset("small").by_method("image_based").model

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
-from hyperplanes.fields import AnyOrderConfig
+from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Marched
@@ -16,8 +16,8 @@ from hyperplanes.training.episodes import prepare_subset, whole_of
 from tests.reference_rendering import Balls
 
 MODEL = ModelConfig(
-    "any_order",
-    AnyOrderConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1),
+    "image_based",
+    ImageBasedConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1),
     VolumeHyperNetworkConfig(),
     sampling=Marched(24),
     hull_resolution=32,

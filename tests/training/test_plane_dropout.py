@@ -58,7 +58,7 @@ def test_where_there_are_fewer_views_than_planes_each_stands_at_one_plane_and_th
     assert small_model(hypernetwork=None, plane_dropout=0.3, order=order).prepare(support).planes.hidden is None
 
 
-@pytest.mark.parametrize("target", ["nerf", "any_order"])
+@pytest.mark.parametrize("target", ["nerf", "image_based"])
 def test_fields_without_a_plane_at_a_place_of_its_own_take_no_dropout(target):
     with pytest.raises(ValueError, match=f"plane_dropout: .* got {target}"):
         HyperPlanes(ModelConfig(target=target, hypernetwork=None, plane_dropout=0.1))

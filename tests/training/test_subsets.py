@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
-from hyperplanes.fields import AnyOrderConfig
+from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Marched
@@ -18,8 +18,8 @@ from hyperplanes.views import Task, Views
 from tests.reference_rendering import Balls, ball_views, ring, small_model
 
 MODEL = ModelConfig(
-    "any_order",
-    AnyOrderConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=2, direction_frequencies=1),
+    "image_based",
+    ImageBasedConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=2, direction_frequencies=1),
     ImageHyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16, join="mean"),
     sampling=Marched(24),
     hull_resolution=16,
@@ -100,7 +100,7 @@ def test_only_random_backgrounds_tell_a_white_surface_from_none(random):
 @pytest.mark.parametrize(
     ("model", "training", "message"),
     [
-        (small_model, TRAINING, "any_order"),
+        (small_model, TRAINING, "image_based"),
         (lambda: HyperPlanes(MODEL), replace(TRAINING, views=(0, 3)), "at least 1"),
     ],
 )

@@ -125,8 +125,8 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
         depth=3, width=128, planes=8, point_frequencies=6, direction_frequencies=2
     )
     assert chosen.model.sampling == Hierarchical(8, 5)
-    of_any_order = {"views": (), "rotations": 0.0, "volume_loss": 0.0}
-    assert chosen.training == replace(small.training, learning_rate=1e-3, steps=11, rays=13, **of_any_order)
+    of_subsets = {"views": (), "rotations": 0.0, "volume_loss": 0.0}
+    assert chosen.training == replace(small.training, learning_rate=1e-3, steps=11, rays=13, **of_subsets)
     assert resolve(replace(given, method="multiplane", protocol="fast", settings=()))[1].model.sampling == Marched()
     assert resolve(replace(given, cache_size=0.5))[1].training.memory == 2**29
     with pytest.raises(ValueError, match="^--cache-size: "):

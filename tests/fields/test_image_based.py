@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.fields import AnyOrderConfig, AnyOrderNeRF
+from hyperplanes.fields import ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.geometry import carve
 from hyperplanes.geometry.cameras import camera_from_world
 from hyperplanes.geometry.visibility import VisibilityPlanes
@@ -15,13 +15,13 @@ from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views, join_views
 from tests.reference_rendering import ball_views, camera_at, ring
 
-SMALL = AnyOrderConfig(depth=3, width=16, planes=4, blended=2, point_frequencies=2, direction_frequencies=1)
+SMALL = ImageBasedConfig(depth=3, width=16, planes=4, blended=2, point_frequencies=2, direction_frequencies=1)
 SIZE = (24, 24)
 
 
 def network(seed=0, config=SMALL):
     torch.manual_seed(seed)
-    return AnyOrderNeRF(config)
+    return ImageBasedNeRF(config)
 
 
 def coloured(count):
@@ -102,7 +102,7 @@ def test_hidden_views_show_nothing_even_where_too_few_others_are_left():
 @torch.no_grad()
 def test_turning_and_moving_the_world_changes_only_what_reads_world_coordinates():
     """Points and viewing directions are inputs; depths, coverage, angles and colours are not of any world."""
-    config = AnyOrderConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=0, direction_frequencies=0)
+    config = ImageBasedConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=0, direction_frequencies=0)
     target, views, (points, directions) = network(config=config), coloured(5), queries()
     parameters = Parameters({name: value.clone() for name, value in Parameters.of(target).items()})
     for index in range(2):
@@ -130,7 +130,7 @@ def test_turning_and_moving_the_world_changes_only_what_reads_world_coordinates(
 def test_its_first_weights_are_the_visual_hull_in_the_colours_of_the_views():
     views, query = ball_views(ring(12, (48, 48))), ball_views(ring(3, (48, 48), shift=1))
     occupancy = carve(views.masks, views.cameras, views.bounds, 64)
-    target = network(config=AnyOrderConfig(depth=3, width=32, planes=4))
+    target = network(config=ImageBasedConfig(depth=3, width=32, planes=4))
     field = bound(target, views, occupancy=occupancy)
     pictures = render(field, query.cameras, Marched(128), occupancy=occupancy)
     assert psnr(pictures.images, query.images).min() > 25  # measured: 26.2 and more

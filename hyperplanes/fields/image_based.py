@@ -28,7 +28,7 @@ from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-__all__ = ["AnyOrderConfig", "AnyOrderField", "AnyOrderNeRF", "FeatureGrid"]
+__all__ = ["ImageBasedConfig", "ImageBasedField", "ImageBasedNeRF", "FeatureGrid"]
 
 SMALLEST_ANGLE = 1e-2
 FALLOFF = 8.0  # of depths behind the hull, in 1 / radii, where tanh makes them inputs
@@ -62,7 +62,7 @@ class FeatureGrid(nn.Module):
 
 
 @dataclass(frozen=True)
-class AnyOrderConfig(TargetConfig):
+class ImageBasedConfig(TargetConfig):
     """The shape of a field of any number of views.
 
     Attributes:
@@ -74,7 +74,7 @@ class AnyOrderConfig(TargetConfig):
     grid: Annotated[int, range(65)] = 0
 
 
-class AnyOrderNeRF(Target):
+class ImageBasedNeRF(Target):
     """F(x, z, d; theta) = (c, sigma), where z is sorted by visibility.
 
     With its first weights it is nearly the visual hull in the blended colours of the views that see it; what is learned
@@ -82,12 +82,12 @@ class AnyOrderNeRF(Target):
     the scene, the first of them through a sigmoid: weights like all others, which a hypernetwork updates.
     """
 
-    config_type: ClassVar[type[TargetConfig]] = AnyOrderConfig
+    config_type: ClassVar[type[TargetConfig]] = ImageBasedConfig
     permutation_invariant: ClassVar[bool] = True
-    config: AnyOrderConfig
+    config: ImageBasedConfig
     volume_size: ClassVar[tuple[int, int] | None] = (CHANNELS, SIDE)
 
-    def __init__(self, config: AnyOrderConfig) -> None:
+    def __init__(self, config: ImageBasedConfig) -> None:
         super().__init__(config)
         width, blended = config.width, config.blended
         if config.grid:
@@ -175,7 +175,7 @@ class AnyOrderNeRF(Target):
 
     def bind(
         self, parameters: Parameters, planes: VisibilityPlanes | None, bounds: Sphere | None = None
-    ) -> AnyOrderField:
+    ) -> ImageBasedField:
         """The field that these parameters and planes make.
 
         Args:
@@ -191,14 +191,14 @@ class AnyOrderNeRF(Target):
         """
         if planes is None or not len(planes):
             raise ValueError(f"planes: expected VisibilityPlanes of at least one view, got {planes and len(planes)}")
-        return AnyOrderField(self, parameters, planes, bounds or planes.occupancy.bounds)
+        return ImageBasedField(self, parameters, planes, bounds or planes.occupancy.bounds)
 
 
 @dataclass(frozen=True, repr=False)
-class AnyOrderField(Field):
-    """The field of `AnyOrderNeRF`."""
+class ImageBasedField(Field):
+    """The field of `ImageBasedNeRF`."""
 
-    target: AnyOrderNeRF
+    target: ImageBasedNeRF
 
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
