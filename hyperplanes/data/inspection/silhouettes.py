@@ -10,7 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from hyperplanes.data.pictures.bounds import estimate_bounds
+from hyperplanes.data.pictures.bounds import OFTEN_CUT, ROOM, are_shown, cut_off, estimate_bounds
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Sphere
@@ -56,6 +56,8 @@ class CoarseHull:
 def coarse_hull(masks: Float[Tensor, "view 1 height width"], cameras: PinholeCamera) -> CoarseHull:
     """The hull of masks in the sphere that the cameras look at, and once more in the sphere around that.
 
+    Where borders cut many masks off, as in `estimate_bounds`, it is searched in a larger one.
+
     Args:
         masks: opacity, as `small_masks` gives them.
         cameras: one a mask.
@@ -70,10 +72,14 @@ def coarse_hull(masks: Float[Tensor, "view 1 height width"], cameras: PinholeCam
     if (ahead > 0).float().mean() < 0.5:
         return nothing
     hull = nothing
-    for _ in range(2):
+    ends = cut_off(masks)
+    cut = float(ends.float().mean()) > OFTEN_CUT
+    sphere = Sphere(sphere.centre, ROOM * sphere.radius) if cut else sphere
+    for _ in range(3 if cut else 2):
         grid = carve(masks, cameras, sphere, SIDE)
         points = grid.centres()
         points = points[sphere.normalise(points).norm(dim=-1) <= 1]
+        points = points[are_shown(points, cameras, ends)] if cut else points
         if not len(points):
             return nothing
         hull = CoarseHull(points, grid)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -17,13 +17,25 @@ from hyperplanes.geometry.occupancy import carve
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["estimate_bounds", "nearest_point", "smallest_ball", "stated_bounds"]
+__all__ = [
+    "OFTEN_CUT",
+    "ROOM",
+    "are_shown",
+    "cut_off",
+    "estimate_bounds",
+    "nearest_point",
+    "smallest_ball",
+    "stated_bounds",
+]
 
 HULL_SIDE = 48
 HULL_MARGIN = 1.05
 FEWEST_MASKS = 3
 MOST_MASKS = 24  # the hull of fewer views is only larger
 LARGEST_MASK = 256
+OFTEN_CUT = 0.1  # of the masks reach the border of their picture
+ROOM = 3.0  # times the radius of the sphere from the cameras, where that is so
+WHOLE, SHOWN = 0.9, 0.25  # of the pictures that show the object whole, or of all where too few do
 
 
 def estimate_bounds(
@@ -40,6 +52,10 @@ def estimate_bounds(
     and never larger than the one from the cameras. Where the cameras look past each other, as forward-facing ones do,
     the centre lies ahead of them, in the middle of the depths that are known.
 
+    A mask that ends at the border of its picture is no outline there. Where such masks are not rare, as with close-ups,
+    the sphere from the cameras says nothing either: the hull is carved in one three times as large, out of what
+    nearly all pictures that show the object whole have within their borders, and may be larger.
+
     Masks seen through a lens are not carved with: the sphere is then the one from the cameras.
 
     Args:
@@ -52,16 +68,54 @@ def estimate_bounds(
         return outer
     chosen = torch.linspace(0, len(alpha) - 1, min(len(alpha), MOST_MASKS)).round().long()
     masks, small = _reduced(alpha[chosen], camera.select(cameras, chosen))
-    sphere = outer
-    for _ in range(2):
+    ends = cut_off(masks)
+    cut = float(ends.float().mean()) > OFTEN_CUT
+    sphere = room = Sphere(outer.centre, ROOM * outer.radius) if cut else outer
+    for _ in range(3 if cut else 2):
         points = carve(masks, small, sphere, HULL_SIDE).centres()
         points = points[sphere.normalise(points).norm(dim=-1) <= 1]
+        points = points[are_shown(points, small, ends)] if cut else points
         if not len(points):
-            break
+            return outer if sphere is room else sphere
         ball = smallest_ball(points)
         radius = HULL_MARGIN * (ball.radius + sphere.radius / HULL_SIDE * 3**0.5)
-        sphere = Sphere(ball.centre, min(radius, outer.radius))
+        sphere = Sphere(ball.centre, min(radius, room.radius))
     return sphere
+
+
+def cut_off(masks: Float[Tensor, "view 1 height width"]) -> Bool[Tensor, " view"]:
+    """Which masks reach the border of their picture.
+
+    Args:
+        masks: opacity.
+    """
+    opaque = masks[:, 0] > 0
+    sides = [opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]]
+    return torch.cat(sides, -1).any(-1)
+
+
+def are_shown(
+    points: Float[Tensor, "point 3"], cameras: PinholeCamera, cut: Bool[Tensor, " view"]
+) -> Bool[Tensor, " point"]:
+    """Whether a point may belong to the object: nearly all pictures that show it whole show the point.
+
+    Where fewer than three do, a quarter of all pictures has to show it, and two at least.
+
+    Args:
+        points: in the world.
+        cameras: of one size.
+        cut: which of them do not show the object whole.
+    """
+    height, width = camera.image_size(cameras)
+    matrices = camera.projection_matrices(cameras)
+    whole = int((~cut).sum()) >= FEWEST_MASKS
+    matrices = matrices[~cut] if whole else matrices
+    count = torch.zeros(len(points), dtype=torch.long)
+    for matrix in matrices:
+        seen = points @ matrix[:, :3].T + matrix[:, 3]
+        column, row = (seen[:, :2] / seen[:, 2:].clamp_min(1e-6)).unbind(-1)
+        count += (seen[:, 2] > 1e-6) & (column > 0) & (row > 0) & (column < width - 1) & (row < height - 1)
+    return count >= max(2.0, (WHOLE if whole else SHOWN) * len(matrices))
 
 
 def stated_bounds(document: dict[str, Any], path: Path) -> Sphere | None:

@@ -1,0 +1,53 @@
+"""Source of truth: the masks of a ball, known exactly, that the borders of close-ups cut off."""
+
+import pytest
+import torch
+
+from hyperplanes.data.inspection.conventions import check_conventions
+from hyperplanes.data.pictures.bounds import estimate_bounds
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry import cast
+from hyperplanes.geometry.rays import pixel_grid
+from hyperplanes.views import Views
+
+RADIUS, SIZE = 0.8, 64
+
+
+@pytest.fixture(scope="module")
+def close_ups():
+    """Nine cameras that see the whole ball and fifteen that stand so close that none does."""
+    poses = camera.fibonacci_sphere(24, 3.5)
+    poses[9:, :3, 3] *= 1.5 / 3.5
+    poses = poses[torch.randperm(24, generator=torch.Generator().manual_seed(0))]
+    cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.9), poses, SIZE, SIZE)
+    masks = []
+    for view in range(24):
+        rays = cast(cameras, torch.full((SIZE * SIZE,), view), pixel_grid(SIZE, SIZE))
+        along = (rays.origins * rays.directions).sum(-1)
+        masks.append((rays.origins.square().sum(-1) - along.square() < RADIUS**2).reshape(1, SIZE, SIZE))
+    return torch.stack(masks).float(), cameras
+
+
+def test_the_sphere_holds_what_close_ups_cut_off(close_ups):
+    masks, cameras = close_ups
+    from_cameras = estimate_bounds(cameras)
+    assert from_cameras.radius < RADIUS  # what the narrowest pictures show whole
+    sphere = estimate_bounds(cameras, (255 * masks).to(torch.uint8))
+    reach = RADIUS + torch.tensor(sphere.centre).norm()
+    assert reach < 1.05 * sphere.radius
+    assert sphere.radius < 1.4 * RADIUS
+
+
+def test_right_poses_of_close_ups_are_not_called_wrong(close_ups):
+    masks, cameras = close_ups
+    views = Views(1 - 0.5 * masks.expand(-1, 3, -1, -1), cameras, masks)
+    assert check_conventions(views).consistent
+
+
+def test_wrong_poses_of_close_ups_still_are(close_ups):
+    masks, cameras = close_ups
+    generator = torch.Generator().manual_seed(1)
+    moved = camera.camera_from_world(cameras).clone()
+    moved[:, :3, 3] += 1.0 * torch.randn(24, 3, generator=generator)
+    views = Views(1 - 0.5 * masks.expand(-1, 3, -1, -1), camera.with_poses(cameras, moved), masks)
+    assert not check_conventions(views).consistent
