@@ -84,7 +84,7 @@ def both(chosen: Preset, objects: Objects) -> dict[str, Trainer]:
             model, objects, replace(chosen.training, rays=RAYS, tasks=1, warmup=10, final_rate_factor=1.0)
         )
         for name in objects.names("train"):
-            trainers[path].warm(name)
+            trainers[path].loader.get(name)
     return trainers
 
 

@@ -38,7 +38,7 @@ from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
 from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.rotation import Rotation
+from hyperplanes.training.episodes.augmentation import Rotation
 from hyperplanes.utilities.files import encode_png, write_whole
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task, Tasks, Views

@@ -18,7 +18,7 @@ from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
 from hyperplanes.training import Trainer
 from tests.reference_rendering import Balls
-from tests.training.test_completion import MODEL
+from tests.training.test_volume_loss import MODEL
 
 
 @pytest.mark.parametrize("name", [*any_order.VARIANTS, *any_order.HYPERNETWORKS])

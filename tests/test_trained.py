@@ -16,7 +16,7 @@ from hyperplanes.adaptation import HyperPlanes, diagnose, swap_gap
 from hyperplanes.fields import TargetConfig
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.training.rotation import Rotation
+from hyperplanes.training.episodes.augmentation import Rotation
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, small_model
 

@@ -48,7 +48,7 @@ from hyperplanes.utilities.processes import is_first_process
 if TYPE_CHECKING:
     from hyperplanes.configuration.presets import Preset
     from hyperplanes.training import Progress, Trainer
-    from hyperplanes.training.watching import TensorBoard
+    from hyperplanes.training.monitoring import TensorBoard
 
 __all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 
@@ -261,7 +261,7 @@ def _run(arguments: Arguments) -> int:
     from hyperplanes.training import start_training
     from hyperplanes.training.distributed import check_shares
     from hyperplanes.training.launching import count_processes, launched
-    from hyperplanes.training.watching import TensorBoard
+    from hyperplanes.training.monitoring import TensorBoard
 
     if arguments.out.resolve() in {path.resolve() for path in arguments.data}:
         raise ValueError(f"--out: expected a folder of its own, got {arguments.out}, which is --data; name another one")
@@ -298,7 +298,7 @@ def _run(arguments: Arguments) -> int:
         shared = f", shared by {trainer.processes.count} processes" if trainer.processes.count > 1 else ""
         console.say(
             f"{method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "
-            f"{len(trainer.names)} objects to train on, {held_out} held out{shared}"
+            f"{len(trainer.loader.names)} objects to train on, {held_out} held out{shared}"
         )
         if trainer.step:
             console.say(f"going on from step {trainer.step}")

@@ -15,7 +15,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.reproduce.engine import Runner
 from hyperplanes.reproduce.experiments import Experiment, Trained
 from hyperplanes.training import Trainer
-from hyperplanes.training.meta_training import initialisation_trainer
+from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.utilities.formatting import format_duration, format_rate
 
 __all__ = ["Estimate", "estimate"]
@@ -90,7 +90,7 @@ class _Measured:
 
 def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measured:
     trainer = _trainer(runner, experiment, trained)
-    trainer.names = trainer.names[: trainer.config.tasks]  # their planes and hulls are made by the first step
+    trainer.loader.names = trainer.loader.names[: trainer.config.tasks]  # made ready by the first step
     trainer.take_step()
     _wait()
     started = time.perf_counter()
@@ -98,14 +98,14 @@ def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measu
         trainer.take_step()
     _wait()
     step = (time.perf_counter() - started) / STEPS
-    task = trainer.data.task(trainer.names[0])
+    task = trainer.data.task(trainer.loader.names[0])
     field = trainer.model.adapt(task.support)
     view = camera.resized(camera.select(task.query.cameras, [0]), SIDE, SIDE)
     field.render(view)  # what is empty is found once an object
     started = time.perf_counter()
     field.render(view)
     _wait()
-    return _Measured(step, (time.perf_counter() - started) / SIDE**2, trainer.rays_per_step / step)
+    return _Measured(step, (time.perf_counter() - started) / SIDE**2, trainer.objective.rays_per_step / step)
 
 
 def _trainer(runner: Runner, experiment: Experiment, trained: Trained) -> Trainer:

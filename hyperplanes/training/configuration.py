@@ -54,8 +54,8 @@ class TrainingConfig:
         clip: the norm to which the gradient of all weights that a step moves is cut where it is longer; 0 leaves it.
         balanced: classes are drawn equally often, however many objects each has. Where a data set does not state them,
             each data set is one.
-        evaluate_every: steps between looks at held-out objects.
-        held_out: how many of them are looked at: objects of the "val" split, or where there is none of "test".
+        evaluate_every: steps between validations on held-out objects.
+        held_out: how many of them are taken: objects of the "val" split, or where there is none of "test".
         checkpoint_every: steps between checkpoints.
         keep_last: how many of them are kept; older ones are deleted.
         memory: bytes of images, planes and hulls that are kept for later steps; the last object always is.
@@ -121,7 +121,7 @@ class Progress:
         steps: steps to do.
         loss: mean squared error of the last step's rays, plus what `volume_loss` and `empty_points` add.
         rays_per_second: since the last report.
-        psnr: in dB, of some views of held-out objects, where this step looked at them.
+        psnr: in dB, of some views of held-out objects, where this step validated on them.
         seconds_left: by the speed so far.
         diagnostics: of the hypernetwork on those objects.
         ssim: of the same views, where they are large enough for it.

@@ -1,7 +1,7 @@
 """Processes that share the objects of every step, by torch.distributed: gradients averaged, stops and errors agreed on.
 
 Each process renders its share of a step's objects. Weights, optimisers and draws are the same in all of them, so each
-could go on alone from any checkpoint. The first one writes files and looks at held-out objects.
+could go on alone from any checkpoint. The first one writes files and validates on held-out objects.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def other_processes() -> Generator[None]:
 
 
 def check_shares(tasks: int, reference_objects: int, processes: int) -> None:
-    """Nothing, where every process gets equally many objects of a step.
+    """Refuse numbers of objects that the processes cannot share evenly.
 
     Args:
         tasks: objects a step that are rendered.

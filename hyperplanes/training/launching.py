@@ -16,7 +16,7 @@ from torch import distributed
 __all__ = ["count_processes", "launched"]
 
 PATIENCE = timedelta(hours=6)
-"""How long a process waits for another one, such as for the first one's look at held-out objects."""
+"""How long a process waits for another one, such as for the first one's validation."""
 
 GRACE = 5.0
 """Seconds in which the processes that were started here may end by themselves, once this one has ended in an error."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.training.configuration import TrainingConfig
-from hyperplanes.training.episodes import COMPLETED
+from hyperplanes.training.episodes.episode import VOLUME_CHANNELS
 
 __all__ = ["check_requirements"]
 
 
 def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
-    """Nothing, where the model can be trained so.
+    """Refuse a training that the model cannot have.
 
     Raises:
         ValueError: numbers of views for a field that knows them by their places, rotations without such numbers, or
@@ -30,9 +30,9 @@ def check_requirements(config: TrainingConfig, model: HyperPlanes) -> None:
     if config.rotations and not config.views:
         raise ValueError(f"training.rotations: expected 0 without training.views, got {config.rotations}")
     if config.volume_loss and not (
-        model.reads_volume and getattr(model.config.network, "grid", 0) >= COMPLETED and config.views
+        model.reads_volume and getattr(model.config.network, "grid", 0) >= VOLUME_CHANNELS and config.views
     ):
         raise ValueError(
             f"training.volume_loss: expected training.views, a hypernetwork of kind 'volume' and a grid of at "
-            f"least {COMPLETED} features, got another model or training"
+            f"least {VOLUME_CHANNELS} features, got another model or training"
         )

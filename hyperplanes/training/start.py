@@ -12,7 +12,7 @@ from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.distributed import Processes
-from hyperplanes.training.meta_training import initialisation_trainer
+from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.training.trainer import Trainer
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.files import sha256, write_json
@@ -100,7 +100,7 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
 
 
 def _check_views(model: HyperPlanes, tasks: Tasks) -> None:
-    """Nothing, where the first object has a support view for every plane, or the model needs none.
+    """Refuse data whose first object has fewer support views than the model has planes.
 
     Raises:
         ValueError: fewer; the message says what `train --support` can do about it.

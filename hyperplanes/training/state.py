@@ -5,7 +5,7 @@ training-00000500.safetensors   weights and optimisers of step 500
 training-00000500.json          what training.json was at step 500, where earlier steps are kept: copied over
                                 training.json, the training goes on from there
 model.json, model.safetensors   the model alone, for everybody else
-best/                           the model of the look at held-out objects with the highest PSNR
+best/                           the model with the highest PSNR of held-out objects
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def _upgraded(path: Path, config: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def check_whole(folder: Path) -> None:
-    """Nothing, where a new training may begin in a folder.
+    """Refuse a folder in which a new training would replace weights.
 
     Raises:
         CheckpointError: weights are there, but not training.json, which says how they were trained.
@@ -216,7 +216,7 @@ def check_whole(folder: Path) -> None:
 
 
 def check_model(folder: Path, config: ModelConfig) -> None:
-    """Nothing, where the folder holds no model or this one.
+    """Refuse a folder that holds another model.
 
     Raises:
         CheckpointError: it holds another one; the message says in what.

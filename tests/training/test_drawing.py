@@ -10,7 +10,8 @@ from hyperplanes.data.dataset import Datasets, open_dataset
 from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.data.support import WithSupport
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.training.drawing import draw, draw_balanced, object_generator
+from hyperplanes.training.episodes import Batch, Draw
+from hyperplanes.training.episodes.drawing import draw, draw_balanced, object_generator
 from hyperplanes.views import class_of
 from tests.reference_rendering import Balls, small_model
 
@@ -55,7 +56,8 @@ def test_an_object_alone_in_a_step_has_the_rays_that_it_has_beside_others():
         trainer = Trainer(small_model(hypernetwork=None), Balls(3), TrainingConfig(tasks=tasks, rays=8))
         names = [f"train{place}" for place in range(tasks)]
         generators = [object_generator(0, 0, place) for place in range(tasks)]
-        trainer.gradients(names, [trainer._prefetcher.get(name) for name in names], generators)
+        draws = [Draw(name, trainer.loader.get(name), each) for name, each in zip(names, generators, strict=True)]
+        trainer.objective.gradients(Batch(names, draws, []))
         return [each.get_state() for each in generators]
 
     assert torch.equal(left(1)[0], left(3)[0])
@@ -85,4 +87,4 @@ def test_a_balanced_training_draws_by_class():
 
     trainer = Trainer(small_model(), Kinds(5), TrainingConfig(tasks=2, balanced=True))
     for step in range(20):
-        assert sum(name == "train0" for name in trainer._drawn(step, trainer._generator(step))) == 1
+        assert sum(name == "train0" for name in trainer.loader.names_of(step)) == 1

@@ -1,6 +1,7 @@
 """Source of truth: the opacity of a constant density in closed form, and what share of a ball a half grid covers."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.rendering import Marched
-from hyperplanes.training.emptiness import EMPTINESS, emptiness_loss
+from hyperplanes.training.losses import EmptinessLoss
 
 DENSITY = 2.5
 
@@ -28,8 +29,9 @@ def test_a_constant_density_counts_outside_the_hull_alone_in_every_unit(occupied
         return scale * torch.full((len(points),), DENSITY / unit)
 
     field = AdaptedField(None, Occupancy(voxels, bounds), Marched(), densities=(density,) * networks)
-    loss = emptiness_loss(field, 4000, torch.Generator().manual_seed(0))
-    expected = networks * share * EMPTINESS * (1 - math.exp(-DENSITY * 2 / 10))
+    emptiness = EmptinessLoss(4000)
+    loss = emptiness(SimpleNamespace(field=field, generator=torch.Generator().manual_seed(0)))
+    expected = networks * share * emptiness.weight * (1 - math.exp(-DENSITY * 2 / 10))
     assert float(loss.detach()) == pytest.approx(expected, rel=0.05, abs=1e-12)
     if share:
         loss.backward()

@@ -14,8 +14,8 @@ from hyperplanes.evaluation import evaluate
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Hierarchical
 from hyperplanes.training import Trainer, TrainingConfig, start_training
-from hyperplanes.training.drawing import object_generator
-from hyperplanes.training.meta_training import initialisation_trainer
+from hyperplanes.training.episodes.drawing import object_generator
+from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.views import Task
 from tests.reference_rendering import Balls, small_model
 
@@ -29,7 +29,7 @@ def model_of(method, **changes):
 
 def gradients_of(trainer):
     """The gradient of the first step, before an optimiser sees it."""
-    for optimiser in trainer.optimisers:
+    for optimiser in trainer.optimisation.optimisers:
         optimiser.step = lambda: None
     trainer.take_step()
     return Parameters((name, value.grad) for name, value in trainer.model.networks.named_parameters())
@@ -64,7 +64,7 @@ def test_one_inner_step_of_reptile_is_a_gradient_step_on_support_rays():
     generator = object_generator(0, 0, 0)
     rays_generator = torch.Generator().manual_seed(int(torch.randint(2**31, (), generator=generator)))
     trainer = Trainer(model_of("mv_meta"), Balls(train=1), FAST)
-    episode = trainer._prefetcher.get("train0")
+    episode = trainer.loader.get("train0")
     views = episode.prepared.views
     rays, truth = views.sample_rays(FAST.rays, generator=rays_generator, among=episode.support_live)
     field = trainer.model.field(episode.prepared, trainer.model.theta)

@@ -10,11 +10,11 @@ from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.training import Trainer
-from hyperplanes.training.episodes import whole_of
-from hyperplanes.training.rotation import Rotation, draw_rotation
+from hyperplanes.training.episodes.augmentation import Rotation, draw_rotation
+from hyperplanes.training.episodes.episode import volume_of_all_views
 from hyperplanes.views import Task
 from tests.reference_rendering import Balls
-from tests.training.test_completion import MODEL, TRAINING
+from tests.training.test_volume_loss import MODEL, TRAINING
 
 
 def test_rotated_cameras_see_rotated_points_where_the_others_saw_them():
@@ -40,11 +40,11 @@ def test_a_rotated_volume_is_that_of_the_rotated_views(angle):
     beside = Sphere((0.4, 0.0, 0.2))  # the ball is not in the middle of the scene
     task = Task(*(replace(part, bounds=beside) for part in (task.support, task.query)))
     drawn = Rotation(angle)
-    expected = whole_of(model, Task(drawn.views(task.support), drawn.views(task.query))).float()
+    expected = volume_of_all_views(model, Task(drawn.views(task.support), drawn.views(task.query))).float()
     share = expected[:1]
 
     def errors(change):
-        found = change.volume(whole_of(model, task)).float()
+        found = change.volume(volume_of_all_views(model, task)).float()
         return float((found[:1] - share).abs().mean()), float(((found[1:] - expected[1:]).abs() * share).mean())
 
     place, colours = errors(drawn)
@@ -65,11 +65,11 @@ def test_as_many_episodes_are_rotated_as_asked_for():
 def test_a_training_shows_rotated_objects_with_their_volumes_and_goes_on_where_it_stopped(tmp_path):
     config = replace(TRAINING, rotations=1.0, checkpoint_every=2)
     plain, changed = (Trainer(HyperPlanes(MODEL), Balls(size=(24, 24)), each) for each in (TRAINING, config))
-    name = changed._numbered(0)
-    one, other = plain._load(name), changed._load(name)
+    name = changed.loader.names_of(0)[0]
+    one, other = plain.loader.get(name), changed.loader.get(name)
     assert one.prepared.views.images.shape[1:] == other.prepared.views.images.shape[1:]
     assert not torch.equal(camera.centres(one.query.cameras), camera.centres(other.query.cameras))
-    assert not torch.equal(one.whole, other.whole)
+    assert not torch.equal(one.target_volume, other.target_volume)
     while changed.step < 4:
         changed.take_step()
     first = Trainer(HyperPlanes(MODEL), Balls(size=(24, 24)), config, tmp_path)

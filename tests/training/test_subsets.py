@@ -12,8 +12,8 @@ from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Marched
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.training.drawing import episode_object
-from hyperplanes.training.episodes import QUERIES, prepare_subset
+from hyperplanes.training.episodes.drawing import episode_object
+from hyperplanes.training.episodes.episode import QUERIES, prepare_subset
 from hyperplanes.views import Task, Views
 from tests.reference_rendering import Balls, ball_views, ring, small_model
 
@@ -58,7 +58,7 @@ def test_a_step_draws_of_the_episodes_at_hand_and_each_is_drawn_several_times():
     trainer = Trainer(HyperPlanes(MODEL), Balls(train=5), replace(TRAINING, tasks=3, episodes=6))
     numbers = Counter()
     for step in range(200):
-        drawn = [int(name.partition("#")[2]) for name in trainer._drawn(step, trainer._generator(step))]
+        drawn = [int(name.partition("#")[2]) for name in trainer.loader.names_of(step)]
         assert len(set(drawn)) == 3
         assert all(step <= number < step + 6 for number in drawn)
         numbers.update(drawn)

@@ -20,7 +20,7 @@ from hyperplanes.geometry import occupancy
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical, Marched
 from hyperplanes.training import Trainer, TrainingConfig, train
-from hyperplanes.training.watching import TensorBoard
+from hyperplanes.training.monitoring import TensorBoard
 from hyperplanes.utilities import checkpoints, files
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.interrupts import HungUp, Terminated
@@ -98,7 +98,7 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, 
     assert resumed.step == 5
     assert resumed.curve == whole.curve
     assert same(resumed.model.state_dict(), whole.model.state_dict())
-    for one, other in zip(resumed.optimisers, whole.optimisers, strict=True):
+    for one, other in zip(resumed.optimisation.optimisers, whole.optimisation.optimisers, strict=True):
         states = one.state_dict()["state"], other.state_dict()["state"]
         for place in states[0]:
             assert same(states[0][place], states[1][place])
@@ -122,10 +122,10 @@ def test_reference_objects_take_what_objects_share_out_of_the_gradient_of_their_
 
 def test_only_the_objects_of_a_step_are_rendered():
     trainer = Trainer(small_model(), Balls(), with_(tasks=1, reference_objects=2))
-    drawn = trainer._drawn(0, trainer._generator(0))
+    drawn = trainer.loader.names_of(0)
     assert len(set(drawn)) == len(drawn) == 3
     for name in drawn[1:]:
-        trainer._prefetcher.get(name).query.images.fill_(float("nan"))
+        trainer.loader.get(name).query.images.fill_(float("nan"))
     assert np.isfinite(trainer.take_step())
 
 
@@ -158,10 +158,12 @@ def test_a_checkpoint_of_another_model_is_not_resumed(tmp_path):
 def test_theta_and_the_hypernetwork_have_optimisers_of_their_own():
     model = small_model()
     trainer = Trainer(model, Balls(), with_(learning_rate=3e-3, hypernetwork_learning_rate=1e-4))
-    groups = [{id(value) for group in o.param_groups for value in group["params"]} for o in trainer.optimisers]
+    groups = [
+        {id(value) for group in o.param_groups for value in group["params"]} for o in trainer.optimisation.optimisers
+    ]
     assert groups == [{id(value) for value in part.parameters()} for part in (model.networks, model.hypernetwork)]
     trainer.take_step()
-    assert [optimiser.param_groups[0]["lr"] for optimiser in trainer.optimisers] == [3e-3, 1e-4]
+    assert [optimiser.param_groups[0]["lr"] for optimiser in trainer.optimisation.optimisers] == [3e-3, 1e-4]
 
 
 @pytest.mark.parametrize("frozen", ["theta", "hypernetwork"])
@@ -186,7 +188,7 @@ def test_muon_moves_the_hidden_matrices_by_its_own_rate():
 
 def test_without_a_hypernetwork_theta_alone_is_trained():
     trainer = Trainer(small_model(hypernetwork=None), Balls(), FAST)
-    assert len(trainer.optimisers) == 1
+    assert len(trainer.optimisation.optimisers) == 1
 
 
 def test_rates_rise_in_the_warm_up_and_fall_along_half_a_cosine():
@@ -195,7 +197,7 @@ def test_rates_rise_in_the_warm_up_and_fall_along_half_a_cosine():
     rates = []
     for _ in range(6):
         trainer.take_step()
-        rates.append(trainer.optimisers[0].param_groups[0]["lr"])
+        rates.append(trainer.optimisation.optimisers[0].param_groups[0]["lr"])
     half = 2**-0.5
     expected = [0.5, 1.0, 1.0, 0.2 + 0.4 * (1 + half), 0.6, 0.2 + 0.4 * (1 - half)]
     assert rates == pytest.approx(expected)
@@ -205,7 +207,7 @@ def test_the_paper_keeps_its_rate():
     trainer = Trainer(small_model(), Balls(), with_(steps=3))
     for _ in range(3):
         trainer.take_step()
-        assert trainer.optimisers[0].param_groups[0]["lr"] == 1e-3
+        assert trainer.optimisation.optimisers[0].param_groups[0]["lr"] == 1e-3
 
 
 def test_several_objects_a_step_are_averaged():
@@ -229,7 +231,7 @@ def test_only_training_objects_are_trained_on():
     for _ in range(6):
         trainer.take_step()
     assert set(asked) <= set(data.names("train"))
-    trainer.look()
+    trainer.validate()
     assert asked[-1] in data.names("test")
 
 
@@ -247,7 +249,7 @@ def test_progress_is_reported_with_the_held_out_quality(tmp_path):
 
 
 def test_no_held_out_objects_have_no_quality():
-    assert Trainer(small_model(), Balls(test=0), FAST).look() == (None, None)
+    assert Trainer(small_model(), Balls(test=0), FAST).validate() is None
 
 
 def test_no_training_object_is_refused():
@@ -372,7 +374,7 @@ def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, 
         resumed = Trainer(small_model(), Balls(), FAST, tmp_path)
         found.append(resumed.step)
         assert same(resumed.model.state_dict(), states[resumed.step])
-        assert {int(o.state_dict()["state"][0]["step"]) for o in resumed.optimisers} == {resumed.step}
+        assert {int(o.state_dict()["state"][0]["step"]) for o in resumed.optimisation.optimisers} == {resumed.step}
     assert found == [1, 1, 1, 1, 2]
     names = {"model.json", "model.safetensors", "training-00000002.safetensors", "training.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
@@ -429,19 +431,19 @@ def test_a_state_of_another_shape_is_a_checkpoint_error(tmp_path):
 
 def test_memory_is_bounded_in_bytes():
     whole = Trainer(small_model(), Balls(), FAST)
-    whole.warm("train0")
-    one = whole._episodes.nbytes
+    whole.loader.get("train0")
+    one = whole.loader.cache.nbytes
     # 4 support and 4 query views of 16 x 16 pixels, 4 floats each, a third of the colours again for lookups, a hull
     # of 16^3 bytes, and 8 bytes a pixel that sees it
     least = 8 * 16 * 16 * 4 * 4 + 4 * 16 * 16 * 4 + 16**3
     assert least < one <= least + 4 * 16 * 16 * 8
     tight = Trainer(small_model(), Balls(), with_(memory=int(2.5 * one)))
     for name in ("train0", "train1", "train2", "train1"):
-        tight.warm(name)
-        assert tight._episodes.nbytes <= 2.5 * one
-    assert len(tight._episodes) == 2
-    assert tight._episodes.get("train0") is None
-    assert tight._episodes.get("train1") is not None
+        tight.loader.get(name)
+        assert tight.loader.cache.nbytes <= 2.5 * one
+    assert len(tight.loader.cache) == 2
+    assert tight.loader.cache.get("train0") is None
+    assert tight.loader.cache.get("train1") is not None
 
 
 def test_the_papers_protocol_carves_no_hull_unless_empty_space_is_asked_for(monkeypatch):
@@ -450,7 +452,7 @@ def test_the_papers_protocol_carves_no_hull_unless_empty_space_is_asked_for(monk
     dense = {"coarse_network": True, "sampling": Hierarchical(4, 4)}
     trainer = Trainer(small_model(**dense), Balls(), FAST)
     trainer.take_step()
-    trainer.look()
+    trainer.validate()
     assert not carved
     Trainer(small_model(**dense), Balls(), with_(empty_points=8)).take_step()
     assert carved
@@ -463,19 +465,19 @@ def test_held_out_objects_are_of_the_validation_split_where_there_is_one():
     data.splits["val"] = ["test1"]
     trainer = Trainer(small_model(), data, FAST)
     asked.clear()
-    first = trainer.look()
-    assert trainer.look() == first
-    assert asked == ["test1"]  # and its planes and hull are kept between looks
+    first = trainer.validate().psnr
+    assert trainer.validate().psnr == first
+    assert asked == ["test1"]  # and its planes and hull are kept between validations
 
 
-def test_a_look_at_held_out_objects_is_adapting_and_rendering():
+def test_a_validation_is_adapting_and_rendering():
     data = Balls()
     trainer = Trainer(small_model(), data, FAST)
     trainer.take_step()
     task = data.task("test0")
     views = task.query[[0, 2]]
     expected = psnr(trainer.model.adapt(task.support).render(views.cameras).images, views.images).mean()
-    assert trainer.look()[0] == pytest.approx(expected.item())
+    assert trainer.validate().psnr == pytest.approx(expected.item())
     assert trainer.model.training
 
 
@@ -489,8 +491,8 @@ def test_an_object_that_cannot_be_trained_on_is_named():
         Trainer(small_model(), Blank(), FAST).take_step()
 
 
-def test_a_look_tells_what_the_updates_have_in_common(tmp_path):
-    """Diagnostics of the objects that are looked at, recorded in the curve and beside the weights."""
+def test_a_validation_tells_what_the_updates_have_in_common(tmp_path):
+    """Diagnostics of the held-out objects, recorded in the curve and beside the weights."""
     model = awaken(small_model())
     trainer = Trainer(model, Balls(test=3), with_(steps=2, evaluate_every=2), tmp_path)
     (progress,) = list(trainer.run())

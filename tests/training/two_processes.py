@@ -20,7 +20,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.train import follow
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.training.meta_training import initialisation_trainer
+from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.utilities.checkpoints import save_tensors
 from hyperplanes.utilities.files import write_json
 from tests.reference_rendering import Balls, awaken, small_model

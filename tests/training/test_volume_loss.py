@@ -1,6 +1,7 @@
-"""The loss of completion. Source of truth: grids that are right by construction, and what a step must not touch."""
+"""The loss of volumes. Source of truth: grids that are right by construction, and what a step must not touch."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,8 +12,8 @@ from hyperplanes.hypernetwork import ImageHyperNetworkConfig, VolumeHyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Marched
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.training.completion import completion_loss
-from hyperplanes.training.episodes import prepare_subset, whole_of
+from hyperplanes.training.episodes.episode import prepare_subset, volume_of_all_views
+from hyperplanes.training.losses import VolumeLoss
 from tests.reference_rendering import Balls
 
 MODEL = ModelConfig(
@@ -29,7 +30,11 @@ TRAINING = TrainingConfig(
 
 def episode(model, count=2, seed=0):
     task = Balls(views=8, size=(24, 24)).task("train0")
-    return prepare_subset(model, task, (count,), torch.Generator().manual_seed(seed), whole_of(model, task))
+    return prepare_subset(model, task, (count,), torch.Generator().manual_seed(seed), volume_of_all_views(model, task))
+
+
+def volume_loss(parameters, shown):
+    return VolumeLoss(1.0)(SimpleNamespace(parameters=parameters, episode=shown))
 
 
 def weights(grid):
@@ -39,21 +44,21 @@ def weights(grid):
 def test_the_true_hull_and_colours_have_the_least_loss():
     model = HyperPlanes(MODEL)
     shown = episode(model)
-    whole = shown.whole.float()
+    whole = shown.target_volume.float()
     share = whole[:1].clamp(1e-4, 1 - 1e-4)
     right = torch.cat([torch.logit(share), whole[1:], torch.zeros(1, *share.shape[1:])])
-    least = float(completion_loss(weights(right), shown))
+    least = float(volume_loss(weights(right), shown))
     for wrong in (torch.zeros_like(right), right + 0.5, right.flip(1)):
-        assert float(completion_loss(weights(wrong), shown)) > least + 0.01
+        assert float(volume_loss(weights(wrong), shown)) > least + 0.01
 
 
 def test_only_cells_of_the_hull_that_is_shown_count_and_only_the_first_features():
     model = HyperPlanes(MODEL)
     shown = episode(model)
     left = shown.prepared.volume[0] > 0
-    assert bool((left & (shown.whole[0] == 0)).any())  # few views leave more than all do
+    assert bool((left & (shown.target_volume[0] == 0)).any())  # few views leave more than all do
     grid = torch.zeros(5, *left.shape, requires_grad=True)
-    completion_loss(weights(grid), shown).backward()
+    volume_loss(weights(grid), shown).backward()
     assert bool((grid.grad[0, left] != 0).all())
     assert not grid.grad[:, ~left].any()
     assert not grid.grad[4:].any()
@@ -66,7 +71,7 @@ def test_a_training_learns_what_is_behind_the_views_that_are_shown():
 
     def loss():
         with torch.no_grad():
-            return float(completion_loss(model.theta + model.eval().update(shown.prepared), shown))
+            return float(volume_loss(model.theta + model.eval().update(shown.prepared), shown))
 
     before = loss()
     while trainer.step < 40:

@@ -1,4 +1,4 @@
-"""Rotation of training objects about the vertical axis."""
+"""What is changed at random in training objects: how they stand, which planes show them, what is behind them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
+from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
 
-__all__ = ["Rotation", "draw_rotation"]
+__all__ = ["Rotation", "draw_rotation", "drop_planes", "over_random_colour"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,35 @@ def draw_rotation(share: float, generator: torch.Generator) -> Rotation:
     """
     chance, angle = torch.rand(2, generator=generator).tolist()
     return Rotation(2 * math.pi * angle) if chance < share else Rotation()
+
+
+def drop_planes(prepared: SupportContext, chance: float, generator: torch.Generator) -> SupportContext:
+    """The object without some of its planes.
+
+    Args:
+        prepared: the object.
+        chance: that a plane is hidden; with 0, nothing is drawn.
+        generator: of the draw.
+    """
+    if not chance:
+        return prepared
+    hidden = torch.rand(len(prepared.views), generator=generator) < chance
+    return prepared.hiding(hidden.nonzero()[:, 0])
+
+
+def over_random_colour(
+    rendered: Rendered, truth: Float[Tensor, "ray 3"], opacity: Float[Tensor, "ray 1"], generator: torch.Generator
+) -> tuple[Rendered, Float[Tensor, "ray 3"]]:
+    """Prediction and truth composited over one random colour.
+
+    Args:
+        rendered: the prediction.
+        truth: over white.
+        opacity: of the truth.
+        generator: of the colour.
+    """
+    colour = torch.rand(3, generator=generator).to(truth)
+    return rendered.over(colour), truth + (1 - opacity) * (colour - 1)
 
 
 def _rotated(views: Views, angle: float) -> PinholeCamera:

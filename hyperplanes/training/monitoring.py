@@ -1,9 +1,10 @@
-"""What can be seen of a training: its curve as CSV, held-out views beside the truth, and TensorBoard."""
+"""What can be seen of a training: its curve, gradient norms, speed, held-out views, and all that in TensorBoard."""
 
 from __future__ import annotations
 
 import csv
 import io
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.export.images import to_pixels
 from hyperplanes.utilities.files import write_whole
 from hyperplanes.utilities.metrics import ssim
 
-__all__ = ["Samples", "TensorBoard", "write_curve"]
+__all__ = ["Samples", "Speed", "TensorBoard", "gradient_norms", "write_curve"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,43 @@ def write_curve(path: Path, curve: Sequence[Mapping[str, float]]) -> None:
     writer.writeheader()
     writer.writerows(curve)
     write_whole(path, text.getvalue().encode())
+
+
+@torch.no_grad()
+def gradient_norms(model: HyperPlanes) -> dict[str, float]:
+    """Norms of the gradients of the last step, after clipping: of theta and of the hypernetwork, where there is one."""
+    found = {}
+    for name, part in {"theta": model.networks, "hypernetwork": model.hypernetwork}.items():
+        gradients = [] if part is None else [each.grad for each in part.parameters() if each.grad is not None]
+        if gradients:
+            found[f"gradient_{name}"] = float(torch.stack([each.norm() for each in gradients]).norm())
+    return found
+
+
+class Speed:
+    """Rays a second since the last report, and the seconds that are left.
+
+    Args:
+        step: steps done before.
+        steps: steps in all.
+        rays: of a step.
+    """
+
+    def __init__(self, step: int, steps: int, rays: int) -> None:
+        self._first, self._steps, self._rays = step, steps, rays
+        self._began = time.perf_counter()
+        self._reported = (self._began, step)
+
+    def rays_per_second(self, step: int) -> float:
+        """Since the last report; what comes between reports and steps, such as validation, is not counted."""
+        before, reported = self._reported
+        return (step - reported) * self._rays / max(time.perf_counter() - before, 1e-9)
+
+    def seconds_left(self, step: int) -> float:
+        """By the speed so far, all included; a report ends here, and the next one begins."""
+        now = time.perf_counter()
+        self._reported = (now, step)
+        return (now - self._began) / (step - self._first) * (self._steps - step)
 
 
 class TensorBoard:

@@ -11,9 +11,27 @@ from torch import Tensor
 
 from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["draw", "draw_balanced", "episode_generator", "episode_object", "object_generator", "points_in"]
+__all__ = [
+    "draw",
+    "draw_balanced",
+    "episode_generator",
+    "episode_object",
+    "object_generator",
+    "points_in",
+    "step_generator",
+]
 
 EPISODES, ORDERS = 1, 2  # set the streams of these apart from those of rays
+
+
+def step_generator(seed: int, step: int) -> torch.Generator:
+    """What the objects of a step are drawn from.
+
+    Args:
+        seed: of the training.
+        step: steps done before.
+    """
+    return torch.Generator().manual_seed(seed * 1_000_003 + step)
 
 
 def object_generator(seed: int, step: int, place: int) -> torch.Generator:

@@ -1,4 +1,4 @@
-"""The objects of a training as its steps need them: planes, hull and query views."""
+"""One object as a step of training needs it: planes, hull and query views."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.views import Task, Views, join_views
 
-__all__ = ["COMPLETED", "Episode", "prepare_episode", "prepare_subset", "whole_of"]
+__all__ = ["VOLUME_CHANNELS", "Episode", "prepare_episode", "prepare_subset", "volume_of_all_views"]
 
-COMPLETED = 4  # channels of a volume that are completed: the share that is occupied, and the mean colour
+VOLUME_CHANNELS = 4
+"""Channels of a volume that the volume loss compares: the share that is occupied, and the mean colour."""
 
 QUERIES = 4  # views that rays are drawn from, of those that an episode does not show
 
@@ -32,13 +33,13 @@ class Episode:
         prepared: its support side.
         query: the views that the loss is taken on.
         live: flat indices of the query pixels that look into the hull; None where all are drawn from.
-        whole: of `whole_of`, where the training completes volumes.
+        target_volume: of `volume_of_all_views`, where the training has a volume loss.
     """
 
     prepared: SupportContext
     query: Views
     live: Int[Tensor, " pixel"] | None
-    whole: Float[Tensor, "4 x y z"] | None = None
+    target_volume: Float[Tensor, "4 x y z"] | None = None
 
     @cached_property
     def support_live(self) -> Int[Tensor, " pixel"] | None:
@@ -57,7 +58,7 @@ class Episode:
             + self.query.nbytes
             + self.prepared.occupancy.occupied.nbytes
         )
-        further = (self.live, self.prepared.volume, self.whole)
+        further = (self.live, self.prepared.volume, self.target_volume)
         return own + sum(each.nbytes for each in further if each is not None)
 
 
@@ -86,7 +87,7 @@ def prepare_subset(
     task: Task,
     counts: Sequence[int],
     generator: torch.Generator,
-    whole: Float[Tensor, "4 x y z"] | None = None,
+    target_volume: Float[Tensor, "4 x y z"] | None = None,
 ) -> Episode:
     """An object shown by a random number of random views, some others of which are the query views.
 
@@ -95,7 +96,7 @@ def prepare_subset(
         task: the object; which of its views are support and which query does not matter.
         counts: of the views that are shown, each as likely as the others; one is left for the query.
         generator: of the choice.
-        whole: of `whole_of`.
+        target_volume: of `volume_of_all_views`.
 
     Returns:
         The object, made ready for steps of training.
@@ -105,10 +106,10 @@ def prepare_subset(
     count = min(count, len(views) - 1)
     order = torch.randperm(len(views), generator=generator).to(views.images.device)
     shown, asked = views[order[:count]], views[order[count : count + QUERIES]]
-    return replace(prepare_episode(model, Task(shown, asked, task.name)), whole=whole)
+    return replace(prepare_episode(model, Task(shown, asked, task.name)), target_volume=target_volume)
 
 
-def whole_of(model: HyperPlanes, task: Task) -> Float[Tensor, "4 x y z"]:
+def volume_of_all_views(model: HyperPlanes, task: Task) -> Float[Tensor, "4 x y z"]:
     """What all views of an object together show of each cell: the share that the hull occupies, and the mean colour.
 
     Args:
@@ -120,4 +121,4 @@ def whole_of(model: HyperPlanes, task: Task) -> Float[Tensor, "4 x y z"]:
     """
     volume = model.prepare(join_views(task.support, task.query)).volume
     assert volume is not None
-    return volume[:COMPLETED].half()
+    return volume[:VOLUME_CHANNELS].half()

@@ -1,0 +1,6 @@
+"""The objects of the steps of a training: which are drawn, how they are made ready, and how they are augmented."""
+
+from hyperplanes.training.episodes.episode import Episode, prepare_episode
+from hyperplanes.training.episodes.loader import Batch, Draw, EpisodeLoader
+
+__all__ = ["Batch", "Draw", "Episode", "EpisodeLoader", "prepare_episode"]

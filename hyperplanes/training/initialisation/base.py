@@ -1,0 +1,72 @@
+"""What the objectives of learned initialisations have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.context import SupportContext
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.initialisation import InitialisationConfig
+from hyperplanes.geometry.rays import Rays
+from hyperplanes.parameters import Parameters
+from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.training.episodes import Episode
+from hyperplanes.views import Tasks
+
+__all__ = ["InitialisationObjective", "draw_rays", "draw_seed"]
+
+
+class InitialisationObjective:
+    """Weights that are validated after gradient steps on an object, as many as in training.
+
+    Args:
+        model: without a hypernetwork; trained in place.
+        config: of the training.
+    """
+
+    def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
+        self.model, self.config = model, config
+        self.updates: Sequence[Parameters] = ()
+
+    @property
+    def initialisation(self) -> InitialisationConfig:
+        """How the initialisation is learned."""
+        assert self.model.config.initialisation is not None
+        return self.model.config.initialisation
+
+    @property
+    def rays_per_step(self) -> int:
+        """Rays of all objects of a step."""
+        return self.config.rays * self.config.tasks
+
+    def tasks(self, data: Tasks) -> Tasks:
+        """The tasks as they are."""
+        return data
+
+    def adapt(self, prepared: SupportContext) -> AdaptedField:
+        """The field of a held-out object, after the steps of training."""
+        settings = replace(self.initialisation.descent(self.config.rays), seed=self.config.seed)
+        return self.model.fine_tune_to(prepared, self.initialisation.inner_steps, settings)
+
+    def set_gradients(self, gradient: Parameters) -> None:
+        """Give the optimisers a gradient that no backward pass has made."""
+        for name, value in self.model.networks.named_parameters():
+            value.grad = gradient[name]
+
+
+def draw_seed(generator: torch.Generator) -> int:
+    """A seed for what has a generator of its own."""
+    return int(torch.randint(2**31, (), generator=generator))
+
+
+def draw_rays(
+    episode: Episode, field: AdaptedField, count: int, generator: torch.Generator, *, of_support: bool = False
+) -> tuple[Rays, Tensor]:
+    """Rays of the query views or of the planes of an object, and their colours."""
+    views, live = (episode.prepared.views, episode.support_live) if of_support else (episode.query, episode.live)
+    return views.sample_rays(count, generator=generator, among=live, span=field.sampling.span)

@@ -1,0 +1,70 @@
+"""MAML: an initialisation from which gradient steps on an object go far, by the gradient through them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from hyperplanes.adaptation.descent import ray_loss
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.geometry.rays import Rays
+from hyperplanes.parameters import Parameters
+from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.training.episodes import Batch, Episode
+from hyperplanes.training.initialisation.base import InitialisationObjective, draw_rays, draw_seed
+from hyperplanes.training.meta_gradients import maml_gradient
+
+__all__ = ["MAML"]
+
+
+class MAML(InitialisationObjective):
+    """The loss of query rays after gradient steps on support rays, and its gradient through them (Finn et al. 2017).
+
+    Args:
+        model: as in `InitialisationObjective`.
+        config: as in `InitialisationObjective`.
+
+    Raises:
+        ValueError: a field of any order, which would learn to copy the views that support rays come from.
+    """
+
+    def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
+        if model.target.permutation_invariant:
+            raise ValueError(f"maml: expected a field that knows views by their places, got {model.config.target}")
+        super().__init__(model, config)
+
+    @property
+    def rays_per_step(self) -> int:
+        """Rays of all inner steps and of the outer loss on all objects."""
+        return super().rays_per_step * (self.initialisation.inner_steps + 1)
+
+    def gradients(self, batch: Batch) -> float:
+        """MAML's gradient, averaged over the objects."""
+        total, mean, count = 0.0, Parameters(), len(batch.rendered)
+        initialisation, theta = self.initialisation, self.model.theta.detach()
+        first_order = initialisation.method == "maml_first_order"
+        for draw in batch.rendered:
+            episode, generator, rays = draw.episode, draw.generator, self.config.rays
+            field = self.model.field(episode.prepared, theta)
+            # support rays for every inner step, query rays for the outer loss
+            drawn = [
+                draw_rays(episode, field, rays, generator, of_support=True) for _ in range(initialisation.inner_steps)
+            ]
+            drawn.append(draw_rays(episode, field, rays, generator))
+            *inner, outer = [self._loss(episode, *each, draw_seed(generator)) for each in drawn]
+            # the gradient of the outer loss through the inner steps
+            gradient, loss = maml_gradient(theta, inner, outer, initialisation.inner_rate, first_order=first_order)
+            total += float(loss)
+            parts = {name: value / count for name, value in gradient.items()}
+            mean = mean + parts if mean else Parameters(parts)
+        self.set_gradients(mean)
+        return total / count
+
+    def _loss(self, episode: Episode, rays: Rays, truth: Tensor, seed: int) -> Callable[[Parameters], Tensor]:
+        def loss(parameters: Parameters) -> Tensor:
+            generator = torch.Generator().manual_seed(seed)
+            return ray_loss(self.model.field(episode.prepared, parameters).trace(rays, generator), truth)
+
+        return loss
