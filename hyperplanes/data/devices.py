@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
 from hyperplanes.data.upright import upright_task
-from hyperplanes.views import Task, Tasks, class_of
+from hyperplanes.data.wrapper import TaskWrapper
+from hyperplanes.views import Task
 
 __all__ = ["TasksOnDevice", "choose_device"]
 
@@ -31,28 +31,18 @@ def choose_device(name: str) -> torch.device:
 
 
 @dataclass(frozen=True)
-class TasksOnDevice:
+class TasksOnDevice(TaskWrapper):
     """Tasks whose views lie on a device, in a world with y up.
 
     Attributes:
-        data: where they come from.
         device: where they go.
         up: the axis that points up in the data's world.
     """
 
-    data: Tasks
     device: torch.device
     up: str = "y"
 
-    def names(self, split: str) -> Sequence[str]:
-        """The objects of a split."""
-        return self.data.names(split)
-
-    def class_of(self, name: str) -> str:
-        """The class of one object, as the data set states it."""
-        return class_of(self.data, name)
-
-    def task(self, name: str) -> Task:
-        """One object."""
-        task = upright_task(self.data.task(name), self.up)
+    def change(self, task: Task) -> Task:
+        """The task on the device."""
+        task = upright_task(task, self.up)
         return Task(task.support.to(self.device), task.query.to(self.device), task.name)

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
+from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.poses import farthest_first
-from hyperplanes.views import Task, Tasks, class_of, join_views
+from hyperplanes.views import Task, join_views
 
 __all__ = ["Shown", "SingleView", "WithSupport"]
 
 
 @dataclass(frozen=True)
-class WithSupport:
+class WithSupport(TaskWrapper):
     """Tasks with another number of support views.
 
     Where there are more than an object has, its query views follow, in their order: support and query unified, as the
@@ -24,36 +24,22 @@ class WithSupport:
     shown.
 
     Attributes:
-        data: where the tasks come from.
         count: support views of every object.
     """
 
-    data: Tasks
     count: int
 
     def __post_init__(self) -> None:
         if self.count < 1:
             raise ValueError(f"support: expected at least 1 view, got {self.count}")
 
-    def names(self, split: str) -> Sequence[str]:
-        """The objects of a split."""
-        return self.data.names(split)
-
-    def class_of(self, name: str) -> str:
-        """The class of one object, as the data set states it."""
-        return class_of(self.data, name)
-
-    def task(self, name: str) -> Task:
-        """One object.
-
-        Raises:
-            ValueError: it has fewer views.
-        """
-        task = self.data.task(name)
+    def change(self, task: Task) -> Task:
+        """The task with so many support views; ValueError where the object has fewer views."""
         total = len(task.support) + len(task.query)
         if self.count > total:
             raise ValueError(
-                f"{name}: expected {self.count} views for the support, got {total}; --support {total} takes all of them"
+                f"{task.name}: expected {self.count} views for the support, got {total}; "
+                f"--support {total} takes all of them"
             )
         more = self.count - len(task.support)
         support = task.support[: self.count] if more <= 0 else join_views(task.support, task.query[:more])
@@ -61,43 +47,29 @@ class WithSupport:
 
 
 @dataclass(frozen=True)
-class SingleView:
+class SingleView(TaskWrapper):
     """Tasks of which one support view is left, always the same of an object."""
 
-    data: Tasks
-
-    def names(self, split: str) -> Sequence[str]:
-        """The objects of a split."""
-        return self.data.names(split)
-
-    def task(self, name: str) -> Task:
-        """One object with the view that its name decides on."""
-        task = self.data.task(name)
-        chosen = zlib.crc32(name.encode()) % len(task.support)
+    def change(self, task: Task) -> Task:
+        """The task with the view that the name of the object decides on."""
+        chosen = zlib.crc32(task.name.encode()) % len(task.support)
         return replace(task, support=task.support[[chosen]])
 
 
 @dataclass(frozen=True)
-class Shown:
+class Shown(TaskWrapper):
     """Tasks of which so many views are shown, as far apart as they stand, and some query views are kept back.
 
     Attributes:
-        data: where the tasks come from.
         count: views that are shown, support and query alike, at most all but those that are kept back.
         query: how many of the query views are kept back, evenly chosen.
     """
 
-    data: Tasks
     count: int
     query: int
 
-    def names(self, split: str) -> Sequence[str]:
-        """The objects of a split."""
-        return self.data.names(split)
-
-    def task(self, name: str) -> Task:
-        """One object."""
-        task = self.data.task(name)
+    def change(self, task: Task) -> Task:
+        """The task with the views that are farthest apart, the first one first."""
         asked = torch.linspace(0, len(task.query) - 1, min(self.query, len(task.query))).round().long()
         rest = [index for index in range(len(task.query)) if index not in asked.tolist()]
         views = join_views(task.support, task.query[rest])

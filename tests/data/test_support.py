@@ -4,12 +4,14 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.data.support import SingleView, WithSupport
+from hyperplanes.data.devices import TasksOnDevice
+from hyperplanes.data.support import Shown, SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import TrainingConfig, train
+from hyperplanes.views import class_of
 from tests.reference_rendering import Balls, small_model
 
 
@@ -55,3 +57,20 @@ def test_the_single_view_of_an_object_is_always_the_same():
         assert len(first) == 1
         assert torch.equal(first.images, again.images)
         assert torch.equal(data.task(name).query.images, Balls().task(name).query.images)
+
+
+def test_every_wrapper_keeps_splits_and_classes():
+    class Kinds(Balls):
+        def class_of(self, name):
+            return f"class of {name}"
+
+    data = Kinds()
+    for wrapped in (
+        WithSupport(data, 2),
+        SingleView(data),
+        Shown(data, 2, 1),
+        TasksOnDevice(data, torch.device("cpu")),
+    ):
+        assert wrapped.names("train") == data.names("train")
+        assert class_of(wrapped, "train1") == "class of train1"
+        assert class_of(SingleView(wrapped), "train1") == "class of train1"

@@ -145,7 +145,7 @@ def test_gradient_steps_from_an_initialisation_are_plain_descent_unless_an_optim
     for rate, settings in ((0.3, config.descent()), (0.1, config.descent(given=given))):
         assert (settings.optimiser, settings.learning_rate, settings.final_rate_factor) == ("sgd", rate, 1.0)
     adam = config.descent(given=replace(given, optimiser="adam"))
-    assert (adam.optimiser, adam.learning_rate, adam.final, adam.seed) == ("adam", 0.1, 0.2, 4)
+    assert (adam.optimiser, adam.learning_rate, adam.final_rate_factor, adam.seed) == ("adam", 0.1, 0.2, 4)
 
 
 def test_objects_in_another_order_have_the_same_results_and_the_initialisation_stays_as_it_is():
