@@ -30,7 +30,7 @@ from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.data import DataError, read_task
 from hyperplanes.data.dataset import locate_scene
-from hyperplanes.demo.pipeline import DemoSettings, configurations
+from hyperplanes.experiments.demonstration.pipeline import DemoSettings, configurations
 from hyperplanes.export.baking import BakedScene
 from hyperplanes.export.images import to_pixels
 from hyperplanes.fields.baked import BakedField

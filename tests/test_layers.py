@@ -1,6 +1,7 @@
-"""Source of truth: the layers of CONTRIBUTING.md, held against every import statement in the packages."""
+"""Source of truth: the layers of CONTRIBUTING.md, held against every import in the packages, by a string too."""
 
 import ast
+import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -26,7 +27,7 @@ LAYERS = {
     "hyperplanes.configuration.settings_file": 4,
     "hyperplanes.data.devices": 4,
     "hyperplanes.commands.checks": 4,
-    "hyperplanes.reproduce": 4.5,
+    "hyperplanes.experiments": 4.5,
     "hyperplanes.demo": 4.5,
     "hyperplanes.adaptation": 3,
     "hyperplanes.data": 3,
@@ -51,6 +52,8 @@ LAYERS = {
 }
 INSIDE = {"hyperplanes.data": ("pictures", "formats", "dataset", "inspection")}  # from the ground up
 OURS = ("hyperplanes", "data_gen", "benchmarks")
+NAMED = re.compile(r"(hyperplanes|data_gen|benchmarks)(\.[a-z]\w*)+(:\w+|\.)?")
+"""A string that names a module, one of its objects, or where a name in braces goes on."""
 
 
 def unit(module):
@@ -72,8 +75,12 @@ def modules():
 
 
 def imported(path):
-    """Every module of ours that a file imports, at its top or in a function."""
+    """Every module of ours that a file imports, at its top or in a function, or that it names in a string."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and NAMED.fullmatch(node.value):
+            name = node.value.partition(":")[0].removesuffix(".")
+            if is_module(name):  # and no group of entry points
+                yield name
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -81,6 +88,10 @@ def imported(path):
             for alias in node.names:
                 whole = f"{node.module}.{alias.name}"
                 yield whole if unit(whole) != unit(node.module) else node.module
+
+
+def is_module(name):
+    return is_package(name) or (ROOT / Path(*name.split("."))).with_suffix(".py").is_file()
 
 
 def is_package(name):

@@ -41,7 +41,7 @@ def test_it_holds_the_packages_and_nothing_else(wheel):
     }
     models = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/pretrained").glob("*/*.*")}
     examples = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/examples").rglob("*.*")}
-    page = {"hyperplanes/demo/style.css", "hyperplanes/demo/report.html"}
+    page = {"hyperplanes/experiments/page/style.css", "hyperplanes/experiments/page/report.html"}
     assert found == there | page | {*PACKAGED} | models | examples
 
 

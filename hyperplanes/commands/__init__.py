@@ -9,6 +9,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 __all__ = ["EXAMPLES", "VERBS", "Verb", "find_verb", "find_verbs", "split_settings"]
 
@@ -24,6 +26,10 @@ class Verb:
 
     module: str
     about: str
+
+    def load(self) -> Any:
+        """The module with its `Arguments` and its `run`."""
+        return import_module(self.module)
 
 
 VERBS: dict[str, str] = {

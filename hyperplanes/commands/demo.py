@@ -25,8 +25,8 @@ from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
-    from hyperplanes.demo.pipeline import DemoSettings
-    from hyperplanes.demo.stages import Stage, Stages
+    from hyperplanes.experiments.demonstration.pipeline import DemoSettings
+    from hyperplanes.experiments.stages import Stage, Stages
 
 __all__ = ["Arguments", "run", "settings_of"]
 
@@ -72,7 +72,7 @@ def settings_of(arguments: Arguments) -> DemoSettings:
     Raises:
         ValueError: too few objects or pixels, or no folder of meshes.
     """
-    from hyperplanes.demo.pipeline import DemoSettings
+    from hyperplanes.experiments.demonstration.pipeline import DemoSettings
 
     if arguments.meshes is not None and not arguments.meshes.is_dir():
         found = "a file" if arguments.meshes.exists() else "nothing"
@@ -102,8 +102,8 @@ def settings_of(arguments: Arguments) -> DemoSettings:
 @writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """All stages, each skipped when it is done."""
-    from hyperplanes.demo.pipeline import stages
-    from hyperplanes.demo.stages import Stages
+    from hyperplanes.experiments.demonstration.pipeline import stages
+    from hyperplanes.experiments.stages import Stages
 
     console, settings = Console(), settings_of(arguments)
     todo, record = stages(settings), Stages(arguments.out)
@@ -123,7 +123,7 @@ def run(arguments: Arguments) -> int:
 
 def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: Console, record: Stages) -> None:
     from hyperplanes.data import open_dataset
-    from hyperplanes.demo.pipeline import FIRST, MODELS, configurations
+    from hyperplanes.experiments.demonstration.pipeline import FIRST, MODELS, configurations
 
     out = arguments.out
     if stage.name == FIRST:
@@ -136,17 +136,17 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
     if stage.name in MODELS:
         _train(stage.name, configurations(settings)[stage.name], arguments, console)
     elif stage.name == "report":
-        from hyperplanes.demo.pipeline import write_metrics
-        from hyperplanes.demo.report import how_it_was_made, write_report
+        from hyperplanes.experiments.demonstration.pipeline import write_metrics
+        from hyperplanes.experiments.demonstration.report import how_it_was_made, write_report
 
         facts = how_it_was_made(settings, out, data.manifest)
         write_report(out, data, settings, write_metrics(out, settings), facts)
     elif stage.name == "fine-tuning":
-        from hyperplanes.demo.pipeline import measure_tuning
+        from hyperplanes.experiments.demonstration.pipeline import measure_tuning
 
         measure_tuning(settings, data, out, lambda name, psnr: console.say(f"{name}: {psnr:.2f} dB"), arguments.device)
     else:
-        from hyperplanes.demo.pipeline import score_method
+        from hyperplanes.experiments.demonstration.pipeline import score_method
 
         method, names = stage.name.removeprefix("evaluate "), data.names("test")
         with console.bar(method) as bar:
@@ -162,13 +162,11 @@ def _work(stage: Stage, settings: DemoSettings, arguments: Arguments, console: C
 
 def _show_first(settings: DemoSettings, out: Path, console: Console) -> None:
     """Objects that no training saw, and the page on which the packaged model shows them."""
-    from importlib import import_module
-
     from hyperplanes.commands import find_verb
     from hyperplanes.data.dataset import open_datasets
-    from hyperplanes.demo.first_look import write_first_look
+    from hyperplanes.experiments.demonstration.first_page import write_first_page
 
-    generate = import_module(find_verb("generate").module)
+    generate = find_verb("generate").load()
     sizes = {"resolution": settings.first_resolution, "rig": "random", "seed": settings.seed}
     folders = {out / "first" / name: {"class_name": name, "count": 1} for name in settings.first}
     if settings.meshes is not None:
@@ -176,7 +174,7 @@ def _show_first(settings: DemoSettings, out: Path, console: Console) -> None:
     for folder, what in sorted(folders.items(), key=lambda item: "meshes" not in item[1]):  # they may be wrong input
         generate.run(generate.Arguments(folder, held_out=1, **what, **sizes))
     data = open_datasets(list(folders))
-    page = write_first_look(
+    page = write_first_page(
         out / "first.html",
         data,
         data.names()[:MOST],
@@ -188,11 +186,9 @@ def _show_first(settings: DemoSettings, out: Path, console: Console) -> None:
 
 
 def _generate(settings: DemoSettings, out: Path) -> None:
-    from importlib import import_module
-
     from hyperplanes.commands import find_verb
 
-    generate = import_module(find_verb("generate").module)
+    generate = find_verb("generate").load()
     sizes = {name: getattr(settings, name) for name in ("seed", "views", "resolution")}
     unseen = settings.unseen_objects
     for folder, class_name, objects, held_out in (
@@ -217,7 +213,7 @@ def _train(name: str, chosen, arguments: Arguments, console: Console) -> None:
 
 
 def _finish(out: Path, console: Console) -> None:
-    from hyperplanes.demo.pipeline import describe_row
+    from hyperplanes.experiments.demonstration.pipeline import describe_row
     from hyperplanes.utilities.checkpoints import read_json
 
     metrics = read_json(out / "metrics.json")

@@ -28,7 +28,7 @@ from hyperplanes.commands.writing import writes_to
 
 if TYPE_CHECKING:
     from hyperplanes.configuration.presets import Preset
-    from hyperplanes.reproduce.scales import Scale
+    from hyperplanes.experiments.scales import Scale
     from hyperplanes.views import Tasks
 
 __all__ = ["Arguments", "data_sets", "run"]
@@ -76,7 +76,7 @@ def data_sets(given: Sequence[str]) -> dict[str, Path]:
     Raises:
         ValueError: not of the form CLASS=FOLDER, or another class.
     """
-    from hyperplanes.reproduce.experiments import CLASSES
+    from hyperplanes.experiments.tables import CLASSES
 
     found = {}
     for each in given:
@@ -94,10 +94,10 @@ def run(arguments: Arguments) -> int:
     """Run what is not done yet and print the table."""
     from hyperplanes.commands.train import follow
     from hyperplanes.data.devices import choose_device
-    from hyperplanes.reproduce import EXPERIMENTS, SCALES, report
-    from hyperplanes.reproduce.engine import Runner
-    from hyperplanes.reproduce.estimate import estimate
-    from hyperplanes.reproduce.figures import figure_of
+    from hyperplanes.experiments import EXPERIMENTS, SCALES, report
+    from hyperplanes.experiments.engine import Runner
+    from hyperplanes.experiments.estimate import estimate
+    from hyperplanes.experiments.figures import figure_of
     from hyperplanes.training import start_training
     from hyperplanes.utilities.files import write_json, write_whole
     from hyperplanes.utilities.formatting import format_duration
@@ -151,11 +151,9 @@ def _command(arguments: Arguments, seeds: int) -> str:
 
 
 def _generate(class_name: str, folder: Path, scale: Scale) -> None:
-    from importlib import import_module
-
     from hyperplanes.commands import find_verb
 
-    generate = import_module(find_verb("generate").module)
+    generate = find_verb("generate").load()
     generate.run(
         generate.Arguments(
             folder,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hyperplanes.reproduce.published import CROSS, SHAPENET, SINGLE, TARGET, TIME, PublishedTable
+from hyperplanes.experiments.published import CROSS, SHAPENET, SINGLE, TARGET, TIME, PublishedTable
 
 __all__ = ["CLASSES", "EXPERIMENTS", "Cell", "Experiment", "Trained"]
 

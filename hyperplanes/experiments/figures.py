@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyperplanes.reproduce.engine import Curve, Outcome
-from hyperplanes.reproduce.report import value
+from hyperplanes.experiments.engine import Curve, Outcome
+from hyperplanes.experiments.report import value
 from hyperplanes.utilities.plots import draw_bars, draw_boxes, draw_lines, new_figure
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ import torch
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.experiments.engine import Runner
+from hyperplanes.experiments.tables import Experiment, Trained
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.reproduce.engine import Runner
-from hyperplanes.reproduce.experiments import Experiment, Trained
 from hyperplanes.training import Trainer
 from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.utilities.formatting import format_duration, format_rate

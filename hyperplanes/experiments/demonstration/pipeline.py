@@ -13,9 +13,9 @@ import torch
 from hyperplanes.adaptation.base import Adapter, Pictures
 from hyperplanes.configuration.presets import Preset, configure
 from hyperplanes.data.devices import TasksOnDevice, choose_device
-from hyperplanes.demo.first_look import COUNTS
-from hyperplanes.demo.stages import Stage
 from hyperplanes.evaluation import ObjectScore, evaluate
+from hyperplanes.experiments.demonstration.first_page import COUNTS
+from hyperplanes.experiments.stages import Stage
 from hyperplanes.export.images import save_images
 from hyperplanes.methods import at_steps, describe_method, make_method
 from hyperplanes.rendering.renderer import Marched

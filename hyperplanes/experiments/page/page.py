@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 
-from hyperplanes.demo.charts import line_chart
-from hyperplanes.demo.content import Report
-from hyperplanes.demo.pictures import ERROR_SCALE, error_map, gradient, inline, inline_png
+from hyperplanes.experiments.page.charts import line_chart
+from hyperplanes.experiments.page.content import Report
+from hyperplanes.experiments.page.pictures import ERROR_SCALE, error_map, gradient, inline, inline_png
 
 __all__ = ["render_page"]
 
@@ -22,12 +22,12 @@ def render_page(report: Report) -> str:
     """
     from jinja2 import Environment, StrictUndefined
 
-    if not report.exhibits or any(report.method not in look.predictions for e in report.exhibits for look in e.looks):
+    if not report.exhibits or any(report.method not in view.predictions for e in report.exhibits for view in e.views):
         raise ValueError(f"report: expected exhibits that show {report.method}, got {len(report.exhibits)} exhibits")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters |= {"png": inline_png, "inline": inline, "error": error_map}
-    folder = files("hyperplanes.demo")
-    methods = [row for row in report.table if row.method in report.exhibits[0].looks[0].predictions]
+    folder = files("hyperplanes.experiments.page")
+    methods = [row for row in report.table if row.method in report.exhibits[0].views[0].predictions]
     return environment.from_string(folder.joinpath("report.html").read_text(encoding="utf-8")).render(
         report=report,
         methods=methods,

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from hyperplanes.configuration.presets import Preset, configure
-from hyperplanes.reproduce.experiments import Experiment, Trained
-from hyperplanes.reproduce.scales import Scale
+from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.tables import Experiment, Trained
 
 __all__ = ["change", "configuration", "deviations"]
 

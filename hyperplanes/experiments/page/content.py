@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Exhibit", "Look", "Pixels", "Report", "Row"]
+__all__ = ["Exhibit", "QueryView", "Pixels", "Report", "Row"]
 
 Pixels = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Look:
+class QueryView:
     """One view that no method was shown.
 
     Attributes:
@@ -34,7 +34,7 @@ class Exhibit:
         name: of the object.
         support: (view, height, width, 3), what the methods were shown.
         read: which of them the hypernetwork reads.
-        looks: some query views.
+        views: some query views.
         psnr: dB over all query views, by method.
         turntable: an animated WebP of the prediction, or nothing.
     """
@@ -42,7 +42,7 @@ class Exhibit:
     name: str
     support: Pixels
     read: Sequence[int]
-    looks: Sequence[Look]
+    views: Sequence[QueryView]
     psnr: Mapping[str, float]
     turntable: bytes = b""
 

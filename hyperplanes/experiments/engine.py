@@ -18,10 +18,10 @@ from hyperplanes.data import open_dataset
 from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.data.support import WithSupport
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
+from hyperplanes.experiments.configurations import configuration
+from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.tables import Cell, Experiment, Trained
 from hyperplanes.methods import WithSampler, make_method
-from hyperplanes.reproduce.configurations import configuration
-from hyperplanes.reproduce.experiments import Cell, Experiment, Trained
-from hyperplanes.reproduce.scales import Scale
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.files import encode_json, write_json
 from hyperplanes.views import Tasks

@@ -9,24 +9,24 @@ from hyperplanes.adaptation import HyperPlanes, NearestView
 from hyperplanes.adaptation.base import Adapter, Pictures
 from hyperplanes.adaptation.checkpoints import packaged_folder
 from hyperplanes.data.support import Shown
-from hyperplanes.demo.content import Exhibit, Look, Report, Row
-from hyperplanes.demo.page import render_page
 from hyperplanes.evaluation import ObjectScore, Score, evaluate
+from hyperplanes.experiments.page.content import Exhibit, QueryView, Report, Row
+from hyperplanes.experiments.page.page import render_page
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.utilities.files import write_whole
 from hyperplanes.utilities.formatting import format_duration
 from hyperplanes.views import Task, Tasks
 
-__all__ = ["COUNTS", "PACKAGED", "write_first_look"]
+__all__ = ["COUNTS", "PACKAGED", "write_first_page"]
 
 PACKAGED = "small"
 COUNTS = (3, 10, 25)
 """ArrayLike of views that are shown of each object."""
 
-LOOKS = 2  # query views of each object on the page
+QUERY_VIEWS = 2  # query views of each object on the page
 
 
-def write_first_look(
+def write_first_page(
     path: Path,
     data: Tasks,
     names: Sequence[str],
@@ -59,23 +59,23 @@ def write_first_look(
         def keep(score: ObjectScore, task: Task, made: Pictures, row: str = row) -> None:
             pictures.setdefault(row, {})[score.name] = made
 
-        scores[row] = evaluate(row, adapter, Shown(data, count, LOOKS), names, keep)
+        scores[row] = evaluate(row, adapter, Shown(data, count, QUERY_VIEWS), names, keep)
         report(about, scores[row].mean("psnr"))
     exhibits = []
     for name in names:
-        task = Shown(data, most, LOOKS).task(name)
+        task = Shown(data, most, QUERY_VIEWS).task(name)
         truth = to_pixels(task.query.images)
         made = {row: to_pixels(found[name].images) for row, found in pictures.items()}
-        looks = [Look(truth[view], {row: made[row][view] for row in rows}) for view in range(len(truth))]
+        views = [QueryView(truth[view], {row: made[row][view] for row in rows}) for view in range(len(truth))]
         quality = {row: next(each.psnr for each in scores[row].objects if each.name == name) for row in rows}
         around = orbit_cameras(task.support, frames)
         turntable = encode_animation(to_pixels(model.adapt(task.support).render(around).images), "webp")
         support = to_pixels(task.support.images)
-        exhibits.append(Exhibit(name.rpartition("/")[2], support, range(len(support)), looks, quality, turntable))
+        exhibits.append(Exhibit(name.rpartition("/")[2], support, range(len(support)), views, quality, turntable))
     last = scores[f"views_{most}"]
     page = Report(
         title="New views of objects it has never seen",
-        lead=f"The packaged model {PACKAGED!r} looks at posed images of an object, any number of them from anywhere, "
+        lead=f"The packaged model {PACKAGED!r} views at posed images of an object, any number of them from anywhere, "
         "and writes the weights of a field that can be looked at from anywhere. Nothing was trained for this page.",
         figures=[
             (f"{last.mean('psnr'):.2f} dB", f"PSNR from {most} views, in a single step"),

@@ -8,9 +8,9 @@ from statistics import fmean, pstdev
 from typing import Any
 
 from hyperplanes.evaluation import Score
-from hyperplanes.reproduce.configurations import deviations
-from hyperplanes.reproduce.engine import Outcome
-from hyperplanes.reproduce.experiments import Cell
+from hyperplanes.experiments.configurations import deviations
+from hyperplanes.experiments.engine import Outcome
+from hyperplanes.experiments.tables import Cell
 from hyperplanes.utilities.environment import environment
 from hyperplanes.utilities.tables import csv_table, markdown_table
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from hyperplanes.reproduce.experiments import Cell, Experiment
+from hyperplanes.experiments.tables import Cell, Experiment
 
 __all__ = ["SCALES", "Scale"]
 

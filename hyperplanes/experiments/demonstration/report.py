@@ -13,10 +13,10 @@ from PIL import Image
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
-from hyperplanes.demo.content import Pixels
-from hyperplanes.demo.pipeline import MODELS, DemoSettings, describe_row
-from hyperplanes.demo.stages import Stages
+from hyperplanes.experiments.demonstration.pipeline import MODELS, DemoSettings, describe_row
+from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
+from hyperplanes.experiments.page.content import Pixels
+from hyperplanes.experiments.stages import Stages
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.environment import environment
@@ -57,11 +57,11 @@ def write_report(
         rounds.append(frames)
         truth = to_pixels(task.query.images)
         chosen = sorted({len(truth) // 4, 3 * len(truth) // 4})
-        looks = [Look(truth[i], _predictions(folder, settings, name, task.query.names[i])) for i in chosen]
+        views = [QueryView(truth[i], _predictions(folder, settings, name, task.query.names[i])) for i in chosen]
         quality = {method: metrics[method]["objects"][name]["psnr"] for method in settings.methods}
         read = model.prepare(task.support, carved=False).hyperplanes.tolist()
         exhibits.append(
-            Exhibit(name, to_pixels(support.images), read, looks, quality, encode_animation(frames, "webp"))
+            Exhibit(name, to_pixels(support.images), read, views, quality, encode_animation(frames, "webp"))
         )
     curves = {method: read_json(folder / method / "training.json")["curve"] for method in MODELS}
     picture = overview(exhibits[:3], rounds[:3], round(SCALE * settings.resolution))
@@ -113,7 +113,7 @@ def describe(
     shown = len(exhibits[0].support)
     return Report(
         title="New views of objects it has never seen",
-        lead=f"A hypernetwork looks at a few of {shown} posed images of a {settings.class_name} and writes the weights "
+        lead=f"A hypernetwork views at a few of {shown} posed images of a {settings.class_name} and writes the weights "
         "of a field that can be looked at from anywhere.",
         figures=[
             (f"{one_step['psnr']:.2f} dB", "PSNR on held-out objects after a single step"),

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 from hyperplanes.configuration.presets import TRAINABLE, preset
+from hyperplanes.experiments import EXPERIMENTS, SCALES
+from hyperplanes.experiments.configurations import change, configuration, deviations
+from hyperplanes.experiments.published import CROSS, SHAPENET, SINGLE, TARGET, TIME
 from hyperplanes.methods import METHODS
-from hyperplanes.reproduce import EXPERIMENTS, SCALES
-from hyperplanes.reproduce.configurations import change, configuration, deviations
-from hyperplanes.reproduce.published import CROSS, SHAPENET, SINGLE, TARGET, TIME
 
 
 def test_the_numbers_of_the_paper():

@@ -13,10 +13,10 @@ from PIL import Image
 from small_demo import demo_folder
 
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.demo import Exhibit, Look, Report, Row, render_page
-from hyperplanes.demo.charts import line_chart
-from hyperplanes.demo.first_look import write_first_look
-from hyperplanes.demo.pictures import ERROR_SCALE, colour_scale, error_map
+from hyperplanes.experiments.demonstration.first_page import write_first_page
+from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
+from hyperplanes.experiments.page.charts import line_chart
+from hyperplanes.experiments.page.pictures import ERROR_SCALE, colour_scale, error_map
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.environment import find_commit
 from tests.reference_rendering import Balls
@@ -47,7 +47,9 @@ class Balance(HTMLParser):
 
 def report(title="A <title> & more"):
     generator = np.random.default_rng(0)
-    look = Look(*(generator.integers(0, 256, (8, 8, 3), np.uint8),), {"hyperplanes": np.zeros((8, 8, 3), np.uint8)})
+    look = QueryView(
+        *(generator.integers(0, 256, (8, 8, 3), np.uint8),), {"hyperplanes": np.zeros((8, 8, 3), np.uint8)}
+    )
     exhibit = Exhibit("car", generator.integers(0, 256, (4, 8, 8, 3), np.uint8), [2, 0], [look], {"hyperplanes": 20.0})
     row = Row("hyperplanes", "one step", 20.0, 1.5, 17.25, 0.5, "1 s", "2 s")
     curve = [{"step": 25, "loss": 0.1}, {"step": 50, "loss": 0.01, "psnr": 20.0}]
@@ -92,7 +94,7 @@ def test_its_pictures_are_those_that_went_in():
     ]
     (exhibit,) = content.exhibits
     np.testing.assert_array_equal(np.stack(found[:4]), exhibit.support[[2, 0, 1, 3]])
-    np.testing.assert_array_equal(found[4], exhibit.looks[0].truth)
+    np.testing.assert_array_equal(found[4], exhibit.views[0].truth)
 
 
 def test_a_method_that_no_exhibit_shows():
@@ -170,6 +172,6 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     with pytest.raises(CheckpointError, match="small"):
         HyperPlanes.from_pretrained("small")  # a folder of that name goes first, where a name is given
     data, shown = Balls(train=0, test=1, views=6, size=(24, 24)), {}
-    page = write_first_look(tmp_path / "first.html", data, data.names("test"), 2, shown.__setitem__, counts=(2, 3))
+    page = write_first_page(tmp_path / "first.html", data, data.names("test"), 2, shown.__setitem__, counts=(2, 3))
     assert page.exists()
     assert len(shown) == 3

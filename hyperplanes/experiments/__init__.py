@@ -1,6 +1,6 @@
 """The tables and figures of the HyperPlanes paper, each as data and all run by one engine."""
 
-from hyperplanes.reproduce.experiments import EXPERIMENTS
-from hyperplanes.reproduce.scales import SCALES
+from hyperplanes.experiments.scales import SCALES
+from hyperplanes.experiments.tables import EXPERIMENTS
 
 __all__ = ["EXPERIMENTS", "SCALES"]

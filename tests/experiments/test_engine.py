@@ -10,8 +10,8 @@ from hyperplanes.cli import main
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import WithSupport
 from hyperplanes.evaluation import evaluate
+from hyperplanes.experiments import EXPERIMENTS, SCALES
 from hyperplanes.methods import make_method
-from hyperplanes.reproduce import EXPERIMENTS, SCALES
 
 CLASSES = ("car", "chair", "lamp", "plane")
 

@@ -1,0 +1,1 @@
+"""The demonstration: an experiment on procedural objects whose result is a page."""
