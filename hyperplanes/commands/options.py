@@ -64,7 +64,7 @@ ViewsUp = Annotated[str, tyro.conf.arg(metavar="{auto,y,z,x,-y,-z,-x}")]
 
 
 def check_orbit(orbit: int | None, size: int | None) -> None:
-    """Nothing, where both can be done.
+    """Refuse frames and pixels of an orbit that cannot be rendered.
 
     Args:
         orbit: frames around the object, None for no orbit.

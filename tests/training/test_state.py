@@ -60,7 +60,7 @@ def test_the_best_model_is_that_of_the_validation_with_the_highest_quality(tmp_p
             return replace(super().validate(), psnr=qualities[self.step - 1])
 
     def judged(steps, folder):
-        config = replace(CONFIG, evaluate_every=1, steps=steps)
+        config = replace(CONFIG, evaluate_every=1, steps=steps, held_out=1)
         trainer = Judged(awaken(small_model()), Balls(), config, folder)
         list(trainer.run())
 
