@@ -28,7 +28,6 @@ LAYERS = {
     "hyperplanes.data.devices": 4,
     "hyperplanes.commands.checks": 4,
     "hyperplanes.experiments": 4.5,
-    "hyperplanes.demo": 4.5,
     "hyperplanes.adaptation": 3,
     "hyperplanes.data": 3,
     "hyperplanes.export": 3,
