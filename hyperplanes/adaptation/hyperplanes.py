@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -108,6 +109,12 @@ class HyperPlanes(HyperPlanesNetwork):
         for name, network in result.targets.items():
             network.load_state_dict(network.parameters_of(found[name]))
         return result.eval()
+
+    def with_second_pass(self) -> HyperPlanes:
+        """The same model, sharing its weights, which takes a second pass whatever it was configured to do."""
+        result = copy.copy(self)
+        result.config = replace(self.config, second_pass=True)
+        return result
 
     def save(self, folder: Path | str, dtype: torch.dtype | None = None) -> None:
         """Write model.json and model.safetensors.

@@ -11,11 +11,10 @@ Example:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
-from hyperplanes.commands.options import Free, OptionalInt, Steps, ViewsUp
+from hyperplanes.commands.options import Free, ObjectArguments
 from hyperplanes.commands.scene import read_scene, refuse_sources
 from hyperplanes.commands.writing import refuse_checkpoint, writes_to
 
@@ -23,36 +22,14 @@ __all__ = ["Arguments", "run"]
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(ObjectArguments):
     """What to adapt to.
 
     Attributes:
-        checkpoint: What `train` or `demo` wrote, or a packaged model: small, small-paper, cars-64.
-        views: The posed images of the object; example-car comes with the package.
-        out: The folder for the weights.
-        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
-            single forward pass.
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
-        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
-            visual hull: for textures and hollows; needs a model such as small.
-        all_views: Show the model every view, not only the support half.
-        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
-            0,0.1,1, or auto: as the cameras are held.
-        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
-            leave one at most when not given.
-        device: auto, cpu or cuda.
     """
 
-    checkpoint: Path
-    views: Path
-    out: Path
-    steps: Steps = 0
     fine_tune: Free = "weights"
-    second_pass: bool = False
-    all_views: bool = False
-    up: ViewsUp = "auto"
-    downscale: OptionalInt = None
-    device: str = "auto"
 
 
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))

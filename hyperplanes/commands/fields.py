@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -63,7 +62,7 @@ def load_adaptable(path: Path, device: torch.device, *, second_pass: bool = Fals
         if not model.any_order:
             found = f"{path}, a model of {model.config.target}"
             raise ValueError(f"second_pass: expected a model of the field image_based, such as small, got {found}")
-        model.config = replace(model.config, second_pass=True)
+        model = model.with_second_pass()
     return model
 
 
@@ -105,8 +104,8 @@ def adapt_to(
     Raises:
         ValueError: fine-tuning steps of a baked scene.
     """
-    from hyperplanes.commands.suitability import misgivings
     from hyperplanes.configuration.fine_tuning import FineTuning
+    from hyperplanes.evaluation.suitability import suitability_warnings
     from hyperplanes.export.baking import BakedScene
 
     if isinstance(source, BakedScene):
@@ -116,7 +115,7 @@ def adapt_to(
             )
         console.say(f"{len(source.field.values):,} baked voxels, shown from the poses of {name}")
         return source, []
-    warned = misgivings(source, shown, steps)
+    warned = suitability_warnings(source, shown, steps)
     for line in warned:
         console.warn(f"{name}: {line}")
     started, taken, settings = time.perf_counter(), [], settings or FineTuning()

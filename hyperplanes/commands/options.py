@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -10,6 +11,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 __all__ = [
     "Free",
+    "ObjectArguments",
     "OptionalFolder",
     "OptionalInt",
     "OptionalName",
@@ -61,6 +63,38 @@ Free = Literal["weights", "hypernetwork"]
 
 ViewsUp = Annotated[str, tyro.conf.arg(metavar="{auto,y,z,x,-y,-z,-x}")]
 """The axis that points up in the world of photographs, three numbers, or auto: as the cameras are held."""
+
+
+@dataclass(frozen=True)
+class ObjectArguments:
+    """What the verbs of one object share: a model, the views that it is shown, and how they are read.
+
+    Attributes:
+        checkpoint: What `train`, `adapt` or `demo` wrote, or a packaged model: small, small-paper, cars-64. A file that
+            `bake` wrote is taken by `render` and `export`.
+        views: The posed images of the object; example-car comes with the package.
+        out: The folder to write to; for `bake`, the file.
+        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
+            single forward pass.
+        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
+            visual hull: for textures and hollows; needs a model such as small.
+        all_views: Show the model every view, not only the support half.
+        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
+            0,0.1,1, or auto: as the cameras are held. Meshes, turntables and baked files have y up.
+        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
+            leave one at most when not given.
+        device: auto, cpu or cuda.
+    """
+
+    checkpoint: Path
+    views: Path
+    out: Path
+    steps: Steps = 0
+    second_pass: bool = False
+    all_views: bool = False
+    up: ViewsUp = "auto"
+    downscale: OptionalInt = None
+    device: str = "auto"
 
 
 def check_orbit(orbit: int | None, size: int | None) -> None:

@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
-from hyperplanes.commands.options import Free, OptionalInt, Protocol, Steps, ViewsUp, check_orbit, optional
+from hyperplanes.commands.options import Free, ObjectArguments, OptionalInt, Protocol, check_orbit, optional
 from hyperplanes.commands.scene import read_scene, refuse_sources
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
@@ -28,55 +27,32 @@ __all__ = ["Arguments", "run"]
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(ObjectArguments):
     """What to look at, and from where.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote, a file that `bake` wrote, or a packaged model: small,
-            small-paper, cars-64.
-        views: The posed images of the object; example-car comes with the package.
-        out: The folder for the pictures.
-        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
-            single forward pass.
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         orbit: So many pictures evenly around the object, and a turntable, instead of the query poses.
         size: Pixels along the longer side of an orbit's pictures; as the images when not given.
         turntable: The format of the turntable.
-        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
-            visual hull: for textures and hollows; needs a model such as small.
-        all_views: Show the model every view, not only the support half.
-        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
-            0,0.1,1, or auto: as the cameras are held.
-        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
-            leave one at most when not given.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or fast.
-        device: auto, cpu or cuda.
     """
 
-    checkpoint: Path
-    views: Path
-    out: Path
-    steps: Steps = 0
     fine_tune: Free = "weights"
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
     turntable: Literal["webp", "gif"] = "webp"
-    second_pass: bool = False
-    all_views: bool = False
-    up: ViewsUp = "auto"
-    downscale: OptionalInt = None
     protocol: Protocol = "default"
-    device: str = "auto"
 
 
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
     from hyperplanes.adaptation.nearest_view import NearestView
-    from hyperplanes.commands.suitability import left_out_check, worse_than_copying
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
+    from hyperplanes.evaluation.suitability import held_out_psnr, worse_than_copying
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.images import encode_animation, orbit_cameras, save_images, to_pixels
     from hyperplanes.utilities.files import write_whole
@@ -121,7 +97,7 @@ def run(arguments: Arguments) -> int:
         write_whole(animation, encode_animation(to_pixels(pictures.images), arguments.turntable))
         console.say(f"{animation}: the turntable")
     if scores is None and not isinstance(source, BakedScene) and (arguments.steps == 0 or warned):
-        scores = left_out_check(source, shown)
+        scores = held_out_psnr(source, shown)
         if scores is not None:
             console.say(
                 f"without fine-tuning, on support views left out for this: {scores[0]:.2f} dB PSNR, "

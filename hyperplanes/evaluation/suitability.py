@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import torch
 
-if TYPE_CHECKING:
-    from hyperplanes.adaptation.base import Renderable
-    from hyperplanes.adaptation.hyperplanes import HyperPlanes
-    from hyperplanes.views import Views
+from hyperplanes.adaptation.base import Renderable
+from hyperplanes.adaptation.context import observe
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.nearest_view import NearestView
+from hyperplanes.fields.rig import standpoints
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.metrics import psnr
+from hyperplanes.views import Views
 
-__all__ = ["left_out_check", "misgivings", "worse_than_copying"]
+__all__ = ["held_out_psnr", "suitability_warnings", "worse_than_copying"]
 
 COVERED = 0.95  # mean opacity above which masks say no more than none
 UNLIKE = 3.0  # deviations of the codes; held-out objects of a trained class have 0.7 to 2, other classes 3.3 to 8
 ELSEWHERE = 30.0  # degrees between standpoints, on average, above which planes stand in for others
-JUDGED = 4  # left-out views, and pixels along their longer side
-JUDGED_SIZE = 64
+HELD_OUT = 4  # left-out views, and pixels along their longer side
+HELD_OUT_SIZE = 64
 
 
-def misgivings(model: HyperPlanes, shown: Views, steps: object = 0) -> list[str]:
-    """What speaks against good pictures, a sentence each, before anything has been adapted.
+def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) -> list[str]:
+    """What speaks against good pictures of these views, a sentence each, before anything has been adapted.
 
     Args:
         model: what will adapt.
@@ -69,7 +73,7 @@ def worse_than_copying(shown: Views, rendered: float, copied: float, steps: obje
     return [f"worse than copying the nearest view: {rendered:.2f} dB against {copied:.2f} dB; {advice}"]
 
 
-def left_out_check(model: HyperPlanes, shown: Views) -> tuple[float, float] | None:
+def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | None:
     """PSNR of a field on support views that it was not shown, and of the nearest view copied, in one forward pass.
 
     Up to four views are left out, and rendered at 64 pixels.
@@ -81,21 +85,15 @@ def left_out_check(model: HyperPlanes, shown: Views) -> tuple[float, float] | No
     Returns:
         Both figures in decibels; None with fewer than four views.
     """
-    import torch
-
-    from hyperplanes.adaptation.nearest_view import NearestView
-    from hyperplanes.geometry import cameras as camera
-    from hyperplanes.utilities.metrics import psnr
-
     if len(shown) < 4:
         return None
-    left_out = torch.linspace(0, len(shown) - 1, min(JUDGED, len(shown) // 2) + 2)[1:-1].round().long()
+    left_out = torch.linspace(0, len(shown) - 1, min(HELD_OUT, len(shown) // 2) + 2)[1:-1].round().long()
     rest = [index for index in range(len(shown)) if index not in left_out.tolist()]
-    judged, remaining = shown[left_out], shown[rest]
-    scale = min(1.0, JUDGED_SIZE / max(judged.size))
-    size = max(1, round(judged.size[0] * scale)), max(1, round(judged.size[1] * scale))
-    truth = torch.nn.functional.interpolate(judged.images, size, mode="area")
-    cameras = camera.resized(judged.cameras, *size)
+    truth_views, remaining = shown[left_out], shown[rest]
+    scale = min(1.0, HELD_OUT_SIZE / max(truth_views.size))
+    size = max(1, round(truth_views.size[0] * scale)), max(1, round(truth_views.size[1] * scale))
+    truth = torch.nn.functional.interpolate(truth_views.images, size, mode="area")
+    cameras = camera.resized(truth_views.cameras, *size)
     fields: list[Renderable] = [model.adapt(remaining), NearestView().adapt(remaining)]
     first, second = (float(psnr(each.render(cameras).images.clamp(0, 1), truth).mean()) for each in fields)
     return first, second
@@ -103,11 +101,6 @@ def left_out_check(model: HyperPlanes, shown: Views) -> tuple[float, float] | No
 
 def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
     """Root mean square of the standardised codes, None without such, and the mean angle from the training's rig."""
-    import torch
-
-    from hyperplanes.adaptation.context import observe
-    from hyperplanes.fields.rig import standpoints
-
     with torch.no_grad():
         context, network, angle = model.prepare(shown, carved=False), model.hypernetwork, 0.0
         if len(model.rig):
