@@ -43,7 +43,7 @@ class Arguments:
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best.
         orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
         size: Pixels along the longer side of the turntable; as the images when not given.
-        turntable: The format of the turntable.
+        turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
         second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
             visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
@@ -62,7 +62,7 @@ class Arguments:
     steps: Steps = 0
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
-    turntable: Literal["webp", "gif"] = "webp"
+    turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
     second_pass: bool = False
     all_views: bool = False
     up: ViewsUp = "auto"

@@ -43,7 +43,7 @@ class Arguments:
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best.
         frames: Of the turntable.
         size: Pixels along the longer side of the turntable; as the images when not given.
-        turntable: The format of the turntable.
+        turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
         mesh_format: The format of the mesh: glb has a texture and normals, ply and obj a colour a vertex.
         faces: Of a mesh with a texture, at most.
         texture: Pixels along the longer side of the texture, about.
@@ -71,7 +71,7 @@ class Arguments:
     steps: Steps = 0
     frames: int = 48
     size: OptionalInt = None
-    turntable: Literal["webp", "gif"] = "webp"
+    turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
     mesh_format: Literal["ply", "glb", "obj"] = "glb"
     faces: Annotated[int, range(100, 10_000_000)] = 10_000
     texture: Annotated[int, range(16, 8193)] = 1024

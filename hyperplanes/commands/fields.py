@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 __all__ = ["adapt_to", "bake_field", "load_adaptable", "load_source", "refuse_baked", "render_views"]
 
 
+WORTH_KEEPING = 5.0  # seconds that adapting took
+
+
 def load_source(path: Path, device: torch.device, *, second_pass: bool = False) -> HyperPlanes | BakedScene:
     """The model of a checkpoint, or the scene of a file that `bake` wrote.
 
@@ -104,6 +107,7 @@ def adapt_to(
     Raises:
         ValueError: fine-tuning steps of a baked scene.
     """
+    from hyperplanes.adaptation.kept import keep_field, kept_folder, recall_field
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.evaluation.suitability import suitability_warnings
     from hyperplanes.export.baking import BakedScene
@@ -119,6 +123,11 @@ def adapt_to(
     for line in warned:
         console.warn(f"{name}: {line}")
     started, taken, settings = time.perf_counter(), [], settings or FineTuning()
+    folder = kept_folder(source, shown, steps, settings)
+    kept = recall_field(folder, shown, shown.images.device)
+    if kept is not None:
+        console.say(f"{name}: adapted to these {len(shown)} views before, and kept in {folder}")
+        return kept, warned
     with console.bar("fine-tuning") as bar:
 
         def count(done: int) -> None:
@@ -132,6 +141,8 @@ def adapt_to(
             bar.show(done, settings.max_steps, "steps at most, to find how many")
 
         field = source.fine_tune(shown, steps, settings, on_step=count, on_trial=count_trials)
+    if time.perf_counter() - started > WORTH_KEEPING:
+        keep_field(source, field, folder)
     how = f", {taken[-1]} fine-tuning steps" if any(taken) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")

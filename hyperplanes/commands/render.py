@@ -34,14 +34,14 @@ class Arguments(ObjectArguments):
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         orbit: So many pictures evenly around the object, and a turntable, instead of the query poses.
         size: Pixels along the longer side of an orbit's pictures; as the images when not given.
-        turntable: The format of the turntable.
+        turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or fast.
     """
 
     fine_tune: Free = "weights"
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
-    turntable: Literal["webp", "gif"] = "webp"
+    turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
     protocol: Protocol = "default"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,7 +31,8 @@ __all__ = [
     "upward",
 ]
 
-TURNTABLE_FORMATS = ("webp", "gif")
+TURNTABLE_FORMATS = ("webp", "gif", "mp4", "webm")
+CODECS = {"mp4": "libx264", "webm": "libvpx-vp9"}
 
 
 @checked
@@ -44,11 +46,11 @@ def to_pixels(images: Float[Tensor, "view 3 height width"]) -> npt.NDArray[np.ui
 
 
 def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds: float = 4.0) -> bytes:
-    """An animation that repeats for ever.
+    """An animation that repeats for ever, or a video, which needs imageio-ffmpeg: the extra `video`.
 
     Args:
         frames: (frame, height, width, 3) pixels.
-        kind: "webp" or "gif".
+        kind: "webp" or "gif"; "mp4" or "webm" for a video.
         seconds: of one round.
 
     Returns:
@@ -56,6 +58,7 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
 
     Raises:
         ValueError: another kind, or no frame.
+        RuntimeError: a video without imageio-ffmpeg.
     """
     from PIL import Image
 
@@ -63,12 +66,33 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
         raise ValueError(f"kind: expected one of {', '.join(TURNTABLE_FORMATS)}, got {kind!r}")
     if not len(frames):
         raise ValueError("frames: expected at least one, got none")
+    if kind in CODECS:
+        return _video(frames, kind, max(1.0, len(frames) / seconds))
     first, *others = [Image.fromarray(frame) for frame in frames]
     how = {"quality": 90, "method": 4} if kind == "webp" else {}
     buffer = io.BytesIO()
     duration = max(20, round(1000 * seconds / len(frames)))
     first.save(buffer, kind.upper(), save_all=True, append_images=others, duration=duration, loop=0, **how)
     return buffer.getvalue()
+
+
+def _video(frames: npt.NDArray[np.uint8], kind: str, rate: float) -> bytes:
+    """A video of so many frames a second; a column or row is repeated where the number of them is odd."""
+    try:
+        from imageio_ffmpeg import write_frames
+    except ImportError:
+        raise RuntimeError(f"{kind}: expected imageio-ffmpeg, found none; pip install hyperplanes[video]") from None
+    height, width = frames.shape[1:3]
+    even = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"video.{kind}"
+        size = (even.shape[2], even.shape[1])
+        writer = write_frames(str(path), size, fps=rate, codec=CODECS[kind], quality=8, macro_block_size=2)
+        writer.send(None)
+        for frame in even:
+            writer.send(np.ascontiguousarray(frame))
+        writer.close()
+        return path.read_bytes()
 
 
 @checked
@@ -165,7 +189,7 @@ def save_turntable(
     Args:
         field: what is seen.
         views: whose lens, distance and up are taken.
-        path: ends in .webp or .gif.
+        path: ends in .webp, .gif, .mp4 or .webm.
         frames: of the round.
         size: pixels along the longer side; that of the views where absent.
 
@@ -178,7 +202,7 @@ def save_turntable(
     path = Path(path)
     kind = path.suffix.lower().lstrip(".")
     if kind not in TURNTABLE_FORMATS:
-        raise ValueError(f"{path}: expected a name that ends in {' or '.join(TURNTABLE_FORMATS)}, got {kind!r}")
+        raise ValueError(f"{path}: expected a name that ends in {', '.join(TURNTABLE_FORMATS)}, got {kind!r}")
     pictures = field.render(orbit_cameras(views, frames, size=size))
     write_whole(path, encode_animation(to_pixels(pictures.images), kind))
     return path

@@ -134,6 +134,11 @@ class VisibilityPlanes:
         result._hidden = self._hidden.index_fill(0, views.to(self._hidden.device), True)
         return result
 
+    @property
+    def surface(self) -> Float[Tensor, "view height width"] | None:
+        """Distances from each camera to the surface of `with_surface`, or None."""
+        return None if self._surface is None else self._surface[..., 0]
+
     def with_surface(
         self, distances: Float[Tensor, "view height width"], opacity: Float[Tensor, "view height width"]
     ) -> VisibilityPlanes:

@@ -220,3 +220,19 @@ def test_images_are_written_as_they_are(tmp_path):
     assert [path.name for path in save_images(images, tmp_path, ("a/x.png", "b/x.png", "c"))][0] == "0000.png"
     with pytest.raises(ValueError, match="expected 3"):
         save_images(images, tmp_path, ("one",))
+
+
+@pytest.mark.parametrize("kind", ["mp4", "webm"])
+def test_a_video_has_the_frames(kind, tmp_path):
+    # Source of truth: ffmpeg's own reader; sizes are made even, and colours survive the codec nearly.
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed; the extra video")
+    frames = np.zeros((6, 33, 48, 3), np.uint8)
+    frames[..., 0] = np.arange(6)[:, None, None] * 40
+    path = tmp_path / f"round.{kind}"
+    path.write_bytes(encode_animation(frames, kind, seconds=1.0))
+    reader = ffmpeg.read_frames(str(path))
+    about = next(reader)
+    found = [np.frombuffer(frame, np.uint8).reshape(34, 48, 3) for frame in reader]
+    assert about["size"] == (48, 34)
+    assert len(found) == 6
+    assert all(abs(float(part[..., 0].mean()) - 40 * number) < 12 for number, part in enumerate(found))
