@@ -58,7 +58,6 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
 
     Raises:
         ValueError: another kind, or no frame.
-        RuntimeError: a video without imageio-ffmpeg.
     """
     from PIL import Image
 
