@@ -385,7 +385,8 @@ def test_steps_chosen_on_left_out_views_are_reported(tmp_path, monkeypatch, caps
     common = ["--checkpoint", str(demo), "--views", scene, "--steps", "auto", "--voxels", "32"]
     assert main(["export", *common, "--what", "mesh", "--out", str(tmp_path / "export")]) == 0
     assert main(["bake", *common, "--out", str(tmp_path / "voxels.safetensors")]) == 0
-    assert len(re.findall(r"adapted to 6 views of .* in .*, \d+ fine-tuning steps", capsys.readouterr().out)) == 2
+    adapted = r"adapted to 6 views of .* in .*, \d+ fine-tuning steps|adapted to these 6 views before"
+    assert len(re.findall(adapted, capsys.readouterr().out)) == 2  # kept where the first one took long
 
 
 def test_psnr_over_fine_tuning_steps_is_a_table_and_a_chart(tmp_path, capsys):

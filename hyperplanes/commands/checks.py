@@ -38,6 +38,9 @@ OPTIONAL = {
     "tensorboard": "train --tensorboard",
     "ray": "data generation on a cluster",
     "DracoPy": "meshes that Draco compressed",
+    "viser": "view",
+    "imageio_ffmpeg": "turntables as MP4 and WebM",
+    "huggingface_hub": "models on the Hugging Face hub",
 }
 """What some things need: modules, each the package of its name, and what for."""
 

@@ -191,8 +191,9 @@ def _write_mesh(solid: AdaptedField, shown: Views, query: Views, arguments: Argu
         save_mesh(surface, path)
         console.say(f"{path}: {len(surface.vertices):,} vertices, {len(surface.faces):,} faces")
     found = agreement(surface, solid, query.cameras)
+    poses = "shown" if arguments.all_views else "query"
     console.say(
-        f"{path}: its silhouettes overlap the rendered ones of {len(query)} views by {found.overlap:.1%} "
+        f"{path}: its silhouettes overlap the rendered ones of {len(query)} {poses} views by {found.overlap:.1%} "
         f"(intersection over union), and {found.depth:.1%} of what both cover is as far away; cut at density "
         f"{level:.3g}"
     )
