@@ -1,5 +1,6 @@
 """Source of truth: a ball of known density and colour, whose surface and volume have closed forms."""
 
+import gc
 import math
 
 import numpy as np
@@ -222,6 +223,8 @@ def test_images_are_written_as_they_are(tmp_path):
         save_images(images, tmp_path, ("one",))
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pipes that imageio-ffmpeg leaves open
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.parametrize("kind", ["mp4", "webm"])
 def test_a_video_has_the_frames(kind, tmp_path):
     # Source of truth: ffmpeg's own reader; sizes are made even, and colours survive the codec nearly.
@@ -236,3 +239,5 @@ def test_a_video_has_the_frames(kind, tmp_path):
     assert about["size"] == (48, 34)
     assert len(found) == 6
     assert all(abs(float(part[..., 0].mean()) - 40 * number) < 12 for number, part in enumerate(found))
+    del reader
+    gc.collect()
