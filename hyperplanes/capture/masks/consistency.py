@@ -107,7 +107,7 @@ def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreemen
     return Agreement(mended, np.array(disagreement), votes, hull)
 
 
-def _reduced(mask: Mask) -> Bool[np.ndarray, "height width"]:
+def _reduced(mask: Mask) -> Bool[np.ndarray, "row column"]:
     height, width = mask.shape
     factor = min(1.0, LONGEST / max(height, width))
     size = max(1, round(width * factor)), max(1, round(height * factor))
