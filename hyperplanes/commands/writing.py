@@ -29,8 +29,7 @@ def refuse_checkpoint(out: Path, checkpoint: Path) -> None:
     Raises:
         ValueError: the folder of the model that is read or of a training, or a file of a checkpoint.
     """
-    from hyperplanes.adaptation.checkpoints import checkpoint_folder
-    from hyperplanes.adaptation.pretrained import find_checkpoints
+    from hyperplanes.adaptation.checkpoints import checkpoint_folder, find_checkpoints
 
     if out.suffix == ".safetensors":
         taken = WEIGHTS.fullmatch(out.name) is not None and (out.parent / "model.json").exists()
