@@ -148,7 +148,7 @@ def test_a_lamp_with_the_update_of_a_car_is_worse_with_25_planes_too():
 
 @pytest.mark.parametrize(("count", "most"), [(3, 4.5), (25, 1.0)])
 def test_a_car_that_faces_another_way_costs_little(count, most):
-    """3.8 and 0.2 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
+    """4.1 and 0.6 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
     model, found = HyperPlanes.from_pretrained("small"), {}
     for degrees in (0, 45):
         rotation = Rotation(math.radians(degrees))
@@ -177,9 +177,9 @@ def mean_psnr(adapter, tasks, count):
     return float(torch.stack(found).mean())
 
 
-@pytest.mark.parametrize(("count", "least"), [(5, 0.5), (25, 0.5)])
+@pytest.mark.parametrize(("count", "least"), [(5, 1.0), (25, 2.0)])
 def test_objects_that_mean_nothing_are_shown_better_than_by_their_hull(count, least):
-    """Weights of four classes alone were 1.9 dB below `hull_blend` with 5 views (docs/any_order.md)."""
+    """By 2.7 and 4.4 dB on these."""
     model = HyperPlanes.from_pretrained("small")
     assert mean_psnr(model, shapes(), count) > mean_psnr(HullBlend(), shapes(), count) + least
 
