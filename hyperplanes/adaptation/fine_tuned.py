@@ -96,7 +96,9 @@ class FieldFromScratch:
 
 def random_model(config: ModelConfig, seed: int) -> HyperPlanes:
     """The target network of a model with random weights, without what finds better ones."""
-    return HyperPlanes(replace(config, hypernetwork=None, autoencoder=None, initialisation=None), seed=seed)
+    return HyperPlanes(
+        replace(config, hypernetwork=None, autoencoder=None, initialisation=None, judged=False), seed=seed
+    )
 
 
 def _rated(settings: FineTuning, model: HyperPlanes) -> FineTuning:

@@ -103,7 +103,9 @@ class HyperPlanes(HyperPlanesNetwork):
             A model that makes the same field of the same views, without looking at them twice. A field that is
             no network of this model is a ValueError.
         """
-        result = HyperPlanes(replace(self.config, hypernetwork=None, autoencoder=None, initialisation=None))
+        result = HyperPlanes(
+            replace(self.config, hypernetwork=None, autoencoder=None, initialisation=None, judged=False)
+        )
         result.rig.copy_(self.rig)
         found = {"fine": adapted.field, "coarse": adapted.proposal}
         for name, network in result.targets.items():

@@ -7,6 +7,7 @@ import torch
 from torch.nn.functional import softplus
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.adaptation.fine_tuned import random_model
 from hyperplanes.adaptation.judging import FEWEST, STRENGTHS, judge_strength
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.image_based import EMPTY, SOLID
@@ -99,3 +100,13 @@ def test_with_fewer_views_all_that_was_learned_is_used():
 def test_a_field_that_knows_views_by_their_places_has_no_plain_hull():
     with pytest.raises(ValueError, match="judged: .* got point_multiplane"):
         HyperPlanes(replace(ModelConfig(), judged=True))
+
+
+def test_the_weights_of_one_object_are_not_judged_again():
+    adapter, support = model(), ball_views(ring(7, (24, 24)))
+    adapter.theta["fine.density.bias"].data.fill_(-50)  # what was learned is that there is nothing
+    adapted = adapter.adapt(support)
+    again = adapter.with_weights_of(adapted).adapt(support)
+    cameras = ring(2, (10, 13), shift=1)
+    torch.testing.assert_close(again.render(cameras).images, adapted.render(cameras).images, atol=1e-6, rtol=0)
+    assert not random_model(adapter.config, 0).config.judged
