@@ -102,7 +102,7 @@ def capture(
         work.notes.append(f"{len(rest)} photographs could not be posed and are left out: {listed(rest)}")
     straight = _straight(model, pictures, opacities, work)
     masks, how = _masks(model, straight, [one.name for one in kept], work)
-    placement, masks = _placed(model, kept, masks, work)
+    placement, masks = _placed(model, kept, masks, work, trusted=how == "given")
     return _written(out, model, kept, straight, masks, how, placement, work)
 
 
@@ -271,9 +271,14 @@ def _masks(
 
 
 def _placed(
-    model: SparseModel, photographs: Sequence[Photograph], masks: list[np.ndarray] | None, work: _Work
+    model: SparseModel,
+    photographs: Sequence[Photograph],
+    masks: list[np.ndarray] | None,
+    work: _Work,
+    *,
+    trusted: bool,
 ) -> tuple[Placement, list[np.ndarray] | None]:
-    """Where the object is, and the masks after they were compared with each other."""
+    """Where the object is, and the masks after they were compared with each other; trusted ones stay as they are."""
     chosen = object_points(model, masks)
     sphere = object_sphere(model, chosen)
     if masks is not None:
@@ -281,11 +286,10 @@ def _placed(
         found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius))
         if found.wrong:
             names = listed([photographs[row].name for row in found.wrong])
-            work.notes.append(
-                f"{len(found.wrong)} masks contradicted the others and were mended by what these show together: {names}"
-            )
+            done = "look at them" if trusted else "they were mended by what these show together"
+            work.notes.append(f"{len(found.wrong)} masks contradict the others, {done}: {names}")
         work.progress("agreement", 1, 1, f"{1 - float(found.disagreement.mean()):.1%} of their area")
-        masks, sphere = found.masks, found.sphere or sphere
+        masks, sphere = masks if trusted else found.masks, found.sphere or sphere
     up, source = find_up(model, np.array([one.up_in_camera for one in photographs]), sphere, chosen)
     return Placement(sphere, up, source), masks
 

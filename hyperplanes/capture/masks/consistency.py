@@ -31,7 +31,7 @@ MOST_VOTES = 0.125  # of the views
 SETTLED = 0.01  # of intersection over union, by which more votes must be better
 ZOOM = 1.15  # times the radius of the hull: where it is judged again
 DEEP = 0.05  # of the square root of an area: differences thinner than that are the hull's own
-NEIGHBOUR = np.deg2rad(30)  # within which another view must look for a mask to be filled
+NEIGHBOUR = np.deg2rad(30)  # within which others must look, from opposite sides, for a mask to be filled
 DISAGREES = 0.05  # of the object's area
 
 Mask = Float[np.ndarray, "height width"]
@@ -73,8 +73,8 @@ def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreemen
     views.
 
     The hull of the others is larger than the object by what only this view sees past, a thin seam where views are
-    many. So only differences that a disc fits into count, and a mask is filled only where another camera looks from
-    nearly the same side.
+    many. So only differences that a disc fits into count, and a mask is filled only where other cameras look from
+    nearly the same side, to the left and to the right of it.
 
     Args:
         masks: one a camera, opacity of the picture without its lens.
@@ -95,13 +95,13 @@ def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreemen
         return Agreement(list(masks), np.zeros(len(masks)), votes, None)
     if len(masks) < FEWEST:
         return Agreement(list(masks), np.zeros(len(masks)), votes, hull)
-    near = _has_neighbour(model, hull.bounds)
+    surrounded = _is_surrounded(model, hull.bounds)
     mended, disagreement = [], []
     for row, (reduced, one) in enumerate(pairs):
         others = judged.hull(votes, without=row)
         seen = silhouettes(others.centres(), others, one)[0].numpy()
         lost, extra = _differences(reduced, seen)
-        lost &= near[row]
+        lost &= surrounded[row]
         mended.append(_mended(masks[row], lost, extra))
         disagreement.append((lost.sum() + extra.sum()) / max(1, seen.sum()))
     return Agreement(mended, np.array(disagreement), votes, hull)
@@ -201,10 +201,14 @@ def _mended(mask: Mask, lost: np.ndarray, extra: np.ndarray) -> Mask:
     return np.maximum(mask * (1 - scaled(extra)), scaled(lost))
 
 
-def _has_neighbour(model: SparseModel, sphere: Sphere) -> Bool[np.ndarray, " camera"]:
-    """Which cameras have another that looks at the sphere from nearly the same side."""
+def _is_surrounded(model: SparseModel, sphere: Sphere) -> Bool[np.ndarray, " camera"]:
+    """Which cameras have others near them on opposite sides: the hull is not bounded by the outermost of an arc."""
     ways = model.centres - np.array(sphere.centre)
     ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-    cosine = ways @ ways.T
-    np.fill_diagonal(cosine, -1)
-    return cosine.max(1) > np.cos(NEIGHBOUR)
+    result = np.zeros(len(ways), bool)
+    for row, way in enumerate(ways):
+        cosine = ways @ way
+        near = (cosine > np.cos(NEIGHBOUR)) & (cosine < 1 - 1e-6)
+        across = ways[near] - cosine[near, None] * way
+        result[row] = bool((across @ across.T < 0).any())
+    return result
