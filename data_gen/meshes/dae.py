@@ -71,8 +71,9 @@ def declared_up(data: bytes) -> str | None:
 def _errors(data: bytes) -> list[str]:
     """What pycollada finds wrong and leaves out."""
     import collada
+    from collada.common import DaeError
 
-    found = collada.Collada(io.BytesIO(data), ignore=[collada.common.DaeError]).errors
+    found = collada.Collada(io.BytesIO(data), ignore=[DaeError]).errors
     return [f"left out: {' '.join(str(error).split())[:150] or type(error).__name__}" for error in found]
 
 

@@ -86,7 +86,7 @@ def retriangulate(
     """
     sizes = np.array([len(corners) for _, corners in polygons], dtype=np.int64)
     for size in np.unique(sizes):
-        alike = [polygons[index] for index in np.flatnonzero(sizes == size)]
+        alike = [polygons[index] for index in np.flatnonzero(sizes == size).tolist()]
         places = np.array([corners for _, corners in alike], dtype=np.int64)
         corners = positions[places]
         for index in np.flatnonzero(concave(corners) & np.isfinite(corners).all(axis=(1, 2))):

@@ -61,7 +61,8 @@ class Photograph:
     @property
     def stored_size(self) -> tuple[int, int]:
         """(height, width) after the turn."""
-        return self.size[::-1] if self.turned else self.size
+        height, width = self.size
+        return (width, height) if self.turned else (height, width)
 
     @property
     def up_in_camera(self) -> tuple[float, float, float]:

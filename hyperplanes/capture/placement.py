@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.data.pictures.bounds import nearest_point, smallest_ball
@@ -139,7 +139,7 @@ def _without_strays(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     index = np.flatnonzero(chosen)
     if len(index) <= NEIGHBOURS:
         return chosen
-    distance = cKDTree(points[index]).query(points[index], NEIGHBOURS + 1)[0][:, -1]
+    distance = KDTree(points[index]).query(points[index], NEIGHBOURS + 1)[0][:, -1]
     result = np.zeros_like(chosen)
     result[index[distance <= STRAY * np.median(distance) + 1e-12]] = True
     return result

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy import ndimage
 from skimage.color import rgb2lab
 
-from hyperplanes.capture.masks.regions import cleaned
+from hyperplanes.capture.masks.regions import cleaned, connected_regions
 
 __all__ = ["PlainBackground", "is_plain"]
 
@@ -26,7 +25,7 @@ class PlainBackground:
         lab = rgb2lab(picture)
         distance = np.linalg.norm(lab - _border_colour(lab), axis=-1)
         opacity = ((distance - NEAR) / (FAR - NEAR)).clip(0, 1)
-        labels, _ = ndimage.label(opacity < 0.5)
+        labels, _ = connected_regions(opacity < 0.5)
         outer = np.unique(labels[_border(labels.shape)])
         reached = np.isin(labels, outer[outer > 0])
         enclosed = (opacity < 0.5) & ~reached & (distance > NEAR / 2)  # a hole shows the very colour of the background

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import ndimage
+from skimage.measure import label
 
-__all__ = ["cleaned", "firm"]
+__all__ = ["cleaned", "connected_regions", "firm"]
 
 STEEPNESS = 4.0
 SPECK = 0.05  # of the largest region: regions that are smaller do not belong to the object
@@ -22,15 +23,21 @@ def firm(probability: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "h
     return ((probability - 0.5) * STEEPNESS + 0.5).clip(0, 1)
 
 
+def connected_regions(mask: Bool[np.ndarray, "height width"]) -> tuple[np.ndarray, int]:
+    """The number of each pixel's region, 0 outside, and how many regions there are."""
+    labels = label(mask, connectivity=1)
+    return labels, int(labels.max(initial=0))
+
+
 def cleaned(opacity: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
     """The same without regions far smaller than the largest one, and without pinholes."""
-    labels, count = ndimage.label(opacity > 0.5)
+    labels, count = connected_regions(opacity > 0.5)
     if not count:
         return np.zeros_like(opacity)
     sizes = ndimage.sum_labels(np.ones_like(labels), labels, range(1, count + 1))
     kept = np.isin(labels, 1 + np.flatnonzero(sizes >= SPECK * sizes.max()))
     result = np.where(ndimage.binary_dilation(kept, iterations=2), opacity, 0.0)
-    holes, count = ndimage.label(result <= 0.5)
+    holes, count = connected_regions(result <= 0.5)
     if count > 1:
         sizes = ndimage.sum_labels(np.ones_like(holes), holes, range(1, count + 1))
         result[np.isin(holes, 1 + np.flatnonzero(sizes <= PINHOLE * kept.sum()))] = 1.0
