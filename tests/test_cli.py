@@ -243,7 +243,7 @@ def test_presets_and_inspect(capsys, tmp_path):
     assert "paper-128" in shown
     assert re.search(r"^small +128 .* volume +all views ", shown, re.MULTILINE)
     assert main(["inspect", "small"]) == 0
-    assert "hypernetwork: volume reads all views, low_rank update" in capsys.readouterr().out
+    assert "hypernetwork: volume reads all views, update of the grid" in capsys.readouterr().out
     demo = demo_folder()
     assert main(["inspect", str(demo / "hyperplanes")]) == 0
     assert "20 of 20 steps" in capsys.readouterr().out

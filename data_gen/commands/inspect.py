@@ -63,15 +63,13 @@ def checkpoint_lines(folder: Path) -> list[str]:
     ]
     if config.hypernetwork is not None and model.hypernetwork is not None:
         hyper = config.hypernetwork
-        read = (
-            f"{hyper.encoder} reads {hyper.views} views"
+        what = (
+            f"{hyper.encoder} reads {hyper.views} views, {hyper.update} update of {', '.join(hyper.layers)}"
             if isinstance(hyper, ImageHyperNetworkConfig)
-            else ("volume reads all views")
+            else "volume reads all views, update of the grid"
         )
-        lines.append(
-            f"hypernetwork: {read}, {hyper.update} update of "
-            f"{', '.join(hyper.layers)}, {sum(p.numel() for p in model.hypernetwork.parameters()):,} weights"
-        )
+        weights = sum(p.numel() for p in model.hypernetwork.parameters())
+        lines.append(f"hypernetwork: {what}, {weights:,} weights")
         lines.append(f"diagnostics: {recorded_diagnostics(folder) or 'not recorded; `hyperplanes train` does'}")
     else:
         lines.append("hypernetwork: none, the same weights for every object")
