@@ -108,7 +108,7 @@ class _PooledField(ImageBasedField):
     def joined(self, slots: Tensor) -> Tensor:
         features = relu(self.layer("of_view", slots))
         seen = slots[..., 5:6]  # validity
-        scores = self.layer("weight", features) + 1e4 * (seen - 1)
+        scores = features @ self.parameters["weight.weight"].T + 1e4 * (seen - 1)
         weights = torch.softmax(scores, 1) * seen
         mean = (weights * features).sum(1)
         return torch.cat([mean, (weights * (features - mean[:, None]).square()).sum(1)], 1)
@@ -119,7 +119,7 @@ class _Pooled(ImageBasedNeRF):
 
     def __init__(self, config: ImageBasedConfig) -> None:
         super().__init__(config)
-        self.of_view, self.weight = nn.Linear(self.slot_size, POOLED), nn.Linear(POOLED, 1)
+        self.of_view, self.weight = nn.Linear(self.slot_size, POOLED), nn.Linear(POOLED, 1, bias=False)
 
     @property
     def slot_size(self) -> int:

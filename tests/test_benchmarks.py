@@ -48,7 +48,7 @@ def test_pooling_reads_the_views_of_a_point_in_no_order():
 
 def test_parts_of_an_update_are_rendered_with_the_passes_that_the_whole_has():
     model, task = HyperPlanes(replace(MODEL, second_pass=True)), Balls(views=6, size=(24, 24)).task("train0")
-    found = views.PARTS["grid_alone"](model).adapt(task.support)  # outputs start at zero: nothing to leave out
+    found = views.METHODS["unjudged"](model).adapt(task.support)  # outputs start at zero: nothing to leave out
     expected = model.adapt(task.support)
     cameras = task.query.cameras
     assert torch.equal(found.render(cameras).images, expected.render(cameras).images)

@@ -112,7 +112,7 @@ def test_an_unknown_flag_is_wrong_input(capsys):
 @pytest.mark.parametrize(
     ("arguments", "names"),
     [
-        (["generate", "--out", "x", "--class", "None"], "'car', 'chair', 'plane', 'lamp'"),
+        (["generate", "--out", "x", "--class", "None"], "'car', 'chair', 'plane', 'lamp', 'random'"),
     ],
 )
 def test_the_names_of_an_option_that_may_be_left_out_are_listed_in_order_without_none(arguments, names, capsys):
@@ -217,7 +217,7 @@ def test_pictures_are_not_written_over_those_that_are_read(verb, out, more, tmp_
     before = {path: path.read_bytes() for path in (tmp_path / "photos").rglob("*") if path.is_file()}
     arguments = [verb, "--checkpoint", str(demo_folder() / "hyperplanes"), "--views", "photos", "--out", out, *more]
     assert main(arguments) == 2
-    assert "--out: expected a folder without the pictures that are read, got photos/images" in complaint(capsys)
+    assert "--out: expected a folder that no pictures or poses are read from, got photos/images" in complaint(capsys)
     assert {path: path.read_bytes() for path in (tmp_path / "photos").rglob("*") if path.is_file()} == before
 
 

@@ -42,6 +42,7 @@ def test_it_holds_the_packages_and_nothing_else(wheel):
     models = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/pretrained").glob("*/*.*")}
     examples = {str(path.relative_to(ROOT)) for path in (ROOT / "hyperplanes/examples").rglob("*.*")}
     page = {"hyperplanes/experiments/page/style.css", "hyperplanes/experiments/page/report.html"}
+    page.add("hyperplanes/export/viewer.js")
     assert found == there | page | {*PACKAGED} | models | examples
 
 

@@ -106,12 +106,13 @@ def _adapt(
     """Shows the field as it is adapted, fine-tuned and baked; ends early where another number of views is wanted."""
     import torch
 
+    from hyperplanes.adaptation.fine_tuning import make_descent
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene, default_side
 
     console.say(f"adapting to {len(shown)} views")
     context, steps = model.prepare(shown), arguments.steps if len(shown) > 1 else 0
-    descent, variables = model.descent(context, FineTuning(), shown)
+    descent, variables = make_descent(model, context, FineTuning(), shown)
     field = None
     for done in descent.run(steps):
         if done % EVERY == 0 or done == steps:

@@ -182,7 +182,7 @@ class LiveViewer:
                 continue
             height = min(LARGEST, round(self._height * (SHARPER if still else 1)))
             eye = client.camera
-            seen = viewed_camera(eye.wxyz, eye.position, eye.fov, eye.aspect, height)
+            seen = viewed_camera(eye.wxyz.tolist(), eye.position.tolist(), eye.fov, eye.aspect, height)
             started = time.perf_counter()
             picture = to_pixels(shown.render(seen).images)[0]
             if not still:

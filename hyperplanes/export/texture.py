@@ -101,7 +101,7 @@ def _simplified(surface: Surface, faces: int) -> trimesh.Trimesh:
 
     vertices, triangles = surface.vertices, surface.faces
     if len(triangles) > faces:
-        vertices, triangles = fast_simplification.simplify(vertices, triangles, target_count=faces)
+        vertices, triangles = fast_simplification.simplify(vertices, triangles, target_count=faces)  # pyright: ignore
     return trimesh.Trimesh(vertices, triangles, process=True)
 
 
@@ -142,7 +142,7 @@ def _texels(mesh: TexturedSurface) -> tuple[npt.NDArray[np.int64], ...]:
     shares = np.stack([area(here, b, c), area(a, here, c), area(a, b, here)], 1) / np.where(flat, 1, whole)[:, None]
     inside = (shares.min(1) >= -1e-6) & ~flat
     shares = shares[inside].astype(np.float32)
-    return height - 1 - up[inside], column[inside], face[inside], shares
+    return height - 1 - up[inside], column[inside], face[inside], shares  # pyright: ignore[reportReturnType]
 
 
 def _hits(
@@ -151,7 +151,8 @@ def _hits(
     """Which pixels meet the surface: their numbers, faces and points; and distances of all, infinite beside it."""
     rays = cast(cameras, torch.full((len(pixels),), view), pixels)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    face, ray, place = solid.ray.intersects_id(origins, directions, multiple_hits=False, return_locations=True)
+    found = solid.ray.intersects_id(origins, directions, multiple_hits=False, return_locations=True)
+    face, ray, place = found  # pyright: ignore[reportAssignmentType]
     distances = np.full(len(pixels), np.inf, np.float32)
     distances[ray] = np.linalg.norm(place - origins[ray], axis=1)
     return ray, face, place, distances
@@ -238,11 +239,12 @@ def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
     """
     import trimesh
     from PIL import Image
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
 
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0
-    )
-    visual = trimesh.visual.TextureVisuals(uv=mesh.places, material=material)
+    material = PBRMaterial(baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0)
+    visual = TextureVisuals(uv=mesh.places, material=material)
     solid = trimesh.Trimesh(
         mesh.vertices, mesh.faces, vertex_normals=mesh.normals, visual=visual, process=False, validate=False
     )
@@ -253,7 +255,7 @@ def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
 
     buffer = io.BytesIO()
     scene = trimesh.Scene(solid)
-    buffer.write(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=unlit))
+    buffer.write(export_glb(scene, include_normals=True, tree_postprocessor=unlit))
     path = Path(path)
     write_whole(path, buffer.getvalue())
     return path

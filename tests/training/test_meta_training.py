@@ -100,11 +100,11 @@ def test_a_single_view_an_object_is_all_that_sv_meta_sees():
     def poison(name):
         task = clean(name)
         kept = SingleView(data).task(name).support
-        images = torch.full_like(task.support.images, torch.nan)
+        images = torch.full_like(task.support.images, 0.77)
         same = (task.support.images == kept.images).flatten(1).all(1)
         assert same.sum() == 1
         images[same] = kept.images
-        masks = torch.full_like(task.support.masks, torch.nan)
+        masks = torch.ones_like(task.support.masks)
         masks[same] = kept.masks
         return Task(replace(task.support, images=images, masks=masks), task.query, name)
 

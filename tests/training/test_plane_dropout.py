@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
+from hyperplanes.fields import find_targets
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, small_model
@@ -60,7 +61,8 @@ def test_where_there_are_fewer_views_than_planes_each_stands_at_one_plane_and_th
 
 @pytest.mark.parametrize("target", ["nerf", "image_based"])
 def test_fields_without_a_plane_at_a_place_of_its_own_take_no_dropout(target):
+    network = find_targets()[target].config_type()
     with pytest.raises(ValueError, match=f"plane_dropout: .* got {target}"):
-        HyperPlanes(ModelConfig(target=target, hypernetwork=None, plane_dropout=0.1))
+        HyperPlanes(ModelConfig(target=target, network=network, hypernetwork=None, plane_dropout=0.1))
     with pytest.raises(ValueError, match="plane_dropout: expected a probability from 0 to below 1, got 1"):
         ModelConfig(plane_dropout=1.0)

@@ -183,10 +183,10 @@ def _differences(mask: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.nda
 
     def deep(difference: np.ndarray) -> np.ndarray:
         padded = np.pad(difference, radius, mode="edge")  # the border of the picture is no border of the difference
-        opened = ndimage.binary_opening(padded, disc)[radius:-radius, radius:-radius]
+        opened = np.asarray(ndimage.binary_opening(padded, disc))[radius:-radius, radius:-radius]
         return ndimage.binary_dilation(opened, iterations=radius) & difference
 
-    return deep(seen & ~mask), deep(mask & ~ndimage.binary_dilation(seen, iterations=2))
+    return deep(seen & ~mask), deep(mask & ~np.asarray(ndimage.binary_dilation(seen, iterations=2), dtype=bool))
 
 
 def _mended(mask: Mask, lost: np.ndarray, extra: np.ndarray) -> Mask:

@@ -25,7 +25,7 @@ def firm(probability: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "h
 
 def connected_regions(mask: Bool[np.ndarray, "height width"]) -> tuple[np.ndarray, int]:
     """The number of each pixel's region, 0 outside, and how many regions there are."""
-    labels = label(mask, connectivity=1)
+    labels = np.asarray(label(mask, connectivity=1))
     return labels, int(labels.max(initial=0))
 
 

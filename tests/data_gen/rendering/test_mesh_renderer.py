@@ -187,15 +187,14 @@ def test_reversed_faces_look_like_any_others(backend):
     assert np.abs(right.astype(int) - wrong).max() <= 2
 
 
-@pytest.mark.parametrize("class_name", CLASSES)
+@pytest.mark.parametrize("class_name", [name for name in CLASSES if name != "random"])
 def test_inner_sides_of_generated_objects_are_never_seen(class_name):
     """Property: what is closed covers the same samples without its inner sides, and looks the same.
 
-    But for a sample here and there on an outline itself, where both sides have one depth, and where a random solid
-    crosses itself.
+    But for a sample here and there on an outline itself, where both sides have one depth. Solids of the class random
+    may cross themselves, and then show their inner sides.
     """
     _skip_unless_working("pyrender-egl")
-    share = 0.02 if class_name == "random" else 0.002
     with MeshRenderer("pyrender-egl") as renderer:
         for seed in range(4):
             whole, outer = (
@@ -205,7 +204,7 @@ def test_inner_sides_of_generated_objects_are_never_seen(class_name):
                 for closed in (False, True)
             )
             assert np.array_equal(whole[..., 3], outer[..., 3])
-            assert (whole != outer).any(axis=-1).sum() < share * (whole[..., 3] > 0).sum()
+            assert (whole != outer).any(axis=-1).sum() < 0.002 * (whole[..., 3] > 0).sum()
 
 
 def test_a_sheet_is_seen_from_both_sides(backend):
