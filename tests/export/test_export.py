@@ -206,10 +206,10 @@ def test_a_turntable_moves(kind, tmp_path):
 
 
 def test_a_turntable_of_another_kind(tmp_path):
-    with pytest.raises(ValueError, match="webp or gif"):
-        save_turntable(ball(), views(), tmp_path / "turn.mp4")
+    with pytest.raises(ValueError, match="webp"):
+        save_turntable(ball(), views(), tmp_path / "turn.avi")
     with pytest.raises(ValueError, match="webp, gif"):
-        encode_animation(np.zeros((1, 2, 2, 3), np.uint8), "mp4")
+        encode_animation(np.zeros((1, 2, 2, 3), np.uint8), "avi")
 
 
 def test_images_are_written_as_they_are(tmp_path):
