@@ -20,9 +20,9 @@ __all__ = [
     "BLOCK",
     "CHANNELS",
     "back_project",
+    "blended",
     "copy",
     "inlined",
-    "inner",
     "place",
     "project",
     "scratch",
@@ -40,13 +40,15 @@ RAW_U, RAW_V, RECIPROCAL, U, V, INSIDE, GRAD_U, GRAD_V, COLUMN, ROW, CORNER, ACR
 # Two rows of four numbers a point; three channels' slopes across and down; the channels, one row each.
 TILE, SLOPES, CHANNELS = BLOCK * 13, BLOCK * 21, BLOCK * 27
 
-# Functions of a block, and functions of a point, which are forced inline: LLVM calls them otherwise, which takes longer
-# than their work.
-inner = njit(fastmath=FASTMATH, error_model="numpy", nogil=True)
+# Everything that a kernel calls is inlined into it. A function of a point would take less time than its call; and what
+# numba does not inline becomes a weak symbol, which the loader resolves to the copy of whichever kernel was compiled or
+# loaded first: the last bit of a result would then depend on what ran before.
 inlined = njit(fastmath=FASTMATH, error_model="numpy", nogil=True, forceinline=True)
+# Products and sums are fused as they are written, and not reordered: planes and interleaved pixels give the same bits.
+blended = njit(fastmath={"contract"}, error_model="numpy", nogil=True, forceinline=True)
 
 
-@inner
+@inlined
 @no_type_check
 def scratch(dtype, channels):
     """The scratch of a block."""
@@ -100,7 +102,7 @@ def place(s, out, column, row, height, width):
         store(out, row + i, v * per_row - one if front else zero)
 
 
-@inner
+@inlined
 @no_type_check
 def copy(s, row, count, values, at, stride):
     """Every `stride`-th of `count` numbers -> a row of the scratch, zeros after them; whole vectors where adjacent."""
@@ -146,7 +148,7 @@ def unnormalize(s, count, values, at, by, height, width):
         _unnormalize(s, count, values, at, by[0], by[2], height, width)
 
 
-@inner
+@inlined
 @no_type_check
 def start_gradient(s, height, width):
     """Gradients of coordinates in COLUMN, ROW -> GRAD_U, GRAD_V."""
@@ -157,7 +159,7 @@ def start_gradient(s, height, width):
         store(s, GRAD_V + i, load(s, ROW + i) * per_row)
 
 
-@inner
+@inlined
 @no_type_check
 def back_project(s, points, at, pitch, matrices, view, gradients, sums):
     """GRAD_U, GRAD_V -> added to the `gradients` of points, laid out like these, and to the view's row of `sums`.

@@ -10,7 +10,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.kernels.blocks import inner
+from hyperplanes.geometry.kernels.blocks import inlined
 from hyperplanes.geometry.kernels.llvm import load, read, store
 
 __all__ = ["carve"]
@@ -18,7 +18,7 @@ __all__ = ["carve"]
 LANES = 16
 
 
-@inner
+@inlined
 @no_type_check
 def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius, min_z):
     """Counts down the votes left in the lanes of `alive` that one view rules out; returns how many are left in all."""

@@ -25,8 +25,8 @@ from hyperplanes.geometry.kernels.blocks import (
     TILE,
     U,
     V,
+    blended,
     inlined,
-    inner,
 )
 from hyperplanes.geometry.kernels.llvm import bits_of, blend, load, load_int, read, slopes, spread, store, store_int
 
@@ -65,7 +65,7 @@ def _taps(images, offset, k, height, width):
     return a, b, read(images, offset, k), read(images, offset, np.int32(k + right))
 
 
-@inner
+@blended
 @no_type_check
 def fetch_plane(s, out, first, images, offset, height, width, background):
     """U, V, INSIDE -> bilinear values of the plane that starts at `offset`, into `out` from `first` on."""
@@ -78,7 +78,7 @@ def fetch_plane(s, out, first, images, offset, height, width, background):
         store(out, first + i, value if load(s, INSIDE + i) > zero else background)
 
 
-@inner
+@inlined
 @no_type_check
 def pull_plane(s, images, offset, height, width, channel):
     """Adds one channel's part to GRAD_U, GRAD_V: its gradient times the slope of its plane."""
@@ -117,7 +117,7 @@ def _contracted(word, gradients, channels):
     return value + gradients[2] * bits_of(word, third[0], third[1])
 
 
-@inner
+@inlined
 @no_type_check
 def fetch_packed(s, out, first, pitch, packed, offset, height, width, bits, background):
     """As `fetch_plane`, for all three channels of packed pixels; their values go `pitch` apart."""
@@ -135,7 +135,7 @@ def fetch_packed(s, out, first, pitch, packed, offset, height, width, bits, back
         store(out, first + 2 * pitch + i, _mixed(words, weights, blue) * unit_last if inside else background)
 
 
-@inner
+@inlined
 @no_type_check
 def pull_packed(s, packed, offset, height, width, bits):
     """As `pull_plane`, for all three channels of packed pixels."""
@@ -156,7 +156,7 @@ def pull_packed(s, packed, offset, height, width, bits):
         store(s, GRAD_V + i, load(s, GRAD_V + i) + ((gc - ga) + fx * twist))
 
 
-@inner
+@inlined
 @no_type_check
 def room(images, bits, segments):
     """Memory for an interleaved plane, or none where segments have too few points for interleaving to pay off."""
@@ -168,7 +168,7 @@ def room(images, bits, segments):
     return np.zeros(4 * (height * width + 1) if pays else 0, images.dtype)
 
 
-@inner
+@inlined
 @no_type_check
 def interleave(images, view, pixels):
     """A plane of three channels -> pixels of four numbers."""
@@ -180,7 +180,7 @@ def interleave(images, view, pixels):
         store(pixels, 4 * i + 2, read(images, (3 * view + 2) * size, i))
 
 
-@inner
+@inlined
 @no_type_check
 def _place_corners(s, height, width):
     """U, V -> CORNER, ACROSS, DOWN."""
@@ -191,7 +191,7 @@ def _place_corners(s, height, width):
         store(s, DOWN + i, fy)
 
 
-@inner
+@inlined
 @no_type_check
 def fetch_pixels(s, out, first, pitch, pixels, height, width, background):
     """As `fetch_packed`, for an interleaved plane."""
@@ -208,7 +208,7 @@ def fetch_pixels(s, out, first, pitch, pixels, height, width, background):
             store(out, to + i, load(s, row + i) if load(s, INSIDE + i) > zero else background)
 
 
-@inner
+@inlined
 @no_type_check
 def pull_pixels(s, pixels, height, width):
     """As `pull_packed`, for an interleaved plane."""

@@ -10,7 +10,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.kernels.blocks import inlined, inner
+from hyperplanes.geometry.kernels.blocks import inlined
 from hyperplanes.geometry.kernels.llvm import load, load_int, read, store, store_int
 from hyperplanes.geometry.lookup_torch import BORDER
 
@@ -40,7 +40,7 @@ def _acos(x):
     return angle if x >= 0 else n(np.pi) - angle
 
 
-@inner
+@inlined
 @no_type_check
 def _place(s, pitch, total, x, y, z, cameras, shape, min_z):
     """Projects a point into every view: direction, distance, whether it is shown, the pixel and the fractions."""
@@ -80,7 +80,7 @@ def _place(s, pitch, total, x, y, z, cameras, shape, min_z):
         store_int(s, AT * pitch, k, np.int32(2 * ((np.int32(k) * height + row) * width + column)))
 
 
-@inner
+@inlined
 @no_type_check
 def _judge(s, pitch, total, along_x, along_y, along_z, maps, shape, limits):
     """Reads depth and opacity where a point falls into each view, and computes the penalties and scores."""
@@ -110,7 +110,7 @@ def _judge(s, pitch, total, along_x, along_y, along_z, maps, shape, limits):
         store(s, SCORE * pitch + k, _acos(min(max(cosine, -one), one)) + by_angle * max(penalty, zero))
 
 
-@inner
+@inlined
 @no_type_check
 def _keep(s, pitch, total, row, count, views, values, scores, start):
     """Writes the `count` views of the least numbers in a row of the scratch, best first, and their results.
