@@ -24,7 +24,8 @@ from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.initialisation import LEARNED
-from hyperplanes.configuration.presets import configure
+from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.configuration.presets import Preset, preset
 from hyperplanes.fields import find_targets
 from hyperplanes.rendering.samplers import Sampler
 from hyperplanes.utilities.entry_points import load_entries
@@ -45,7 +46,7 @@ class Request:
         device: where weights go.
         settings: of fine-tuning.
         objects: the support views of the objects that will be asked for.
-        preset: the shape of fields that need no checkpoint.
+        preset: the shape of fields that need no checkpoint, or its name.
         protocol: how those are sampled while they are optimised.
     """
 
@@ -55,8 +56,13 @@ class Request:
     device: torch.device | str = "cpu"
     settings: FineTuning = field(default_factory=FineTuning)
     objects: Iterable[Views] = ()
-    preset: str = "quick"
+    preset: str | Preset = "quick"
     protocol: str = "default"
+
+    def configured(self, method: str) -> ModelConfig:
+        """The model of a method at the scale of the preset."""
+        chosen = preset(self.preset) if isinstance(self.preset, str) else self.preset
+        return chosen.by_protocol(self.protocol).by_method(method).model
 
     def model(self, method: str) -> HyperPlanes:
         """The model of the checkpoint of a method, on the device.
@@ -131,7 +137,7 @@ def _scratch(request: Request) -> Adapter:
 
 def _field_scratch(name: str, request: Request) -> Adapter:
     """A field of the preset's shape, from random weights."""
-    config = configure(request.preset, name, protocol=request.protocol).model
+    config = request.configured(name)
     return FieldFromScratch(config, request.needed_steps, request.settings, request.device)
 
 
@@ -147,7 +153,7 @@ def _standard(request: Request) -> Adapter:
     """Random weights in the architecture of the learned initialisations that they stand beside."""
     family = next((each for each in LEARNED if each in request.checkpoints), None)
     trained = None if family is None else request.model(family)
-    config = replace(configure(request.preset, "mv_meta", protocol=request.protocol).model, order="file")
+    config = replace(request.configured("mv_meta"), order="file")
     model = random_model(config if trained is None else trained.config, request.settings.seed)
     if trained is not None:
         model.rig.copy_(trained.rig)
@@ -283,7 +289,7 @@ def make_method(
     device: torch.device | str = "cpu",
     settings: FineTuning | None = None,
     objects: Iterable[Views] = (),
-    preset: str = "quick",
+    preset: str | Preset = "quick",
     protocol: str = "default",
 ) -> Adapter:
     """The adapter behind a method's name.
@@ -294,7 +300,7 @@ def make_method(
         device: where its weights go.
         settings: of fine-tuning.
         objects: the support views of the objects that will be asked for; "hyperplanes_swapped" reads them.
-        preset: the shape of the fields that need no checkpoint.
+        preset: the shape of the fields that need no checkpoint, or its name.
         protocol: how those are sampled while they are optimised, as in `presets.configure`.
 
     Returns:

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from hyperplanes.configuration.presets import Preset, configure
+from hyperplanes.configuration.presets import Preset, configure, preset
 from hyperplanes.experiments.scales import Scale
 from hyperplanes.experiments.tables import Experiment, Trained
 
-__all__ = ["change", "configuration", "deviations"]
+__all__ = ["change", "configuration", "deviations", "scaled_preset"]
 
 Value = TypeVar("Value")
 
@@ -50,9 +50,9 @@ def configuration(experiment: Experiment, trained: Trained, scale: Scale, object
     Returns:
         A preset that nobody has named.
     """
-    chosen = configure(scale.presets[experiment.size], trained.method, seed=seed, protocol=scale.protocol)
+    chosen = scaled_preset(experiment, scale).by_method(trained.method)
     steps = scale.steps if scale.steps is not None else experiment.epochs_of(trained.on) * objects
-    changes = {**scale.changes, **trained.changes, "training.steps": steps}
+    changes = {**trained.changes, "training.steps": steps, "training.seed": seed}
     changes["model.network.planes"] = scale.planes(trained.planes)
     for part in ("hypernetwork", "autoencoder"):
         reader, name = getattr(chosen.model, part), f"model.{part}.views"
@@ -61,6 +61,11 @@ def configuration(experiment: Experiment, trained: Trained, scale: Scale, object
             assert isinstance(views, int)
             changes[name] = scale.planes(views)
     return change(chosen, changes)
+
+
+def scaled_preset(experiment: Experiment, scale: Scale) -> Preset:
+    """The preset of an experiment with what the scale changes, before a method is chosen."""
+    return change(preset(scale.presets[experiment.size]), scale.changes).by_protocol(scale.protocol)
 
 
 def deviations(experiment: Experiment, scale: Scale) -> list[str]:

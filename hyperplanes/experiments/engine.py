@@ -5,20 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from hyperplanes.adaptation.checkpoints import find_checkpoints
-from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.adaptation.checkpoints import find_checkpoints, packaged_folder
 from hyperplanes.configuration.presets import PROTOCOLS, Preset
 from hyperplanes.data import open_dataset
 from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.data.support import WithSupport
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
-from hyperplanes.experiments.configurations import configuration
+from hyperplanes.experiments.configurations import configuration, scaled_preset
 from hyperplanes.experiments.scales import Scale
 from hyperplanes.experiments.tables import Cell, Experiment, Trained
 from hyperplanes.methods import WithSampler, make_method
@@ -133,8 +132,11 @@ class Runner:
         curves: dict[str, dict[tuple[str, int], Curve]] = {}
         for seed in range(seeds):
             for cell in experiment.cells:
+                if cell.trained.packaged and seed:
+                    continue  # the same whatever the seed
                 folder = self.checkpoint(experiment, cell.trained, seed)
-                curve = read_json(folder / "training.json").get("curve", [])
+                state = folder / "training.json"  # none of a packaged model
+                curve = read_json(state).get("curve", []) if state.exists() else []
                 curves.setdefault(_curve_name(experiment, cell), {})[str(folder), seed] = curve
                 score = self.score(experiment, cell, folder, seed)
                 scores.setdefault((cell.row, cell.column), []).append(score)
@@ -153,7 +155,9 @@ class Runner:
         return configuration(experiment, trained, self.scale, objects, seed)
 
     def checkpoint(self, experiment: Experiment, trained: Trained, seed: int) -> Path:
-        """The folder of a finished training."""
+        """The folder of a finished training, or of a packaged model."""
+        if trained.packaged:
+            return packaged_folder(trained.packaged)
         data = self.tasks(trained.on)
         chosen = self.configuration(experiment, trained, seed)
         reference = trained.reference and self.checkpoint(experiment, trained.reference, seed)
@@ -189,6 +193,8 @@ class Runner:
             "objects": names,
             "free": cell.free if method != cell.trained.method else "",
             "seed": seed,
+            "views": self._views(cell, checkpoint),
+            "fine_tuning": asdict(self.scale.fine_tuning),
         }
         path = self.out / "evaluations" / f"{_name(f'{self.folder(cell.on).name}-{method}-{seed}', settings)}.json"
         if not path.exists():
@@ -200,23 +206,29 @@ class Runner:
         self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, names: list[str], seed: int
     ) -> Score:
         checkpoints = find_checkpoints([checkpoint])
-        settings = FineTuning(trainable=cell.free if "hyperplanes" in checkpoints else "weights", seed=seed)
-        planes = read_json(checkpoint / "model.json")["network"]["planes"]
-        tasks = WithSupport(self.tasks(cell.on), planes)
+        trainable = cell.free if "hyperplanes" in checkpoints else "weights"
+        settings = replace(self.scale.fine_tuning, trainable=trainable, seed=seed)
+        tasks = WithSupport(self.tasks(cell.on), self._views(cell, checkpoint))
         adapter = make_method(
             method,
             checkpoints,
             device=self.device,
             settings=settings,
-            preset=self.scale.presets[experiment.size],
-            protocol=self.scale.protocol,
+            preset=scaled_preset(experiment, self.scale),
         )
+        sampling = None if cell.trained.packaged else PROTOCOLS[self.scale.protocol]
         heading = f"{cell.row}, {cell.column}, seed {seed}"
 
         def show(score: ObjectScore, *_: Any) -> None:
             self.say(f"{heading}: {score.name} {score.psnr:.2f} dB")
 
-        return evaluate(method, WithSampler(adapter, PROTOCOLS[self.scale.protocol]), tasks, names, show)
+        return evaluate(method, WithSampler(adapter, sampling), tasks, names, show)
+
+    def _views(self, cell: Cell, checkpoint: Path) -> int:
+        """How many support views a cell shows: as many as the model has planes, where it does not say."""
+        if cell.views is not None:
+            return self.scale.planes(cell.views)
+        return int(read_json(checkpoint / "model.json")["network"]["planes"])
 
 
 def _name(start: str, settings: Mapping[str, Any]) -> str:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import torch
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.experiments.engine import Runner
 from hyperplanes.experiments.tables import Experiment, Trained
 from hyperplanes.geometry import cameras as camera
@@ -52,11 +51,13 @@ def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
     """
     rows, whole = [], 0.0
     for trained in experiment.trainings:
+        if trained.packaged:
+            continue
         chosen = runner.configuration(experiment, trained, 0)
         measured = _measure(runner, experiment, trained)
         training = measured.step * chosen.training.steps
         learned = chosen.model.initialisation
-        tuned = FineTuning().rays if learned is None else learned.test_rays
+        tuned = runner.scale.fine_tuning.rays if learned is None else learned.test_rays
         evaluation = 0.0
         for cell in experiment.cells:
             if cell.trained == trained:

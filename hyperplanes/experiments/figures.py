@@ -47,7 +47,7 @@ def _bars(outcome: Outcome) -> Figure:
     parts[0].set(ylabel=AXES[experiment.cells[0].quantity], title="here")
     if published is not None:
         theirs = {
-            column: ([published.value(row, column) or math.nan for row in experiment.rows], None)
+            column: ([experiment.published_value(row, column) or math.nan for row in experiment.rows], None)
             for column in experiment.columns
         }
         draw_bars(parts[1], experiment.rows, theirs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from statistics import fmean, pstdev
 from typing import Any
 
@@ -16,7 +17,7 @@ from hyperplanes.utilities.tables import csv_table, markdown_table
 
 __all__ = ["as_csv", "as_json", "as_markdown", "headings", "rows", "value", "what_differs"]
 
-DECIMALS = {"psnr": 2, "ssim": 3, "image_seconds": 2}
+DECIMALS = {"psnr": 2, "psnr_pooled": 2, "ssim": 3, "image_seconds": 2}
 
 
 def value(score: Score, quantity: str) -> tuple[float, float | None]:
@@ -28,10 +29,12 @@ def value(score: Score, quantity: str) -> tuple[float, float | None]:
 
 
 def headings(outcome: Outcome) -> list[str]:
-    """The heading of the rows, then of every column: ours, and the paper's where it has one."""
+    """The heading of the rows, then of every column: ours, its pooled PSNR, and the paper's where it has one."""
     found = [""]
     for column in outcome.experiment.columns:
         found.append(column)
+        if _pooled_column(outcome, column):
+            found.append("pooled")
         if _published_column(outcome, column):
             found.append("paper")
     return found
@@ -47,10 +50,17 @@ def rows(outcome: Outcome) -> list[list[str]]:
         for column in experiment.columns:
             cell = cells.get((row, column))
             line.append("-" if cell is None else _ours(outcome, cell))
+            if _pooled_column(outcome, column):
+                pooled = cell is not None and cell.quantity == "psnr"
+                line.append(_ours(outcome, replace(cell, quantity="psnr_pooled")) if cell and pooled else "-")
             if _published_column(outcome, column):
                 line.append(_theirs(outcome, row, column))
         table.append(line)
     return table
+
+
+def _pooled_column(outcome: Outcome, column: str) -> bool:
+    return any(cell.column == column and cell.quantity == "psnr" for cell in outcome.experiment.cells)
 
 
 def _published_column(outcome: Outcome, column: str) -> bool:
@@ -68,11 +78,10 @@ def _ours(outcome: Outcome, cell: Cell) -> str:
 
 
 def _theirs(outcome: Outcome, row: str, column: str) -> str:
-    published = outcome.experiment.published
-    number = published and published.value(row, column)
-    if published is None or number is None:
+    number = outcome.experiment.published_value(row, column)
+    if number is None:
         return "-"
-    return _shown(number, published.deviation(row, column), 3 if row == "SSIM" else 2)
+    return _shown(number, outcome.experiment.published_deviation(row, column), 3 if row == "SSIM" else 2)
 
 
 def what_differs(outcome: Outcome) -> list[str]:
@@ -128,23 +137,23 @@ def as_csv(outcome: Outcome) -> str:
     lines: list[Sequence[object]] = []
     for cell in outcome.experiment.cells:
         number, deviation = value(outcome.scores[cell.row, cell.column], cell.quantity)
-        published = outcome.experiment.published
-        theirs = published and published.value(cell.row, cell.column)
-        lines.append((cell.row, cell.column, cell.quantity, number, deviation, outcome.seeds, theirs))
-    return csv_table(("row", "column", "quantity", "value", "deviation", "seeds", "paper"), lines)
+        pooled = outcome.scores[cell.row, cell.column].mean("psnr_pooled") if cell.quantity == "psnr" else None
+        theirs = outcome.experiment.published_value(cell.row, cell.column)
+        lines.append((cell.row, cell.column, cell.quantity, number, deviation, pooled, outcome.seeds, theirs))
+    return csv_table(("row", "column", "quantity", "value", "deviation", "pooled", "seeds", "paper"), lines)
 
 
 def as_json(outcome: Outcome, command: str) -> dict[str, Any]:
     """All numbers, objects and seeds included."""
     found: dict[str, Any] = {}
     for cell in outcome.experiment.cells:
-        score, published = outcome.scores[cell.row, cell.column], outcome.experiment.published
+        score = outcome.scores[cell.row, cell.column]
         number, deviation = value(score, cell.quantity)
         found.setdefault(cell.row, {})[cell.column] = {
             "quantity": cell.quantity,
             "value": number if math.isfinite(number) else None,
             "deviation": deviation,
-            "paper": published and published.value(cell.row, cell.column),
+            "paper": outcome.experiment.published_value(cell.row, cell.column),
             "score": score.as_json(),
         }
     return {

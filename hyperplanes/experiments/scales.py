@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.experiments.tables import Cell, Experiment
 
 __all__ = ["SCALES", "Scale"]
@@ -30,8 +31,9 @@ class Scale:
         tuning: the most gradient steps on the support views of an object.
         longest: the same where PSNR is drawn over their number.
         evaluated: objects a class and split; None for all.
-        trainings: about as many a table; where one seed of all models takes fewer, more seeds are run.
-        changes: of the configuration, by dotted names, for every model.
+        most_seeds: of a table; None for as many as the paper has.
+        changes: of the preset, by dotted names, before a method is chosen.
+        fine_tuning: rays, optimiser and rates of the gradient steps on an object.
     """
 
     name: str
@@ -46,14 +48,13 @@ class Scale:
     tuning: int | None
     longest: int | None
     evaluated: int | None
-    trainings: int | None
+    most_seeds: int | None
     changes: Mapping[str, object] = field(default_factory=dict)
+    fine_tuning: FineTuning = field(default_factory=FineTuning)
 
     def seeds(self, experiment: Experiment) -> int:
-        """How many seeds of an experiment are run; never more than in the paper."""
-        if self.trainings is None:
-            return experiment.runs
-        return min(experiment.runs, max(1, self.trainings // len(experiment.trainings)))
+        """How many seeds of an experiment are run: as many as in the paper, or as the scale has."""
+        return experiment.runs if self.most_seeds is None else self.most_seeds
 
     def applied(self, experiment: Experiment) -> Experiment:
         """The experiment with columns of so many steps only as the scale allows, where columns are numbers of steps."""
@@ -105,10 +106,10 @@ SCALES: dict[str, Scale] = {
                 "model.hypernetwork.code": 4,
                 "model.hypernetwork.depth": 1,
                 "model.hypernetwork.width": 8,
-                "model.autoencoder.code": 4,
-                "model.autoencoder.latent": 4,
-                "model.initialisation.inner_steps": 2,
-                "model.initialisation.test_rays": 16,
+                "autoencoder.code": 4,
+                "autoencoder.latent": 4,
+                "initialisation.inner_steps": 2,
+                "initialisation.test_rays": 16,
                 "model.sampling.steps": 8,
                 "model.hull_resolution": 8,
                 "training.tasks": 2,
@@ -119,18 +120,32 @@ SCALES: dict[str, Scale] = {
         ),
         Scale(
             "small",
-            "one to a few hours on two cores: 64x64, procedural objects",
+            "about half an hour a seed of all ten on one core: 32x32, procedural objects",
             {128: "quick", 200: "quick"},
             "default",
-            64,
-            105,
-            5,
+            32,
             50,
-            800,
-            2000,
-            10_000,
-            None,
-            15,
+            10,
+            50,
+            200,
+            150,
+            1000,
+            4,
+            3,
+            {
+                "model.network.depth": 3,
+                "model.network.width": 64,
+                "model.sampling.steps": 32,
+                "model.hull_resolution": 32,
+                "initialisation.test_rays": 128,
+                "training.tasks": 2,
+                "training.rays": 128,
+                "training.warmup": 20,
+                "training.held_out": 2,
+                "training.evaluate_every": 50,
+                "training.checkpoint_every": 1000,
+            },
+            FineTuning(rays=256),
         ),
         Scale(
             "paper",
