@@ -137,6 +137,7 @@ SCALES: dict[str, Scale] = {
                 "model.network.width": 64,
                 "model.sampling.steps": 32,
                 "model.hull_resolution": 32,
+                "initialisation.inner_steps": 8,
                 "initialisation.test_rays": 128,
                 "training.tasks": 2,
                 "training.rays": 128,

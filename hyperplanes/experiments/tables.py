@@ -199,8 +199,8 @@ def _shapenet() -> Experiment:
         (
             "The paper gives HyperPlanes 25 support views and does not say how many the methods of Tancik et al. were "
             "given for their 2,000 steps. Their published notebook (tancik/learnit, Experiments/shapenet.ipynb, "
-            "test_time_views = 1) judges every training by one, so the paper's numbers stand beside the rows of 1 view: "
-            "a guess, which the order of the rows supports.",
+            "test_time_views = 1) judges every training by one, so the paper's numbers stand beside 1 view, as a "
+            "guess.",
             "small: the packaged model of any number of views, trained by this project on four procedural classes at "
             "128x128; not in the paper.",
         ),
