@@ -34,6 +34,8 @@ class Scale:
         most_seeds: of a table; None for as many as the paper has.
         changes: of the preset, by dotted names, before a method is chosen.
         fine_tuning: rays, optimiser and rates of the gradient steps on an object.
+        shown: numbers of support views, where a table has rows of several; None for all of them.
+        packaged: with the rows of models that come with the package.
     """
 
     name: str
@@ -51,13 +53,22 @@ class Scale:
     most_seeds: int | None
     changes: Mapping[str, object] = field(default_factory=dict)
     fine_tuning: FineTuning = field(default_factory=FineTuning)
+    shown: tuple[int, ...] | None = None
+    packaged: bool = True
 
     def seeds(self, experiment: Experiment) -> int:
         """How many seeds of an experiment are run: as many as in the paper, or as the scale has."""
         return experiment.runs if self.most_seeds is None else self.most_seeds
 
     def applied(self, experiment: Experiment) -> Experiment:
-        """The experiment with columns of so many steps only as the scale allows, where columns are numbers of steps."""
+        """The experiment with the rows and the numbers of steps that the scale has."""
+        kept = tuple(
+            cell
+            for cell in experiment.cells
+            if (cell.views is None or self.shown is None or cell.views in self.shown)
+            and (self.packaged or not cell.trained.packaged)
+        )
+        experiment = replace(experiment, cells=kept)
         if experiment.figure != "steps" or self.longest is None:
             return experiment
         cells: dict[tuple[str, str], Cell] = {}
@@ -117,6 +128,8 @@ SCALES: dict[str, Scale] = {
                 "training.warmup": 0,
                 "training.held_out": 1,
             },
+            shown=(1, 25),
+            packaged=False,
         ),
         Scale(
             "small",
@@ -130,7 +143,7 @@ SCALES: dict[str, Scale] = {
             200,
             150,
             1000,
-            4,
+            3,
             3,
             {
                 "model.network.depth": 3,
@@ -146,7 +159,8 @@ SCALES: dict[str, Scale] = {
                 "training.evaluate_every": 50,
                 "training.checkpoint_every": 1000,
             },
-            FineTuning(rays=256),
+            FineTuning(rays=128),
+            shown=(1, 25),
         ),
         Scale(
             "paper",
