@@ -30,7 +30,8 @@ from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.data import read_task
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.pictures.images import read_image
-from hyperplanes.utilities.files import encode_png, write_json, write_whole
+from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.files import write_json, write_whole
 from hyperplanes.utilities.metrics import psnr
 
 __all__ = ["PoseErrors", "compare_poses", "main"]

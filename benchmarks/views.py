@@ -39,7 +39,8 @@ from hyperplanes.export.images import to_pixels
 from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.episodes.augmentation import Rotation
-from hyperplanes.utilities.files import encode_png, write_whole
+from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.files import write_whole
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task, Tasks, Views
 

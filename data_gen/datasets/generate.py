@@ -18,7 +18,8 @@ from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
 from data_gen.meshes.files import MESH_SUFFIXES
 from data_gen.rigs import OBJECT_RADIUS
-from hyperplanes.utilities.files import DataError, sha256
+from hyperplanes.utilities.encoding import sha256
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from data_gen.datasets.contact_sheet import contact_sheet
 from data_gen.datasets.manifest import Verification, verify
-from hyperplanes.utilities.files import encode_png, write_whole
+from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.files import write_whole
 
 __all__ = ["Inspection", "inspect"]
 

@@ -27,7 +27,8 @@ from hyperplanes.capture.video import VIDEO_SUFFIXES, take_frames
 from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import Pixels, read_image
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError, encode_png, write_whole
+from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.files import DataError, write_whole
 
 __all__ = ["Captured", "Progress", "Settings", "capture"]
 

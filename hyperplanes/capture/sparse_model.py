@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from hyperplanes.utilities.files import DataError, encode_npz, malformed, write_whole
+from hyperplanes.utilities.encoding import encode_npz
+from hyperplanes.utilities.files import DataError, malformed, write_whole
 
 __all__ = ["SparseModel"]
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hyperplanes.utilities.files import DataError, read_json, sha256, write_json
+from hyperplanes.utilities.encoding import sha256
+from hyperplanes.utilities.files import DataError, read_json, write_json
 
 __all__ = ["Stages", "fingerprint"]
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
 from hyperplanes.commands.options import Free, ObjectArguments
-from hyperplanes.commands.scene import read_scene, refuse_sources
+from hyperplanes.commands.scene import read_object, refuse_sources
 from hyperplanes.commands.writing import refuse_checkpoint, writes_to
 
 __all__ = ["Arguments", "run"]
@@ -43,13 +43,7 @@ def run(arguments: Arguments) -> int:
     refuse_baked(arguments.checkpoint, "adapt")
     refuse_checkpoint(arguments.out, arguments.checkpoint)
     model = load_adaptable(arguments.checkpoint, device, second_pass=arguments.second_pass)
-    task, up = read_scene(
-        arguments.views,
-        console,
-        all_views=arguments.all_views,
-        up=arguments.up,
-        downscale=arguments.downscale,
-    )
+    task, up = read_object(arguments, console)
     settings = FineTuning(trainable=arguments.fine_tune)
     field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)
     assert isinstance(field, AdaptedField)

@@ -14,13 +14,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, bake_field, load_adaptable, refuse_baked
-from hyperplanes.commands.options import OptionalInt, Steps, ViewsUp, check_orbit, optional
-from hyperplanes.commands.scene import read_scene
+from hyperplanes.commands.options import ObjectArguments, OptionalInt, check_orbit, optional
+from hyperplanes.commands.scene import read_object
 from hyperplanes.commands.writing import refuse_checkpoint, writes_to
 from hyperplanes.utilities.formatting import format_duration
 
@@ -31,43 +30,22 @@ __all__ = ["Arguments", "run"]
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(ObjectArguments):
     """What to bake.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote, or a packaged model: small, small-paper, cars-64.
-        views: The posed images of the object; example-car comes with the package.
-        out: The file to write, with a name that ends in .safetensors.
         voxels: Along each side of the grid; two for every pixel that the object is wide lose little.
         fit: Gradient steps that fit the voxels to the shown views; 0 keeps what the field shows.
-        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best.
         orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
         size: Pixels along the longer side of the turntable; as the images when not given.
         turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
-        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
-            visual hull: for textures and hollows; needs a model such as small.
-        all_views: Show the model every view, not only the support half.
-        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
-            0,0.1,1, or auto: as the cameras are held. What is written has y up.
-        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
-            leave one at most when not given.
-        device: What adapts and bakes: auto, cpu or cuda.
     """
 
-    checkpoint: Path
-    views: Path
-    out: Path
     voxels: int = 256
     fit: Annotated[int, range(10_000)] = 80
-    steps: Steps = 0
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
     turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
-    second_pass: bool = False
-    all_views: bool = False
-    up: ViewsUp = "auto"
-    downscale: OptionalInt = None
-    device: str = "auto"
 
 
 def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
@@ -99,13 +77,7 @@ def run(arguments: Arguments) -> int:
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "bake")
     model = load_adaptable(arguments.checkpoint, device, second_pass=arguments.second_pass)
-    task, _ = read_scene(
-        arguments.views,
-        console,
-        all_views=arguments.all_views,
-        up=arguments.up,
-        downscale=arguments.downscale,
-    )
+    task, _ = read_object(arguments, console)
     shown, query = task.support.to(device), task.query
     field, _ = adapt_to(model, shown, task.name, console, steps=arguments.steps)
     assert isinstance(field, AdaptedField)

@@ -13,13 +13,12 @@ Example:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, bake_field, load_source, render_views
-from hyperplanes.commands.options import OptionalInt, Steps, ViewsUp, optional
-from hyperplanes.commands.scene import read_scene, refuse_sources
+from hyperplanes.commands.options import ObjectArguments, OptionalInt, optional
+from hyperplanes.commands.scene import read_object, refuse_sources
 from hyperplanes.commands.writing import writes_to
 
 if TYPE_CHECKING:
@@ -31,16 +30,11 @@ __all__ = ["Arguments", "run"]
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(ObjectArguments):
     """What to write.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote, a file that `bake` wrote, or a packaged model: small,
-            small-paper, cars-64.
-        views: The posed images of the object; example-car comes with the package.
-        out: The folder to write to.
         what: Any of them.
-        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best.
         frames: Of the turntable.
         size: Pixels along the longer side of the turntable; as the images when not given.
         turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
@@ -54,21 +48,9 @@ class Arguments:
             and at most 256, when not given.
         fit: Gradient steps that fit these voxels, and splats, to the shown views; 0 keeps what the field shows.
         splat_format: ply, which viewers of Gaussian splats read, or the smaller splat without colour by direction.
-        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
-            visual hull: for textures and hollows; needs a model such as small.
-        all_views: Show the model every view, not only the support half.
-        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
-            0,0.1,1, or auto: as the cameras are held. What is written has y up.
-        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
-            leave one at most when not given.
-        device: auto, cpu or cuda.
     """
 
-    checkpoint: Path
-    views: Path
-    out: Path
     what: tuple[Literal["images", "turntable", "mesh", "page", "splats"], ...] = ("images", "turntable", "mesh")
-    steps: Steps = 0
     frames: int = 48
     size: OptionalInt = None
     turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
@@ -80,11 +62,6 @@ class Arguments:
     page_voxels: OptionalInt = None
     fit: Annotated[int, range(10_000)] = 80
     splat_format: Literal["ply", "splat"] = "ply"
-    second_pass: bool = False
-    all_views: bool = False
-    up: ViewsUp = "auto"
-    downscale: OptionalInt = None
-    device: str = "auto"
 
 
 GOOD_OVERLAP = 0.9
@@ -111,13 +88,7 @@ def run(arguments: Arguments) -> int:
             coarsening(arguments.page_voxels)
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
-    task, _ = read_scene(
-        arguments.views,
-        console,
-        all_views=arguments.all_views,
-        up=arguments.up,
-        downscale=arguments.downscale,
-    )
+    task, _ = read_object(arguments, console)
     refuse_sources(out / "images", arguments.views, task.query.names)
     shown, query = task.support.to(device), task.query.to(device)
     field, _ = adapt_to(source, shown, task.name, console, steps=arguments.steps)

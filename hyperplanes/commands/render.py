@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
 from hyperplanes.commands.options import Free, ObjectArguments, OptionalInt, Protocol, check_orbit, optional
-from hyperplanes.commands.scene import read_scene, refuse_sources
+from hyperplanes.commands.scene import read_object, refuse_sources
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
 
@@ -61,13 +61,7 @@ def run(arguments: Arguments) -> int:
     check_orbit(arguments.orbit, arguments.size)
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
-    task, _ = read_scene(
-        arguments.views,
-        console,
-        all_views=arguments.all_views,
-        up=arguments.up,
-        downscale=arguments.downscale,
-    )
+    task, _ = read_object(arguments, console)
     refuse_sources(arguments.out, arguments.views, task.query.names)
     shown, asked = task.support.to(device), task.query.to(device)
     settings = FineTuning(trainable=arguments.fine_tune)

@@ -9,10 +9,22 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from hyperplanes.commands.console import Console
+    from hyperplanes.commands.options import ObjectArguments
     from hyperplanes.data.pictures.posed import Posed
     from hyperplanes.views import Task, Views
 
-__all__ = ["read_scene", "say_up"]
+__all__ = ["read_object", "read_scene", "refuse_sources", "say_up"]
+
+
+def read_object(arguments: ObjectArguments, console: Console) -> tuple[Task, str]:
+    """As `read_scene`, of the options that the verbs of one object share."""
+    return read_scene(
+        arguments.views,
+        console,
+        all_views=arguments.all_views,
+        up=arguments.up,
+        downscale=arguments.downscale,
+    )
 
 
 def read_scene(

@@ -22,7 +22,8 @@ from hyperplanes.experiments.scales import Scale
 from hyperplanes.experiments.tables import Cell, Experiment, Trained
 from hyperplanes.methods import WithSampler, make_method
 from hyperplanes.utilities.checkpoints import read_json
-from hyperplanes.utilities.files import encode_json, write_json
+from hyperplanes.utilities.encoding import encode_json
+from hyperplanes.utilities.files import write_json
 from hyperplanes.views import Tasks
 
 __all__ = ["Outcome", "Runner"]

@@ -21,13 +21,13 @@ from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.images import render_images
 from hyperplanes.rendering.renderer import Marched
-from hyperplanes.rendering.transmittance import compiled_transmittance, transmittance
-from hyperplanes.rendering.voxels import compiled_caster, distance_to_filled, render_voxels
+from hyperplanes.rendering.transmittance import transmittance
+from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
 
 __all__ = ["BakedScene", "bake", "coarsening", "default_side"]
 
 CHUNK = 1 << 12
-SIDE = 128  # voxels an axis of the grid of transmittances; half of that where they are not computed by numba
+SIDE = 128  # voxels an axis of the grid of transmittances
 MIN_TRANSMITTANCE = 0.02  # a voxel is left out where no viewing direction reaches it with more than this
 MIN_OPACITY = 0.005  # over 1/128 of the scene's diameter; voxels below it are left out
 MIN_WEIGHT = 0.01  # of a voxel in the pixel from which it is seen best; voxels below it are left out
@@ -47,9 +47,9 @@ class BakedScene:
 
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Pictures:
-        """The pictures of the cameras, by a kernel on a CPU with numba and by `Marched` elsewhere."""
+        """The pictures of the cameras, by a kernel on a CPU and by `Marched` elsewhere."""
         bounds = self.field.bounds
-        if compiled_caster() is None or self.field.index.device.type != "cpu":
+        if self.field.index.device.type != "cpu":
             return self.adapted.render(cameras, self.adapted.sampling)
         step = 2 * bounds.radius / self.steps
 
@@ -146,7 +146,7 @@ def coarsening(side: int) -> int:
     Raises:
         ValueError: too few, too many, or no multiple of that number.
     """
-    coarser = max(2, side // (SIDE if compiled_transmittance() else SIDE // 2))
+    coarser = max(2, side // SIDE)
     if side % coarser or not 8 <= side <= LARGEST_SIDE:
         raise ValueError(f"side: expected a multiple of {coarser} from 8 to {LARGEST_SIDE}, got {side}")
     return coarser

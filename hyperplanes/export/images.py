@@ -18,7 +18,8 @@ from torch import Tensor
 from hyperplanes.adaptation.base import Renderable
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.files import encode_png, write_whole
+from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.files import format_of, write_whole
 from hyperplanes.views import Views
 
 __all__ = [
@@ -193,15 +194,10 @@ def save_turntable(
         size: pixels along the longer side; that of the views where absent.
 
     Returns:
-        The file.
-
-    Raises:
-        ValueError: another ending.
+        The file. Another ending is a ValueError.
     """
     path = Path(path)
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in TURNTABLE_FORMATS:
-        raise ValueError(f"{path}: expected a name that ends in {', '.join(TURNTABLE_FORMATS)}, got {kind!r}")
+    kind = format_of(path, TURNTABLE_FORMATS)
     pictures = field.render(orbit_cameras(views, frames, size=size))
     write_whole(path, encode_animation(to_pixels(pictures.images), kind))
     return path

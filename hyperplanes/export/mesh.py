@@ -25,7 +25,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.utilities.colour import linear_from_srgb
-from hyperplanes.utilities.files import write_whole
+from hyperplanes.utilities.files import format_of, write_whole
 
 if TYPE_CHECKING:
     import trimesh
@@ -357,15 +357,10 @@ def save_mesh(surface: Surface, path: str | Path) -> Path:
         path: ends in .ply, .glb or .obj.
 
     Returns:
-        The file.
-
-    Raises:
-        ValueError: another ending.
+        The file. Another ending is a ValueError.
     """
     path = Path(path)
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in MESH_FORMATS:
-        raise ValueError(f"{path}: expected a name that ends in {', '.join(MESH_FORMATS)}, got {kind!r}")
+    kind = format_of(path, MESH_FORMATS)
     mesh = _mesh(surface.vertices, surface.faces)
     colours = surface.colours.clip(0, 1)
     if kind == "glb":

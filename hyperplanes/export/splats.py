@@ -19,7 +19,7 @@ from torch import Tensor
 from hyperplanes.fields.baked import HARMONICS, BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.splats import render_splats, splat_gradients
-from hyperplanes.utilities.files import write_whole
+from hyperplanes.utilities.files import format_of, write_whole
 from hyperplanes.views import Views
 
 __all__ = ["SPLAT_FORMATS", "Splats", "fit_splats", "save_splats", "splats_of"]
@@ -119,15 +119,10 @@ def save_splats(splats: Splats, path: str | Path) -> Path:
         path: ends in .ply or .splat.
 
     Returns:
-        The file.
-
-    Raises:
-        ValueError: another ending.
+        The file. Another ending is a ValueError.
     """
     path = Path(path)
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in SPLAT_FORMATS:
-        raise ValueError(f"{path}: expected a name that ends in {' or '.join(SPLAT_FORMATS)}, got {kind!r}")
+    kind = format_of(path, SPLAT_FORMATS)
     turned = replace(
         splats,
         means=splats.means * torch.tensor([1.0, -1.0, -1.0]),

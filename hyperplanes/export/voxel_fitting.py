@@ -6,14 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from hyperplanes.export.baking import BakedScene
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
-from hyperplanes.geometry.rays import Rays
-from hyperplanes.rendering.renderer import render
-from hyperplanes.rendering.voxel_gradients import compiled_gradients, voxel_gradients
+from hyperplanes.rendering.voxels import voxel_gradients
 from hyperplanes.views import Views
 
 __all__ = ["STEPS", "fit_voxels"]
@@ -62,11 +58,13 @@ def fit_voxels(
     groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
     descent = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, DECAY ** (1 / max(1, steps)))
-    generator = torch.Generator().manual_seed(seed)
+    generator, step_length = torch.Generator().manual_seed(seed), 2 * baked.bounds.radius / STEPS_A_DIAMETER
     for step in range(steps):
         drawn, truth = views.sample_rays(rays, generator=generator, among=live)
-        now = BakedScene(replace(baked, values=torch.cat([depth / voxel, colour], 1)), STEPS_A_DIAMETER)
-        gradient = _gradient(now, drawn, truth, scene)
+        values, basis = torch.cat([depth / voxel, colour], 1), spherical_harmonics(drawn.directions)
+        _, gradient = voxel_gradients(
+            baked.index, values, baked.bounds, drawn, basis, truth, step=step_length, empty=scene.distances
+        )
         depth.grad, colour.grad = gradient[:, :1] / voxel, gradient[:, 1:].contiguous()
         descent.step()
         schedule.step()
@@ -74,19 +72,3 @@ def fit_voxels(
         if on_step:
             on_step(step + 1)
     return replace(baked, values=torch.cat([depth / voxel, colour], 1))
-
-
-def _gradient(now: BakedScene, rays: Rays, truth: Float[Tensor, "ray 3"], first: BakedScene) -> Tensor:
-    """The gradient of the mean squared error, by the compiled kernel where numba is there, by autograd elsewhere."""
-    field, step = now.field, 2 * now.field.bounds.radius / now.steps
-    if compiled_gradients() is not None:
-        basis = spherical_harmonics(rays.directions)
-        return voxel_gradients(
-            field.index, field.values, field.bounds, rays, basis, truth, step=step, empty=first.distances
-        )[1]
-    values = field.values.clone().requires_grad_()
-    adapted = first.adapted
-    seen = render(replace(field, values=values), rays, adapted.sampling, occupancy=adapted.occupancy)
-    (seen.colour - truth).square().mean().backward()
-    assert values.grad is not None
-    return values.grad

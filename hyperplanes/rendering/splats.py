@@ -7,7 +7,6 @@ perspective, widened by 0.3 square pixels, and composited front to back in the o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import no_type_check
 
 import torch
@@ -105,15 +104,14 @@ def _drawn(
     arrays = [part.float().contiguous().numpy() for part in (centre, shapes, opacities[order], colours[order])]
     picture = torch.zeros(height, width, 3)
     left = torch.ones(height, width)
-    kernel: Callable[..., None] = compile_function(_forward) or _forward
-    kernel(*arrays, picture.numpy(), left.numpy())
+    compile_function(_forward)(*arrays, picture.numpy(), left.numpy())
     image = picture + left[..., None] * background
     by_opacity, by_colour = torch.zeros_like(opacities), torch.zeros_like(colours)
     if truth is not None:
         wrong = 2 * (image - truth.permute(1, 2, 0)).contiguous()
         found = torch.zeros(len(order)), torch.zeros(len(order), 3)
         behind = (left * wrong.sum(-1) * background).contiguous()  # what lies behind, times the errors
-        gradient: Callable[..., None] = compile_function(_backward) or _backward
+        gradient = compile_function(_backward)
         gradient(*arrays, wrong.numpy(), left.numpy(), behind.numpy(), found[0].numpy(), found[1].numpy())
         by_opacity[order], by_colour[order] = found
     return image.permute(2, 0, 1), by_opacity, by_colour

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import no_type_check
 
 import torch
@@ -13,15 +12,10 @@ from torch import Tensor
 from hyperplanes.geometry.kernels.compiling import compile_function
 from hyperplanes.geometry.kernels.threads import parallel_for
 
-__all__ = ["compiled_transmittance", "transmittance"]
+__all__ = ["transmittance"]
 
 CELLS = 1 << 12  # that are processed together
 MAX_OPTICAL_DEPTH = 12.0  # beyond it the transmittance is zero in single precision
-
-
-def compiled_transmittance() -> Callable[..., None] | None:
-    """The compiled loop over voxels, or None where numba is missing."""
-    return compile_function(_transmittance)
 
 
 def transmittance(
@@ -41,8 +35,8 @@ def transmittance(
         Transmittances in [0, 1].
     """
     found = torch.empty(len(cells), len(directions), device=optical_depth.device)
-    kernel = compiled_transmittance()
-    if kernel is not None and optical_depth.device.type == "cpu":
+    if optical_depth.device.type == "cpu":
+        kernel = compile_function(_transmittance)
         arrays = (optical_depth.contiguous().numpy(), cells.contiguous().numpy(), directions.contiguous().numpy())
         parallel_for(lambda start, stop: kernel(*arrays, found.numpy(), start, stop), len(cells), CELLS)
         return found

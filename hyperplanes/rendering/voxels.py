@@ -1,30 +1,26 @@
-"""A ray caster for sparse voxel grids, compiled for the CPU where numba is there."""
+"""A ray caster for sparse voxel grids, compiled for the CPU, and the gradient of what it renders."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import no_type_check
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from hyperplanes.geometry.kernels import voxel_rays
 from hyperplanes.geometry.kernels.compiling import compile_function
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered
 
-__all__ = ["compiled_caster", "distance_to_filled", "render_voxels"]
+__all__ = ["distance_to_filled", "render_voxels", "voxel_gradients"]
 
 MAX_DISTANCE = 255  # of the distance transform, which is stored in a byte
 RAYS = 1 << 10  # in one call of the kernel
-
-
-def compiled_caster() -> Callable[..., int] | None:
-    """The compiled loop over rays, or None where numba is missing."""
-    return compile_function(_render)
 
 
 def distance_to_filled(index: Int[Tensor, "x y z"]) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
@@ -78,107 +74,77 @@ def render_voxels(
 
     Returns:
         Pixels; `samples` counts the samples of positive density.
-
-    Raises:
-        RuntimeError: numba is missing; `compiled_caster` says so beforehand.
     """
-    caster = compiled_caster()
-    if caster is None:
-        raise RuntimeError("render_voxels: expected numba, found none; pip install numba")
+    kernel = compile_function(voxel_rays.render)
+    out = np.empty((len(rays), 5), np.float32)
+    arrays = _arrays(index, values, bounds, rays, basis, distance_to_filled(index) if empty is None else empty)
+    numbers = _numbers(step, stop, background)
+    samples = sum(parallel_for(lambda first, last: kernel(*arrays, *numbers, out, first, last), len(rays), RAYS))
+    found = torch.from_numpy(out)
+    return Rendered(found[:, :3], found[:, 3], found[:, 4], samples)
+
+
+def voxel_gradients(
+    index: Int[Tensor, "x y z"],
+    values: Float[Tensor, "row 28"],
+    bounds: Sphere,
+    rays: Rays,
+    basis: Float[Tensor, "ray 9"],
+    truth: Float[Tensor, "ray 3"],
+    *,
+    step: float,
+    empty: UInt8[Tensor, "cell_x cell_y cell_z"],
+    stop: float = 1e-3,
+    background: float = 1.0,
+) -> tuple[float, Float[Tensor, "row 28"]]:
+    """The mean squared error of the pixels of `render_voxels`, and its gradient with respect to `values`.
+
+    Args:
+        index: as there.
+        values: as there.
+        bounds: as there.
+        rays: as there.
+        basis: as there.
+        truth: what the pixels should be.
+        step: as there.
+        empty: the result of `distance_to_filled`.
+        stop: as there.
+        background: as there.
+
+    Returns:
+        The error, and its gradient.
+    """
+    kernel = compile_function(voxel_rays.add_gradients)
+    chunk = max(1, -(-len(rays) // torch.get_num_threads()))  # one a thread, each with a gradient of its own
+    found = torch.zeros(-(-len(rays) // chunk), *values.shape)
+    arrays = _arrays(index, values, bounds, rays, basis, empty)
+    numbers, colours = _numbers(step, stop, background), truth.float().contiguous().numpy()
+
+    def work(first: int, last: int) -> float:
+        return kernel(*arrays, *numbers, colours, found[first // chunk].numpy(), first, last)
+
+    error = sum(parallel_for(work, len(rays), chunk))
+    return error / (3 * len(rays)), (found.sum(0) if len(found) > 1 else found[0]) / (3 * len(rays))
+
+
+def _arrays(
+    index: Tensor, values: Tensor, bounds: Sphere, rays: Rays, basis: Tensor, empty: Tensor
+) -> tuple[npt.NDArray[Any], ...]:
+    """What both kernels read, rays in units of cells."""
     scale = index.shape[0] / (2 * bounds.radius)
     corner = torch.tensor(bounds.centre) - bounds.radius
-    out = np.empty((len(rays), 5), np.float32)
-    arguments = (
+    return (
         index.numpy(),
         values.numpy(),
-        (distance_to_filled(index) if empty is None else empty).numpy(),
+        empty.numpy(),
         ((rays.origins.float() - corner) * scale + 0.5).contiguous().numpy(),
         (rays.directions.float() * scale).contiguous().numpy(),
         rays.near.float().numpy(),
         rays.far.float().numpy(),
         basis.contiguous().numpy(),
-        np.float32(step),
-        np.float32(-math.log(stop) if stop > 0 else math.inf),
-        np.float32(background),
-        out,
     )
-    samples = sum(parallel_for(lambda start, stop: caster(*arguments, start, stop), len(rays), RAYS))
-    found = torch.from_numpy(out)
-    return Rendered(found[:, :3], found[:, 3], found[:, 4], samples)
 
 
-@no_type_check
-def _render(index, values, empty, origins, directions, near, far, basis, step, limit, background, out, start, stop):  # noqa: PLR0913
-    """The loop over rays start..stop: (colour, opacity, depth) into `out`; returns the samples of positive density.
-
-    Positions are in cells: the whole part is the index of the cell, the fraction the place between its voxel centres.
-    """
-    side, harmonics = empty.shape[0], basis.shape[1]
-    one, zero = np.float32(1.0), np.float32(0.0)
-    mixed = np.empty(values.shape[1], np.float32)
-    total = 0
-    for ray in range(start, stop):
-        origin_x, origin_y, origin_z = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-        along_x, along_y, along_z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        first, last = near[ray] + np.float32(0.5) * step, far[ray]
-        per_cell = one / (max(abs(along_x), abs(along_y), abs(along_z)) * step)  # least number of samples in a cell
-        optical_depth, opacity, depth = zero, zero, zero
-        red, green, blue = zero, zero, zero
-        sample = 0
-        while optical_depth < limit:  # early ray termination
-            t = first + np.float32(sample) * step
-            if t >= last:
-                break
-            # The cell that the sample lies in.
-            x, y, z = origin_x + t * along_x, origin_y + t * along_y, origin_z + t * along_z
-            low_x, low_y, low_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
-            if min(low_x, low_y, low_z) < 0 or max(low_x, low_y, low_z) >= side:
-                sample += 1
-                continue
-            # Empty-space skipping: all samples within the distance to the nearest filled cell.
-            distance = empty[low_x, low_y, low_z]
-            if distance > 0:
-                sample += 1 + int(np.float32(distance - 1) * per_cell)
-                continue
-            sample += 1
-            # Trilinear interpolation of density, and of coefficients weighted by density.
-            x, y, z = x - np.float32(low_x), y - np.float32(low_y), z - np.float32(low_z)
-            density = zero
-            mixed[:] = zero
-            for corner in range(8):
-                right, up, behind = corner >> 2, corner >> 1 & 1, corner & 1
-                at_x, at_y, at_z = low_x + right - 1, low_y + up - 1, low_z + behind - 1
-                if min(at_x, at_y, at_z) < 0 or max(at_x, at_y, at_z) >= side - 1:
-                    continue
-                row = index[at_x, at_y, at_z]
-                if row < 0:
-                    continue
-                at_corner = (x if right else one - x) * (y if up else one - y) * (z if behind else one - z)
-                at_corner *= values[row, 0]
-                density += at_corner
-                for number in range(mixed.shape[0]):
-                    mixed[number] += at_corner * values[row, number]
-            if density <= zero:
-                continue
-            total += 1
-            # Colour: the spherical harmonics of the ray's direction.
-            r, g, b = zero, zero, zero
-            for number in range(harmonics):
-                r += basis[ray, number] * mixed[1 + number]
-                g += basis[ray, number] * mixed[1 + harmonics + number]
-                b += basis[ray, number] * mixed[1 + 2 * harmonics + number]
-            # Compositing (NeRF, Eq. 3).
-            added = density * step
-            weight = math.exp(-optical_depth) * (one - math.exp(-added))
-            optical_depth += added
-            red += weight * min(max(r / density, zero), one)
-            green += weight * min(max(g / density, zero), one)
-            blue += weight * min(max(b / density, zero), one)
-            opacity += weight
-            depth += weight * t
-        out[ray, 0] = red + (one - opacity) * background
-        out[ray, 1] = green + (one - opacity) * background
-        out[ray, 2] = blue + (one - opacity) * background
-        out[ray, 3] = opacity
-        out[ray, 4] = depth / max(opacity, np.float32(1e-10))
-    return total
+def _numbers(step: float, stop: float, background: float) -> tuple[np.float32, ...]:
+    """The step, the optical depth at which a ray is finished, and the background."""
+    return np.float32(step), np.float32(-math.log(stop) if stop > 0 else math.inf), np.float32(background)

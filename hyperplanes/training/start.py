@@ -15,7 +15,8 @@ from hyperplanes.training.distributed import Processes
 from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.training.trainer import Trainer
 from hyperplanes.utilities.checkpoints import read_json
-from hyperplanes.utilities.files import sha256, write_json
+from hyperplanes.utilities.encoding import sha256
+from hyperplanes.utilities.files import write_json
 from hyperplanes.views import Tasks
 
 __all__ = ["start_training"]

@@ -23,7 +23,8 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.optimisers import Muon
 from hyperplanes.training.configuration import upgraded
 from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
-from hyperplanes.utilities.files import DataError, encode_json, malformed, write_json
+from hyperplanes.utilities.encoding import encode_json
+from hyperplanes.utilities.files import DataError, malformed, write_json
 from hyperplanes.utilities.settings import SettingsError
 
 __all__ = ["Curve", "check_model", "check_whole", "load_state", "save_state"]

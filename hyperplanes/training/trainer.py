@@ -22,8 +22,9 @@ from hyperplanes.training.objective import Objective, RenderingObjective
 from hyperplanes.training.optimisation import Optimisation
 from hyperplanes.training.requirements import check_requirements
 from hyperplanes.training.validation import Validation, Validator
+from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.errors import prefix_errors
-from hyperplanes.utilities.files import encode_png, write_whole
+from hyperplanes.utilities.files import write_whole
 from hyperplanes.views import Tasks
 
 __all__ = ["Trainer", "train"]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
-import io
 import itertools
 import json
 import math
@@ -16,22 +14,19 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Collection, Generator, Mapping
+from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
+from hyperplanes.utilities.encoding import encode_json
 
 __all__ = [
     "DataError",
     "WriteError",
     "check_link",
     "check_regular",
-    "encode_json",
-    "encode_npz",
-    "encode_png",
+    "format_of",
     "inside",
     "list_files",
     "malformed",
@@ -39,13 +34,11 @@ __all__ = [
     "read_bytes",
     "read_json",
     "read_text",
-    "sha256",
     "write_folder",
     "write_json",
     "write_whole",
 ]
 
-_COLOUR_TYPES = {1: 0, 3: 2, 4: 6}  # PNG's numbers, by channels
 _unfinished = itertools.count()
 
 UNFINISHED = re.compile(r"\..+\.(\d+)-\d+\.part")
@@ -256,6 +249,25 @@ def inside(folder: str | Path, relative: str, source: str | Path) -> Path:
     return Path(folder) / text
 
 
+def format_of(path: str | Path, formats: Sequence[str]) -> str:
+    """The format of a file that is to be written, by the ending of its name, in small letters.
+
+    Args:
+        path: the file.
+        formats: the known ones.
+
+    Raises:
+        ValueError: another ending.
+
+    >>> format_of("chair.GLB", ("ply", "glb"))
+    'glb'
+    """
+    kind = Path(path).suffix.lower().lstrip(".")
+    if kind not in formats:
+        raise ValueError(f"{path}: expected a name that ends in {', '.join(formats)}, got {kind!r}")
+    return kind
+
+
 def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None, *, durable: bool = True) -> None:
     """Write a file so that nobody ever sees half of it: beside its name first, then renamed.
 
@@ -416,73 +428,3 @@ def write_folder(folder: str | Path, files: dict[str, bytes], scratch: str | Pat
 
 def _unfinished_beside(path: Path, scratch: str | Path | None) -> str:
     return os.path.join(scratch or path.parent, f".{path.name}.{os.getpid()}-{next(_unfinished)}.part")
-
-
-def encode_json(value: Any) -> bytes:
-    r"""JSON with sorted keys, two spaces a level and a final newline: the same value gives the same bytes.
-
-    >>> encode_json({"b": 1, "a": [1.5]})
-    b'{\n  "a": [\n    1.5\n  ],\n  "b": 1\n}\n'
-    """
-    return (json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n").encode()
-
-
-def encode_png(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], *, small: bool = False) -> bytes:
-    """PNG bytes of (height, width), (height, width, 3) or (height, width, 4) pixels; the same pixels, the same bytes.
-
-    Rows are not filtered: drawn pictures, most of them background, take 6.8 kB and 0.27 ms at 128x128. Pillow, which
-    tries five filters on every row, takes 6.9 kB and 0.54 ms at its fastest level, 6.6 kB and 0.64 ms at this one.
-
-    Args:
-        pixels: the image; 16-bit only where it need not be small.
-        small: let Pillow search for the smallest file, which pays for photographs and noisy pictures.
-
-    Returns:
-        The file.
-
-    >>> encode_png(np.zeros((2, 2, 4), np.uint8))[1:4]
-    b'PNG'
-    """
-    if small:
-        from PIL import Image
-
-        buffer = io.BytesIO()
-        Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
-        return buffer.getvalue()
-    height, width = pixels.shape[:2]
-    rows = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">"), copy=False)).view(np.uint8)
-    lines = np.zeros((height, 1 + rows.size // height), dtype=np.uint8)  # each begins with its filter: 0, none
-    lines[:, 1:] = rows.reshape(height, -1)
-    colour = _COLOUR_TYPES[pixels.shape[2] if pixels.ndim == 3 else 1]
-    header = struct.pack(">IIBBBBB", width, height, 8 * pixels.dtype.itemsize, colour, 0, 0, 0)
-    chunks = (b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 3)), (b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
-        for kind, data in chunks
-    )
-
-
-def encode_npz(arrays: dict[str, npt.NDArray[Any]]) -> bytes:
-    """Compressed .npz bytes of named arrays, without pickles and without a date.
-
-    >>> encode_npz({"a": np.zeros(3)}) == encode_npz({"a": np.zeros(3)})
-    True
-    """
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-        for name, array in arrays.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
-            entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, member.getvalue())
-    return buffer.getvalue()
-
-
-def sha256(data: bytes) -> str:
-    """The checksum of some bytes, in hexadecimal.
-
-    >>> sha256(b"")[:8]
-    'e3b0c442'
-    """
-    return hashlib.sha256(data).hexdigest()

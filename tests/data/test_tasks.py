@@ -14,7 +14,8 @@ from PIL import Image
 from hyperplanes.data import DataError, Dataset, open_dataset
 from hyperplanes.data.dataset import open_datasets
 from hyperplanes.data.formats.catalogue import FORMAT
-from hyperplanes.utilities.files import encode_npz, encode_png, read_json, write_folder, write_whole
+from hyperplanes.utilities.encoding import encode_npz, encode_png
+from hyperplanes.utilities.files import read_json, write_folder, write_whole
 
 
 @pytest.fixture

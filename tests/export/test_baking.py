@@ -18,7 +18,7 @@ from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering import transmittance as module
 from hyperplanes.rendering.renderer import Marched
 from hyperplanes.rendering.transmittance import compiled_transmittance, transmittance
-from hyperplanes.rendering.voxels import compiled_caster, distance_to_filled, render_voxels
+from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
@@ -60,7 +60,6 @@ def test_baked_pictures_are_those_of_the_field(adapted, baked):
     assert float((found.depth - truth.depth)[hit].abs().mean()) < 0.02
 
 
-@pytest.mark.skipif(compiled_caster() is None, reason="numba, which compiles the caster, is not installed")
 def test_the_compiled_caster_agrees_with_packed_torch(baked):
     # Source of truth: the same voxels as a callable through the generic renderer, at the same steps.
     scene = BakedScene(baked)
@@ -71,7 +70,6 @@ def test_the_compiled_caster_agrees_with_packed_torch(baked):
     assert float((generic.images - compiled.images).abs().mean()) < 1e-4
 
 
-@pytest.mark.skipif(compiled_caster() is None, reason="numba, which compiles the caster, is not installed")
 def test_a_constant_slab_is_beer_lambert():
     # Closed form: opacity = 1 - exp(-sigma L) for sigma = 2 over the interpolated length L = 2.
     index = torch.arange(16**3, dtype=torch.int32).reshape(16, 16, 16)

@@ -17,7 +17,7 @@ from hyperplanes.data import open_dataset, read_channel, read_task, read_views
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import Sphere, cameras
 from hyperplanes.training.state import load_state, save_state
-from hyperplanes.utilities.files import encode_json, sha256
+from hyperplanes.utilities.encoding import encode_json, sha256
 
 VIEWS, HEIGHT, WIDTH = 4, 10, 12
 CONFIG = {"steps": 3, "seed": 0}

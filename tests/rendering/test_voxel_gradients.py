@@ -7,11 +7,9 @@ from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering.renderer import Marched, render
-from hyperplanes.rendering.voxel_gradients import compiled_gradients, voxel_gradients
-from hyperplanes.rendering.voxels import distance_to_filled
+from hyperplanes.rendering.voxels import distance_to_filled, voxel_gradients
 
 
-@pytest.mark.skipif(compiled_gradients() is None, reason="numba, which compiles the kernel, is not installed")
 def test_the_compiled_gradient_is_that_of_autograd():
     generator = torch.Generator().manual_seed(0)
     filled = torch.rand(8, 8, 8, generator=generator) < 0.4

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from hyperplanes.data.pictures.images import read_image
-from hyperplanes.utilities.files import DataError, encode_png
+from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.files import DataError
 
 __all__ = ["Command"]
 

@@ -19,8 +19,9 @@ from hyperplanes.experiments.page.content import Pixels
 from hyperplanes.experiments.stages import Stages
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.utilities.checkpoints import read_json
+from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.environment import environment
-from hyperplanes.utilities.files import encode_png, write_whole
+from hyperplanes.utilities.files import write_whole
 from hyperplanes.utilities.formatting import format_duration
 from hyperplanes.views import Tasks
 

@@ -51,24 +51,20 @@ def compile_kernel(name: str, dtype: torch.dtype, points: str = "") -> Callable[
     number = str(dtype).removeprefix("torch.")
     signature = {"": "", "projected": f"{_POINTS}, ", "given": f"{_COORDINATES}, "}[points] + _SIGNATURES[name]
     signature = signature.replace("T[", f"{number}[").replace("T,", f"{number},")
-    compiled = compile_function(getattr(kernels, function), f"void({signature})")
-    assert compiled is not None
-    return compiled
+    return compile_function(getattr(kernels, function), f"void({signature})")
 
 
 @functools.cache
-def compile_function(function: Callable[..., Any], signature: str | None = None) -> Callable[..., Any] | None:
-    """A function compiled without the interpreter lock, or None where numba is not installed.
+def compile_function(function: Callable[..., Any], signature: str | None = None) -> Callable[..., Any]:
+    """A function compiled by numba, which releases the interpreter lock when called.
 
     Args:
         function: loops over NumPy arrays.
         signature: types of its arguments, compiled at once; without it they are those of the first call.
     """
-    try:
-        from numba import njit
-        from numba.core import config
-    except ImportError:
-        return None
+    from numba import njit
+    from numba.core import config
+
     previous = getattr(config, "CACHE_DIR", "")
     setattr(config, "CACHE_DIR", _cache_folder())  # noqa: B010 - the module's attributes are not declared
     try:

@@ -25,7 +25,7 @@ from hyperplanes.training.episodes.drawing import (
 )
 from hyperplanes.training.episodes.episode import Episode, prepare_episode, prepare_subset, volume_of_all_views
 from hyperplanes.training.episodes.prefetching import Prefetcher
-from hyperplanes.utilities.files import sha256
+from hyperplanes.utilities.encoding import sha256
 from hyperplanes.utilities.lru_cache import LRUCache
 from hyperplanes.views import Task, Tasks, class_of
 
