@@ -12,7 +12,7 @@ from torch import Tensor
 from hyperplanes.geometry.kernels.compiling import compile_function
 from hyperplanes.geometry.kernels.threads import parallel_for
 
-__all__ = ["transmittance"]
+__all__ = ["transmittance", "transmittance_torch"]
 
 CELLS = 1 << 12  # that are processed together
 MAX_OPTICAL_DEPTH = 12.0  # beyond it the transmittance is zero in single precision
@@ -34,12 +34,19 @@ def transmittance(
     Returns:
         Transmittances in [0, 1].
     """
+    if optical_depth.device.type != "cpu":
+        return transmittance_torch(optical_depth, cells, directions)
+    found, kernel = torch.empty(len(cells), len(directions)), compile_function(_transmittance)
+    arrays = (optical_depth.contiguous().numpy(), cells.contiguous().numpy(), directions.contiguous().numpy())
+    parallel_for(lambda start, stop: kernel(*arrays, found.numpy(), start, stop), len(cells), CELLS)
+    return found
+
+
+def transmittance_torch(
+    optical_depth: Float[Tensor, "x y z"], cells: Int[Tensor, "cell 3"], directions: Float[Tensor, "direction 3"]
+) -> Float[Tensor, "cell direction"]:
+    """As `transmittance`, on any device: all cells step by step."""
     found = torch.empty(len(cells), len(directions), device=optical_depth.device)
-    if optical_depth.device.type == "cpu":
-        kernel = compile_function(_transmittance)
-        arrays = (optical_depth.contiguous().numpy(), cells.contiguous().numpy(), directions.contiguous().numpy())
-        parallel_for(lambda start, stop: kernel(*arrays, found.numpy(), start, stop), len(cells), CELLS)
-        return found
     side, flat = optical_depth.shape[0], optical_depth.flatten()
     for start in range(0, len(cells), CELLS):
         total = torch.zeros_like(found[start : start + CELLS])

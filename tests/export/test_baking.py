@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.export import voxel_fitting
 from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.export.voxel_fitting import fit_voxels
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
@@ -15,9 +14,8 @@ from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.rendering import transmittance as module
 from hyperplanes.rendering.renderer import Marched
-from hyperplanes.rendering.transmittance import compiled_transmittance, transmittance
+from hyperplanes.rendering.transmittance import transmittance, transmittance_torch
 from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.metrics import psnr
@@ -160,15 +158,13 @@ def test_transmittance_of_a_slab_is_beer_lambert():
     torch.testing.assert_close(found, torch.exp(-0.3 * layers))
 
 
-@pytest.mark.skipif(compiled_transmittance() is None, reason="numba, which compiles the walk, is not installed")
-def test_compiled_transmittance_is_that_of_plain_torch(monkeypatch):
+def test_compiled_transmittance_is_that_of_plain_torch():
     # Source of truth: the same walk with all cells at once, step by step.
     generator = torch.Generator().manual_seed(0)
     optical_depth = torch.rand(12, 12, 12, generator=generator) * (torch.rand(12, 12, 12, generator=generator) < 0.3)
     cells, directions = torch.randint(0, 12, (50, 3), generator=generator), camera.fibonacci_sphere(9, 1.0)[:, 2, :3]
     compiled = transmittance(optical_depth, cells, directions)
-    monkeypatch.setattr(module, "compiled_transmittance", lambda: None)
-    torch.testing.assert_close(transmittance(optical_depth, cells, directions), compiled)
+    torch.testing.assert_close(transmittance_torch(optical_depth, cells, directions), compiled)
 
 
 def test_fitting_brings_back_colours_and_densities(adapted):
@@ -182,14 +178,3 @@ def test_fitting_brings_back_colours_and_densities(adapted):
     assert after > before + 5
     assert steps == list(range(1, 31))
     assert torch.equal(fitted.index, whole.index)
-
-
-@pytest.mark.skipif(compiled_caster() is None, reason="numba, whose kernel is compared, is not installed")
-def test_fitting_without_numba_does_the_same(adapted, monkeypatch):
-    # Source of truth: the compiled gradient.
-    coarse, views = bake(adapted, side=16), Views(adapted.render(CAMERAS).images, CAMERAS)
-    with_numba = fit_voxels(coarse, views, steps=2, rays=256)
-    monkeypatch.setattr(voxel_fitting, "compiled_gradients", lambda: None)
-    without = fit_voxels(coarse, views, steps=2, rays=256)
-    before, found, expected = (BakedScene(each).render(CAMERAS).images for each in (coarse, without, with_numba))
-    assert float(psnr(found, expected).min()) > float(psnr(before, expected).min()) + 10

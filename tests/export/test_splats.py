@@ -75,7 +75,7 @@ def test_the_small_format(splats, tmp_path):
     means = np.frombuffer(content, "<f4").reshape(-1, 8)[:, :3]
     wanted = (splats.means @ DOWN[:3, :3]).numpy()
     assert np.allclose(np.sort(means, axis=0), np.sort(wanted, axis=0))
-    with pytest.raises(ValueError, match=r"ball\.obj: expected a name that ends in ply or splat, got 'obj'"):
+    with pytest.raises(ValueError, match=r"ball\.obj: expected a name that ends in ply, splat, got 'obj'"):
         save_splats(splats, tmp_path / "ball.obj")
 
 

@@ -30,11 +30,8 @@ def _corner(index, cell_x, cell_y, cell_z, x, y, z, corner):
     at_x, at_y, at_z = cell_x + right - 1, cell_y + up - 1, cell_z + behind - 1
     if min(at_x, at_y, at_z) < 0 or max(at_x, at_y, at_z) >= index.shape[0]:
         return -1, np.float32(0.0)
-    row = index[at_x, at_y, at_z]
-    if row < 0:
-        return -1, np.float32(0.0)
     weight = (x if right else one - x) * (y if up else one - y) * (z if behind else one - z)
-    return row, weight
+    return index[at_x, at_y, at_z], weight
 
 
 @inlined
@@ -49,9 +46,9 @@ def _next_sample(index, values, empty, origin, along, first, last, step, per_cel
     side, zero = empty.shape[0], np.float32(0.0)
     while True:
         t = first + np.float32(sample) * step
-        x, y, z = origin[0] + t * along[0], origin[1] + t * along[1], origin[2] + t * along[2]
         if t >= last:
-            return sample, t, x, y, z, zero
+            return sample, t, zero, zero, zero, zero
+        x, y, z = origin[0] + t * along[0], origin[1] + t * along[1], origin[2] + t * along[2]
         # The cell that the sample lies in.
         cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
         if min(cell_x, cell_y, cell_z) < 0 or max(cell_x, cell_y, cell_z) >= side:
