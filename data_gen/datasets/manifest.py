@@ -15,17 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.datasets.sources import Item
-from hyperplanes.utilities.files import (
-    DataError,
-    encode_json,
-    inside,
-    malformed,
-    one_writer,
-    read_bytes,
-    read_json,
-    sha256,
-    write_whole,
-)
+from hyperplanes.utilities.encoding import encode_json, sha256
+from hyperplanes.utilities.files import DataError, inside, malformed, one_writer, read_bytes, read_json, write_whole
 
 __all__ = ["FORMAT", "MANIFEST", "GenerationState", "Verification", "build_manifest", "verify"]
 
