@@ -40,14 +40,9 @@ LAYERS = {
     "hyperplanes.views": 2,
     "hyperplanes.geometry": 1,
     "hyperplanes.hypernetwork": 1,
-    "hyperplanes.utilities.metrics": 1,
-    "hyperplanes.utilities.checkpoints": 1,
     "hyperplanes.adaptation.optimisers": 1,
     "hyperplanes.parameters": 1,
-    "hyperplanes.utilities.files": 1,
-    "hyperplanes.utilities.colour": 1,
-    "hyperplanes.utilities.axes": 1,
-    "hyperplanes.utilities": 1,
+    "hyperplanes.utilities": 0.5,
 }
 INSIDE = {"hyperplanes.data": ("pictures", "formats", "dataset", "inspection")}  # from the ground up
 OURS = ("hyperplanes", "data_gen", "benchmarks")
