@@ -2,6 +2,7 @@
 
     python -m benchmarks views --checkpoint small --data data/cars data/chairs --json FILE
     python -m benchmarks views --suite random --objects 10 --json FILE
+    python -m benchmarks views --suite srn --inputs 64 128 --objects 10 --json FILE
 
 Of every held-out object some query views are kept back to be judged by; of all others, support and query alike, so many
 are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
@@ -9,6 +10,9 @@ are shown, as far apart as they stand. The rows: the nearest of them copied; the
 another object of the data set, with its own where no left-out views may decide otherwise, and as it is used; and
 fine-tuned. Beside each mean stands how far it lies above
 `hull_blend`, with the 95 % interval of that difference over the objects (paired, Student's t).
+
+With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
+Image are compared, has 251 views on a spiral, of which view 64, or views 64 and 128, are shown.
 
 The suites are the data sets that every model is judged by; none of their objects is in any training.
 """
@@ -32,7 +36,7 @@ from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.data import open_dataset
-from hyperplanes.data.support import Shown
+from hyperplanes.data.support import Inputs, Shown
 from hyperplanes.evaluation import Score, evaluate
 from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
@@ -64,7 +68,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="of fine-tuning, and of the same field "
                         "from random weights")  # fmt: skip
     parser.add_argument("--objects", type=int, default=3, help="of each data set")
-    parser.add_argument("--query", type=int, default=3, help="views of each object to be judged by")
+    parser.add_argument("--inputs", type=int, nargs="+", metavar="VIEW", help="instead of --counts: these views by "
+                        "their place, from 0")  # fmt: skip
+    parser.add_argument("--query", type=int, help="views of each object to be judged by: 3; all with --inputs")
     parser.add_argument(
         "--methods",
         nargs="*",
@@ -93,6 +99,8 @@ def main(arguments: list[str]) -> int:
                 )
     if chosen.quick:
         chosen.counts, chosen.objects, chosen.query = [3], 2, 1
+    if chosen.inputs:
+        chosen.counts = [len(chosen.inputs)]
     model, rows, sheet = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint))), [], []
     model.config = replace(model.config, second_pass=chosen.second_pass or model.config.second_pass)
     for path in chosen.data:
@@ -100,7 +108,8 @@ def main(arguments: list[str]) -> int:
         names = sorted(data.names("test"))[: chosen.objects]
         seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count: truth and prediction of every view
         for count in chosen.counts:
-            shown = _Rotated(Shown(data, count, chosen.query), chosen.rotated)
+            inputs = Inputs(data, tuple(chosen.inputs), chosen.query) if chosen.inputs else None
+            shown = _Rotated(inputs or Shown(data, count, chosen.query or 3), chosen.rotated)
             steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
             plain: Score | None = None
             for method, adapter in adapters(model, shown, names, chosen.methods, steps).items():
@@ -139,6 +148,14 @@ SUITES: dict[str, dict[str, str]] = {
     "random": {"random-unseen": "--class random --count 12 --held-out 10 --resolution 128 --rig random --seed 9001"},
     "cc0": {
         f"cc0/{kind}": f"--meshes MESHES/{kind} --resolution 128 --rig random --seed 5 --held-out 0.99"
+        for kind in ("cars", "chairs", "lamps", "planes")
+    },
+    "srn": {
+        f"srn/{kind}s": f"--class {kind} --count 12 --held-out 10 --rig srn --seed 1300"
+        for kind in ("car", "chair", "plane", "lamp")
+    }
+    | {
+        f"srn/cc0-{kind}": f"--meshes MESHES/{kind} --rig srn --seed 5 --held-out 0.99"
         for kind in ("cars", "chairs", "lamps", "planes")
     },
     "posed": {"chair": ""},

@@ -1,4 +1,4 @@
-"""Camera rigs: posed cameras of one size that look at a generated object; fixed, random, in an orbit, or by name.
+"""Camera rigs: posed cameras of one size that look at a generated object; fixed, random, orbit, spiral, or by name.
 
 Conventions: OpenCV camera axes (x right, y down, z forward), a world with y up, `world_from_camera` poses, intrinsics
 in pixels with INTEGER pixel centres, so a centred principal point is `((W - 1) / 2, (H - 1) / 2)`. Objects are
@@ -35,6 +35,7 @@ __all__ = [
     "make_rig",
     "orbit",
     "random",
+    "spiral",
 ]
 
 Array = npt.NDArray[np.float64]
@@ -48,6 +49,8 @@ DEFAULT_DISTANCE = 3.0
 _MARGIN = 1.04
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _BLENDER_FIELD_OF_VIEW = math.degrees(2.0 * math.atan(36.0 / 2.0 / 50.0))  # a lens of 50 mm before a film of 36 mm
+_SRN_FIELD_OF_VIEW = math.degrees(2.0 * math.atan(128.0 / 2.0 / 131.25))  # a focal length of 131.25 of 128 pixels
+_SPIRAL_ANGLE = 20.0  # radians about the vertical axis from the horizon to the pole, as SRN's renderer has it
 
 
 @dataclass(frozen=True)
@@ -55,14 +58,14 @@ class RigPreset:
     """Named settings of a rig.
 
     Attributes:
-        kind: the same poses for every object, or random ones for each, anywhere on the sphere.
+        kind: the same poses for every object, random ones for each, anywhere on the sphere, or a spiral.
         views: cameras an object.
         resolution: pixels along a side.
         distance: of the cameras from the origin, in world units.
         field_of_view: full angle in degrees; None fits the unit sphere.
     """
 
-    kind: Literal["fixed", "random"]
+    kind: Literal["fixed", "random", "spiral"]
     views: int
     resolution: int
     distance: float = DEFAULT_DISTANCE
@@ -72,17 +75,22 @@ class RigPreset:
 RIG_PRESETS: dict[str, RigPreset] = {
     "paper-128": RigPreset("random", 50, 128, distance=4.0, field_of_view=_BLENDER_FIELD_OF_VIEW),
     "paper-200": RigPreset("fixed", 50, 200, distance=4.0, field_of_view=_BLENDER_FIELD_OF_VIEW),
+    "srn": RigPreset("spiral", 251, 128, distance=2.6, field_of_view=_SRN_FIELD_OF_VIEW),
 }
-"""The cameras of the paper's two data sets.
+"""The cameras of the paper's two data sets, and those of the test objects of SRN.
 
 `paper-128` follows the ShapeNet renders of "Learned Initializations" (Tancik et al. 2021), the paper's first data set:
 at random all over the sphere, at distance 4 (its loaders sample rays from 2 to 6), with Blender's field of view; the
 unit sphere spans 72 % of the picture. `paper-200` is the paper's second: the same 50 poses for every object. The
 paper does not say where they stand; its loader assumes a focal length of 277.77 pixels, which is the same field of
 view, near 2 and far 6.
+
+`srn` follows the test cars of "Scene Representation Networks" (Sitzmann et al. 2019), by which pixelNeRF and Splatter
+Image are compared: 251 views of 128x128 on an Archimedean spiral (`spiral`), 1.3 from the centre of a car whose sphere
+has a radius of a half, with a focal length of 131.25 pixels.
 """
 
-RIGS = ("fixed", "random", "hemisphere", "orbit", *RIG_PRESETS)
+RIGS = ("fixed", "random", "hemisphere", "orbit", "spiral", *RIG_PRESETS)
 """Names of camera rigs."""
 
 
@@ -178,7 +186,7 @@ def make_rig(
     Args:
         name: one of RIGS; of a preset only the kind is taken, all its numbers are arguments here.
         views: number of views.
-        resolution: pixels along a side; `fixed`, `random` and `orbit` also take (width, height).
+        resolution: pixels along a side; `fixed`, `random`, `orbit` and `spiral` also take (width, height).
         seed: seed of random rigs.
         distance: distance of the cameras from the origin in world units.
         field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
@@ -195,6 +203,8 @@ def make_rig(
         return fixed(views, resolution, **lens)
     if kind == "orbit":
         return orbit(views, resolution, **lens)
+    if kind == "spiral":
+        return spiral(views, resolution, **lens)
     if kind not in RIGS:
         raise ValueError(f"rig: expected one of {', '.join(RIGS)}, got {name!r}")
     return random(views, resolution, seed=seed, lowest=-90.0 if kind == "random" else 0.0, **lens)
@@ -275,6 +285,23 @@ def orbit(
     azimuths = 2.0 * math.pi * np.arange(views) / views
     heights = np.full(views, math.sin(math.radians(elevation)))
     return _rig(_directions(heights, azimuths), resolution, distance, field_of_view)
+
+
+def spiral(
+    views: int = 251,
+    resolution: int | tuple[int, int] = 128,
+    *,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+) -> Rig:
+    """Cameras on an Archimedean spiral over the upper hemisphere, from the horizon to the pole.
+
+    Elevations grow by equal steps, 90 degrees in all, while the azimuth turns by 20 radians, as in the renderings of
+    SRN's test objects (Sitzmann et al. 2019); the arguments are those of `make_rig`.
+    """
+    _check_views(views)
+    steps = np.arange(views) / max(views - 1, 1)
+    return _rig(_directions(np.sin(0.5 * math.pi * steps), -_SPIRAL_ANGLE * steps), resolution, distance, field_of_view)
 
 
 def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:

@@ -48,8 +48,8 @@ class Arguments:
         views: Cameras an object, alternately support and query; 50 when not given.
         held_out: Objects for the test split: a count, or a fraction below 1. A seventh when not given; of mesh files
             the split that their tree states, else a fifth.
-        rig: Where the cameras stand: the same places for all objects, random ones, a circle, or as in one of the two
-            data sets of the paper, with its distance, lens and resolution.
+        rig: Where the cameras stand: the same places for all objects, random ones, a circle, a spiral, or as in one
+            of the two data sets of the paper or in SRN's, with its distance, lens and resolution.
         distance: Of the cameras from the object's centre, in radii of the object; what the rig or the layout is made
             for, else 3, when not given.
         field_of_view: Of the cameras in degrees; that of the rig or the layout, else the object just fits.
@@ -76,7 +76,7 @@ class Arguments:
     resolution: OptionalInt = None
     views: OptionalInt = None
     held_out: OptionalNumber = None
-    rig: Literal["fixed", "random", "hemisphere", "orbit", "paper-128", "paper-200"] = "fixed"
+    rig: Literal["fixed", "random", "hemisphere", "orbit", "spiral", "paper-128", "paper-200", "srn"] = "fixed"
     distance: Annotated[float | None, optional("RADII")] = None
     field_of_view: Annotated[float | None, optional("DEGREES")] = None
     lighting: Literal["studio", "headlight", "random"] = "studio"

@@ -108,8 +108,8 @@ class GenerationConfig:
     """How objects are rendered into a data set.
 
     Attributes:
-        rig: "fixed" (the same poses for all objects), "random" (on the sphere), "hemisphere", "orbit", or a name in
-            `data_gen.rigs.RIG_PRESETS`.
+        rig: "fixed" (the same poses for all objects), "random" (on the sphere), "hemisphere", "orbit", "spiral", or a
+            name in `data_gen.rigs.RIG_PRESETS`.
         views: pictures an object, alternately support and query; the preset's when None, else 50.
         resolution: pixels along a side; what the layout's loaders assume or the preset has when None, else 64.
         lighting: "studio", "headlight" or "random".

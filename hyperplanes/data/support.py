@@ -12,7 +12,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.views import Task, join_views
 
-__all__ = ["Shown", "SingleView", "WithSupport"]
+__all__ = ["Inputs", "Shown", "SingleView", "WithSupport"]
 
 
 @dataclass(frozen=True)
@@ -76,3 +76,29 @@ class Shown(TaskWrapper):
         standing = camera.standpoints(views.cameras, views.bounds.centre)
         chosen = farthest_first(standing, 0, min(self.count, len(views)))
         return replace(task, support=views[torch.tensor(chosen)], query=task.query[asked])
+
+
+@dataclass(frozen=True)
+class Inputs(TaskWrapper):
+    """Tasks whose support views are those at given places in the order of their names, whose query views the others.
+
+    Protocols that name their input views are followed with it: views 64, or 64 and 128, of SRN's 251.
+
+    Attributes:
+        places: of the support views, from 0.
+        query: how many of the others are query views, evenly chosen; all where None.
+    """
+
+    places: tuple[int, ...]
+    query: int | None = None
+
+    def change(self, task: Task) -> Task:
+        """The task with these support views; ValueError where the object has no such view."""
+        views = join_views(task.support, task.query)
+        order = sorted(range(len(views)), key=lambda index: views.names[index]) if views.names else range(len(views))
+        if not all(0 <= place < len(views) for place in self.places):
+            raise ValueError(f"{task.name}: expected inputs from 0 to {len(views) - 1}, got {self.places}")
+        inputs = [order[place] for place in self.places]
+        rest = [index for index in order if index not in inputs]
+        asked = torch.linspace(0, len(rest) - 1, min(self.query or len(rest), len(rest))).round().long()
+        return replace(task, support=views[inputs], query=views[[rest[index] for index in asked]])

@@ -1,11 +1,13 @@
 """Source of truth: the views of a task themselves."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data.devices import TasksOnDevice
-from hyperplanes.data.support import Shown, SingleView, WithSupport
+from hyperplanes.data.support import Inputs, Shown, SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
@@ -59,6 +61,31 @@ def test_the_single_view_of_an_object_is_always_the_same():
         assert torch.equal(data.task(name).query.images, Balls().task(name).query.images)
 
 
+@pytest.mark.parametrize("named", [True, False])
+def test_inputs_are_counted_in_the_order_of_their_names(named):
+    """As pixelNeRF does with SRN's pictures; views without names are counted support first."""
+
+    class Alternating(Balls):
+        def task(self, name):
+            task = super().task(name)
+            if not named:
+                return task
+            names = [tuple(f"{2 * index + half:03d}" for index in range(4)) for half in (0, 1)]
+            return replace(
+                task, support=replace(task.support, names=names[0]), query=replace(task.query, names=names[1])
+            )
+
+    before = Alternating().task("test0")
+    expected = (before.support, 0), (before.query, 1 if named else 3)
+    after = Inputs(Alternating(), (0, 3 if named else 7)).task("test0")
+    for got, (views, place) in zip(after.support.images, expected, strict=True):
+        assert torch.equal(got, views.images[place])
+    assert len(after.query) == 6
+    assert len(Inputs(Alternating(), (0, 3), 2).task("test0").query) == 2
+    with pytest.raises(ValueError, match="test0: expected inputs from 0 to 7, got"):
+        Inputs(Alternating(), (8,)).task("test0")
+
+
 def test_every_wrapper_keeps_splits_and_classes():
     class Kinds(Balls):
         def class_of(self, name):
@@ -69,6 +96,7 @@ def test_every_wrapper_keeps_splits_and_classes():
         WithSupport(data, 2),
         SingleView(data),
         Shown(data, 2, 1),
+        Inputs(data, (0,)),
         TasksOnDevice(data, torch.device("cpu")),
     ):
         assert wrapped.names("train") == data.names("train")

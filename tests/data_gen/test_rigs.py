@@ -37,6 +37,7 @@ def _kornia_project(rig, points):
         rigs.random(7, 64, seed=1),
         rigs.random(7, 64, seed=1, lowest=0.0),
         rigs.orbit(7, 64),
+        rigs.spiral(7, 64),
         rigs.orbit(3, 64, elevation=90.0),
         rigs.orbit(3, 64, elevation=-90.0),
     ],
@@ -55,6 +56,22 @@ def test_unit_sphere_fits_with_a_margin(distance):
     rig = rigs.fixed(1, (60, 40), distance=distance)
     radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(1.0 / distance))
     assert 0.90 * 20 < radius < 0.97 * 20
+
+
+def test_the_spiral_of_srn():
+    """The renderings of SRN's test cars: 251 views 1.3 from cars of radius 1/2, 131.25 pixels of focal length.
+
+    Its renderer steps i from 20 by 20/250 and puts cameras pi i / 40 from the pole below, at the azimuth i.
+    """
+    preset = rigs.RIG_PRESETS["srn"]
+    rig = rigs.make_rig("srn", 251, 128, distance=preset.distance, field_of_view=preset.field_of_view)
+    assert rig.intrinsics[0, 0, 0] == pytest.approx(131.25)
+    x, y, z = (rig.camera_centres / 2).T
+    np.testing.assert_allclose(np.linalg.norm(rig.camera_centres, axis=1) / 2, 1.3)
+    steps = np.arange(251) * 20 / 250
+    np.testing.assert_allclose(y, 1.3 * np.sin(np.pi * steps / 40), atol=1e-12)
+    turned = np.unwrap(np.arctan2(x, z)[:-1])  # the last one stands at the pole
+    np.testing.assert_allclose(turned - turned[0], -steps[:-1], atol=1e-9)
 
 
 def test_fixed_is_the_same_every_time_and_spread():
@@ -94,17 +111,18 @@ def test_random_rigs_follow_their_seed_and_cover_their_part_of_the_sphere():
 
 
 def test_presets():
-    assert set(RIG_PRESETS) == {"paper-128", "paper-200"}
-    assert [(preset.views, preset.resolution) for preset in RIG_PRESETS.values()] == [(50, 128), (50, 200)]
+    assert set(RIG_PRESETS) == {"paper-128", "paper-200", "srn"}
+    papers = [RIG_PRESETS[name] for name in ("paper-128", "paper-200")]
+    assert [(preset.views, preset.resolution) for preset in papers] == [(50, 128), (50, 200)]
     small, large = (
         [make_rig(name, 50, 16, seed=seed).world_from_camera for seed in (5, 6)] for name in ("paper-128", "paper-200")
     )
-    assert {preset.distance for preset in RIG_PRESETS.values()} == {4.0}  # near 2 and far 6 of both loaders
+    assert {preset.distance for preset in papers} == {4.0}  # near 2 and far 6 of both loaders
     focal = 100 / np.tan(np.radians(RIG_PRESETS["paper-200"].field_of_view) / 2)
     assert focal == pytest.approx(277.77, abs=0.01)  # of the authors' loader
     assert not np.array_equal(*small)
     assert np.array_equal(*large)
-    with pytest.raises(ValueError, match="paper-128, paper-200, got 'paper-64'"):
+    with pytest.raises(ValueError, match="paper-128, paper-200, srn, got 'paper-64'"):
         make_rig("paper-64", 50, 16)
 
 
