@@ -13,7 +13,7 @@ from hyperplanes.utilities.files import DataError
 
 NAMES = (
     "all",
-    "any_order",
+    "image_based",
     "busy",
     "captures",
     "generation",

@@ -11,7 +11,7 @@ import torch
 from small_demo import demo_folder
 
 from benchmarks import __main__ as benchmarks_main
-from benchmarks import any_order, views
+from benchmarks import image_based, views
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
@@ -21,9 +21,9 @@ from tests.reference_rendering import Balls
 from tests.training.test_volume_loss import MODEL
 
 
-@pytest.mark.parametrize("name", [*any_order.VARIANTS, *any_order.HYPERNETWORKS])
+@pytest.mark.parametrize("name", [*image_based.VARIANTS, *image_based.HYPERNETWORKS])
 def test_every_weight_of_every_variant_is_trained(name):
-    made = any_order.configured(name, 4, 0)
+    made = image_based.configured(name, 4, 0)
     small = replace(made.model.network, depth=2, width=16, planes=3)
     model = HyperPlanes(replace(made.model, network=small, hull_resolution=16))
     trainer = Trainer(model, Balls(views=6, size=(24, 24)), replace(made.training, rays=48, views=(3, 5), episodes=4))
@@ -34,7 +34,7 @@ def test_every_weight_of_every_variant_is_trained(name):
 
 
 def test_pooling_reads_the_views_of_a_point_in_no_order():
-    made = any_order.configured("pooled", 4, 0)
+    made = image_based.configured("pooled", 4, 0)
     model = HyperPlanes(replace(made.model, hull_resolution=16))
     task = Balls(views=6, size=(24, 24)).task("train0")
     field = model.adapt(task.support).field

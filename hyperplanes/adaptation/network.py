@@ -65,11 +65,6 @@ class HyperPlanesNetwork(nn.Module):
         return self.targets["fine"]
 
     @property
-    def any_order(self) -> bool:
-        """Whether it takes any number of views in any order."""
-        return self.target.permutation_invariant
-
-    @property
     def reads_volume(self) -> bool:
         """Whether its hypernetwork reads what all views show on a grid."""
         return self.hypernetwork is not None and self.hypernetwork.reads_volume

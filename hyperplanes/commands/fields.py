@@ -62,7 +62,7 @@ def load_adaptable(path: Path, device: torch.device, *, second_pass: bool = Fals
 
     model = HyperPlanes.from_pretrained(find_checkpoint(path)).to(device)
     if second_pass:
-        if not model.any_order:
+        if not model.target.permutation_invariant:
             found = f"{path}, a model of {model.config.target}"
             raise ValueError(f"second_pass: expected a model of the field image_based, such as small, got {found}")
         model = model.with_second_pass()

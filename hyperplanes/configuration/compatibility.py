@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.fields import Target, find_targets
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.utilities.errors import did_you_mean
 
-__all__ = ["check_fine_tuning", "check_model"]
+__all__ = ["VOLUME_CHANNELS", "check_fine_tuning", "check_model", "check_training"]
+
+VOLUME_CHANNELS = 4
+"""Channels of a volume that the volume loss compares: the share that is occupied, and the mean colour."""
 
 
 def check_model(config: ModelConfig) -> type[Target]:
@@ -85,4 +89,32 @@ def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: Mo
         raise ValueError(
             f"steps: expected 0 with a single view, whose colours {config.target} would learn to copy, got "
             f"{steps}; give 2 views or more"
+        )
+
+
+def check_training(config: TrainingConfig, model: ModelConfig) -> None:
+    """Refuse a training that a model cannot have.
+
+    Raises:
+        ValueError: numbers of views for a field that knows them by their places, rotations without such numbers, or
+            the volume loss for a model without a volume or a grid.
+    """
+    if config.views and (not find_targets()[model.target].permutation_invariant or min(config.views) < 1):
+        raise ValueError(
+            "training.views: expected numbers of at least 1, for the field image_based, which takes any of them, "
+            f"got {list(config.views)} for {model.target}"
+        )
+    for name in ("random_background", "empty_points"):
+        if getattr(config, name) and model.initialisation is not None:
+            raise ValueError(
+                f"training.{name}: expected {type(getattr(config, name))()} for {model.method}, whose steps on "
+                f"an object are plain fine-tuning, got {getattr(config, name)}"
+            )
+    if config.rotations and not config.views:
+        raise ValueError(f"training.rotations: expected 0 without training.views, got {config.rotations}")
+    volume, grid = isinstance(model.hypernetwork, VolumeHyperNetworkConfig), getattr(model.network, "grid", 0)
+    if config.volume_loss and not (volume and grid >= VOLUME_CHANNELS and config.views):
+        raise ValueError(
+            f"training.volume_loss: expected training.views, a hypernetwork of kind 'volume' and a grid of at "
+            f"least {VOLUME_CHANNELS} features, got another model or training"
         )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from hyperplanes.adaptation.hyperplanes import ModelConfig
 from hyperplanes.configuration.initialisation import LEARNED, InitialisationConfig
+from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.configuration.upgrade import TARGETS as FORMER_TARGETS
 from hyperplanes.fields import TARGETS, ImageBasedConfig, TargetConfig, find_targets
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, Marched
-from hyperplanes.training import TrainingConfig
 from hyperplanes.utilities.errors import did_you_mean
 
 __all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]

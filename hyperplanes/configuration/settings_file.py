@@ -18,11 +18,10 @@ import yaml
 
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.presets import Preset
-from hyperplanes.configuration.upgrade import upgrade_model
+from hyperplanes.configuration.training import TrainingConfig
+from hyperplanes.configuration.upgrade import upgrade_model, upgrade_training
 from hyperplanes.fields import find_targets
 from hyperplanes.hypernetwork import KINDS
-from hyperplanes.training import TrainingConfig
-from hyperplanes.training.configuration import upgraded
 from hyperplanes.utilities.files import DataError, read_bytes, write_whole
 from hyperplanes.utilities.settings import SettingsError, nearest, structure
 
@@ -114,7 +113,7 @@ def changed(chosen: Preset, changes: Mapping[str, Any]) -> Preset:
         _change_kind(model, wanted)
         made = ModelConfig.structured(_merged(model, wanted))
         path = "training"
-        trained = structure(TrainingConfig, _merged(training, upgraded(changes.get("training", {}))))
+        trained = structure(TrainingConfig, _merged(training, upgrade_training(changes.get("training", {}))))
     except SettingsError as error:
         raise SettingsError(f"{path}.{error.path}" if error.path else path, error.problem) from None
     return replace(chosen, model=made, training=trained)

@@ -9,10 +9,11 @@ from typing import Any
 from hyperplanes.hypernetwork.configuration import HeadConfig
 from hyperplanes.utilities.settings import SettingsError
 
-__all__ = ["TARGETS", "upgrade_model"]
+__all__ = ["TARGETS", "upgrade_model", "upgrade_training"]
 
 MODEL = {"hull_side": "hull_resolution"}
 NETWORK = {"point_octaves": "point_frequencies", "direction_octaves": "direction_frequencies"}
+TRAINING = {"final": "final_rate_factor", "completion": "volume_loss"}
 """Entries by their former names."""
 
 TARGETS = {"any_order": "image_based"}
@@ -25,6 +26,9 @@ OF_HEADS = tuple(each.name for each in fields(HeadConfig))
 
 REMOVED: dict[str, object] = {"gain": 1.0, "code_activation": "none"}
 """Settings of hypernetworks that are gone, with the value that left them off; docs/hypernetwork.md says why."""
+
+REMOVED_FROM_TRAINING: dict[str, object] = {"alternating": False, "average": 0.0}
+"""Settings of a training that are gone, likewise."""
 
 
 def upgrade_model(entries: Any) -> Any:
@@ -73,3 +77,23 @@ def _hypernetwork(entries: Mapping[str, Any]) -> dict[str, Any]:
     if result["encoder"] == "volume":
         return {"kind": "volume", **{name: value for name, value in result.items() if name not in dropped}}
     return {"kind": "images", **result}
+
+
+def upgrade_training(entries: Any) -> Any:
+    """The entries of a training's settings as an earlier version wrote them, by the names of this one.
+
+    >>> upgrade_training({"final": 0.1, "average": 0.0})
+    {'final_rate_factor': 0.1}
+
+    Args:
+        entries: what a file or an option says; anything but a mapping is returned as it is.
+
+    Raises:
+        SettingsError: a setting that is gone, at another value than the one that left it off.
+    """
+    if not isinstance(entries, Mapping):
+        return entries
+    for name, off in REMOVED_FROM_TRAINING.items():
+        if entries.get(name, off) != off:
+            raise SettingsError(name, f"expected {off}, since this setting was removed, got {entries[name]}")
+    return {TRAINING.get(name, name): value for name, value in entries.items() if name not in REMOVED_FROM_TRAINING}

@@ -27,7 +27,7 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
     Returns:
         Five channels: the share of the cell that the hull occupies; the mean of the colours, in [-1, 1], that the views
         which see the cell best show at its centre; and the logarithm of the number of views that show it. The variance
-        of these colours and the penalty of the best view brought nothing (docs/any_order.md).
+        of these colours and the penalty of the best view brought nothing (docs/small.md).
     """
     occupancy = planes.occupancy
     share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.depth_opacity), SIDE)[0, 0]

@@ -1,6 +1,7 @@
 """Meta-training: the hypernetwork and theta, or an initialisation alone, from tasks (HyperPlanes, Algorithm 1)."""
 
-from hyperplanes.training.configuration import Progress, TrainingConfig
+from hyperplanes.configuration.training import TrainingConfig
+from hyperplanes.training.monitoring import Progress
 from hyperplanes.training.start import start_training
 from hyperplanes.training.trainer import Trainer, train
 

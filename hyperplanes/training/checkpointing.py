@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes import EpisodeLoader
 from hyperplanes.training.optimisation import Optimisation
 from hyperplanes.training.state import Curve, check_model, check_whole, load_state, save_state

@@ -11,9 +11,9 @@ from torch.profiler import record_function
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.episodes import Draw, Episode
 from hyperplanes.training.episodes.augmentation import drop_planes, over_random_colour
 from hyperplanes.utilities.errors import prefix_errors

@@ -14,12 +14,38 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.export.images import to_pixels
 from hyperplanes.utilities.files import write_whole
 from hyperplanes.utilities.metrics import ssim
 
-__all__ = ["Samples", "Speed", "TensorBoard", "gradient_norms", "write_curve"]
+__all__ = ["Progress", "Samples", "Speed", "TensorBoard", "gradient_norms", "write_curve"]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training stands.
+
+    Attributes:
+        step: steps done.
+        steps: steps to do.
+        loss: mean squared error of the last step's rays, plus what `volume_loss` and `empty_points` add.
+        rays_per_second: since the last report.
+        psnr: in dB, of some views of held-out objects, where this step validated on them.
+        seconds_left: by the speed so far.
+        diagnostics: of the hypernetwork on those objects.
+        ssim: of the same views, where they are large enough for it.
+    """
+
+    step: int
+    steps: int
+    loss: float
+    rays_per_second: float
+    psnr: float | None
+    seconds_left: float
+    diagnostics: Diagnostics | None = None
+    ssim: float | None = None
 
 
 @dataclass(frozen=True)

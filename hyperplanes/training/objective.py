@@ -11,8 +11,8 @@ from torch.profiler import record_function
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.episodes import Batch
 from hyperplanes.training.forward import forward
 from hyperplanes.training.losses import losses_of

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.optimisers import make_optimisers
-from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.configuration.training import TrainingConfig
 
 __all__ = ["Optimisation"]
 

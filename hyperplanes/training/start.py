@@ -9,8 +9,8 @@ import torch
 from hyperplanes.adaptation.checkpoints import checkpoint_folder
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.data.devices import TasksOnDevice
-from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.distributed import Processes
 from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.training.trainer import Trainer

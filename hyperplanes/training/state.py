@@ -21,7 +21,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.optimisers import Muon
-from hyperplanes.training.configuration import upgraded
+from hyperplanes.configuration.upgrade import upgrade_training
 from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
 from hyperplanes.utilities.encoding import encode_json
 from hyperplanes.utilities.files import DataError, malformed, write_json
@@ -196,7 +196,7 @@ def _load(
 def _upgraded(path: Path, config: Mapping[str, Any]) -> Mapping[str, Any]:
     """The settings of the training, by the names of this version; CheckpointError where one of them is gone."""
     try:
-        return upgraded(config)
+        return upgrade_training(config)
     except SettingsError as error:
         raise CheckpointError(f"{path}: {error}; {REMEDY}") from None
 

@@ -12,15 +12,15 @@ from torch.profiler import record_function
 
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.compatibility import check_training
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.checkpointing import Checkpointing
-from hyperplanes.training.configuration import Progress, TrainingConfig
 from hyperplanes.training.distributed import ProcessEnded, Processes, check_shares, other_processes
 from hyperplanes.training.episodes import EpisodeLoader
 from hyperplanes.training.episodes.loader import reference_objects, training_names
-from hyperplanes.training.monitoring import Samples, Speed, gradient_norms, write_curve
+from hyperplanes.training.monitoring import Progress, Samples, Speed, gradient_norms, write_curve
 from hyperplanes.training.objective import Objective, RenderingObjective
 from hyperplanes.training.optimisation import Optimisation
-from hyperplanes.training.requirements import check_requirements
 from hyperplanes.training.validation import Validation, Validator
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.errors import prefix_errors
@@ -69,7 +69,7 @@ class Trainer:
         self.stopping = False  # set by whoever wants `run` to end after the step at hand
         self._stopped = False  # what the processes agreed on in the last step
         names = training_names(data)
-        check_requirements(config, model)
+        check_training(config, model.config)
         self.config = config = replace(config, steps=config.steps_for(len(names)))
         check_shares(config.tasks, reference_objects(model, config), self.processes.count)
         self.folder = folder if self.processes.first else None

@@ -11,7 +11,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes.episode import Episode, prepare_episode
 from hyperplanes.training.episodes.loader import reads_hull
 from hyperplanes.training.monitoring import Samples

@@ -12,15 +12,13 @@ from torch import Tensor
 
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.compatibility import VOLUME_CHANNELS
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.views import Task, Views, join_views
 
-__all__ = ["VOLUME_CHANNELS", "Episode", "prepare_episode", "prepare_subset", "volume_of_all_views"]
-
-VOLUME_CHANNELS = 4
-"""Channels of a volume that the volume loss compares: the share that is occupied, and the mean colour."""
+__all__ = ["Episode", "prepare_episode", "prepare_subset", "volume_of_all_views"]
 
 QUERIES = 4  # views that rays are drawn from, of those that an episode does not show
 

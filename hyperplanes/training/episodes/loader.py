@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.distributed import Processes
 from hyperplanes.training.episodes.augmentation import draw_rotation
 from hyperplanes.training.episodes.drawing import (
@@ -191,4 +191,4 @@ def reference_objects(model: HyperPlanes, config: TrainingConfig) -> int:
 
 def reads_hull(model: HyperPlanes, config: TrainingConfig) -> bool:
     """Whether a sample or the field depends on the hull; the paper's protocol samples without one."""
-    return model.any_order or model.config.sampling.needs_occupancy or config.empty_points > 0
+    return model.target.permutation_invariant or model.config.sampling.needs_occupancy or config.empty_points > 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.initialisation.maml import MAML
 from hyperplanes.training.initialisation.matching import Matching
 from hyperplanes.training.initialisation.reptile import Reptile

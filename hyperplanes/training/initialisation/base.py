@@ -12,9 +12,9 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.initialisation import InitialisationConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.episodes import Episode
 from hyperplanes.views import Tasks
 

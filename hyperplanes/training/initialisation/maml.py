@@ -9,9 +9,9 @@ from torch import Tensor
 
 from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.configuration import TrainingConfig
 from hyperplanes.training.episodes import Batch, Episode
 from hyperplanes.training.initialisation.base import InitialisationObjective, draw_rays, draw_seed
 from hyperplanes.training.meta_gradients import maml_gradient

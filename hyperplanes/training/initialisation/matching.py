@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes import Batch
 from hyperplanes.training.episodes.drawing import points_in
 from hyperplanes.training.initialisation.base import InitialisationObjective

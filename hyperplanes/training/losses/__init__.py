@@ -6,7 +6,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from hyperplanes.training.configuration import TrainingConfig
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.forward import ForwardOutput
 from hyperplanes.training.losses.emptiness import EmptinessLoss
 from hyperplanes.training.losses.photometric import PhotometricLoss

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from hyperplanes.training.episodes.episode import VOLUME_CHANNELS
+from hyperplanes.configuration.compatibility import VOLUME_CHANNELS
 from hyperplanes.training.forward import ForwardOutput
 
 __all__ = ["VolumeLoss"]

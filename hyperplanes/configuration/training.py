@@ -1,20 +1,12 @@
-"""How a model is trained, and where a training stands."""
+"""How a model is trained."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
-from hyperplanes.adaptation.diagnostics import Diagnostics
-from hyperplanes.utilities.settings import SettingsError
-
-__all__ = ["Progress", "TrainingConfig", "upgraded"]
-
-RENAMED = {"final": "final_rate_factor", "completion": "volume_loss"}
-REMOVED: dict[str, object] = {"alternating": False, "average": 0.0}
-"""Settings of earlier versions: what they are called now; those that are gone, with the value that left them off."""
+__all__ = ["TrainingConfig"]
 
 
 @dataclass(frozen=True)
@@ -110,48 +102,3 @@ class TrainingConfig:
             objects: to train on.
         """
         return -(-self.epochs * objects // self.tasks) if self.epochs else self.steps
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a training stands.
-
-    Attributes:
-        step: steps done.
-        steps: steps to do.
-        loss: mean squared error of the last step's rays, plus what `volume_loss` and `empty_points` add.
-        rays_per_second: since the last report.
-        psnr: in dB, of some views of held-out objects, where this step validated on them.
-        seconds_left: by the speed so far.
-        diagnostics: of the hypernetwork on those objects.
-        ssim: of the same views, where they are large enough for it.
-    """
-
-    step: int
-    steps: int
-    loss: float
-    rays_per_second: float
-    psnr: float | None
-    seconds_left: float
-    diagnostics: Diagnostics | None = None
-    ssim: float | None = None
-
-
-def upgraded(entries: Any) -> Any:
-    """The entries of a training's settings as an earlier version wrote them, by the names of this one.
-
-    >>> upgraded({"final": 0.1, "average": 0.0})
-    {'final_rate_factor': 0.1}
-
-    Args:
-        entries: what a file or an option says; anything but a mapping is returned as it is.
-
-    Raises:
-        SettingsError: a setting that is gone, at another value than the one that left it off.
-    """
-    if not isinstance(entries, Mapping):
-        return entries
-    for name, off in REMOVED.items():
-        if entries.get(name, off) != off:
-            raise SettingsError(name, f"expected {off}, since this setting was removed, got {entries[name]}")
-    return {RENAMED.get(name, name): value for name, value in entries.items() if name not in REMOVED}

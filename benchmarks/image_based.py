@@ -1,6 +1,6 @@
 """What the parts of the field of any number of views are worth: each left out, trained again and judged by views shown.
 
-    python -m benchmarks any_order --data data/cars --json FILE
+    python -m benchmarks image_based --data data/cars --json FILE
 
 Every variant is trained for the same steps on the same rays of random numbers of random views, and judged on held-out
 objects by 3, 5, 10 and 25 views that stand as far apart as they can. The network is smaller than that of the preset
@@ -216,7 +216,7 @@ def main(arguments: list[str]) -> int:
     Args:
         arguments: see --help.
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmarks any_order", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks image_based", description=__doc__)
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets")
     parser.add_argument("--variant", nargs="+", choices=(*VARIANTS, *HYPERNETWORKS, "white"), default=list(VARIANTS))
     parser.add_argument("--steps", type=int, default=400)
@@ -242,7 +242,7 @@ def main(arguments: list[str]) -> int:
                     row |= {f"psnr_{count}_{each}": value for each, value in zip(sets, found, strict=True)}
             rows.append(row)
             print(row, flush=True)
-    return finish("any_order", rows, chosen.json)
+    return finish("image_based", rows, chosen.json)
 
 
 def _judged(model: HyperPlanes, data: Dataset, count: int, objects: int) -> float:
