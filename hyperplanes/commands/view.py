@@ -8,11 +8,13 @@ Example:
     hyperplanes view example-car
     hyperplanes view photos/ --steps 100
     hyperplanes view photos/ --checkpoint chair.safetensors
+    hyperplanes view photos/ --compare hull_blend scratch_100
 """
 
 from __future__ import annotations
 
 import queue
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,6 +27,9 @@ from hyperplanes.commands.options import OptionalInt, ViewsUp
 from hyperplanes.commands.scene import read_scene
 
 if TYPE_CHECKING:
+    import torch
+
+    from hyperplanes.adaptation.base import Adapter
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.export.live import LiveViewer
     from hyperplanes.views import Views
@@ -43,6 +48,8 @@ class Arguments:
         checkpoint: What adapts to them, or a file that `bake` wrote, which is shown as it is.
         steps: Fine-tuning steps on the views.
         fit: Gradient steps that fit the baked voxels to the views; 0 shows the field itself and bakes nothing.
+        compare: Methods of `hyperplanes evaluate` to see beside the model on the right half of the page, such as
+            hull_blend, nearest_view, hyperplanes (the model after one step), or scratch_100.
         port: Of the page on this machine.
         second_pass: Render the views first, and take colours from those that see the surface found there.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
@@ -56,6 +63,7 @@ class Arguments:
     checkpoint: Path = Path("small")
     steps: Annotated[int, range(100_000)] = 0
     fit: Annotated[int, range(10_000)] = 80
+    compare: tuple[str, ...] = ()
     port: Annotated[int, range(65_536)] = 8080
     second_pass: bool = False
     up: ViewsUp = "auto"
@@ -75,16 +83,19 @@ def run(arguments: Arguments) -> int:
     shown = task.support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
     baked = isinstance(source, BakedScene)
-    viewer = LiveViewer(shown, arguments.port, None if baked else wanted.put)
+    others = _others(arguments, device)
+    viewer = LiveViewer(shown, arguments.port, None if baked else wanted.put, list(others))
     console.say(f"{viewer.address}: open it in a browser; Ctrl-C ends it")
     try:
         if isinstance(source, BakedScene):
             viewer.show(source, f"{len(source.field.values):,} baked voxels")
+            _show_others(others, shown, viewer, console)
             wanted.get()  # until Ctrl-C
             return 0
         number = len(shown)
         while True:
             _adapt(source, shown[:number], arguments, viewer, wanted, console)
+            _show_others(others, shown[:number], viewer, console)
             number = wanted.get()
             while not wanted.empty():
                 number = wanted.get()
@@ -93,6 +104,23 @@ def run(arguments: Arguments) -> int:
     finally:
         viewer.stop()
     return 0
+
+
+def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
+    """The methods to compare with, by name."""
+    from hyperplanes.adaptation.checkpoints import find_checkpoint
+    from hyperplanes.methods import make_method
+
+    if not arguments.compare:
+        return {}
+    checkpoints = {"hyperplanes": find_checkpoint(arguments.checkpoint)} if not arguments.checkpoint.is_file() else {}
+    return {name: make_method(name, checkpoints, device=device) for name in arguments.compare}
+
+
+def _show_others(others: Mapping[str, Adapter], shown: Views, viewer: LiveViewer, console: Console) -> None:
+    for name, adapter in others.items():
+        console.say(f"adapting {name}")
+        viewer.show_other(name, adapter.adapt(shown))
 
 
 def _adapt(

@@ -19,13 +19,14 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.images import Pictures
 from hyperplanes.views import Views
 
-__all__ = ["LiveViewer", "viewed_camera"]
+__all__ = ["LiveViewer", "beside", "viewed_camera"]
 
 SECONDS = 0.15  # that a picture may take while the camera moves
 IDLE = 0.4  # seconds after which a camera that stands still gets a larger picture
 SHARPER = 2.5  # times as large
 SMALLEST, LARGEST = 48, 1024  # pixels of height
 THUMBNAIL = 128  # pixels of a photograph in its frustum
+ALONE = "nothing"  # what is shown beside the field unless somebody chooses
 
 
 class Shown(Protocol):
@@ -57,6 +58,14 @@ def viewed_camera(
     return camera.pinhole(intrinsics, pose[None], height, width)
 
 
+def beside(left: Pictures, right: Pictures) -> Float[Tensor, "view 3 height width"]:
+    """The left half of one method's pictures and the right half of another's, with a grey line between them."""
+    middle = left.images.shape[-1] // 2
+    images = torch.cat([left.images[..., :middle], right.images[..., middle:]], -1)
+    images[..., middle] = 0.5
+    return images
+
+
 class LiveViewer:
     """A page on this machine that shows a field from where each visitor looks.
 
@@ -64,17 +73,27 @@ class LiveViewer:
         views: the support views, whose cameras are drawn as frusta with their photographs.
         port: of the page.
         on_number: told how many of the views are wanted when somebody moves the slider; no slider where absent.
+        others: names of other methods, one of which somebody may choose to see beside the field; `show_other` gives
+            their fields.
 
     Raises:
         RuntimeError: viser is not installed.
     """
 
-    def __init__(self, views: Views, port: int = 8080, on_number: Callable[[int], None] | None = None) -> None:
+    def __init__(
+        self,
+        views: Views,
+        port: int = 8080,
+        on_number: Callable[[int], None] | None = None,
+        others: Sequence[str] = (),
+    ) -> None:
         try:
             import viser
         except ImportError:
             raise RuntimeError("view: expected the package viser, found none; pip install hyperplanes[viz]") from None
         self._shown: Shown | None = None
+        self._others: dict[str, Shown] = {}
+        self._chosen = ALONE
         self._changed, self._stopped = threading.Condition(), False
         self._versions: dict[int, tuple[float, float]] = {}  # of each visitor: last change, and what was drawn of it
         self._height = 96
@@ -86,6 +105,10 @@ class LiveViewer:
         if on_number is not None:
             slider = self._server.gui.add_slider("support views", 1, len(views), 1, len(views))
             slider.on_update(lambda _: on_number(int(slider.value)))
+        if others:
+            choice = self._server.gui.add_dropdown("on the right", (ALONE, *others), initial_value=others[0])
+            choice.on_update(lambda _: self._choose(choice.value))
+            self._chosen = others[0]
         self._server.on_client_connect(self._welcome)
         self._worker = threading.Thread(target=self._draw, daemon=True)
         self._worker.start()
@@ -105,9 +128,29 @@ class LiveViewer:
         with self._changed:
             self._shown = shown
             self._note.content = note
-            now = time.monotonic()
-            self._versions = {visitor: (now, 0.0) for visitor in self._versions}
-            self._changed.notify()
+            self._draw_anew()
+
+    def show_other(self, name: str, shown: Shown) -> None:
+        """What another method makes of the same views.
+
+        Args:
+            name: one of `others`.
+            shown: its field.
+        """
+        with self._changed:
+            self._others[name] = shown
+            self._draw_anew()
+
+    def _choose(self, name: str) -> None:
+        with self._changed:
+            self._chosen = name
+            self._draw_anew()
+
+    def _draw_anew(self) -> None:
+        """For every visitor; called with the lock."""
+        now = time.monotonic()
+        self._versions = {visitor: (now, 0.0) for visitor in self._versions}
+        self._changed.notify()
 
     def stop(self) -> None:
         """Close the page."""
@@ -131,7 +174,9 @@ class LiveViewer:
                     f"/photographs/{view}",
                     2 * math.atan(height / 2 / focal),
                     width / height,
-                    scale=0.1 * self._views.bounds.radius,
+                    scale=0.08 * self._views.bounds.radius,
+                    thickness=1.0,
+                    thickness_units="screen",
                     image=picture,
                     wxyz=_quaternion(rotations[view]),
                     position=tuple(place),
@@ -169,7 +214,7 @@ class LiveViewer:
                 if self._shown is None or not waiting:
                     self._changed.wait()
                     continue
-                shown, now = self._shown, time.monotonic()
+                shown, other, now = self._shown, self._others.get(self._chosen), time.monotonic()
                 visitor, moved, drawn = min(waiting, key=lambda each: each[2])
                 still = drawn >= moved
                 if still and now - moved < IDLE:
@@ -184,11 +229,13 @@ class LiveViewer:
             eye = client.camera
             seen = viewed_camera(eye.wxyz.tolist(), eye.position.tolist(), eye.fov, eye.aspect, height)
             started = time.perf_counter()
-            picture = to_pixels(shown.render(seen).images)[0]
+            found = shown.render(seen)
+            picture = to_pixels(found.images if other is None else beside(found, other.render(seen)))[0]
             if not still:
                 ratio = (SECONDS / max(1e-3, time.perf_counter() - started)) ** 0.5
                 self._height = round(min(LARGEST / SHARPER, max(SMALLEST, self._height * min(1.5, max(0.5, ratio)))))
-            client.scene.set_background_image(picture, "jpeg", jpeg_quality=90)
+            # without loss where it stands still: blocks of JPEG would be taken for the field's
+            client.scene.set_background_image(picture, "png" if still else "jpeg", jpeg_quality=90)
 
 
 def _quaternion(matrix: Float[Tensor, "3 3"]) -> tuple[float, float, float, float]:
