@@ -12,7 +12,7 @@ demo: $(USE)  ## meshes, training, new views and a page about them: runs/demo/re
 	$(BIN)/hyperplanes demo $(DEMO)
 
 test: $(DEVELOP)  ## all tests, on the CPU, by two processes (WORKERS=8: more)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadscope $(TESTS)
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadscope --no-loadscope-reorder $(TESTS)
 
 fuzz: $(DEVELOP)  ## 10,000 damaged files are read or refused in one line
 	$(BIN)/python -m tests.fuzz --files 10000 $(FUZZ)

@@ -1,11 +1,37 @@
 """Shapes are checked in tests: the package's functions run under jaxtyping and beartype."""
 
+import atexit
 import os
+import shutil
 import tempfile
 
 import torch
 import typechecker
 
-os.environ["HYPERPLANES_CACHE"] = tempfile.mkdtemp(prefix="hyperplanes-cache-")  # not the user's own
+SLOWEST_FIRST = (
+    "test_cli",
+    "test_trained",
+    "test_generate",
+    "test_distributed",
+    "test_training",
+    "test_engine",
+    "test_any_number_of_views",
+    "test_inputs",
+    "test_tutorials",
+    "test_mesh_renderer",
+    "test_methods",
+)
+"""Modules that processes of the tests begin with (`make test`), so that none of them is left for the end."""
+
+if "HYPERPLANES_TESTS" not in os.environ:  # the first process: it starts the others, which share the folder
+    os.environ["HYPERPLANES_TESTS"] = tempfile.mkdtemp(prefix="hyperplanes-tests-")
+    atexit.register(shutil.rmtree, os.environ["HYPERPLANES_TESTS"], ignore_errors=True)
+os.environ["HYPERPLANES_CACHE"] = tempfile.mkdtemp(dir=os.environ["HYPERPLANES_TESTS"])  # not the user's own
 torch.set_num_threads(1)  # small tensors: more threads only wait for each other; tests of threads set their own
 typechecker.install("hyperplanes")
+
+
+def pytest_collection_modifyitems(items):
+    """Slow modules first; the others as they were."""
+    order = {name: place for place, name in enumerate(SLOWEST_FIRST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))

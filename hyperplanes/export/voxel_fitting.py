@@ -41,7 +41,7 @@ def fit_voxels(
         baked: where it starts; on the CPU.
         views: posed images of the object, on any device.
         steps: gradient steps.
-        rays: of each step, drawn from all views.
+        rays: of each step, drawn from all views; no more than there are pixels that show something.
         seed: of the rays.
         on_step: told the number of steps done.
 
@@ -54,6 +54,7 @@ def fit_voxels(
     live = scene.footprint(views.cameras).flatten().nonzero()[:, 0]
     if not len(live):
         return baked
+    rays = min(rays, len(live))
     depth, colour = (baked.values[:, :1] * voxel).clamp_min(SMALLEST_DEPTH), baked.values[:, 1:].clone()
     groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
     descent = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)

@@ -8,7 +8,8 @@ import importlib
 import os
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -69,9 +70,25 @@ def compile_function(function: Callable[..., Any], signature: str | None = None)
     setattr(config, "CACHE_DIR", _cache_folder())  # noqa: B010 - the module's attributes are not declared
     try:
         options = {"fastmath": FASTMATH, "error_model": "numpy", "nogil": True, "cache": True}
-        return njit(signature, **options)(function) if signature else njit(**options)(function)
+        if signature is None:
+            return njit(**options)(function)
+        with _one_at_a_time(Path(_cache_folder()) / f"{function.__module__}.{function.__name__}.lock"):
+            return njit(signature, **options)(function)
     finally:
         setattr(config, "CACHE_DIR", previous)  # noqa: B010
+
+
+@contextmanager
+def _one_at_a_time(path: Path) -> Generator[None]:
+    """Processes that start together compile each kernel once: the others wait, and find it in the cache."""
+    try:
+        import fcntl
+    except ImportError:  # Windows: each compiles its own
+        yield
+        return
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _is_private(folder: Path) -> bool:
