@@ -9,6 +9,7 @@ from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.fields.rig import standpoints
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.parameters import Parameters
+from hyperplanes.rendering.renderer import render
 from hyperplanes.views import Views
 
 __all__ = ["FEWEST", "STRENGTHS", "judge_strength", "judged_weights"]
@@ -51,7 +52,8 @@ def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
         among=live_pixels(context.occupancy, judged),
         span=fields[0].sampling.span,
     )
-    errors = [float((field.trace(rays).colour - truth).square().mean()) for field in fields]
+    seen = [render(each.field, rays, each.sampling, occupancy=each.occupancy, differentiable=False) for each in fields]
+    errors = [float((each.colour - truth).square().mean()) for each in seen]
     return STRENGTHS[errors.index(min(errors))]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import torch
@@ -23,7 +23,7 @@ from hyperplanes.fields.rig import Rig, standpoints
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.visibility import ANGLE, ChosenViews, Visibility, VisibilityPlanes
+from hyperplanes.geometry.visibility import ANGLE, ChosenViews, Described, Reading, Visibility, VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
@@ -194,6 +194,24 @@ class ImageBasedNeRF(Target):
         return ImageBasedField(self, parameters, planes, bounds or planes.occupancy.bounds)
 
 
+@dataclass(frozen=True)
+class HiddenPoints:
+    """What the heads read of points.
+
+    Attributes:
+        points: in the world.
+        values: of the trunk.
+        coverage: the least opacity over the views that show the point.
+    """
+
+    points: Float[Tensor, "point 3"]
+    values: Float[Tensor, "point width"]
+    coverage: Float[Tensor, " point"]
+
+    def __getitem__(self, index: slice | Tensor) -> HiddenPoints:
+        return HiddenPoints(self.points[index], self.values[index], self.coverage[index])
+
+
 @dataclass(frozen=True, repr=False)
 class ImageBasedField(Field):
     """The field of `ImageBasedNeRF`."""
@@ -204,16 +222,75 @@ class ImageBasedField(Field):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
         """Colour in [0, 1] and density per world unit at points seen along unit directions."""
+        if self._is_described(points):
+            inputs, coverage, near = self._read(points, directions)
+            hidden = self.trunk(inputs)
+            return self._coloured(hidden, near), self._density(hidden, coverage)
         config = self.target.config
         visibility = self.planes.choose(points, directions, best=config.planes, nearest=config.blended)
         colours = self.planes.colours.lookup(points).colours
         hidden = self._hidden(points, visibility, colours)
-        return self._colour(hidden, visibility, colours, directions), self._density(hidden, visibility)
+        return self._colour(hidden, visibility, colours, directions), self._density(hidden, visibility.coverage)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit alone."""
+        return self.density_of(self.hidden(points))
+
+    def hidden(self, points: Float[Tensor, "point 3"]) -> HiddenPoints:
+        """What the heads read; all that is expensive about a point."""
+        if self._is_described(points):
+            inputs, coverage, _ = self._read(points)
+            return HiddenPoints(points, self.trunk(inputs), coverage)
         visibility = self.planes.choose(points, best=self.target.config.planes)
-        return self._density(self._hidden(points, visibility, self.planes.colours.lookup(points).colours), visibility)
+        hidden = self._hidden(points, visibility, self.planes.colours.lookup(points).colours)
+        return HiddenPoints(points, hidden, visibility.coverage)
+
+    def density_of(self, hidden: HiddenPoints) -> Float[Tensor, " point"]:
+        """Density per world unit."""
+        return self._density(hidden.values, hidden.coverage)
+
+    def colour_of(self, hidden: HiddenPoints, directions: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """Colour in [0, 1] as seen along unit directions."""
+        points, config = hidden.points, self.target.config
+        if self._is_described(points):
+            near = self.planes.describe(points, directions, replace(self._reading, best=0), self.bounds)
+            return self._coloured(hidden.values, near)
+        visibility = self.planes.choose(points, directions, best=1, nearest=config.blended)
+        return self._colour(hidden.values, visibility, self.planes.colours.lookup(points).colours, directions)
+
+    @property
+    def _reading(self) -> Reading:
+        config = self.target.config
+        return Reading(
+            config.planes, config.blended, config.point_frequencies, config.direction_frequencies, FALLOFF,
+            SMALLEST_ANGLE,
+        )  # fmt: skip
+
+    def _is_described(self, points: Tensor) -> bool:
+        """Whether one kernel writes what the network reads; not of fields that read something else."""
+        plain = type(self) is ImageBasedField and self.dtype == torch.float32 == points.dtype
+        return plain and isinstance(self.planes, VisibilityPlanes) and self.planes.can_describe(points)
+
+    def _read(self, points: Tensor, directions: Tensor | None = None) -> tuple[Tensor, Tensor, Described]:
+        """The inputs of the trunk, the least coverage, and what the colour head reads where there are directions."""
+        grid = self.parameters.get("grid.weight")
+        learned = grid is not None and grid.requires_grad and torch.is_grad_enabled()
+        found = self.planes.describe(points, directions, self._reading, self.bounds, None if learned else grid)
+        if not learned:
+            return found.rows, found.coverage, found
+        return torch.cat([found.rows, *self._features(points)], 1), found.coverage, found
+
+    def _features(self, points: Tensor) -> list[Float[Tensor, "point number"]]:
+        """Those of the grid, the first through a sigmoid."""
+        if not self.target.config.grid:
+            return []
+        features = interpolate_grid(self.parameters["grid.weight"], points, self.bounds)
+        return [torch.sigmoid(features[:, :1]), features[:, 1:]]
+
+    def _coloured(self, hidden: Tensor, near: Described) -> Float[Tensor, "point 3"]:
+        """As `_colour`, of what the kernel wrote."""
+        value = torch.cat([self.layer("feature", hidden), near.near_rows], 1)
+        return self._blend(value, near.near_weights, near.near_colours)
 
     def _hidden(self, points: Tensor, visibility: Visibility, shown: Tensor) -> Float[Tensor, "point width"]:
         """The trunk at points, which reads the `config.planes` views that see them best; `shown` are all colours."""
@@ -229,10 +306,7 @@ class ImageBasedField(Field):
         overall = [mean, variance, colours[:, 0] - mean, torch.stack([visibility.coverage, number], 1)]
 
         inputs = [encode(self.bounds.normalise(points), config.point_frequencies)]
-        inputs += [self.joined(slots), *overall]
-        if config.grid:
-            features = interpolate_grid(self.parameters["grid.weight"], points, self.bounds)
-            inputs += [torch.sigmoid(features[:, :1]), features[:, 1:]]
+        inputs += [self.joined(slots), *overall, *self._features(points)]
         return self.trunk(torch.cat(inputs, 1))
 
     def slots(
@@ -251,8 +325,8 @@ class ImageBasedField(Field):
         """What the trunk reads of all of them: one after the other, the best first."""
         return _padded(slots, self.target.config.planes).flatten(1)
 
-    def _density(self, hidden: Tensor, visibility: Visibility) -> Float[Tensor, " point"]:
-        raw = self.layer("density", torch.cat([hidden, visibility.coverage[:, None]], 1))[:, 0]
+    def _density(self, hidden: Tensor, coverage: Tensor) -> Float[Tensor, " point"]:
+        raw = self.layer("density", torch.cat([hidden, coverage[:, None]], 1))[:, 0]
         return softplus(raw) * (self.target.config.density_scale / self.bounds.radius)
 
     def _colour(
@@ -276,8 +350,12 @@ class ImageBasedField(Field):
         slots = torch.cat([(2 * colours - 1) * valid, angle[:, :count, None] * valid, _described(seen)], -1)
         along = encode(directions, config.direction_frequencies)
         value = torch.cat([self.layer("feature", hidden), along, _padded(slots, config.blended).flatten(1)], 1)
-        factors, shift = self.layer("colour", relu(self.layer("view", value))).split([config.blended, 3], 1)
-        weights = torch.softmax(weights.log() + factors[:, :count], 1)
+        return self._blend(value, weights.log(), colours)
+
+    def _blend(self, value: Tensor, weights: Tensor, colours: Tensor) -> Float[Tensor, "point 3"]:
+        """The mean of colours by weights, given as logarithms, which the network multiplies; and its shift."""
+        factors, shift = self.layer("colour", relu(self.layer("view", value))).split([self.target.config.blended, 3], 1)
+        weights = torch.softmax(weights + factors[:, : weights.shape[1]], 1)
         return torch.sigmoid(torch.logit(self.blended(weights, colours), 0.005) + shift)
 
     def blended(

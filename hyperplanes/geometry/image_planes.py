@@ -122,7 +122,7 @@ class ImagePlanes:
                 views,
                 background=self.background,
                 nearest=self.nearest,
-                packed=self._packed_images(points),
+                packed=self.packed_images(points),
                 backend=self.backend,
             )
         if self.hidden is not None:
@@ -147,8 +147,11 @@ class ImagePlanes:
         colours = lookup_torch.interpolate(self.images.to(points), coordinates, views)
         return Lookup(torch.where(valid[..., None], colours, self.background), coordinates, valid)
 
-    def _packed_images(self, points: Tensor) -> PackedImages | None:
-        """The packed images, made at the first lookup that can use them and again after the images were changed."""
+    def packed_images(self, points: Tensor) -> PackedImages | None:
+        """The images in 32 bits a pixel, for points that may be looked up in them; None elsewhere.
+
+        They are made at the first lookup that can use them, and again after the images were changed.
+        """
         if self.exact or self.images.requires_grad or self.images.device.type != "cpu" or points.dtype != torch.float32:
             return None
         if torch.compiler.is_compiling() or (self.backend or choose(points, self.images)) != "cpu":

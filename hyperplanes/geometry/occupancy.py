@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
-from torch.nn.functional import max_pool3d, pad
+from torch.nn.functional import pad
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
@@ -70,7 +70,11 @@ class Occupancy:
 
     def dilated(self, voxels: int = 1) -> Occupancy:
         """The grid grown by some voxels in every direction."""
-        grown = max_pool3d(self.occupied[None, None].float(), 2 * voxels + 1, 1, voxels)[0, 0] > 0
+        grown, last = self.occupied.clone(), self.occupied.shape[0] - 1
+        for axis in voxels * (0, 1, 2):
+            before = grown.clone()
+            grown.narrow(axis, 1, last).logical_or_(before.narrow(axis, 0, last))
+            grown.narrow(axis, 0, last).logical_or_(before.narrow(axis, 1, last))
         return Occupancy(grown, self.bounds)
 
 

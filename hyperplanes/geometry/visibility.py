@@ -18,10 +18,20 @@ from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.inputs import ArrayLike
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
+from hyperplanes.geometry.lookup_torch import transform_of
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.rays import Rays, cast
+from hyperplanes.geometry.rays import Rays, Sphere, cast
 
-__all__ = ["ANGLE", "UNSEEN", "ChosenViews", "Visibility", "VisibilityPlanes", "first_hits"]
+__all__ = [
+    "ANGLE",
+    "UNSEEN",
+    "ChosenViews",
+    "Described",
+    "Reading",
+    "Visibility",
+    "VisibilityPlanes",
+    "first_hits",
+]
 
 STEPS = 128  # along a diameter of the scene, where rays look for their first occupied voxel
 ROUND = 8  # of them at once, without a compiler
@@ -82,6 +92,58 @@ class Visibility:
     nearest: ChosenViews | None
     coverage: Float[Tensor, " point"]
     number: Float[Tensor, " point"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a network reads views.
+
+    Attributes:
+        best: views of the least penalty; 0 reads none of them.
+        nearest: views nearest to a direction.
+        octaves: of the encoded point.
+        along_octaves: of the encoded direction.
+        falloff: of depths behind the hull, in 1 / radii, where tanh makes them inputs.
+        smallest_angle: between a view and a direction, in radians: nearer ones count as that far.
+    """
+
+    best: int
+    nearest: int
+    octaves: int
+    along_octaves: int
+    falloff: float
+    smallest_angle: float
+
+    @property
+    def row_size(self) -> int:
+        """The encoded point, nine numbers of each of the best views, eleven of all of them."""
+        return 3 + 6 * self.octaves + 9 * self.best + 11
+
+    @property
+    def near_size(self) -> int:
+        """The encoded direction, and seven numbers of each of the nearest views."""
+        return 3 + 6 * self.along_octaves + 7 * self.nearest
+
+
+@dataclass(frozen=True)
+class Described:
+    """What a network reads of points, in rows.
+
+    Attributes:
+        rows: the encoded point; colour in [-1, 1], depth behind the hull, coverage, validity and direction of each of
+            the best views; mean, variance and difference to the best of their colours, least coverage, logarithm of the
+            number of views; features of a grid.
+        coverage: the least opacity over the views that show the point.
+        near_rows: the encoded direction; colour, angle, depth, coverage and validity of each of the nearest views.
+        near_weights: logarithms of the weights of the blend (`fields.image_based`).
+        near_colours: in [0, 1], white where a view does not show the point.
+    """
+
+    rows: Float[Tensor, "point number"]
+    coverage: Float[Tensor, "..."]
+    near_rows: Float[Tensor, "seen near_number"]
+    near_weights: Float[Tensor, "seen near"]
+    near_colours: Float[Tensor, "seen near 3"]
 
 
 class VisibilityPlanes:
@@ -176,34 +238,97 @@ class VisibilityPlanes:
             The views. All of them are looked at; colours are looked up by who wants them.
         """
         best, nearest = min(best, len(self)), min(nearest + 1, len(self)) if directions is not None else 0
-        pinholes = not isinstance(self.colours.cameras, DistortedCamera)
-        compiled = find_spec("numba") and points.device.type == "cpu" and self.depth_opacity.numel() < 2**31
-        fast = compiled and points.dtype == torch.float32 and pinholes
-        choose = self._choose_compiled if fast else self._choose_torch
+        choose = self._choose_compiled if self._has_kernels(points) else self._choose_torch
         if self._surface is None or directions is None:
             return choose(points, directions, best, nearest, self.depth_opacity)
         near = choose(points, directions, 1, nearest, self._surface).nearest
         return replace(choose(points, None, best, 0, self.depth_opacity), nearest=near)
+
+    def _has_kernels(self, points: Tensor) -> bool:
+        """Whether the kernels take these points: single precision, on the CPU, pinhole cameras."""
+        pinholes = not isinstance(self.colours.cameras, DistortedCamera)
+        compiled = find_spec("numba") and points.device.type == "cpu" and self.depth_opacity.numel() < 2**31
+        return bool(compiled) and points.dtype == torch.float32 and pinholes
+
+    def _limits(self) -> list[float]:
+        """The numbers by which the kernels judge."""
+        per_radius = 1 / self.occupancy.bounds.radius
+        return [self.colours.nearest, per_radius, self.tolerance, DEEPEST, PARTLY, WHOLE, UNSEEN, ANGLE]
+
+    def _shown_cameras(self) -> Tensor:
+        """What the kernels read of each view: centre, projection matrix, and 0 where it is hidden."""
+        return torch.cat([self._cameras, (~self._hidden).to(self._cameras)[None]])
 
     def _choose_compiled(
         self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
     ) -> Visibility:
         """As `choose`, by the compiled kernel."""
         count = len(points)
-        limits = (self.colours.nearest, 1 / self.occupancy.bounds.radius, self.tolerance, DEEPEST, PARTLY, WHOLE)
         views = torch.empty(count, best, dtype=torch.long), torch.empty(count, nearest, dtype=torch.long)
         values = torch.empty(count, best, 6), torch.empty(count, nearest, 6)
         overall = torch.empty(count, 2)
         along = points[:0] if directions is None else directions
-        cameras = torch.cat([self._cameras, (~self._hidden).to(points)[None]])
-        fixed = [each.contiguous().flatten().numpy() for each in (points, along, cameras, depth_opacity)]
+        fixed = [each.contiguous().flatten().numpy() for each in (points, along, self._shown_cameras(), depth_opacity)]
         shape = (*depth_opacity.shape[:3], best, nearest, len(self))
-        numbers = np.array([*limits, UNSEEN, ANGLE], np.float32)
+        numbers = np.array(self._limits(), np.float32)
         outputs = [each.flatten().numpy() for each in (views[0], values[0], views[1], values[1], overall)]
         kernel = compile_kernel("visibility.choose", torch.float32)
         parallel_for(lambda a, b: kernel(*fixed, shape, numbers, *outputs, a, b), count, POINTS)
         chosen = [ChosenViews(each, *_split(value)) for each, value in zip(views, values, strict=True)]
         return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
+
+    def can_describe(self, points: Float[Tensor, "point 3"]) -> bool:
+        """Whether `describe` takes these points: those that the kernels take, where no gradient goes through them."""
+        given = (points, *(getattr(self.colours.cameras, name) for name in ("intrinsics", "extrinsics")))
+        if type(self) is not VisibilityPlanes or torch.compiler.is_compiling() or transform_of(points):
+            return False
+        if torch.is_grad_enabled() and any(each.requires_grad for each in given):
+            return False
+        if not self._has_kernels(points) or self.colours.background != 1.0:
+            return False
+        return self.colours.packed_images(points) is not None
+
+    @torch.no_grad()
+    def describe(
+        self,
+        points: Float[Tensor, "point 3"],
+        directions: Float[Tensor, "point 3"] | None,
+        reading: Reading,
+        bounds: Sphere,
+        grid: Float[Tensor, "channel x y z"] | None = None,
+    ) -> Described:
+        """What a network reads of points, by one kernel; `can_describe` says where. Without gradients.
+
+        Args:
+            points: in the world.
+            directions: unit vectors along which the points are seen; without them nothing is blended.
+            reading: how many views, and how they are encoded.
+            bounds: the sphere that the network sees as the unit sphere.
+            grid: features over the scene, which are written into the same rows, the first through a sigmoid.
+        """
+        count, views = len(points), self.depth_opacity.shape[:3]
+        packed = self.colours.packed_images(points)
+        assert packed is not None
+        features = points.new_zeros(1, 1, 1, 0) if grid is None else grid.permute(1, 2, 3, 0).contiguous()
+        rows = torch.empty(count, reading.row_size + features.shape[3]) if reading.best else torch.empty(count, 0)
+        coverage = torch.empty(count if reading.best else 0)
+        along = points[:0] if directions is None else directions
+        near = torch.empty(len(along), reading.near_size)
+        kept = min(reading.nearest, len(self))
+        weights, colours = torch.empty(len(along), kept), torch.empty(len(along), kept, 3)
+        surface = points.new_zeros(0) if self._surface is None else self._surface
+        numbers = [*self._limits(), FADING, reading.falloff, reading.smallest_angle]
+        maps = [each.contiguous().flatten().numpy() for each in (self._shown_cameras(), self.depth_opacity, surface)]
+        fixed = (
+            points.contiguous().numpy(), along.contiguous().numpy(), *maps,
+            packed.words.flatten().numpy().view(np.uint32), features.numpy(),
+            (*views, reading.best, reading.nearest, len(self), packed.bits, reading.octaves, reading.along_octaves),
+            np.array(numbers, np.float32), np.array([*bounds.centre, 1 / bounds.radius], np.float32),
+            *(each.numpy() for each in (rows, coverage, near, weights, colours)),
+        )  # fmt: skip
+        kernel = compile_kernel("described.describe", torch.float32)
+        parallel_for(lambda a, b: kernel(*fixed, a, b), count, POINTS)
+        return Described(rows, coverage, near, weights, colours)
 
     def _choose_torch(
         self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor

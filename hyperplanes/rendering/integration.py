@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,11 +13,14 @@ from torch import Tensor
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples, Sampler
-from hyperplanes.rendering.scene import FieldFunction, Scene, evaluate
+from hyperplanes.rendering.scene import FieldFunction, Scene, SplitField, evaluate, points_per_batch
 
 __all__ = ["integrate"]
 
 FIRST_ROUND = 4  # samples a ray before the first test for opaque rays
+MIN_WEIGHT = 0.01  # of a sample in its pixel from which on its colour is evaluated; all others are 2 % of a car's weight
+KNOWN_SHARE = 0.9  # of a pixel's weight whose colours are evaluated at least, in pixels above
+MIN_OPACITY = 1 / 512
 GROWTH = 4  # every later round takes this fraction of the samples so far, and at least as many as the first
 
 
@@ -75,7 +80,7 @@ def _all_at_once(scene: Scene, rays: Rays, samples: PackedSamples) -> Rendered:
     """
 
     def composited(function: FieldFunction, chosen: PackedSamples, lengths: Tensor | float) -> Rendered:
-        colour, density = _evaluate_packed(function, rays, chosen, differentiable=True)
+        colour, density = evaluate(function, *_packed_points(rays, chosen), differentiable=True)
         weights = packed_weights(density * lengths, chosen.ray, len(rays))
         return composite_packed(colour, weights, chosen.distances, chosen.ray, len(rays), scene.background)
 
@@ -98,36 +103,79 @@ def _ranks(ray: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float) -> Rendered:
     """Rounds of a few samples a ray; rays whose transmittance has fallen below `stop` leave (early ray termination)."""
-    optical_depth = torch.zeros(len(rays), dtype=samples.distances.dtype, device=samples.distances.device)
-    limit = -math.log(stop) if stop > 0 else math.inf
+    field, zeros = scene.field, samples.distances.new_zeros(len(rays))
+    optical_depth, limit = zeros, -math.log(stop) if stop > 0 else math.inf
+    split = stop > 0 and isinstance(field, SplitField)
     remaining = torch.arange(len(samples), device=samples.ray.device)
     rank, _ = _ranks(samples.ray, len(rays))
     colours, weights, evaluated = [rays.origins.new_zeros(0, 3)], [optical_depth[:0]], [remaining[:0]]
-    reach = 0
+    known, reach = [remaining[:0] > 0], 0
     while len(remaining):
         # This round: the samples of the rays left whose rank is below `reach`.
         reach += max(FIRST_ROUND, reach // GROWTH)
         now = rank[remaining] < reach
         chosen, remaining = remaining[now], remaining[~now]
         part = samples[chosen]
-        colour, density = _evaluate_packed(scene.field, rays, part, differentiable=False)
+        points, directions = _packed_points(rays, part)
+        if split:
+            hidden = _in_batches(field.hidden, points)
+            density = torch.cat([field.density_of(each) for each in hidden])
+        else:
+            colour, density = evaluate(field, points, directions, differentiable=False)
         # Weights within the round, times the transmittance of what earlier rounds passed through.
         added = density * part.step
-        weights.append(packed_weights(added, part.ray, len(rays)) * torch.exp(-optical_depth[part.ray]))
+        weight = packed_weights(added, part.ray, len(rays)) * torch.exp(-optical_depth[part.ray])
+        seen = weight > MIN_WEIGHT if split else torch.ones_like(weight, dtype=torch.bool)
+        if split:
+            colour = _colours_where(seen, field, hidden, directions)
+        weights.append(weight)
         colours.append(colour)
+        known.append(seen)
         evaluated.append(chosen)
         optical_depth = optical_depth.index_add(0, part.ray, added)
         remaining = remaining[optical_depth[samples.ray[remaining]] < limit]
-    part = samples[torch.cat(evaluated)]
-    return composite_packed(
-        torch.cat(colours), torch.cat(weights), part.distances, part.ray, len(rays), scene.background
-    )
+    part, weight, colour = samples[torch.cat(evaluated)], torch.cat(weights), torch.cat(colours)
+    if split:
+        colour = _filled(scene, rays, part, weight, colour, torch.cat(known))
+    return composite_packed(colour, weight, part.distances, part.ray, len(rays), scene.background)
 
 
-def _evaluate_packed(
-    field: FieldFunction, rays: Rays, samples: PackedSamples, differentiable: bool
-) -> tuple[Tensor, Tensor]:
-    """Colours and densities at packed samples."""
+def _in_batches(function: Callable[[Tensor], Any], points: Tensor) -> list[Any]:
+    return [function(part) for part in points.split(points_per_batch(points.device))]
+
+
+def _colours_where(chosen: Tensor, field: SplitField, hidden: list[Any], directions: Tensor) -> Tensor:
+    """Colours of the chosen points, zero elsewhere; `hidden` in batches as `_in_batches` made them."""
+    colour, size = torch.zeros_like(directions), points_per_batch(directions.device)
+    for part, where, along, out in zip(
+        hidden, chosen.split(size), directions.split(size), colour.split(size), strict=True
+    ):
+        index = where.nonzero()[:, 0]
+        if len(index):
+            out[index] = field.colour_of(part[index], along[index])
+    return colour
+
+
+def _filled(scene: Scene, rays: Rays, samples: PackedSamples, weights: Tensor, colour: Tensor, known: Tensor) -> Tensor:
+    """Colours such that samples that were left out have the weighted mean colour of those of their ray that were not.
+
+    Where these are too few, those that count are evaluated now.
+    """
+    def sums(values: Tensor) -> Tensor:
+        return values.new_zeros(len(rays)).index_add(0, samples.ray, values)
+
+    total = sums(weights)
+    lacking = (sums(weights * known) < KNOWN_SHARE * total) & (total > MIN_OPACITY)
+    late = (lacking[samples.ray] & ~known & (weights > MIN_WEIGHT / 10)).nonzero()[:, 0]
+    if len(late):
+        colour[late] = evaluate(scene.field, *_packed_points(rays, samples[late]), differentiable=False)[0]
+        known[late] = True
+    share = sums(weights * known) / total.clamp_min(1e-12)
+    scale = torch.where(share > 0, 1 / share.clamp_min(1e-12), 0.0)[samples.ray] * known
+    return torch.where((share > 0)[samples.ray, None], colour * scale[:, None], scene.background)
+
+
+def _packed_points(rays: Rays, samples: PackedSamples) -> tuple[Tensor, Tensor]:
+    """Points of packed samples, and the directions along which they are seen."""
     directions = rays.directions[samples.ray]
-    points = rays.origins[samples.ray] + samples.distances[:, None] * directions
-    return evaluate(field, points, directions, differentiable)
+    return rays.origins[samples.ray] + samples.distances[:, None] * directions, directions

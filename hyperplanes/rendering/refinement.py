@@ -14,6 +14,7 @@ from hyperplanes.geometry.rays import Sphere
 __all__ = ["refine"]
 
 CHUNK = 1 << 14  # voxels in one call of the density
+OPAQUE = 1.0  # optical depth of a voxel from which on it hides what lies behind it
 COARSE_FIRST = 60_000  # occupied voxels from which on half the resolution is evaluated first
 
 
@@ -23,7 +24,7 @@ def refine(
 ) -> Occupancy:
     """The voxels of a grid in which a field is not empty.
 
-    The density is evaluated at the centre of every occupied voxel, then, in voxels that are to be dropped, at the
+    The density is evaluated at the centre of every occupied voxel that does not lie behind opaque ones, then, in voxels that are to be dropped, at the
     centres of their eighths, half a voxel apart. Voxels above the threshold are dilated by `margin` voxels and never
     beyond the grid that was given. What is kept of an object with sharp borders:
 
@@ -51,11 +52,11 @@ def refine(
     asked, large = occupancy.occupied, side >= 64 and int(occupancy.occupied.sum()) > COARSE_FIRST
     if large:
         halved = _halved(occupancy)
-        coarse = _dilated(halved, _filled(halved, halved.occupied, density, threshold, 1), margin)
+        coarse = _dilated(halved, _filled_from_outside(halved, halved.occupied, density, threshold), margin)
         asked = (
             asked & coarse.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)[:side, :side, :side]
         )
-    filled = _filled(occupancy, asked, density, threshold, 1)
+    filled = _filled_from_outside(occupancy, asked, density, threshold)
     kept, divided = _dilated(occupancy, filled, margin), torch.zeros_like(filled)
     while True:
         near = Occupancy(kept, bounds).dilated().occupied if large else occupancy.occupied
@@ -67,6 +68,31 @@ def refine(
         if not found.any():
             return Occupancy(kept, bounds)
         kept = kept | _dilated(occupancy, found, margin)
+
+
+def _filled_from_outside(
+    grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor], threshold: float
+) -> Tensor:
+    """Which of the asked voxels have density above a threshold at their centre, or lie behind opaque ones.
+
+    The density is evaluated from the surface inwards, as far as voxels are not opaque: three quarters of the hull of a
+    car lie behind, and no ray gets there.
+    """
+    filled, done = asked.clone(), torch.zeros_like(asked)
+    padded = torch.nn.functional.pad(asked, (1,) * 6)  # what lies beyond the grid is outside, too
+    layer = asked & Occupancy(~padded, grid.bounds).dilated().occupied[1:-1, 1:-1, 1:-1]
+    while layer.any():
+        found = _densities(Occupancy(layer, grid.bounds).centres(), density)
+        filled[layer] = found > threshold
+        done |= layer
+        passed = torch.zeros_like(asked)
+        passed[layer] = found * grid.voxel < OPAQUE
+        layer = Occupancy(passed, grid.bounds).dilated().occupied & asked & ~done
+    return filled
+
+
+def _densities(points: Tensor, density: Callable[[Tensor], Tensor]) -> Tensor:
+    return torch.cat([density(part) for part in points.split(CHUNK)])
 
 
 def _filled(

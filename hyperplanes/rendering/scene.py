@@ -4,16 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from hyperplanes.geometry.occupancy import Occupancy
 
-__all__ = ["FieldFunction", "Scene", "evaluate", "points_per_batch"]
+__all__ = ["FieldFunction", "Scene", "SplitField", "evaluate", "points_per_batch"]
 
 FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Points (n, 3) and unit directions (n, 3) -> colours (n, 3) in [0, 1] and densities (n,) per world unit."""
+
+
+@runtime_checkable
+class SplitField(Protocol):
+    """A field whose colours can be asked for later than its densities, at some of the points."""
+
+    def hidden(self, points: Tensor) -> Any:
+        """What densities and colours of points (n, 3) are computed from; it can be indexed like a tensor."""
+        ...
+
+    def density_of(self, hidden: Any) -> Tensor:
+        """Densities (n,) per world unit."""
+        ...
+
+    def colour_of(self, hidden: Any, directions: Tensor) -> Tensor:
+        """Colours (n, 3) in [0, 1] seen along unit directions (n, 3)."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from hyperplanes.geometry.kernels.blocks import inlined
 from hyperplanes.geometry.kernels.llvm import load, load_int, read, store, store_int
 from hyperplanes.geometry.lookup_torch import BORDER
 
-__all__ = ["choose"]
+__all__ = ["choose", "judge", "least", "place", "rank"]
 
 # Rows of the scratch: the direction from the camera, depth behind the hull, opacity and penalty, which are results;
 # then the distance, whether the view shows the point, the fractions of a pixel, the pixel, the score by direction.
@@ -42,7 +42,7 @@ def _acos(x):
 
 @inlined
 @no_type_check
-def _place(s, pitch, total, x, y, z, cameras, shape, min_z):
+def place(s, pitch, total, x, y, z, cameras, shape, min_z):
     """Projects a point into every view: direction, distance, whether it is shown, the pixel and the fractions."""
     number = s.dtype.type
     zero, one = number(0), number(1)
@@ -82,13 +82,13 @@ def _place(s, pitch, total, x, y, z, cameras, shape, min_z):
 
 @inlined
 @no_type_check
-def _judge(s, pitch, total, along_x, along_y, along_z, maps, shape, limits):
-    """Reads depth and opacity where a point falls into each view, and computes the penalties and scores."""
+def judge(s, pitch, total, maps, shape, limits):
+    """Reads depth and opacity where a point falls into each view, and computes the penalties."""
     number = s.dtype.type
     zero, one = number(0), number(1)
     across_next, down_next = np.int32(2 * min(shape[2] - 1, 1)), np.int32(2 * shape[2] * min(shape[1] - 1, 1))
     per_unit, tolerance, deepest = limits[1], limits[2], limits[3]
-    partly, whole, unseen, by_angle = limits[4], limits[5], limits[6], limits[7]
+    partly, whole, unseen = limits[4], limits[5], limits[6]
     for k in range(total):
         at, across, down = load_int(s, AT * pitch, k), load(s, ACROSS * pitch + k), load(s, DOWN * pitch + k)
         right, below = np.int32(at + across_next), np.int32(at + down_next)
@@ -102,18 +102,27 @@ def _judge(s, pitch, total, along_x, along_y, along_z, maps, shape, limits):
         shown = load(s, SHOWN * pitch + k) > zero
         behind = (load(s, DISTANCE * pitch + k) - depth) * per_unit
         penalty = min(max(behind - tolerance, -deepest), deepest) + (partly if opacity < whole else zero)
-        penalty = penalty if shown else unseen
-        cosine = along_x * load(s, X * pitch + k) + along_y * load(s, Y * pitch + k) + along_z * load(s, Z * pitch + k)
         store(s, BEHIND * pitch + k, behind if shown else zero)
         store(s, OPACITY * pitch + k, opacity if shown else one)
-        store(s, PENALTY * pitch + k, penalty)
-        store(s, SCORE * pitch + k, _acos(min(max(cosine, -one), one)) + by_angle * max(penalty, zero))
+        store(s, PENALTY * pitch + k, penalty if shown else unseen)
 
 
 @inlined
 @no_type_check
-def _keep(s, pitch, total, row, count, views, values, scores, start):
-    """Writes the `count` views of the least numbers in a row of the scratch, best first, and their results.
+def rank(s, pitch, total, along_x, along_y, along_z, by_angle):
+    """The score of each view by its direction: the angle to another one, and by how much it counts, the penalty."""
+    number = s.dtype.type
+    zero, one = number(0), number(1)
+    for k in range(total):
+        cosine = along_x * load(s, X * pitch + k) + along_y * load(s, Y * pitch + k) + along_z * load(s, Z * pitch + k)
+        score = _acos(min(max(cosine, -one), one)) + by_angle * max(load(s, PENALTY * pitch + k), zero)
+        store(s, SCORE * pitch + k, score)
+
+
+@inner
+@no_type_check
+def least(s, pitch, total, row, count, views, scores, start):
+    """Writes the `count` views of the least numbers in a row of the scratch, best first, from `start` on.
 
     Where all numbers are NaN, as those of a point that is not finite, these are the first views.
     """
@@ -127,6 +136,12 @@ def _keep(s, pitch, total, row, count, views, values, scores, start):
                 scores[place], views[start + place] = scores[place - 1], views[start + place - 1]
                 place -= 1
             scores[place], views[start + place] = score, view
+
+
+@inner
+@no_type_check
+def _keep(s, pitch, count, views, values, start):
+    """Writes the results of the chosen views."""
     for place in range(start, start + count):
         for result in range(RESULTS):
             values[RESULTS * place + result] = load(s, result * pitch + views[place])
@@ -148,18 +163,18 @@ def choose(
     number = limits.dtype.type
     total, best_count, near_count, pitch = shape[0], shape[3], shape[4], shape[5]
     s, scores = np.empty(ROWS * pitch, limits.dtype), np.empty(max(best_count, near_count), limits.dtype)
-    along_x, along_y, along_z = number(0), number(0), number(0)
     for point in range(start, stop):
         at = 3 * point
-        _place(s, pitch, total, points[at], points[at + 1], points[at + 2], cameras, shape, limits[0])
-        if near_count:
-            along_x, along_y, along_z = directions[at], directions[at + 1], directions[at + 2]
-        _judge(s, pitch, total, along_x, along_y, along_z, maps, shape, limits)
+        place(s, pitch, total, points[at], points[at + 1], points[at + 2], cameras, shape, limits[0])
+        judge(s, pitch, total, maps, shape, limits)
         covered, seen = number(1), number(0)
         for k in range(total):
             covered = min(covered, load(s, OPACITY * pitch + k))
             seen += load(s, SHOWN * pitch + k)
         overall[2 * point], overall[2 * point + 1] = covered, seen
-        _keep(s, pitch, total, PENALTY, best_count, best, best_values, scores, point * best_count)
+        least(s, pitch, total, PENALTY, best_count, best, scores, point * best_count)
+        _keep(s, pitch, best_count, best, best_values, point * best_count)
         if near_count:
-            _keep(s, pitch, total, SCORE, near_count, near, near_values, scores, point * near_count)
+            rank(s, pitch, total, directions[at], directions[at + 1], directions[at + 2], limits[7])
+            least(s, pitch, total, SCORE, near_count, near, scores, point * near_count)
+            _keep(s, pitch, near_count, near, near_values, point * near_count)
