@@ -140,7 +140,7 @@ class Described:
     """
 
     rows: Float[Tensor, "point number"]
-    coverage: Float[Tensor, "..."]
+    coverage: Float[Tensor, " covered"]
     near_rows: Float[Tensor, "seen near_number"]
     near_weights: Float[Tensor, "seen near"]
     near_colours: Float[Tensor, "seen near 3"]

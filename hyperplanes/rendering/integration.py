@@ -18,8 +18,8 @@ from hyperplanes.rendering.scene import FieldFunction, Scene, SplitField, evalua
 __all__ = ["integrate"]
 
 FIRST_ROUND = 4  # samples a ray before the first test for opaque rays
-MIN_WEIGHT = 0.01  # of a sample in its pixel from which on its colour is evaluated; all others are 2 % of a car's weight
-KNOWN_SHARE = 0.9  # of a pixel's weight whose colours are evaluated at least, in pixels above
+MIN_WEIGHT = 0.01  # of a sample from which on its colour is evaluated; 2 % of the weight of a car are below
+KNOWN_SHARE = 0.95  # of a pixel's weight whose colours are evaluated at least, where its opacity is above
 MIN_OPACITY = 1 / 512
 GROWTH = 4  # every later round takes this fraction of the samples so far, and at least as many as the first
 
@@ -161,12 +161,13 @@ def _filled(scene: Scene, rays: Rays, samples: PackedSamples, weights: Tensor, c
 
     Where these are too few, those that count are evaluated now.
     """
+
     def sums(values: Tensor) -> Tensor:
         return values.new_zeros(len(rays)).index_add(0, samples.ray, values)
 
     total = sums(weights)
     lacking = (sums(weights * known) < KNOWN_SHARE * total) & (total > MIN_OPACITY)
-    late = (lacking[samples.ray] & ~known & (weights > MIN_WEIGHT / 10)).nonzero()[:, 0]
+    late = (lacking[samples.ray] & ~known & (weights > MIN_WEIGHT * total[samples.ray])).nonzero()[:, 0]
     if len(late):
         colour[late] = evaluate(scene.field, *_packed_points(rays, samples[late]), differentiable=False)[0]
         known[late] = True

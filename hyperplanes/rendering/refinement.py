@@ -24,9 +24,9 @@ def refine(
 ) -> Occupancy:
     """The voxels of a grid in which a field is not empty.
 
-    The density is evaluated at the centre of every occupied voxel that does not lie behind opaque ones, then, in voxels that are to be dropped, at the
-    centres of their eighths, half a voxel apart. Voxels above the threshold are dilated by `margin` voxels and never
-    beyond the grid that was given. What is kept of an object with sharp borders:
+    The density is evaluated at the centre of every occupied voxel that does not lie behind opaque ones, then, in voxels
+    that are to be dropped, at the centres of their eighths, half a voxel apart. Voxels above the threshold are dilated
+    by `margin` voxels and never beyond the grid that was given. What is kept of an object with sharp borders:
 
     - in a grid of up to 60,000 occupied voxels, such as a visual hull: whatever is at least half a voxel thick;
     - in a larger one (no masks, so no hull), which is evaluated at half its resolution first: what is two voxels thick,

@@ -1,6 +1,6 @@
 """Source of truth: what must not matter (the order of views, views that see nothing), and the visual hull of a ball."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -145,6 +145,47 @@ def test_density_does_not_depend_on_the_direction_and_colour_does():
     assert torch.equal(one[1], other[1])
     torch.testing.assert_close(one[1], field.density(points))
     assert not torch.allclose(one[0], other[0], atol=1e-3)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("count", [1, 3, 9])
+@pytest.mark.parametrize("grid", [0, 3])
+def test_the_kernel_reads_what_plain_pytorch_does(count, grid, monkeypatch):
+    """Another implementation; points outside the pictures and hidden views among them."""
+    config = ImageBasedConfig(**{**asdict(SMALL), "grid": grid})
+    target, views, (points, directions) = network(config=config), coloured(count), queries()
+    parameters = Parameters({name: value.clone() for name, value in Parameters.of(target).items()})
+    if grid:
+        parameters["grid.weight"].normal_(generator=torch.Generator().manual_seed(2))
+    field, points = bound(target, views, parameters), 2.5 * points
+    hiding = replace(field, planes=field.planes.hiding(torch.tensor([0])))
+    surface = field.planes.depth_opacity[..., 0] + 0.1
+    second = replace(field, planes=field.planes.with_surface(surface, torch.ones_like(surface)))
+
+    def outputs():
+        for each in (field, hiding, second):
+            hidden = each.hidden(points)
+            yield each(points, directions)
+            yield each.colour_of(hidden[::3], directions[::3]), each.density_of(hidden)
+
+    compiled = list(outputs())
+    monkeypatch.setattr(VisibilityPlanes, "can_describe", lambda planes, points: False)
+    for found, expected in zip(compiled, outputs(), strict=True):
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+
+
+def test_gradients_are_those_of_plain_pytorch(monkeypatch):
+    config = ImageBasedConfig(**{**asdict(SMALL), "grid": 3})
+    target, (points, directions) = network(config=config), queries()
+    field, gradients = bound(target, coloured(5)), []
+    for _ in range(2):
+        colour, density = field(points, directions)
+        loss = (colour - 0.3).square().sum() + density.log1p().sum()
+        gradients.append(torch.autograd.grad(loss, list(target.parameters())))
+        monkeypatch.setattr(VisibilityPlanes, "can_describe", lambda planes, points: False)
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
 
 
 def test_every_parameter_has_a_gradient():

@@ -317,6 +317,41 @@ def test_a_proposal_sees_each_ray_by_itself_and_its_whole_length():
     torch.testing.assert_close(seen.coarse.colour[:, 0], 0.2 * opacity.double())
 
 
+class SplitBall:
+    """A soft ball of some share of its density, whose colours are asked for after it; it counts for how many points."""
+
+    def __init__(self, share):
+        self.share, self.coloured = share, 0
+
+    def __call__(self, points, directions):
+        return self.colour_of(points, directions), self.density_of(points)
+
+    def hidden(self, points):
+        return points
+
+    def density_of(self, hidden):
+        return self.share * soft_ball(hidden, hidden)[1]
+
+    def colour_of(self, hidden, directions):
+        self.coloured += len(hidden)
+        return soft_ball(hidden, directions)[0]
+
+
+@pytest.mark.parametrize("share", [1.0, 0.02])
+def test_colours_that_hardly_count_are_not_asked_for(share):
+    # Another implementation: the same field as a function, all of whose colours are. In haze all samples count alike.
+    rays, split = some_rays(300), SplitBall(share)
+    plain = render(lambda *given: split(*given), rays, Marched(96, 1e-3), occupancy=GRID, differentiable=False)
+    split.coloured = 0
+    found = render(split, rays, Marched(96, 1e-3), occupancy=GRID, differentiable=False)
+    error = found.colour - plain.colour
+    assert error.abs().max() < 0.05 * 0.25  # the share that is left out, by how far its colours can be from the mean
+    torch.testing.assert_close(found.opacity, plain.opacity)
+    torch.testing.assert_close(found.depth, plain.depth)
+    assert found.samples == plain.samples
+    assert 0 < split.coloured < 0.9 * plain.samples
+
+
 @torch.no_grad()
 def test_a_threshold_of_zero_never_stops():
     rays = some_rays(30)

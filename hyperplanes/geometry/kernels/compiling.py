@@ -33,8 +33,8 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
         "int64, int64"
     ),
     "described.describe": (
-        "T[:, ::1], T[:, ::1], T[::1], T[::1], T[::1], uint32[::1], T[:, :, :, ::1], UniTuple(int64, 9), T[::1], T[::1], "
-        "T[:, ::1], T[::1], T[:, ::1], T[:, ::1], T[:, :, ::1], int64, int64"
+        "T[:, ::1], T[:, ::1], T[::1], T[::1], T[::1], uint32[::1], T[:, :, :, ::1], UniTuple(int64, 9), T[::1], "
+        "T[::1], T[:, ::1], T[::1], T[:, ::1], T[:, ::1], T[:, :, ::1], int64, int64"
     ),
     "first_hits.first_hits": (
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T, uint8[:, :, ::1], T[::1], int64, int64"

@@ -11,7 +11,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.kernels.blocks import inlined, inner
+from hyperplanes.geometry.kernels.blocks import inlined
 from hyperplanes.geometry.kernels.llvm import load, load_int
 from hyperplanes.geometry.kernels.visibility import (
     ACROSS,
@@ -48,7 +48,7 @@ def _bilinear(a, b, c, d, across, down, shift, mask):
     return left + across * (right - left)
 
 
-@inner
+@inlined
 @no_type_check
 def _colour(s, pitch, view, packed, bits, width, height, colour):
     """The colour of the point in one view, the background where it is not shown."""
@@ -66,7 +66,7 @@ def _colour(s, pitch, view, packed, bits, width, height, colour):
     colour[2] = _bilinear(a, b, c, d, across, down, np.uint32(2 * bits), last) / number(last)
 
 
-@inner
+@inlined
 @no_type_check
 def _encode(row, at, x, y, z, frequencies):
     """x, y, z and their sines and cosines from `at` on, as `fields.encoding.encode`; returns where the row goes on."""
@@ -84,7 +84,7 @@ def _encode(row, at, x, y, z, frequencies):
     return at + 6 * frequencies
 
 
-@inner
+@inlined
 @no_type_check
 def _interpolate(grid, row, at, x, y, z):
     """Trilinear features of a grid (x, y, z, channel) at a point of the unit cube, the first through a sigmoid."""
@@ -108,7 +108,7 @@ def _interpolate(grid, row, at, x, y, z):
     row[at] = one / (one + number(math.exp(-row[at])))
 
 
-@inner
+@inlined
 @no_type_check
 def _describe_best(s, pitch, packed, shape, chosen, numbers, covered, seen, row, at, colours, weights, colour):
     """Nine numbers of each of the best views, then what all of them have in common; returns where the row goes on."""
@@ -155,7 +155,7 @@ def _describe_best(s, pitch, packed, shape, chosen, numbers, covered, seen, row,
     return at + 11
 
 
-@inner
+@inlined
 @no_type_check
 def _describe_nearest(s, pitch, packed, shape, chosen, scores, numbers, direction, row, at, weights, shown, colour):
     """Seven numbers of each of the nearest views; their colours, and the logarithms of their weights in the blend."""

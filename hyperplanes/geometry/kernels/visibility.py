@@ -119,7 +119,7 @@ def rank(s, pitch, total, along_x, along_y, along_z, by_angle):
         store(s, SCORE * pitch + k, score)
 
 
-@inner
+@inlined
 @no_type_check
 def least(s, pitch, total, row, count, views, scores, start):
     """Writes the `count` views of the least numbers in a row of the scratch, best first, from `start` on.
@@ -138,7 +138,7 @@ def least(s, pitch, total, row, count, views, scores, start):
             scores[place], views[start + place] = score, view
 
 
-@inner
+@inlined
 @no_type_check
 def _keep(s, pitch, count, views, values, start):
     """Writes the results of the chosen views."""
