@@ -104,7 +104,7 @@ class Descent:
             settings.optimiser or name,
             adam if settings.learning_rate is None else settings.learning_rate,
             muon if settings.muon_learning_rate is None else settings.muon_learning_rate,
-            betas=(0.9, 0.99),
+            betas=settings.betas,
         )
         rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
         generator = torch.Generator().manual_seed(settings.seed)

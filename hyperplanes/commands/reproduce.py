@@ -1,16 +1,17 @@
 """Run a table or a figure of the HyperPlanes paper and print it beside the paper's numbers.
 
-The scale `smoke` takes seconds and shows that everything runs; `small` is sized for two cores, one to a few hours each,
-as --estimate says, on procedural objects that `hyperplanes generate` makes; `paper` is the paper's setting on data sets
-as they were published, one folder a class, and says first how long it will take by what it has measured here. All
-tables share --out: a data set, a training or an evaluation that lies there is not made again, so Ctrl-C and the same
-command go on. The table goes to --out/NAME as Markdown, CSV and JSON with its figure.
+The scale `smoke` takes seconds and shows that everything runs; `small` makes all ten tables in an hour or two on one
+core, on procedural objects of 32x32 pixels that `hyperplanes generate` makes; `gpu` is sized for all ten in about a day
+on one card, and `paper` is the paper's setting, both on data sets as they were published, one folder a class. These two
+say first how long they will take by what they have measured here, as --estimate does for any. All tables share --out: a
+data set, a training or an evaluation that lies there is not made again, so Ctrl-C and the same command go on. The table
+goes to --out/NAME as Markdown, CSV and JSON with its figures.
 
 Example:
     hyperplanes reproduce target --scale smoke
     hyperplanes reproduce cross-class --scale small --out runs/reproduce
     hyperplanes reproduce shapenet --scale paper --data car=shapenet/cars chair=shapenet/chairs lamp=shapenet/lamps
-    hyperplanes reproduce shapenet --scale paper --data car=shapenet/cars ... --estimate
+    hyperplanes reproduce shapenet --scale gpu --legacy --data car=shapenet/cars ... --estimate
 """
 
 from __future__ import annotations
@@ -57,15 +58,18 @@ class Arguments:
         out: The folder for data, trainings, evaluations and tables, shared by all of them.
         data: Data sets by class, such as car=FOLDER, in any layout; what is not given is generated.
         seeds: Other than the scale's: seeds of trainings and of the fine-tuning of their evaluations.
+        legacy: Read the principal points of published data at W / 2 at integer pixel centres, as the code published
+            with them has it.
         estimate: Only measure a few steps of every training and say how long all will take here.
         device: auto, cpu or cuda.
     """
 
     name: Annotated[Name, tyro.conf.Positional]
-    scale: Literal["smoke", "small", "paper"] = "small"
+    scale: Literal["smoke", "small", "gpu", "paper"] = "small"
     out: Path = Path("runs/reproduce")
     data: tuple[str, ...] = ()
     seeds: OptionalInt = None
+    legacy: bool = False
     estimate: bool = False
     device: str = "auto"
 
@@ -95,9 +99,10 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.commands.train import follow
     from hyperplanes.data.devices import choose_device
     from hyperplanes.experiments import EXPERIMENTS, SCALES, report
+    from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
     from hyperplanes.experiments.engine import Runner
     from hyperplanes.experiments.estimate import estimate
-    from hyperplanes.experiments.figures import figure_of
+    from hyperplanes.experiments.figures import curves_of, figure_of, pictures_of
     from hyperplanes.training import start_training
     from hyperplanes.utilities.files import write_json, write_whole
     from hyperplanes.utilities.formatting import format_duration
@@ -123,8 +128,9 @@ def run(arguments: Arguments) -> int:
         train=train,
         say=console.say,
         device=device,
+        legacy=arguments.legacy,
     )
-    if arguments.estimate or scale.name == "paper":
+    if arguments.estimate or scale.resolution is None:
         found = estimate(runner, experiment, seeds)
         console.table(found.headings, found.rows)
         console.say(f"all of it: {format_duration(found.seconds)} on this machine")
@@ -136,18 +142,26 @@ def run(arguments: Arguments) -> int:
     write_json(folder / "results.json", report.as_json(outcome, command))
     write_whole(folder / "table.md", report.as_markdown(outcome, command).encode())
     write_whole(folder / "table.csv", report.as_csv(outcome).encode())
-    save_figure(figure_of(outcome), folder / "figure.png")
+    made = {"figure": figure_of(outcome), "curves": curves_of(outcome), "pictures": pictures_of(runner, outcome)}
+    names = {f"{name}.png": figure for name, figure in made.items() if figure is not None}
+    for name, figure in names.items():
+        save_figure(figure, folder / name)
     console.say(f"{experiment.title}; HyperPlanes (arXiv 2402.01524), {experiment.where}")
     console.table(report.headings(outcome), report.rows(outcome))
     for line in report.what_differs(outcome):
         console.say(f"- {line}")
-    console.say(f"{folder}: table.md, table.csv, results.json, figure.png")
+    if settings := report.settings(outcome):
+        console.table(DIFFERENCE_HEADINGS, settings)
+        for line in report.sources():
+            console.say(f"- {line}")
+    console.say(f"{folder}: {', '.join(['table.md', 'table.csv', 'results.json', *names])}")
     return 0
 
 
 def _command(arguments: Arguments, seeds: int) -> str:
     data = f" --data {' '.join(arguments.data)}" if arguments.data else ""
-    return f"hyperplanes reproduce {arguments.name} --scale {arguments.scale} --seeds {seeds}{data}"
+    legacy = " --legacy" if arguments.legacy else ""
+    return f"hyperplanes reproduce {arguments.name} --scale {arguments.scale} --seeds {seeds}{legacy}{data}"
 
 
 def _generate(class_name: str, folder: Path, scale: Scale) -> None:

@@ -40,7 +40,9 @@ class FineTuning:
         learning_rate: of Adam or of plain gradient descent at the first step; that of RATES where None, or of
             the field (`Target.fine_tuning_rates`).
         muon_learning_rate: of Muon at the first step; likewise.
-        final_rate_factor: what the rates fall to along half a cosine, as a fraction.
+        final_rate_factor: what the rates fall to, as a fraction; 1 keeps them.
+        decay: along half a "cosine", or "exponential".
+        betas: of Adam.
         max_steps: the most steps that "auto" may choose.
         holdout: every so many-th support view is held out of the planes and of the rays while "auto" chooses.
         mask_views: a field that takes any number of views is not shown those that the rays of a step come from, a share
@@ -60,6 +62,8 @@ class FineTuning:
     learning_rate: float | None = None
     muon_learning_rate: float | None = None
     final_rate_factor: float = 0.1
+    decay: Literal["cosine", "exponential"] = "cosine"
+    betas: tuple[float, float] = (0.9, 0.99)
     max_steps: int = 300
     holdout: int = 6
     mask_views: bool = True
@@ -67,7 +71,8 @@ class FineTuning:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_choices(self, {"trainable": RATES, "optimiser": (None, "adam", "muon", "sgd")})
+        choices = {"trainable": RATES, "optimiser": (None, "adam", "muon", "sgd"), "decay": ("cosine", "exponential")}
+        check_choices(self, choices)
         for name, least in (("rays", 1), ("max_steps", 1), ("holdout", 2)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
@@ -89,5 +94,7 @@ class FineTuning:
 
     def schedule(self, step: int, steps: int) -> float:
         """What the rates are multiplied with at a step, counted from 0."""
+        if self.decay == "exponential":
+            return self.final_rate_factor ** (step / max(1, steps))
         cosine = (1 + math.cos(math.pi * step / max(1, steps))) / 2
         return self.final_rate_factor + (1 - self.final_rate_factor) * cosine

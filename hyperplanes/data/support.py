@@ -1,4 +1,4 @@
-"""Tasks with other support views: more or fewer of them, or a single one."""
+"""Tasks with other support views: more or fewer of them, or a single one; or with a sphere that files do not state."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import torch
 from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, join_views
 
-__all__ = ["Inputs", "Shown", "SingleView", "WithSupport"]
+__all__ = ["Inputs", "Shown", "SingleView", "WithBounds", "WithSupport"]
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,22 @@ class SingleView(TaskWrapper):
         """The task with the view that the name of the object decides on."""
         chosen = zlib.crc32(task.name.encode()) % len(task.support)
         return replace(task, support=task.support[[chosen]])
+
+
+@dataclass(frozen=True)
+class WithBounds(TaskWrapper):
+    """Tasks whose scene is held by a given sphere, whatever their masks say.
+
+    Attributes:
+        bounds: the sphere; rays of constant span begin and end at the distance of its centre minus and plus its radius.
+    """
+
+    bounds: Sphere
+
+    def change(self, task: Task) -> Task:
+        """The task with that sphere."""
+        support, query = (replace(views, bounds=self.bounds) for views in (task.support, task.query))
+        return replace(task, support=support, query=query)
 
 
 @dataclass(frozen=True)

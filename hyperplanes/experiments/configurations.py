@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from hyperplanes.configuration.presets import Preset, configure, preset
+from hyperplanes.configuration.fine_tuning import RATES
+from hyperplanes.configuration.initialisation import LEARNED
+from hyperplanes.configuration.presets import Preset, preset
+from hyperplanes.experiments.published import SOURCES
 from hyperplanes.experiments.scales import Scale
 from hyperplanes.experiments.tables import Experiment, Trained
 
-__all__ = ["change", "configuration", "deviations", "scaled_preset"]
+__all__ = ["DIFFERENCE_HEADINGS", "Difference", "change", "configuration", "differences", "scaled_preset"]
 
 Value = TypeVar("Value")
 
@@ -50,9 +54,10 @@ def configuration(experiment: Experiment, trained: Trained, scale: Scale, object
     Returns:
         A preset that nobody has named.
     """
-    chosen = scaled_preset(experiment, scale).by_method(trained.method)
+    learned = trained.method in LEARNED
+    chosen = scaled_preset(experiment, scale).by_method(trained.method, scale.learned_target if learned else None)
     steps = scale.steps if scale.steps is not None else experiment.epochs_of(trained.on) * objects
-    changes = {**trained.changes, "training.steps": steps, "training.seed": seed}
+    changes = {"training.steps": steps, **(scale.learned if learned else {}), **trained.changes, "training.seed": seed}
     changes["model.network.planes"] = scale.planes(trained.planes)
     for part in ("hypernetwork", "autoencoder"):
         reader, name = getattr(chosen.model, part), f"model.{part}.views"
@@ -68,35 +73,84 @@ def scaled_preset(experiment: Experiment, scale: Scale) -> Preset:
     return change(preset(scale.presets[experiment.size]), scale.changes).by_protocol(scale.protocol)
 
 
-def deviations(experiment: Experiment, scale: Scale) -> list[str]:
-    """What a scale does otherwise than the paper's Appendix B, entry by entry.
+@dataclass(frozen=True)
+class Difference:
+    """A setting that is not everywhere as it is here.
+
+    Attributes:
+        kind: of method: "HyperPlanes", "fine-tuning" or "learned initialisations".
+        entry: the setting.
+        here: its value.
+        sources: what each of `published.SOURCES` states, in their order; "-" where it states nothing.
+    """
+
+    kind: str
+    entry: str
+    here: str
+    sources: tuple[str, ...]
+
+    @property
+    def row(self) -> list[str]:
+        """For tables."""
+        return [self.kind, self.entry, self.here, *self.sources]
+
+
+DIFFERENCE_HEADINGS = ("of", "setting", "here", *(source.name for source in SOURCES))
+
+
+def differences(experiment: Experiment, scale: Scale) -> list[Difference]:
+    """The settings of an experiment that a source states otherwise; of what no source states there is nothing to say.
 
     Args:
-        experiment: of the paper.
+        experiment: whose kinds of methods are compared: HyperPlanes, their fine-tuning, learned initialisations. Of
+            MultiPlaneNeRF, of the autoencoder and of a NeRF from random weights no source states settings of its own.
         scale: that it is run at.
 
     Returns:
-        Names and values of HyperPlanes such as "model.network.width 128 (paper 256)", none at the scale of the paper.
+        In the order of the sources' tables; what the experiment varies on purpose is not among them.
     """
-    first = next(each for each in experiment.trainings if each.method == "hyperplanes")
-    name = {128: "paper-128", 200: "paper-200"}[experiment.size]
-    paper = configure(name, first.method, protocol="paper")
-    ours = configuration(experiment, first, scale, 1, 0)
     varied = {name for trained in experiment.trainings for name in trained.changes}
     found = []
-    for part in ("model", "training"):
-        mine, theirs = _flat(getattr(ours, part)), _flat(getattr(paper, part))
-        for entry in sorted(mine.keys() | theirs.keys()):
-            if mine.get(entry) != theirs.get(entry) and entry not in IGNORED and f"{part}.{entry}" not in varied:
-                found.append(f"{part}.{entry} {_shown(mine.get(entry))} (paper {_shown(theirs.get(entry))})")
+    for kind, here in _settings(experiment, scale).items():
+        entries = dict.fromkeys(fact.entry for source in SOURCES for fact in source.facts.get(kind, ()))
+        for entry in entries:
+            facts = [source.fact(kind, entry, experiment.size) for source in SOURCES]
+            mine = here.get(entry)
+            if entry not in varied and any(fact is not None and fact.value != mine for fact in facts):
+                stated = tuple("-" if fact is None else _shown(fact.value) for fact in facts)
+                found.append(Difference(kind, entry, _shown(mine), stated))
     return found
 
 
-IGNORED = ("steps", "seed", "evaluate_every", "checkpoint_every", "held_out", "memory", "hull_resolution")
+def _settings(experiment: Experiment, scale: Scale) -> dict[str, dict[str, object]]:
+    """The settings of each kind of method that an experiment has, by their dotted names."""
+    found: dict[str, dict[str, object]] = {}
+    for cell in experiment.cells:
+        method, tuning = cell.trained.method, re.fullmatch(r"hyperplanes_\d+", cell.method)
+        if cell.trained.packaged:
+            continue
+        if method == "hyperplanes" or method in LEARNED:
+            kind = "HyperPlanes" if method == "hyperplanes" else "learned initialisations"
+            if kind not in found:
+                made = configuration(experiment, replace(cell.trained, changes={}), scale, 1, 0)
+                found[kind] = _flat(made)
+            if steps := re.fullmatch(r".+_(\d+)", scale.method(cell.method)):
+                found[kind]["views.steps"] = int(steps[1])
+            if cell.views is not None and experiment.published_row(cell.row):
+                found[kind]["views.shown"] = scale.planes(cell.views)
+        if tuning and cell.free == "hypernetwork":
+            tuned = _flat(scale.fine_tuning, "fine_tuning.")
+            optimiser, rate, _ = RATES["hypernetwork"]
+            stated = {"fine_tuning.optimiser": optimiser, "fine_tuning.learning_rate": rate}
+            tuned |= {name: value for name, value in stated.items() if tuned[name] is None}
+            found["fine-tuning"] = tuned | {"fine_tuning.trainable": cell.free}
+    return found
 
 
 def _shown(value: object) -> str:
-    return "-" if value is None else " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value))
+    return "-" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _flat(value: object, prefix: str = "") -> dict[str, object]:

@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from hyperplanes.adaptation.checkpoints import find_checkpoints, packaged_folder
+from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.configuration.presets import PROTOCOLS, Preset
 from hyperplanes.data import open_dataset
 from hyperplanes.data.devices import TasksOnDevice
-from hyperplanes.data.support import WithSupport
+from hyperplanes.data.support import WithBounds, WithSupport
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.experiments.configurations import configuration, scaled_preset
 from hyperplanes.experiments.scales import Scale
@@ -68,6 +71,7 @@ class Runner:
             training it reads, if any; goes on where it was interrupted.
         say: called with a line about what is done.
         device: where to compute.
+        legacy: as in `open_dataset`.
     """
 
     def __init__(
@@ -80,7 +84,9 @@ class Runner:
         train: Callable[[str, Preset, Tasks, Path, Path | None], None],
         say: Callable[[str], None],
         device: torch.device,
+        legacy: bool = False,
     ) -> None:
+        self.legacy = legacy
         self.out, self.scale, self.given = out, scale, given
         self.generate, self.train, self.say, self.device = generate, train, say, device
         self._tasks: dict[str, TasksOnDevice] = {}
@@ -88,7 +94,10 @@ class Runner:
     def tasks(self, class_name: str) -> Tasks:
         """The data set of a class, generated where none was given; ValueError where the scale generates none."""
         if class_name not in self._tasks:
-            self._tasks[class_name] = TasksOnDevice(open_dataset(self.folder(class_name)), self.device)
+            data: Tasks = open_dataset(self.folder(class_name), legacy=self.legacy)
+            if self.scale.bounds is not None:
+                data = WithBounds(data, self.scale.bounds)
+            self._tasks[class_name] = TasksOnDevice(data, self.device)
         return self._tasks[class_name]
 
     def folder(self, class_name: str) -> Path:
@@ -169,6 +178,7 @@ class Runner:
             "model": chosen.model.as_json(),
             "training": asdict(chosen.training),
             "given": str(self.folder(trained.on)) if trained.on in self.given else "",
+            **self._reading,
         }
         folder = self.out / "trainings" / _name(f"{self.folder(trained.on).name}-{trained.method}-{seed}", settings)
         state = folder / "training.json"
@@ -195,7 +205,8 @@ class Runner:
             "free": cell.free if method != cell.trained.method else "",
             "seed": seed,
             "views": self._views(cell, checkpoint),
-            "fine_tuning": asdict(self.scale.fine_tuning),
+            "fine_tuning": stated(self.fine_tuning(cell)),
+            **self._reading,
         }
         path = self.out / "evaluations" / f"{_name(f'{self.folder(cell.on).name}-{method}-{seed}', settings)}.json"
         if not path.exists():
@@ -203,12 +214,32 @@ class Runner:
             write_json(path, {"settings": settings, "score": score.as_json()})
         return Score.of_json(method, read_json(path)["score"])
 
+    def picture(self, experiment: Experiment, cell: Cell, seed: int = 0) -> tuple[Tensor, Tensor]:
+        """The first query view of the first object of a cell: the truth, and what the method shows; (3, h, w)."""
+        checkpoint = self.checkpoint(experiment, cell.trained, seed)
+        adapter, tasks = self._method(experiment, cell, self.scale.method(cell.method), checkpoint, seed)
+        task = tasks.task(self.names(cell.on, cell.split, experiment.objects)[0])
+        query = task.query[:1]
+        return query.images[0], adapter.adapt(task.support).render(query.cameras).images[0].clamp(0, 1)
+
     def _evaluate(
         self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, names: list[str], seed: int
     ) -> Score:
+        adapter, tasks = self._method(experiment, cell, method, checkpoint, seed)
+        heading = f"{cell.row}, {cell.column}, seed {seed}"
+
+        def show(score: ObjectScore, *_: Any) -> None:
+            self.say(f"{heading}: {score.name} {score.psnr:.2f} dB")
+
+        return evaluate(method, adapter, tasks, names, show)
+
+    def _method(
+        self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, seed: int
+    ) -> tuple[WithSampler, Tasks]:
+        """The adapter of a cell, and the objects with as many support views as it shows."""
         checkpoints = find_checkpoints([checkpoint])
         trainable = cell.free if "hyperplanes" in checkpoints else "weights"
-        settings = replace(self.scale.fine_tuning, trainable=trainable, seed=seed)
+        settings = replace(self.fine_tuning(cell), trainable=trainable, seed=seed)
         tasks = WithSupport(self.tasks(cell.on), self._views(cell, checkpoint))
         adapter = make_method(
             method,
@@ -218,18 +249,32 @@ class Runner:
             preset=scaled_preset(experiment, self.scale),
         )
         sampling = None if cell.trained.packaged else PROTOCOLS[self.scale.protocol]
-        heading = f"{cell.row}, {cell.column}, seed {seed}"
+        return WithSampler(adapter, sampling), tasks
 
-        def show(score: ObjectScore, *_: Any) -> None:
-            self.say(f"{heading}: {score.name} {score.psnr:.2f} dB")
+    @property
+    def _reading(self) -> dict[str, Any]:
+        """How data sets are read, where it is not the usual way."""
+        bounds = self.scale.bounds
+        stated_bounds = {} if bounds is None else {"bounds": asdict(bounds)}
+        return ({"legacy": True} if self.legacy else {}) | stated_bounds
 
-        return evaluate(method, WithSampler(adapter, sampling), tasks, names, show)
+    def fine_tuning(self, cell: Cell) -> FineTuning:
+        """Rays, optimiser and rates of the gradient steps of a cell; a learned initialisation states its own."""
+        if cell.trained.method in LEARNED:
+            return FineTuning()
+        return self.scale.scratch if "_scratch_" in cell.method else self.scale.fine_tuning
 
     def _views(self, cell: Cell, checkpoint: Path) -> int:
         """How many support views a cell shows: as many as the model has planes, where it does not say."""
         if cell.views is not None:
             return self.scale.planes(cell.views)
         return int(read_json(checkpoint / "model.json")["network"]["planes"])
+
+
+def stated(settings: FineTuning) -> dict[str, Any]:
+    """What settings state otherwise than the defaults."""
+    usual = asdict(FineTuning())
+    return {name: value for name, value in asdict(settings).items() if value != usual[name]}
 
 
 def _name(start: str, settings: Mapping[str, Any]) -> str:

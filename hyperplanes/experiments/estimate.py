@@ -57,13 +57,13 @@ def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
         measured = _measure(runner, experiment, trained)
         training = measured.step * chosen.training.steps
         learned = chosen.model.initialisation
-        tuned = runner.scale.fine_tuning.rays if learned is None else learned.test_rays
         evaluation = 0.0
         for cell in experiment.cells:
             if cell.trained == trained:
                 names = runner.names(cell.on, cell.split, experiment.objects)
                 task = runner.tasks(cell.on).task(names[0])
                 tuning = re.search(r"_(\d+)$", runner.scale.method(cell.method))
+                tuned = runner.fine_tuning(cell).rays if learned is None else learned.test_rays
                 rays = tuned * int(tuning[1]) if tuning else 0
                 pixels = len(task.query) * task.query.size[0] * task.query.size[1]
                 evaluation += len(names) * (rays / measured.rays_per_second + measured.pixel * pixels)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyperplanes.experiments.engine import Curve, Outcome
+from hyperplanes.experiments.engine import Curve, Outcome, Runner
 from hyperplanes.experiments.report import value
-from hyperplanes.utilities.plots import draw_bars, draw_boxes, draw_lines, new_figure
+from hyperplanes.utilities.plots import draw_bars, draw_boxes, draw_grid, draw_lines, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["figure_of"]
+__all__ = ["curves_of", "figure_of", "pictures_of"]
 
 AXES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "image_seconds": "seconds a view"}
 
@@ -53,16 +53,39 @@ def _bars(outcome: Outcome) -> Figure:
         draw_bars(parts[1], experiment.rows, theirs)
         parts[1].set(ylabel=AXES[experiment.cells[0].quantity], title=f"paper, {published.label}")
         parts[1].get_legend().remove()
-    parts[-1].tick_params(axis="x", labelrotation=20 if len(experiment.rows) > 4 else 0)
+    many = len(experiment.rows)
+    parts[-1].tick_params(axis="x", labelrotation=60 if many > 9 else 20 if many > 4 else 0)
     return figure
 
 
+def curves_of(outcome: Outcome) -> Figure | None:
+    """PSNR, SSIM and loss while training, beside a figure of boxes, as the paper has them; None beside others."""
+    if outcome.experiment.figure != "boxes":
+        return None
+    figure = _curves(outcome)
+    figure.suptitle(f"{outcome.experiment.title} ({outcome.scale.name}, seeds: {outcome.seeds})", fontsize=10)
+    return figure
+
+
+def pictures_of(runner: Runner, outcome: Outcome) -> Figure | None:
+    """A view of the first object of some rows by every method, beside the truth; None where no row is to be shown."""
+    experiment = outcome.experiment
+    if not experiment.pictures:
+        return None
+    lines, cells = [], {(cell.row, cell.column): cell for cell in experiment.cells}
+    for row in experiment.pictures:
+        shown = [runner.picture(experiment, cells[row, column]) for column in experiment.columns]
+        lines.append([shown[0][0], *(picture for _, picture in shown)])
+    columns = ["truth", *(column.replace(", ", ",\n") for column in experiment.columns)]
+    pixels = [[(255 * each).round().byte().cpu().permute(1, 2, 0).numpy() for each in line] for line in lines]
+    return draw_grid(pixels, columns, experiment.pictures)
+
+
 def _curves(outcome: Outcome) -> Figure:
-    """PSNR of held-out objects and the loss while training, mean over the seeds and a band of their deviation."""
-    figure = new_figure(10.0, 4.0)
-    for axes, (entry, label) in zip(
-        figure.subplots(1, 2), {"psnr": "held-out PSNR (dB)", "loss": "loss"}.items(), strict=True
-    ):
+    """PSNR and SSIM of held-out objects and the loss, mean over the seeds and a band of their deviation."""
+    figure = new_figure(14.0, 4.0)
+    entries = {"psnr": "held-out PSNR (dB)", "ssim": "held-out SSIM", "loss": "loss"}
+    for axes, (entry, label) in zip(figure.subplots(1, 3), entries.items(), strict=True):
         series, spread = {}, {}
         for name, curves in outcome.curves.items():
             series[name], spread[name] = _over_seeds(curves, entry)

@@ -1,11 +1,28 @@
-"""The numbers of the HyperPlanes paper (arXiv 2402.01524), by the labels of its LaTeX source."""
+"""What is published: the numbers of the paper, and what the paper, its code and learnit's say about settings.
+
+The numbers are those of HyperPlanes (arXiv 2402.01524), by the labels of its LaTeX source. A setting that a source does
+not state has no `Fact`; nothing is filled in.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["CROSS", "SHAPENET", "SINGLE", "TARGET", "TIME", "PublishedTable"]
+__all__ = [
+    "CODE",
+    "CROSS",
+    "LEARNIT",
+    "PAPER",
+    "SHAPENET",
+    "SINGLE",
+    "SOURCES",
+    "TARGET",
+    "TIME",
+    "Fact",
+    "PublishedTable",
+    "Source",
+]
 
 
 @dataclass(frozen=True)
@@ -93,3 +110,153 @@ SINGLE = PublishedTable(
         "Test Planes": (24.26, 14.18, 26.94, 28.08, 28.58),
     },
 )
+
+
+@dataclass(frozen=True)
+class Fact:
+    """What a source states about a setting.
+
+    Attributes:
+        entry: the setting as this project names it, dotted, such as "model.network.depth"; "fine_tuning." and "views."
+            are those of an evaluation.
+        value: as this project would write it, or in words where it has nothing of the kind.
+        where: in the source.
+        size: pixels a side of the images that it is said of; 0 for all.
+    """
+
+    entry: str
+    value: object
+    where: str
+    size: int = 0
+
+
+@dataclass(frozen=True)
+class Source:
+    """A publication or a repository.
+
+    Attributes:
+        name: heading of its column.
+        where: it is to be found.
+        facts: by the kind of the method that they are said of: "HyperPlanes", "fine-tuning" or "learned
+            initialisations".
+    """
+
+    name: str
+    where: str
+    facts: Mapping[str, tuple[Fact, ...]]
+
+    def fact(self, kind: str, entry: str, size: int) -> Fact | None:
+        """What it states about a setting of a kind of method at a size; None where it states nothing."""
+        found = (each for each in self.facts.get(kind, ()) if each.entry == entry and each.size in (0, size))
+        return next(found, None)
+
+
+PAPER = Source(
+    "the paper",
+    "arXiv 2402.01524",
+    {
+        "HyperPlanes": (
+            Fact("model.target", "point_multiplane", "Eq. 6"),
+            Fact("model.network.depth", 8, "Appendix B, target network: layer depth"),
+            Fact("model.network.width", 256, "Appendix B, target network: layer width"),
+            Fact("model.network.planes", 25, "Appendix B: ImagePlanes"),
+            Fact("model.sampling.coarse", 64, "Appendix B, target network: samples"),
+            Fact("model.sampling.fine", 128, "Appendix B, target network: importance"),
+            Fact("model.hypernetwork.views", 5, "Appendix B: HyperPlanes", 128),
+            Fact("model.hypernetwork.views", 25, "Appendix B: HyperPlanes", 200),
+            Fact("model.hypernetwork.encoder", "convnet", "Appendix B: encoder", 128),
+            Fact("model.hypernetwork.encoder", "resnet101", "Appendix B: encoder", 200),
+            Fact("model.hypernetwork.normalisation", "batch", "Appendix B: convolutions and batch normalization", 128),
+            Fact("model.hypernetwork.depth", 3, "Appendix B, hypernetwork: layer depth", 128),
+            Fact("model.hypernetwork.depth", 10, "Appendix B, hypernetwork: layer depth", 200),
+            Fact("model.hypernetwork.width", 256, "Appendix B, hypernetwork: layer width"),
+            Fact("model.hypernetwork.activation", "relu", "Appendix B, hypernetwork"),
+            Fact("model.hypernetwork.layers", ("colour", "density"), "Appendix A, selection of updated layers"),
+            Fact("model.hypernetwork.see_weights", True, "Eq. 7"),
+            Fact("model.hypernetwork.weights_seen", "all", "Eq. 7: theta"),
+            Fact("model.hypernetwork.see_directions", True, "Eq. 7"),
+            Fact("training.optimiser", "adam", "Algorithm 1"),
+            Fact("training.tasks", 1, "Appendix B: a batch of one task"),
+            Fact("training.rays", 512, "Appendix B, target network: rand"),
+            Fact("training.learning_rate", 1e-4, "Appendix B, target network"),
+            Fact("training.hypernetwork_learning_rate", 1e-4, "Appendix B, hypernetwork and encoder"),
+        ),
+        "fine-tuning": (Fact("fine_tuning.trainable", "hypernetwork", "section 3, fine-tuning: the target is frozen"),),
+        "learned initialisations": (Fact("views.steps", 2000, "section 4.1: 2000 fine-tuning steps"),),
+    },
+)
+"""What the paper states."""
+
+CODE = Source(
+    "its code",
+    "github.com/gmum/HyperPlanes at 8c4de8d",
+    {
+        "HyperPlanes": (
+            Fact("model.target", "a tri-plane of an encoder, in place of ImagePlanes", "fewshot/hypermaml.py"),
+            Fact("model.network.depth", "2048-512-512, then 256-256", "nerf/models/multiplane_maml.py"),
+            Fact("model.network.width", "2048 to 256; heads of 256", "nerf/models/multiplane_maml.py"),
+            Fact("model.coarse_network", True, "nerf/nerf_maml_utils.py: network_fn and network_fine"),
+            Fact("model.order", "file", "run_hyperplanes_new.py: the first 25 of 50 views are the support"),
+            Fact("model.sampling.coarse", 64, "configs: N_samples"),
+            Fact("model.sampling.fine", 128, "configs: N_importance"),
+            Fact("model.sampling.placement", "samples", "nerf/nerf_maml_utils.py: render_rays"),
+            Fact("model.hypernetwork.views", 5, "config_parser.py: img2embed, at both sizes"),
+            Fact("model.hypernetwork.choice", "first", "fewshot/hypermaml.py: imgs[:img2embed]"),
+            Fact("model.hypernetwork.encoder", "convnet", "configs: Conv4", 128),
+            Fact("model.hypernetwork.encoder", "resnet101", "configs: ResNet", 200),
+            Fact("model.hypernetwork.depth", 3, "config_parser.py: hm_hn_len, at both sizes"),
+            Fact("model.hypernetwork.width", 256, "config_parser.py: hm_hn_width"),
+            Fact("model.hypernetwork.activation", "relu", "hypernetwork.py"),
+            Fact(
+                "model.hypernetwork.layers",
+                "colour, density and the last hidden one",
+                "run_hyperplanes_new.py: layers2update",
+            ),
+            Fact("training.optimiser", "adam", "nerf/nerf_maml_utils.py"),
+            Fact("training.tasks", 1, "configs: batch_size"),
+            Fact("training.rays", 512, "configs: N_rand, of one random query view"),
+            Fact("training.learning_rate", 1e-4, "configs: lrate"),
+            Fact("training.hypernetwork_learning_rate", 1e-4, "config_parser.py: hn_rate, encoder_rate"),
+            Fact("training.final_rate_factor", 1.0, "run_hyperplanes_new.py: lrate_decay is never read"),
+        ),
+        "fine-tuning": (
+            Fact("fine_tuning.trainable", "hypernetwork and target", "run_hyperplanes_new_eval.py"),
+            Fact("fine_tuning.rays", 512, "fewshot/hypermaml.py: N_rand, of one random support view"),
+            Fact("fine_tuning.optimiser", "adam", "run_hyperplanes_new_eval.py"),
+            Fact("fine_tuning.learning_rate", 1e-4, "config_parser.py: hn_rate, encoder_rate, lrate"),
+            Fact("fine_tuning.final_rate_factor", 1.0, "run_hyperplanes_new_eval.py: no schedule"),
+        ),
+    },
+)
+"""What the authors' code does."""
+
+LEARNIT = Source(
+    "learnit",
+    "github.com/tancik/learnit at b5635b3, Experiments/shapenet.ipynb; what that leaves open: "
+    "github.com/sanowar-raihan/nerf-meta at 85418c0, configs/shapenet/cars.json, a reimplementation",
+    {
+        "learned initialisations": (
+            Fact("model.target", "simplified_nerf", "Model: use_viewdirs = False"),
+            Fact("model.network.depth", 5, "Model: depth = 6, the output layer among them"),
+            Fact("model.network.width", 256, "Model: width"),
+            Fact("model.network.point_frequencies", 20, "Model: 2 ** linspace(0, 8, 20)"),
+            Fact("model.coarse_network", False, "one model"),
+            Fact("model.sampling.coarse", 128, "N_samples"),
+            Fact("model.sampling.fine", 0, "one pass"),
+            Fact("model.initialisation.inner_steps", 32, "inner_update_steps"),
+            Fact("model.initialisation.inner_rate", 0.5, "inner_step_size"),
+            Fact("model.initialisation.test_rays", 64, "train_single_model: batch_size; tto_batchsize"),
+            Fact("training.steps", 100_000, "max_iters"),
+            Fact("training.tasks", 1, "one object an iteration"),
+            Fact("training.rays", 128, "batch_size"),
+            Fact("training.optimiser", "adam", "optix.adam"),
+            Fact("training.learning_rate", "5e-4; the reimplementation 5e-5", "lr; meta_lr"),
+            Fact("training.final_rate_factor", 1.0, "no schedule"),
+            Fact("views.steps", 2000, "the reimplementation: tto_steps"),
+            Fact("views.shown", 1, "test_time_views; tto_views"),
+        ),
+    },
+)
+"""What learnit does, Tancik et al. 2021, whose methods the first table compares with."""
+
+SOURCES = (PAPER, CODE, LEARNIT)

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from statistics import fmean, pstdev
 from typing import Any
 
 from hyperplanes.evaluation import Score
-from hyperplanes.experiments.configurations import deviations
+from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS, differences
 from hyperplanes.experiments.engine import Outcome
+from hyperplanes.experiments.published import SOURCES
 from hyperplanes.experiments.tables import Cell
 from hyperplanes.utilities.environment import environment
 from hyperplanes.utilities.tables import csv_table, markdown_table
 
-__all__ = ["as_csv", "as_json", "as_markdown", "headings", "rows", "value", "what_differs"]
+__all__ = ["as_csv", "as_json", "as_markdown", "headings", "rows", "settings", "sources", "value", "what_differs"]
+
+SILENT = ("MultiPlaneNeRF", "PointMultiPlaneNeRF", "Autoencoder")
+"""Rows and columns of models of whose own settings the paper and its code say nothing."""
 
 DECIMALS = {"psnr": 2, "psnr_pooled": 2, "ssim": 3, "image_seconds": 2}
 
@@ -100,18 +104,36 @@ def what_differs(outcome: Outcome) -> list[str]:
     if scale.steps is not None:
         epochs = experiment.epochs
         paper = epochs if isinstance(epochs, int) else ", ".join(f"{n}s {count}" for n, count in epochs.items())
-        lines.append(f"Training: {scale.steps:,} steps of each model. Paper: epochs, {paper}.")
+        learned = scale.learned.get("training.steps") if experiment.name == "shapenet" else None
+        others = f", {learned:,} of learned initialisations" if learned else ""
+        lines.append(f"Training: {scale.steps:,} steps of each model{others}. Paper: epochs, {paper}.")
     if scale.tuning is not None and any(scale.method(cell.method) != cell.method for cell in experiment.cells):
         lines.append(f"At most {scale.tuning} gradient steps on the support views of an object.")
     if experiment.figure == "steps" and scale.longest is not None:
         lines.append(f"At most {scale.longest:,} gradient steps on the support views of an object.")
+    if scale.evaluated is not None:
+        count = min(scale.evaluated, experiment.objects or scale.evaluated)
+        lines.append(f"Judged by {count} object{'s' if count > 1 else ''} a class. Paper: all test objects.")
     lines.append(
         f"Seeds: {outcome.seeds}, each that of a training and of the fine-tuning of its evaluations"
         f"{'; ± is the standard deviation over them' if outcome.seeds > 1 else ''}. Paper: {experiment.runs}."
     )
-    if found := deviations(experiment, scale):
-        lines.append(f"Configuration ({scale.presets[experiment.size]}): {'; '.join(found)}.")
+    silent = [
+        name for name in SILENT if any(cell.column == name or cell.row.endswith(name) for cell in experiment.cells)
+    ]
+    if silent:
+        lines.append(f"Of {', '.join(silent)} no source states settings: those of the target of HyperPlanes are taken.")
     return [*lines, *experiment.notes]
+
+
+def settings(outcome: Outcome) -> list[list[str]]:
+    """The settings that a source states otherwise, a line each under `DIFFERENCE_HEADINGS`."""
+    return [each.row for each in differences(outcome.experiment, outcome.scale)]
+
+
+def sources() -> list[str]:
+    """Where the columns of `settings` come from, a line each."""
+    return [f"{source.name}: {source.where}" for source in SOURCES]
 
 
 def as_markdown(outcome: Outcome, command: str) -> str:
@@ -124,10 +146,13 @@ def as_markdown(outcome: Outcome, command: str) -> str:
     experiment, where = outcome.experiment, environment()
     machine = f"{where['gpu'] or where['processor']}, {where['cores']} cores, torch {where['torch']}"
     notes = "\n".join(f"- {line}" for line in what_differs(outcome))
+    columns = "\n".join(f"- {line}" for line in sources())
     return (
         f"# {experiment.title}\n\nHyperPlanes (arXiv 2402.01524), {experiment.where}.\n\n"
         f"{markdown_table(headings(outcome), rows(outcome))}\n"
-        f"![figure](figure.png)\n\n## What differs\n\n{notes}\n\n## How it was made\n\n"
+        f"![figure](figure.png)\n\n## What differs\n\n{notes}\n\n"
+        f"Settings that a source states otherwise (preset {outcome.scale.presets[experiment.size]}); - where it states "
+        f"nothing:\n\n{markdown_table(DIFFERENCE_HEADINGS, settings(outcome))}\n{columns}\n\n## How it was made\n\n"
         f"    {command}\n\nCommit {where['commit']}; {machine}.\n"
     )
 
@@ -163,6 +188,7 @@ def as_json(outcome: Outcome, command: str) -> dict[str, Any]:
         "seeds": outcome.seeds,
         "command": command,
         "differs": what_differs(outcome),
+        "settings": [asdict(each) for each in differences(outcome.experiment, outcome.scale)],
         **environment(),
         "table": found,
         "curves": outcome.curves,

@@ -1,4 +1,4 @@
-"""How large an experiment is run: smoke, small or paper."""
+"""How large an experiment is run: smoke, small, gpu or paper."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.experiments.tables import Cell, Experiment
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering.hierarchical import Hierarchical
 
 __all__ = ["SCALES", "Scale"]
 
@@ -33,7 +35,11 @@ class Scale:
         evaluated: objects a class and split; None for all.
         most_seeds: of a table; None for as many as the paper has.
         changes: of the preset, by dotted names, before a method is chosen.
+        learned: likewise of learned initialisations, after the method is chosen.
+        learned_target: their field; "nerf" where None.
         fine_tuning: rays, optimiser and rates of the gradient steps on an object.
+        scratch: the same of a field from random weights.
+        bounds: the sphere of every scene; what the files say or the masks show where None.
         shown: numbers of support views, where a table has rows of several; None for all of them.
         packaged: with the rows of models that come with the package.
     """
@@ -52,7 +58,11 @@ class Scale:
     evaluated: int | None
     most_seeds: int | None
     changes: Mapping[str, object] = field(default_factory=dict)
+    learned: Mapping[str, object] = field(default_factory=dict)
+    learned_target: str | None = None
     fine_tuning: FineTuning = field(default_factory=FineTuning)
+    scratch: FineTuning = field(default_factory=FineTuning)
+    bounds: Sphere | None = None
     shown: tuple[int, ...] | None = None
     packaged: bool = True
 
@@ -93,6 +103,28 @@ class Scale:
             return name
         return f"{match[1]}_{min(int(match[2]), self.tuning)}"
 
+
+PUBLISHED_BOUNDS = Sphere((0.0, 0.0, 0.0), 2.0)
+"""Near 2 and far 6 of cameras at a distance of 4, as learnit and the authors have them (`published.LEARNIT`)."""
+
+AUTHORS_FINE_TUNING = FineTuning(
+    "hypernetwork", 512, "adam", learning_rate=1e-4, final_rate_factor=1.0, betas=(0.9, 0.999), mask_views=False
+)
+"""The hypernetwork with the target frozen, as the paper says, by the steps of the authors' code (`published.CODE`)."""
+
+NERF_TRAINING = FineTuning(
+    "weights", 4096, "adam", learning_rate=5e-4, final_rate_factor=0.1, decay="exponential", betas=(0.9, 0.999)
+)
+"""NeRF's own (Mildenhall et al. 2020, section 5.3): 4,096 rays, Adam at 5e-4 that falls exponentially to 5e-5."""
+
+LEARNIT = {
+    "model.network.depth": 5,
+    "model.network.point_frequencies": 20,
+    "model.coarse_network": False,
+    "model.sampling": Hierarchical(128, 0),
+    "training.steps": 100_000,
+}
+"""One network of five hidden layers and an output layer, 128 samples, 100,000 iterations (`published.LEARNIT`)."""
 
 SCALES: dict[str, Scale] = {
     each.name: each
@@ -159,8 +191,34 @@ SCALES: dict[str, Scale] = {
                 "training.evaluate_every": 50,
                 "training.checkpoint_every": 1000,
             },
-            FineTuning(rays=128),
+            fine_tuning=FineTuning(rays=128),
+            scratch=FineTuning(rays=128),
             shown=(1, 25),
+        ),
+        Scale(
+            "gpu",
+            "all ten in about a day on one card: data sets as they were published, samples in the visual hull alone",
+            {128: "paper-128", 200: "paper-200"},
+            "fast",
+            None,
+            0,
+            0,
+            50,
+            5000,
+            None,
+            10_000,
+            5,
+            1,
+            {"training.evaluate_every": 500, "training.checkpoint_every": 1000},
+            learned={
+                "model.network.depth": 5,
+                "model.network.point_frequencies": 20,
+                "model.coarse_network": False,
+                "training.steps": 2000,
+            },
+            learned_target="simplified_nerf",
+            fine_tuning=AUTHORS_FINE_TUNING,
+            scratch=NERF_TRAINING,
         ),
         Scale(
             "paper",
@@ -176,6 +234,11 @@ SCALES: dict[str, Scale] = {
             None,
             None,
             None,
+            learned=LEARNIT,
+            learned_target="simplified_nerf",
+            fine_tuning=AUTHORS_FINE_TUNING,
+            scratch=NERF_TRAINING,
+            bounds=PUBLISHED_BOUNDS,
         ),
     )
 }

@@ -85,6 +85,7 @@ class Experiment:
         notes: what the paper says in words, leaves open or says twice.
         objects: evaluated a class; None for all.
         published_rows: headings of the paper's rows by ours, where ours say more.
+        pictures: rows of which a view is shown by every method, beside the truth; none where empty.
     """
 
     name: str
@@ -99,16 +100,18 @@ class Experiment:
     notes: tuple[str, ...] = ()
     objects: int | None = None
     published_rows: Mapping[str, str] = field(default_factory=dict)
+    pictures: tuple[str, ...] = ()
 
     def published_value(self, row: str, column: str) -> float | None:
         """The paper's number beside a cell; None where it has none."""
-        return None if self.published is None else self.published.value(self._published_row(row), column)
+        return None if self.published is None else self.published.value(self.published_row(row), column)
 
     def published_deviation(self, row: str, column: str) -> float | None:
         """Its standard deviation; None where the paper has none."""
-        return None if self.published is None else self.published.deviation(self._published_row(row), column)
+        return None if self.published is None else self.published.deviation(self.published_row(row), column)
 
-    def _published_row(self, row: str) -> str:
+    def published_row(self, row: str) -> str:
+        """The heading of the paper's row beside ours; empty where it has none."""
         return self.published_rows.get(row, "") if self.published_rows else row
 
     @property
@@ -311,7 +314,9 @@ def _single_class() -> Experiment:
         (
             "On training objects the paper prints one number for 0, 10 and 100 steps; here they are fine-tuned.",
             f"{WHOLE}: not in the paper.",
+            "pictures.png shows what fig:reconstruction, fig:reconstruction_big and fig:fine_tuning do.",
         ),
+        pictures=("Test Cars", "Test Chairs", "Test Planes"),
     )
 
 

@@ -7,6 +7,7 @@ from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.image_based import ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.fields.multiplane import MultiPlaneNeRF, PointMultiPlaneNeRF
 from hyperplanes.fields.nerf import NeRF
+from hyperplanes.fields.simplified import SimplifiedNeRF
 from hyperplanes.utilities.entry_points import load_entries
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "MultiPlaneNeRF",
     "NeRF",
     "PointMultiPlaneNeRF",
+    "SimplifiedNeRF",
     "Target",
     "TargetConfig",
     "find_targets",
@@ -27,6 +29,7 @@ TARGETS: dict[str, type[Target]] = {
     "multiplane": MultiPlaneNeRF,
     "point_multiplane": PointMultiPlaneNeRF,
     "image_based": ImageBasedNeRF,
+    "simplified_nerf": SimplifiedNeRF,
 }
 
 

@@ -7,10 +7,11 @@ import torch
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data.devices import TasksOnDevice
-from hyperplanes.data.support import Inputs, Shown, SingleView, WithSupport
+from hyperplanes.data.support import Inputs, Shown, SingleView, WithBounds, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
+from hyperplanes.geometry.rays import Sphere
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import TrainingConfig, train
 from hyperplanes.views import class_of
@@ -29,6 +30,16 @@ def test_the_support_is_its_first_views_and_then_those_of_the_query(count):
     assert torch.equal(after.support.masks, masks[:count])
     assert torch.equal(after.query.images, before.query.images)
     assert WithSupport(data, count).names("train") == data.names("train")
+
+
+def test_a_sphere_of_radius_2_seen_from_4_is_near_2_and_far_6():
+    # near and far of learnit and of the authors' code, for every ray, whatever the masks show
+    data = WithBounds(Balls(), Sphere((0.0, 0.0, 0.0), 2.0))
+    for views in (data.task("train1").support, data.task("train1").query):
+        distance = centres(views.cameras).norm(dim=1)
+        rays = views.rays(0, span="constant")
+        torch.testing.assert_close(rays.near, (distance[0] - 2).expand_as(rays.near))
+        torch.testing.assert_close(rays.far, (distance[0] + 2).expand_as(rays.far))
 
 
 def test_more_views_than_there_are_and_none_are_refused():

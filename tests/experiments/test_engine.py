@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -89,6 +90,33 @@ def test_a_cell_is_the_evaluation_of_its_checkpoint(out, cars, given):
     score = evaluate("hyperplanes", adapter, data, data.names("test")[:1])
     assert table["PSNR"]["NeRF"]["value"] == pytest.approx(score.mean("psnr"), abs=1e-4)
     assert table["SSIM"]["NeRF"]["value"] == pytest.approx(score.mean("ssim"), abs=1e-4)
+
+
+def test_what_a_cell_fine_tunes_is_what_its_column_says(out, cars, given):
+    """The paper's columns freeze theta and tune the hypernetwork; the last one tunes all weights."""
+    main(["reproduce", "single-class", "--scale", "smoke", "--out", str(out), *given])
+    row = json.loads((out / "single-class" / "results.json").read_text())["table"]["Test Cars"]
+    (folder,) = {
+        path.parent
+        for path in (out / "trainings").glob("car-*-hyperplanes-0-*/model.json")
+        if json.loads(path.read_text())["hypernetwork"]["views"] == 4
+    }
+    data = WithSupport(open_dataset(cars), 4)
+    for column, trainable in (("HyperPlanes-100", "hypernetwork"), ("HyperPlanes-100, all weights", "weights")):
+        settings = replace(SCALES["smoke"].fine_tuning, trainable=trainable)
+        adapter = make_method("hyperplanes_2", {"hyperplanes": folder}, settings=settings)
+        score = evaluate("hyperplanes_2", adapter, data, data.names("test")[:1])
+        assert row[column]["value"] == pytest.approx(score.mean("psnr"), abs=1e-4)
+    values = [row[column]["value"] for column in row if column.startswith("HyperPlanes")]
+    assert len(set(values)) == len(values) - 1  # 10 and 100 steps are both 2 at this scale
+
+
+def test_every_row_of_an_ablation_is_another_model(out, given):
+    for name in ("target", "layers", "inputs"):
+        main(["reproduce", name, "--scale", "smoke", "--out", str(out), *given])
+        table = json.loads((out / name / "results.json").read_text())["table"]
+        values = [cell["value"] for row in table.values() for cell in row.values()]
+        assert len(set(values)) == len(values), name
 
 
 def test_seeds_are_of_trainings(out, given):

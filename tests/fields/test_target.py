@@ -2,6 +2,8 @@
 nothing, permuted planes with permuted first weights are the same field).
 """
 
+import math
+
 import pytest
 import torch
 
@@ -35,7 +37,7 @@ def make(name="point_multiplane", config=SMALL, seed=0):
     return TARGETS[name](config)
 
 
-@pytest.fixture(params=[name for name, kind in TARGETS.items() if not kind.permutation_invariant])
+@pytest.fixture(params=["nerf", "multiplane", "point_multiplane"])
 def target(request):
     return make(request.param)
 
@@ -246,3 +248,25 @@ def test_a_hidden_plane_is_five_zeros():
 def test_an_abstract_target_says_so():
     with pytest.raises(TypeError, match="Target does not say what it reads"):
         Target(SMALL)
+
+
+@torch.no_grad()
+def test_the_simplified_nerf_is_its_formula_point_by_point():
+    # tancik/learnit: sines and cosines at 2 ** linspace(0, 8, L), layers without a skip connection, ReLU of the density
+    config = TargetConfig(depth=3, width=8, point_frequencies=4)
+    network, bounds = make("simplified_nerf", config).double(), Sphere((0.1, 0.0, -0.2), 2.0)
+    parameters, (points, directions) = Parameters.of(network), queries(dtype=torch.float64)
+    colour, density = network.bind(parameters, None, bounds)(points, directions)
+    for index, point in enumerate(points):
+        here = [float(value) - centre for value, centre in zip(point, bounds.centre, strict=True)]
+        angles = [value * 2 ** (8 * step / 3) for step in range(4) for value in here]
+        value = torch.tensor([*map(math.sin, angles), *map(math.cos, angles)], dtype=torch.float64)
+        for layer in range(3):
+            value = (parameters[f"layers.{layer}.weight"] @ value + parameters[f"layers.{layer}.bias"]).clamp_min(0)
+        expected = torch.sigmoid(parameters["colour.weight"] @ value + parameters["colour.bias"])
+        torch.testing.assert_close(colour[index], expected)
+        thick = (parameters["density.weight"] @ value + parameters["density.bias"])[0].clamp_min(0)
+        torch.testing.assert_close(density[index], thick)
+    assert (density > 0).any()
+    along = network.bind(parameters, None, bounds).colours_along(torch.ones(1, 8).double(), directions)
+    assert along.shape == (1, len(directions), 3)
