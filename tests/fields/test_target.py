@@ -255,6 +255,7 @@ def test_the_simplified_nerf_is_its_formula_point_by_point():
     # tancik/learnit: sines and cosines at 2 ** linspace(0, 8, L), layers without a skip connection, ReLU of the density
     config = TargetConfig(depth=3, width=8, point_frequencies=4)
     network, bounds = make("simplified_nerf", config).double(), Sphere((0.1, 0.0, -0.2), 2.0)
+    torch.nn.init.ones_(network.density.bias)  # so that not all of it is cut off
     parameters, (points, directions) = Parameters.of(network), queries(dtype=torch.float64)
     colour, density = network.bind(parameters, None, bounds)(points, directions)
     for index, point in enumerate(points):
