@@ -57,6 +57,7 @@ class Arguments:
         scale: How large.
         out: The folder for data, trainings, evaluations and tables, shared by all of them.
         data: Data sets by class, such as car=FOLDER, in any layout; what is not given is generated.
+        only: Rows and columns by their headings, such as Cars; all where empty.
         seeds: Other than the scale's: seeds of trainings and of the fine-tuning of their evaluations.
         legacy: Read the principal points of published data at W / 2 at integer pixel centres, as the code published
             with them has it.
@@ -68,6 +69,7 @@ class Arguments:
     scale: Literal["smoke", "small", "gpu", "paper"] = "small"
     out: Path = Path("runs/reproduce")
     data: tuple[str, ...] = ()
+    only: tuple[str, ...] = ()
     seeds: OptionalInt = None
     legacy: bool = False
     estimate: bool = False
@@ -110,7 +112,7 @@ def run(arguments: Arguments) -> int:
 
     console, device = Console(), choose_device(arguments.device)
     scale = SCALES[arguments.scale]
-    experiment = scale.applied(EXPERIMENTS[arguments.name])
+    experiment = scale.applied(EXPERIMENTS[arguments.name]).of(arguments.only)
     seeds = scale.seeds(experiment) if arguments.seeds is None else arguments.seeds
     if seeds < 1:
         raise ValueError(f"--seeds: expected at least 1, got {seeds}")
@@ -161,7 +163,9 @@ def run(arguments: Arguments) -> int:
 def _command(arguments: Arguments, seeds: int) -> str:
     data = f" --data {' '.join(arguments.data)}" if arguments.data else ""
     legacy = " --legacy" if arguments.legacy else ""
-    return f"hyperplanes reproduce {arguments.name} --scale {arguments.scale} --seeds {seeds}{legacy}{data}"
+    only = "".join(f" {each!r}" if " " in each else f" {each}" for each in arguments.only)
+    only = f" --only{only}" if only else ""
+    return f"hyperplanes reproduce {arguments.name} --scale {arguments.scale} --seeds {seeds}{only}{legacy}{data}"
 
 
 def _generate(class_name: str, folder: Path, scale: Scale) -> None:

@@ -194,25 +194,29 @@ class Runner:
         return WithSupport(self.tasks(trained.on), chosen.model.network.planes)
 
     def score(self, experiment: Experiment, cell: Cell, checkpoint: Path, seed: int) -> Score:
-        """The evaluation of a cell with one seed."""
-        method = self.scale.method(cell.method)
-        names = self.names(cell.on, cell.split, experiment.objects)
-        settings = {
-            "checkpoint": checkpoint.name,
-            "method": method,
-            "on": str(self.folder(cell.on)) if cell.on in self.given else self.folder(cell.on).name,
-            "objects": names,
-            "free": cell.free if method != cell.trained.method else "",
-            "seed": seed,
-            "views": self._views(cell, checkpoint),
-            "fine_tuning": stated(self.fine_tuning(cell)),
-            **self._reading,
-        }
-        path = self.out / "evaluations" / f"{_name(f'{self.folder(cell.on).name}-{method}-{seed}', settings)}.json"
-        if not path.exists():
-            score = self._evaluate(experiment, cell, method, checkpoint, names, seed)
-            write_json(path, {"settings": settings, "score": score.as_json()})
-        return Score.of_json(method, read_json(path)["score"])
+        """The evaluation of a cell with one seed, kept object by object."""
+        method, made = self.scale.method(cell.method), None
+        objects: list[ObjectScore] = []
+        for name in self.names(cell.on, cell.split, experiment.objects):
+            settings = {
+                "checkpoint": checkpoint.name,
+                "method": method,
+                "on": str(self.folder(cell.on)) if cell.on in self.given else self.folder(cell.on).name,
+                "object": name,
+                "free": cell.free if method != cell.trained.method else "",
+                "seed": seed,
+                "views": self._views(cell, checkpoint),
+                "fine_tuning": stated(self.fine_tuning(cell)),
+                **self._reading,
+            }
+            path = self.out / "evaluations" / f"{_name(f'{self.folder(cell.on).name}-{method}-{seed}', settings)}.json"
+            if not path.exists():
+                made = made or self._method(experiment, cell, method, checkpoint, seed)
+                score = evaluate(method, *made, [name])
+                self.say(f"{cell.row}, {cell.column}, seed {seed}: {name} {score.mean('psnr'):.2f} dB")
+                write_json(path, {"settings": settings, "score": score.as_json()})
+            objects += Score.of_json(method, read_json(path)["score"]).objects
+        return Score(method, tuple(objects))
 
     def picture(self, experiment: Experiment, cell: Cell, seed: int = 0) -> tuple[Tensor, Tensor]:
         """The first query view of the first object of a cell: the truth, and what the method shows; (3, h, w)."""
@@ -221,17 +225,6 @@ class Runner:
         task = tasks.task(self.names(cell.on, cell.split, experiment.objects)[0])
         query = task.query[:1]
         return query.images[0], adapter.adapt(task.support).render(query.cameras).images[0].clamp(0, 1)
-
-    def _evaluate(
-        self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, names: list[str], seed: int
-    ) -> Score:
-        adapter, tasks = self._method(experiment, cell, method, checkpoint, seed)
-        heading = f"{cell.row}, {cell.column}, seed {seed}"
-
-        def show(score: ObjectScore, *_: Any) -> None:
-            self.say(f"{heading}: {score.name} {score.psnr:.2f} dB")
-
-        return evaluate(method, adapter, tasks, names, show)
 
     def _method(
         self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, seed: int

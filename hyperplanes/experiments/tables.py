@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from hyperplanes.experiments.published import CROSS, SHAPENET, SINGLE, TARGET, TIME, PublishedTable
@@ -101,6 +101,27 @@ class Experiment:
     objects: int | None = None
     published_rows: Mapping[str, str] = field(default_factory=dict)
     pictures: tuple[str, ...] = ()
+
+    def of(self, headings: Sequence[str]) -> Experiment:
+        """The same with some rows and columns alone; all of them where no heading is given.
+
+        Args:
+            headings: of rows, columns or both.
+
+        Returns:
+            The cells whose row or column, or of headings of both kinds whose row and column, are among them.
+
+        Raises:
+            ValueError: a heading that the table has not.
+        """
+        known = [*self.rows, *self.columns]
+        if unknown := [each for each in headings if each not in known]:
+            listed = ", ".join(map(repr, known))
+            raise ValueError(f"--only: expected headings of {self.name}, {listed}, got {unknown[0]!r}")
+        rows = [each for each in headings if each in self.rows] or self.rows
+        columns = [each for each in headings if each in self.columns] or self.columns
+        kept = tuple(cell for cell in self.cells if cell.row in rows and cell.column in columns)
+        return replace(self, cells=kept, pictures=tuple(each for each in self.pictures if each in rows))
 
     def published_value(self, row: str, column: str) -> float | None:
         """The paper's number beside a cell; None where it has none."""

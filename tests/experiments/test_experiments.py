@@ -205,6 +205,16 @@ def test_the_ablations_change_what_they_name():
     ]
 
 
+def test_some_rows_and_columns_of_a_table():
+    shapenet = EXPERIMENTS["shapenet"]
+    assert shapenet.of(()) == shapenet
+    one = shapenet.of(["Cars", "Standard, 1 view", "MV Meta, 1 view"])
+    assert (one.rows, one.columns) == (["Standard, 1 view", "MV Meta, 1 view"], ["Cars"])
+    assert [each.on for each in shapenet.of(["Lamps"]).trainings] == ["lamp"] * len(shapenet.of(["Lamps"]).trainings)
+    with pytest.raises(ValueError, match="--only: expected headings of shapenet, .*'Cars', 'Lamps', got 'Boats'"):
+        shapenet.of(["Boats"])
+
+
 def test_scales_make_things_smaller_and_say_so():
     smoke, small, paper = SCALES["smoke"], SCALES["small"], SCALES["paper"]
     assert [scale.method("hyperplanes_100") for scale in (smoke, small)] == ["hyperplanes_2", "hyperplanes_100"]
