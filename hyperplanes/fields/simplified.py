@@ -32,12 +32,10 @@ class SimplifiedNeRF(NeRF):
         super().__init__(config)
         width = config.width
         self.skip = 0
-        self.layers = nn.ModuleList(
-            nn.Linear(self.input_size if index == 0 else width, width) for index in range(config.depth)
-        )
+        layers = [nn.Linear(self.input_size if index == 0 else width, width) for index in range(config.depth)]
         del self.feature, self.view
-        self.colour = nn.Linear(width, 3)
-        for layer in (*self.layers, self.colour):
+        self.layers, self.colour = nn.ModuleList(layers), nn.Linear(width, 3)
+        for layer in (*layers, self.colour):
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
         nn.init.zeros_(self.density.bias)
