@@ -69,10 +69,13 @@ class SimplifiedField(MLPField):
         self, hidden: Float[Tensor, "point width"], directions: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point 3"]:
         """The same from every direction."""
-        return torch.sigmoid(self.layer("colour", hidden))
+        return self._colour(hidden)
 
     def colours_along(
         self, hidden: Float[Tensor, "point width"], directions: Float[Tensor, "direction 3"]
     ) -> Float[Tensor, "point direction 3"]:
         """The same along every direction."""
-        return self.colour_of(hidden, directions)[:, None].expand(-1, len(directions), -1)
+        return self._colour(hidden)[:, None].expand(-1, len(directions), -1)
+
+    def _colour(self, hidden: Float[Tensor, "point width"]) -> Float[Tensor, "point 3"]:
+        return torch.sigmoid(self.layer("colour", hidden))
