@@ -29,7 +29,7 @@ from hyperplanes.geometry.rays import cast, pixel_grid
 from hyperplanes.rendering.compositing import composite_packed, packed_weights
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.marching import march
-from hyperplanes.rendering.renderer import Hierarchical, Marched, render
+from hyperplanes.rendering.renderer import Hierarchical, RayMarching, render
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task, Views
 
@@ -92,7 +92,7 @@ def paper_view(adapted: AdaptedField, query: Views, view: int) -> tuple[float, f
     total = height * width
     chosen = torch.arange(0, total, max(1, total // RAYS_OF_A_LARGE_VIEW) if total > 128 * 128 else 1)
     pixels = pixel_grid(height, width)[chosen]
-    rays = cast(query.cameras, torch.full_like(chosen, view), pixels, query.bounds, span=PAPER.span)
+    rays = cast(query.cameras, torch.full_like(chosen, view), pixels, query.bounds, near_far=PAPER.near_far)
     seconds, seen = timed(lambda: render(adapted.field, rays, PAPER, proposal=adapted.proposal, differentiable=False))
     truth = query.images[view].flatten(1).T[chosen]
     ours = adapted.render(camera.select(query.cameras, [view])).images[0].flatten(1).T[chosen]
@@ -166,7 +166,7 @@ def parts(model: HyperPlanes, task: Task) -> list[Row]:
     adapted = model.adapt(task.support)
     occupancy, query = adapted.refined_occupancy, task.query
     field, sampling = adapted.field, adapted.sampling
-    if not isinstance(field, Field) or not isinstance(sampling, Marched):
+    if not isinstance(field, Field) or not isinstance(sampling, RayMarching):
         return []
     one = camera.select(query.cameras, [3])
     with torch.no_grad():

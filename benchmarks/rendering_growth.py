@@ -14,7 +14,7 @@ from benchmarks.reporting import Row
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.rendering.renderer import Marched
+from hyperplanes.rendering.renderer import RayMarching
 
 __all__ = ["growth", "plot_growth"]
 
@@ -30,16 +30,22 @@ def growth(model: HyperPlanes, quick: bool) -> list[Row]:
     device = model.rig.device
     task = held_out(1, 128, device=device)[0]
     adapted, one = model.adapt(task.support), camera.select(task.query.cameras, [3])
-    settings: list[tuple[str, int, AdaptedField, PinholeCamera, Marched]] = []
-    settings += [("pixels", n, adapted, camera.resized(one, n, n), Marched()) for n in sizes]
-    settings += [("steps", n, adapted, one, Marched(n)) for n in steps]
+    settings: list[tuple[str, int, AdaptedField, PinholeCamera, RayMarching]] = []
+    settings += [("pixels", n, adapted, camera.resized(one, n, n), RayMarching()) for n in sizes]
+    settings += [("steps", n, adapted, one, RayMarching(n)) for n in steps]
     for count in counts:
         config = ModelConfig(network=replace(model.config.network, planes=count), hypernetwork=None)
         untrained = HyperPlanes(config).to(device)
         support = held_out(1, 128, 2 * count, device)[0].support
         untrained.set_rig(support)
         settings.append(
-            ("planes", count, replace(untrained.adapt(support), occupancy=adapted.refined_occupancy), one, Marched())
+            (
+                "planes",
+                count,
+                replace(untrained.adapt(support), occupancy=adapted.refined_occupancy),
+                one,
+                RayMarching(),
+            )
         )
     for axis, value, field, cameras, sampling in settings:
         _ = field.refined_occupancy

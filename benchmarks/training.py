@@ -20,7 +20,7 @@ from benchmarks.objects import held_out
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.presets import Preset, preset
-from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.training import Trainer
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task
@@ -69,7 +69,7 @@ def main(arguments: list[str]) -> int:
             plot(rows, options.plot)
         return finish("training", rows, options.json)
     for name in ("quick",) if options.quick else ("quick", "small-paper", "paper-128"):
-        chosen = preset(name).by_protocol("fast")
+        chosen = preset(name).by_protocol("ray_marching")
         tasks = held_out(2 + UNSEEN, chosen.resolution, device=options.device)
         rows += compare(name, chosen, Objects(tasks), 3 if options.quick else 8)
     return finish("training", rows, options.json)
@@ -137,7 +137,7 @@ def unseen_psnr(trained: Trainer, objects: Objects) -> float:
     for name in objects.names("test"):
         task = objects.task(name)
         query = task.query[3::8]
-        pictures = trained.model.adapt(task.support).render(query.cameras, Marched())
+        pictures = trained.model.adapt(task.support).render(query.cameras, RayMarching())
         found.append(psnr(pictures.images.clamp(0, 1), query.images))
     return float(torch.cat(found).mean())
 

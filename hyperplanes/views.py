@@ -134,11 +134,11 @@ class Views:
         views.__dict__.update({**self.__dict__, **changes})
         return views
 
-    def rays(self, view: int, *, span: str = "sphere") -> Rays:
+    def rays(self, view: int, *, near_far: str = "sphere") -> Rays:
         """The rays through all pixels of one view, row by row."""
         pixels = pixel_grid(*self.size, device=self.images.device)
         index = torch.full((len(pixels),), view, dtype=torch.long, device=pixels.device)
-        return cast(self.cameras, index, pixels, self.bounds, span=span)
+        return cast(self.cameras, index, pixels, self.bounds, near_far=near_far)
 
     def sample_rays(
         self,
@@ -146,7 +146,7 @@ class Views:
         *,
         generator: torch.Generator | None = None,
         among: Int[Tensor, " pixel"] | None = None,
-        span: str = "sphere",
+        near_far: str = "sphere",
     ) -> tuple[Rays, Float[Tensor, "ray 3"]]:
         """Rays through pixels drawn uniformly from all views, and the colours seen there.
 
@@ -154,12 +154,12 @@ class Views:
             count: how many, drawn with replacement.
             generator: where the randomness comes from; on the CPU, so that every device draws the same.
             among: flat indices (view, row, column) of the pixels to draw from; all where absent.
-            span: as in `geometry.cast`.
+            near_far: as in `geometry.cast`.
 
         Returns:
             The rays and their true colours. No pixel to draw from raises ValueError.
         """
-        return self.sample_masked_rays(count, generator=generator, among=among, span=span)[:2]
+        return self.sample_masked_rays(count, generator=generator, among=among, near_far=near_far)[:2]
 
     def sample_masked_rays(
         self,
@@ -167,7 +167,7 @@ class Views:
         *,
         generator: torch.Generator | None = None,
         among: Int[Tensor, " pixel"] | None = None,
-        span: str = "sphere",
+        near_far: str = "sphere",
     ) -> tuple[Rays, Float[Tensor, "ray 3"], Float[Tensor, "ray 1"]]:
         """As `sample_rays`, with the opacity of the masks there; 1 without masks."""
         if not isinstance(count, int) or count < 1:
@@ -180,7 +180,7 @@ class Views:
         flat = flat if among is None else among[flat]
         view, pixel = flat // (height * width), flat % (height * width)
         row, column = pixel // width, pixel % width
-        rays = cast(self.cameras, view, torch.stack([column, row], -1).to(self.images), self.bounds, span=span)
+        rays = cast(self.cameras, view, torch.stack([column, row], -1).to(self.images), self.bounds, near_far=near_far)
         colours = self.images[view, :, row, column]
         return (
             rays,

@@ -12,7 +12,7 @@ from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import fibonacci_sphere, look_at, pinhole, symmetric_intrinsics
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
-from hyperplanes.rendering import Marched
+from hyperplanes.rendering import RayMarching
 from hyperplanes.views import Task, Views
 
 
@@ -126,7 +126,7 @@ def small_model(**changes):
     parts = {
         "network": TargetConfig(depth=2, width=24, planes=4, point_frequencies=3, direction_frequencies=1),
         "hypernetwork": ImageHyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16),
-        "sampling": Marched(24),
+        "sampling": RayMarching(24),
         "hull_resolution": 16,
     }
     model = HyperPlanes(ModelConfig(**{**parts, **changes}))

@@ -135,7 +135,7 @@ def test_rays_meet_the_bounding_sphere():
     assert rays.near[0].item() == pytest.approx(2, abs=1e-5)
     assert rays.far[0].item() == pytest.approx(4, abs=1e-5)
     assert rays.near[1] == rays.far[1]
-    whole = cast(ours, torch.zeros(2, dtype=torch.long), pixels, Sphere(radius=0.5), span="constant")
+    whole = cast(ours, torch.zeros(2, dtype=torch.long), pixels, Sphere(radius=0.5), near_far="constant")
     assert whole.near.tolist() == pytest.approx([2.5, 2.5])
     assert whole.far.tolist() == pytest.approx([3.5, 3.5])
 

@@ -62,10 +62,10 @@ def test_rays_go_row_by_row_through_the_pixels_of_one_view():
     torch.testing.assert_close(pixel.flatten(), torch.tensor([7.0, 4.0]), atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("span", ["sphere", "constant"])
-def test_sampled_rays_come_with_the_colours_that_their_pixels_show(span):
+@pytest.mark.parametrize("near_far", ["sphere", "constant"])
+def test_sampled_rays_come_with_the_colours_that_their_pixels_show(near_far):
     whole = views()
-    rays, truth = whole.sample_rays(200, generator=torch.Generator().manual_seed(1), span=span)
+    rays, truth = whole.sample_rays(200, generator=torch.Generator().manual_seed(1), near_far=near_far)
     for index in range(200):
         view = int((centres(whole.cameras) - rays.origins[index]).norm(dim=1).argmin())
         point = rays.origins[index] + 3 * rays.directions[index]

@@ -42,13 +42,13 @@ class SupportContext:
     hyperplanes: Int[Tensor, " k"]
     volume: Float[Tensor, "channel x y z"] | None = None
 
-    def hiding(self, views: Int[Tensor, " masked"]) -> SupportContext:
+    def mask_views(self, views: Int[Tensor, " masked"]) -> SupportContext:
         """The same object, of which some views show the field nothing.
 
         Args:
             views: their indices.
         """
-        return self if self.planes is None else replace(self, planes=self.planes.hiding(views))
+        return self if self.planes is None else replace(self, planes=self.planes.mask_views(views))
 
 
 def arrange(support: Views, target: Target, rig: Rig) -> Views:
@@ -96,7 +96,7 @@ def prepare_context(
     # what the field looks colours up in
     planes = target.planes_of(views, occupancy)
     if masks_repeated and len(support) < len(views):
-        planes = planes.hiding(rig.repeated(support).to(device))
+        planes = planes.mask_views(rig.repeated(support).to(device))
 
     # what the hypernetwork reads: a volume of all views, or images of some of them
     if reads_volume:

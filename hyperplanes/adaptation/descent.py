@@ -118,7 +118,7 @@ class Descent:
                 # the field of the variables as they are now, and how far its rays are from the truth
                 field = self.field(masked)
                 rays, truth = views.sample_rays(
-                    settings.rays, generator=generator, among=among, span=field.sampling.span
+                    settings.rays, generator=generator, among=among, near_far=field.sampling.near_far
                 )
                 loss = ray_loss(field.trace(rays, generator), truth)
                 # one step of every optimiser, at the rate of the schedule
@@ -150,8 +150,8 @@ class Descent:
         longest = self.settings.max_steps
         generator = torch.Generator().manual_seed(self.settings.seed + 1)
         with torch.no_grad():
-            span = self.field(None).sampling.span
-            rays, truth = holdout.sample_rays(HOLDOUT_RAYS, generator=generator, among=pixels, span=span)
+            near_far = self.field(None).sampling.near_far
+            rays, truth = holdout.sample_rays(HOLDOUT_RAYS, generator=generator, among=pixels, near_far=near_far)
         errors: dict[int, float] = {}
         every = max(1, longest // CHECKS)
 

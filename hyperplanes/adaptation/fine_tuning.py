@@ -116,7 +116,7 @@ def make_descent(
     shown = network.second_pass(context, variables.weights()) if start is None else context
 
     def field(masked: Tensor | None) -> AdaptedField:
-        return network.field(shown if masked is None else shown.hiding(masked), variables.weights())
+        return network.field(shown if masked is None else shown.mask_views(masked), variables.weights())
 
     pixels, masks_views = network.live_pixels_of(context, views), network.target.permutation_invariant
     return Descent(field, variables.tensors, views, settings, pixels, masks_views), variables

@@ -12,7 +12,7 @@ from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.rendering.renderer import Marched
+from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.views import Views
 
 __all__ = ["HullBlend"]
@@ -53,7 +53,7 @@ class HullBlend:
             raise ValueError("hull_blend: expected support views with masks, got none; images with alpha have them")
         support, alpha = support.to(dtype=torch.float32), support.masks.float()
         masks = ImagePlanes(alpha.expand(-1, 3, -1, -1), support.cameras, background=1.0)
-        region, sampling = hull(support, self.side), Marched(self.steps)
+        region, sampling = hull(support, self.side), RayMarching(self.steps)
         shape = _Hull(masks, support.bounds)
         solid = AdaptedField(shape, region, sampling, densities=(shape.density,))
         distance = solid.render(support.cameras).depth

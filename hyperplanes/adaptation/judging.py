@@ -6,7 +6,7 @@ import torch
 
 from hyperplanes.adaptation.context import SupportContext, live_pixels
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
-from hyperplanes.fields.rig import standpoints
+from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.renderer import render
@@ -40,7 +40,7 @@ def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
     """
     if len(support) < FEWEST:
         return STRENGTHS[0]
-    standing = standpoints(support).cpu()
+    standing = camera_directions(support).cpu()
     order = farthest_first(standing, int((standing @ standing.mean(0)).argmin()), len(support))
     shown, judged = support[sorted(order[:-LEFT_OUT])], support[order[-LEFT_OUT:]]
     context = network.prepare(shown)
@@ -50,7 +50,7 @@ def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
         RAYS,
         generator=torch.Generator().manual_seed(0),
         among=live_pixels(context.occupancy, judged),
-        span=fields[0].sampling.span,
+        near_far=fields[0].sampling.near_far,
     )
     seen = [render(each.field, rays, each.sampling, occupancy=each.occupancy, differentiable=False) for each in fields]
     errors = [float((each.colour - truth).square().mean()) for each in seen]

@@ -24,7 +24,7 @@ class _Copies:
         Its mask is the opacity; without masks all that is in a picture counts as there. Depth is not known: 0.
         """
         known, asked = (
-            camera.standpoints(each, self.support.bounds.centre).to(self.support.images)
+            camera.camera_directions(each, self.support.bounds.centre).to(self.support.images)
             for each in (self.support.cameras, cameras)
         )
         nearest = (asked @ known.T).argmax(1)

@@ -14,7 +14,7 @@ from hyperplanes.adaptation.context import SupportContext, arrange, live_pixels,
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
-from hyperplanes.fields.rig import Rig, standpoints
+from hyperplanes.fields.rig import Rig, camera_directions
 from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
@@ -75,14 +75,14 @@ class HyperPlanesNetwork(nn.Module):
         return Rig(self.rig, self.config.order)
 
     def set_rig(self, support: Views) -> None:
-        """Take the standpoints of these support views as the order of the planes; some fields have none.
+        """Take the camera directions of these support views as the order of the planes; some fields have none.
 
         Raises:
             ValueError: fewer views than planes.
         """
         if len(support) < len(self.rig):
             raise ValueError(f"support: expected at least {len(self.rig)} views, one a plane, got {len(support)}")
-        self.rig.copy_(standpoints(support)[: len(self.rig)])
+        self.rig.copy_(camera_directions(support)[: len(self.rig)])
 
     def arrange(self, support: Views) -> Views:
         """The support views as the field takes them: one a plane of the rig, or all as they are.

@@ -52,7 +52,7 @@ OptionalInt = Annotated[int | None, optional("INT")]
 OptionalName = Annotated[str | None, optional("NAME")]
 OptionalNumber = Annotated[int | float | None, optional("NUMBER")]
 
-Protocol = Literal["default", "paper", "fast"]
+Protocol = Literal["default", "paper", "ray_marching"]
 """A name in `hyperplanes.configuration.presets.PROTOCOLS`."""
 
 Steps = int | Literal["auto"]

@@ -35,7 +35,8 @@ class Arguments(ObjectArguments):
         orbit: So many pictures evenly around the object, and a turntable, instead of the query poses.
         size: Pixels along the longer side of an orbit's pictures; as the images when not given.
         turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
-        protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or fast.
+        protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
+            marching through what is not empty.
     """
 
     fine_tune: Free = "weights"

@@ -75,8 +75,8 @@ class Arguments:
         support: Support views and ImagePlanes an object; more than there are go on with the query views.
         checkpoint: Weights to begin with instead of random ones: a checkpoint, or a packaged model such as small; for
             mv_matched the checkpoint of mv_meta that it is to match.
-        protocol: How rays are sampled: paper is 64 + 128 times each on every ray, fast only where something is; as the
-            preset says where not given.
+        protocol: How rays are sampled: paper is 64 + 128 times each on every ray, ray_marching only where something is;
+            as the preset says where not given.
         steps: Other than the preset's.
         epochs: Instead of steps: how often each object is drawn, on average.
         seed: Of the first weights and of every draw.

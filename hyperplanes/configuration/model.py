@@ -11,7 +11,7 @@ from hyperplanes.configuration.initialisation import InitialisationConfig
 from hyperplanes.configuration.upgrade import upgrade_model
 from hyperplanes.fields import TargetConfig, find_targets
 from hyperplanes.hypernetwork import KINDS, AutoencoderConfig, HyperNetworkConfig, ImageHyperNetworkConfig
-from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.settings import SettingsError, choose_by_tag, structure, tagged
 
@@ -19,10 +19,10 @@ __all__ = ["ORDERS", "ModelConfig"]
 
 ORDERS = ("matched", "file")
 
-PROTOCOLS = {"hierarchical": Hierarchical, "marched": Marched}
+PROTOCOLS = {"hierarchical": Hierarchical, "ray_marching": RayMarching}
 """Samplers by the entry `protocol`."""
 
-choose_by_tag(Hierarchical | Marched, "protocol", PROTOCOLS)
+choose_by_tag(Hierarchical | RayMarching, "protocol", PROTOCOLS)
 choose_by_tag(HyperNetworkConfig | None, "kind", KINDS)
 
 
@@ -41,8 +41,8 @@ class ModelConfig:
         sampling: how fields are rendered by default, in training too.
         hull_resolution: voxels an axis of the visual hull; at least, where a field of any number of views is shown
             larger pictures, up to 192.
-        order: which support view a plane is: the one "matched" to the standpoint that it had in training, or views in
-            the order of their "file", as the paper takes them.
+        order: which support view a plane is: the one "matched" to its camera direction in training, or views in the
+            order of their "file", as the paper takes them.
         plane_dropout: how likely a step of training hides a plane of an object, for a field that knows planes by their
             places. It learns to do without any of them, and where there are fewer views than planes, each stands at one
             plane and the others are hidden, not filled with views that stand elsewhere.
@@ -59,7 +59,7 @@ class ModelConfig:
     autoencoder: AutoencoderConfig | None = None
     initialisation: InitialisationConfig | None = None
     coarse_network: bool = False
-    sampling: Hierarchical | Marched = field(default_factory=Marched)
+    sampling: Hierarchical | RayMarching = field(default_factory=RayMarching)
     hull_resolution: Annotated[int, range(1, 513)] = 64
     order: str = "matched"
     plane_dropout: float = 0.0

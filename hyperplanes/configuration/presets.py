@@ -10,7 +10,7 @@ from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.configuration.upgrade import TARGETS as FORMER_TARGETS
 from hyperplanes.fields import TARGETS, ImageBasedConfig, TargetConfig, find_targets
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
-from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.utilities.errors import did_you_mean
 
 __all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]
@@ -19,7 +19,11 @@ __all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "con
 PAPER_SAMPLING = Hierarchical(64, 128)
 """The paper's: 64 stratified and 128 importance samples on every ray, no masks (Appendix B)."""
 
-PROTOCOLS: dict[str, Hierarchical | Marched | None] = {"default": None, "paper": PAPER_SAMPLING, "fast": Marched()}
+PROTOCOLS: dict[str, Hierarchical | RayMarching | None] = {
+    "default": None,
+    "paper": PAPER_SAMPLING,
+    "ray_marching": RayMarching(),
+}
 """How fields are sampled: as the preset or the checkpoint says, as the paper does, or packed where something is."""
 
 
@@ -49,7 +53,7 @@ class Preset:
         """The same model sampled by another protocol.
 
         Args:
-            name: of PROTOCOLS; "fast" leaves a preset that is sampled so already as it is.
+            name: of PROTOCOLS; "ray_marching" leaves a preset that is sampled so already as it is.
 
         Returns:
             The preset.
@@ -60,7 +64,7 @@ class Preset:
         if name not in PROTOCOLS:
             raise ValueError(f"protocol: expected one of {', '.join(PROTOCOLS)}, got {name!r}")
         sampling = PROTOCOLS[name]
-        if sampling is None or (name == "fast" and isinstance(self.model.sampling, Marched)):
+        if sampling is None or (name == "ray_marching" and isinstance(self.model.sampling, RayMarching)):
             return self
         return replace(self, model=replace(self.model, sampling=sampling))
 
@@ -163,7 +167,7 @@ PRESETS: dict[str, Preset] = {
         ModelConfig(
             network=TargetConfig(depth=4, width=128, point_frequencies=5, direction_frequencies=2),
             hypernetwork=ALL_LAYERS,
-            sampling=Marched(steps=64),
+            sampling=RayMarching(steps=64),
             hull_resolution=64,
         ),
         TrainingConfig(
@@ -188,7 +192,7 @@ PRESETS: dict[str, Preset] = {
                 depth=4, width=128, planes=8, grid=8, point_frequencies=6, direction_frequencies=2
             ),
             hypernetwork=VolumeHyperNetworkConfig(),
-            sampling=Marched(steps=64),
+            sampling=RayMarching(steps=64),
             hull_resolution=96,
         ),
         TrainingConfig(
@@ -212,7 +216,7 @@ PRESETS: dict[str, Preset] = {
         ModelConfig(
             network=TargetConfig(depth=6, width=192, point_frequencies=6),
             hypernetwork=ALL_LAYERS,
-            sampling=Marched(steps=96),
+            sampling=RayMarching(steps=96),
             hull_resolution=96,
         ),
         TrainingConfig(
@@ -249,7 +253,7 @@ PRESETS: dict[str, Preset] = {
             evaluate_every=200,
         ),
         128,
-        "the paper's 128x128 networks by the fast protocol, half an hour on one core: what the benchmarks render with",
+        "the paper's 128x128 networks by ray marching, half an hour on one core: what the benchmarks render with",
     ),
     "paper-200": Preset(
         ModelConfig(

@@ -46,6 +46,8 @@ def upgrade_model(entries: Any) -> Any:
     if not isinstance(entries, Mapping):
         return entries
     result = {MODEL.get(name, name): value for name, value in entries.items()}
+    if result.get("protocol") == "marched":
+        result["protocol"] = "ray_marching"
     if isinstance(target := result.get("target"), str):
         result["target"] = TARGETS.get(target, target)
     if isinstance(network := result.get("network"), Mapping):

@@ -90,7 +90,7 @@ class Shown(TaskWrapper):
         asked = torch.linspace(0, len(task.query) - 1, min(self.query, len(task.query))).round().long()
         rest = [index for index in range(len(task.query)) if index not in asked.tolist()]
         views = join_views(task.support, task.query[rest])
-        standing = camera.standpoints(views.cameras, views.bounds.centre)
+        standing = camera.camera_directions(views.cameras, views.bounds.centre)
         chosen = farthest_first(standing, 0, min(self.count, len(views)))
         return replace(task, support=views[torch.tensor(chosen)], query=task.query[asked])
 

@@ -8,7 +8,7 @@ from hyperplanes.adaptation.base import Renderable
 from hyperplanes.adaptation.context import observe
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
-from hyperplanes.fields.rig import standpoints
+from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
@@ -17,7 +17,7 @@ __all__ = ["held_out_psnr", "suitability_warnings", "worse_than_copying"]
 
 COVERED = 0.95  # mean opacity above which masks say no more than none
 UNLIKE = 3.0  # deviations of the codes; held-out objects of a trained class have 0.7 to 2, other classes 3.3 to 8
-ELSEWHERE = 30.0  # degrees between standpoints, on average, above which planes stand in for others
+ELSEWHERE = 30.0  # degrees between camera directions, on average, above which planes stand in for others
 HELD_OUT = 4  # left-out views, and pixels along their longer side
 HELD_OUT_SIZE = 64
 
@@ -104,7 +104,7 @@ def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
     with torch.no_grad():
         context, network, angle = model.prepare(shown, carved=False), model.hypernetwork, 0.0
         if len(model.rig):
-            cosine = (standpoints(context.views).to(model.rig) * model.rig).sum(-1)
+            cosine = (camera_directions(context.views).to(model.rig) * model.rig).sum(-1)
             angle = float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).mean())
         codes = None if network is None else network.standardised_codes(observe([context], network.resolution))
     return None if codes is None else float(codes.square().mean().sqrt()), angle

@@ -20,7 +20,7 @@ from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.images import render_images
-from hyperplanes.rendering.renderer import Marched
+from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.rendering.transmittance import transmittance
 from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
 
@@ -47,7 +47,7 @@ class BakedScene:
 
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Pictures:
-        """The pictures of the cameras, by a kernel on a CPU and by `Marched` elsewhere."""
+        """The pictures of the cameras, by a kernel on a CPU and by `RayMarching` elsewhere."""
         bounds = self.field.bounds
         if self.field.index.device.type != "cpu":
             return self.adapted.render(cameras, self.adapted.sampling)
@@ -64,7 +64,7 @@ class BakedScene:
     @cached_property
     def adapted(self) -> AdaptedField:
         """The voxels as any other field of one object."""
-        return AdaptedField(self.field, self.field.occupancy, Marched(self.steps, 1e-3))
+        return AdaptedField(self.field, self.field.occupancy, RayMarching(self.steps, 1e-3))
 
     @cached_property
     def distances(self) -> UInt8[Tensor, "cell_x cell_y cell_z"]:

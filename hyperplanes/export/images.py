@@ -157,16 +157,16 @@ def orbit_cameras(
     if count < 1:
         raise ValueError(f"count: expected at least one camera, got {count}")
     cameras, centre = views.cameras, torch.tensor(views.bounds.centre)
-    standpoints = camera.centres(cameras).cpu().float() - centre
+    positions = camera.centres(cameras).cpu().float() - centre
     up = torch.tensor(upward(cameras))
-    front = standpoints[0] - (standpoints[0] @ up) * up
+    front = positions[0] - (positions[0] @ up) * up
     if float(front.norm()) < 1e-6:
         front = torch.linalg.cross(up, up.roll(1))
     front = front / front.norm()
     side = torch.linalg.cross(up, front)
     angle = torch.arange(count) * (2 * math.pi / count)
     around = angle.cos()[:, None] * front + angle.sin()[:, None] * side
-    distance = float(standpoints.norm(dim=1).median())
+    distance = float(positions.norm(dim=1).median())
     eyes = centre + distance * (math.cos(elevation) * around + math.sin(elevation) * up)
     x, y, z = up.tolist()
     pose = camera.look_at(eyes, views.bounds.centre, (x, y, z)).to(cameras.extrinsics)

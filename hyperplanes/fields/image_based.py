@@ -19,7 +19,7 @@ from torch.nn.functional import pad, relu, softplus
 
 from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.encoding import encode, encoded_size
-from hyperplanes.fields.rig import Rig, standpoints
+from hyperplanes.fields.rig import Rig, camera_directions
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
@@ -146,7 +146,7 @@ class ImageBasedNeRF(Target):
         count, device = min(count, len(views)), views.images.device
         if choice == "first":
             return torch.arange(count, device=device)
-        standing = standpoints(views).cpu()
+        standing = camera_directions(views).cpu()
         first = int((standing @ standing.mean(0)).argmin())
         return torch.tensor(farthest_first(standing, first, count), dtype=torch.long, device=device)
 

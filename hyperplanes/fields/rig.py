@@ -13,17 +13,17 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.views import Views
 
-__all__ = ["Rig", "match", "repeated_planes", "standpoints"]
+__all__ = ["Rig", "match", "repeated_planes", "camera_directions"]
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Standpoints of the planes, and which support view becomes which plane.
+    """Camera directions of the planes, and which support view becomes which plane.
 
     Attributes:
         positions: unit vectors from the scene's centre to where the cameras stood in training; zeros where no views
             have been shown yet.
-        order: "matched" gives each plane the view nearest to its standpoint; "file" takes the views as they come, again
+        order: "matched" gives each plane the view nearest to its direction; "file" takes the views as they come, again
             from the first where there are too few.
     """
 
@@ -35,7 +35,7 @@ class Rig:
 
     @property
     def known(self) -> Float[Tensor, "plane 3"]:
-        """The standpoints on the CPU, where views are matched to them.
+        """The camera directions on the CPU, where views are matched to them.
 
         Raises:
             ValueError: no views have been shown yet.
@@ -43,7 +43,7 @@ class Rig:
         positions = self.positions.float().cpu()
         if not positions.any():
             raise ValueError(
-                "rig: expected the standpoints of the training's views, got none; set_rig takes them from views"
+                "rig: expected the camera directions of the training's views, got none; set_rig takes them from views"
             )
         return positions
 
@@ -52,7 +52,7 @@ class Rig:
         if self.order == "file":
             chosen = torch.arange(len(self)) % len(support)
         else:
-            chosen = match(self.known, standpoints(support).cpu())
+            chosen = match(self.known, camera_directions(support).cpu())
         return chosen.to(support.images.device)
 
     def repeated(self, support: Views) -> Int[Tensor, " repeated"]:
@@ -60,7 +60,7 @@ class Rig:
         places = self.places(support)
         near = torch.zeros(len(self))
         if self.order != "file":
-            near = (self.known * standpoints(support[places]).cpu()).sum(1)
+            near = (self.known * camera_directions(support[places]).cpu()).sum(1)
         return repeated_planes(places, near)
 
     def farthest(self, count: int) -> Int[Tensor, " k"]:
@@ -68,13 +68,13 @@ class Rig:
         return torch.tensor(farthest_first(self.known, 0, count), dtype=torch.long, device=self.positions.device)
 
 
-def standpoints(views: Views) -> Float[Tensor, "view 3"]:
+def camera_directions(views: Views) -> Float[Tensor, "view 3"]:
     """Unit vectors from the scene's centre to the cameras.
 
     Args:
         views: of one scene.
     """
-    return camera.standpoints(views.cameras, views.bounds.centre).float()
+    return camera.camera_directions(views.cameras, views.bounds.centre).float()
 
 
 def match(rig: Float[Tensor, "plane 3"], standing: Float[Tensor, "view 3"]) -> Int[Tensor, " plane"]:
@@ -83,7 +83,7 @@ def match(rig: Float[Tensor, "plane 3"], standing: Float[Tensor, "view 3"]) -> I
     More views than planes: none stands at two. Fewer: some stand at several, as evenly as their numbers allow.
 
     Args:
-        rig: standpoints of the planes in training, on the CPU.
+        rig: camera directions of the planes in training, on the CPU.
         standing: those of the views, on the CPU.
     """
     from scipy.optimize import linear_sum_assignment

@@ -36,7 +36,7 @@ __all__ = [
     "resized",
     "scale",
     "select",
-    "standpoints",
+    "camera_directions",
     "symmetric_intrinsics",
     "to",
     "viewing_directions",
@@ -173,10 +173,11 @@ def centres(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
     return -(pose[:, :3, :3].mT @ pose[:, :3, 3:]).squeeze(-1)
 
 
-def standpoints(cameras: PinholeCamera, centre: tuple[float, float, float]) -> Float[Tensor, "view 3"]:
+def camera_directions(cameras: PinholeCamera, centre: tuple[float, float, float]) -> Float[Tensor, "view 3"]:
     """Unit vectors from a point, such as the centre of a scene, to the cameras; zero for a camera that is there.
 
-    >>> standpoints(pinhole(torch.eye(3), look_at(torch.tensor([[0.0, 0.0, 3.0]])), 1, 1), (0.0, 0.0, 1.0)).tolist()
+    >>> camera = pinhole(torch.eye(3), look_at(torch.tensor([[0.0, 0.0, 3.0]])), 1, 1)
+    >>> camera_directions(camera, (0.0, 0.0, 1.0)).tolist()
     [[0.0, 0.0, 1.0]]
     """
     standing = centres(cameras)

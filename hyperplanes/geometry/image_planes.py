@@ -78,7 +78,7 @@ class ImagePlanes:
         """The images and where their cameras stand, for notebooks."""
         return show_views(repr(self), self.images, self.cameras)
 
-    def hiding(self, views: Int[Tensor, " hidden"]) -> ImagePlanes:
+    def mask_views(self, views: Int[Tensor, " hidden"]) -> ImagePlanes:
         """The same planes, some more of which show no point: their colours are the background, and nothing is valid.
 
         Args:

@@ -89,7 +89,7 @@ def cast(
     pixels: ArrayLike,
     bounds: Sphere | None = None,
     *,
-    span: str = "sphere",
+    near_far: str = "sphere",
 ) -> Rays:
     """Rays from camera centres through pixels.
 
@@ -98,14 +98,14 @@ def cast(
         view: (ray,), index of the camera of each ray.
         pixels: (ray, 2), (column, row) in the image, integer pixel centres; lens distortion is undone.
         bounds: what near and far are taken from; the unit sphere where absent.
-        span: "sphere" clips each ray to the sphere (a miss gets near == far); "constant" gives every ray of a camera
-            the same near and far, the distance of the sphere's centre minus and plus its radius, as NeRF does.
+        near_far: "sphere" clips each ray to the sphere (a miss gets near == far); "constant" gives every ray of a
+            camera the same near and far, the distance of the sphere's centre minus and plus its radius, as NeRF does.
 
     Returns:
         Rays with unit directions, differentiable in the cameras.
 
     Raises:
-        ValueError: an unknown `span`, or views and pixels of other shapes.
+        ValueError: an unknown `near_far`, or views and pixels of other shapes.
     """
     bounds = bounds or Sphere()
     view, pixels = as_tensor("view", view), as_tensor("pixels", pixels)
@@ -127,13 +127,13 @@ def cast(
     directions = torch.nn.functional.normalize((pose[:, :3, :3].mT @ local[..., None]).squeeze(-1), dim=-1)
     origins = camera.centres(cameras)[view]
     to_centre = origins.new_tensor(bounds.centre) - origins
-    if span == "constant":
+    if near_far == "constant":
         distance = to_centre.norm(dim=-1)
         near = (distance - bounds.radius).clamp_min(0)
         far = distance + bounds.radius
         return Rays(origins, directions, near, far if shown is None else torch.where(shown, far, near))
-    if span != "sphere":
-        raise ValueError(f"span: expected 'sphere' or 'constant', got {span!r}")
+    if near_far != "sphere":
+        raise ValueError(f"near_far: expected 'sphere' or 'constant', got {near_far!r}")
     middle = (to_centre * directions).sum(-1)
     # the squared distance of the ray from the centre, of the vector between them: the difference of the squares of
     # `to_centre` and `middle` is nothing but rounding where the camera is far away

@@ -185,14 +185,14 @@ class VisibilityPlanes:
         """The side of a voxel in radii of the scene: what depths are exact to."""
         return 2 / self.occupancy.occupied.shape[0]
 
-    def hiding(self, views: Int[Tensor, " hidden"]) -> VisibilityPlanes:
+    def mask_views(self, views: Int[Tensor, " hidden"]) -> VisibilityPlanes:
         """The same planes, some more of which see nothing: no point is valid there, and its colour is the background.
 
         Args:
             views: their indices.
         """
         result = copy.copy(self)
-        result.colours = self.colours.hiding(views)
+        result.colours = self.colours.mask_views(views)
         result._hidden = self._hidden.index_fill(0, views.to(self._hidden.device), True)
         return result
 

@@ -3,7 +3,7 @@
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
 from hyperplanes.rendering.hierarchical import Hierarchical, importance, intervals, stratified
 from hyperplanes.rendering.images import Pictures
-from hyperplanes.rendering.marching import Marched, march
+from hyperplanes.rendering.marching import RayMarching, march
 from hyperplanes.rendering.renderer import render
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples, Sampler
 from hyperplanes.rendering.scene import FieldFunction
@@ -12,7 +12,7 @@ __all__ = [
     "DenseSamples",
     "FieldFunction",
     "Hierarchical",
-    "Marched",
+    "RayMarching",
     "PackedSamples",
     "Pictures",
     "Rendered",

@@ -46,7 +46,7 @@ class Hierarchical:
             raise ValueError(f"coarse: expected at least 3 samples to draw fine ones between, got {self.coarse}")
 
     @property
-    def span(self) -> str:
+    def near_far(self) -> str:
         """One near and far for all rays of a camera, as in NeRF."""
         return "constant"
 
@@ -70,7 +70,7 @@ class Hierarchical:
         return f"{self.coarse} + {self.fine}"
 
     def rays_per_chunk(self, device: torch.device) -> int:
-        """A quarter of what `Marched` takes on a CPU, since every ray has all its samples."""
+        """A quarter of what `RayMarching` takes on a CPU, since every ray has all its samples."""
         return 1 << 16 if device.type == "cuda" else 1 << 12
 
     @property

@@ -43,7 +43,7 @@ def render_images(
     render_rays: Callable[[Rays], Rendered],
     *,
     occupancy: Occupancy | None = None,
-    span: str = "sphere",
+    near_far: str = "sphere",
     background: float = 1.0,
 ) -> Pictures:
     """The images of cameras, by a function that renders rays.
@@ -55,7 +55,7 @@ def render_images(
         bounds: what near and far of the rays are taken from.
         render_rays: the pixels of rays.
         occupancy: pixels whose rays miss every occupied voxel are background, and no ray is rendered for them.
-        span: as in `geometry.cast`.
+        near_far: as in `geometry.cast`.
         background: grey value of those pixels.
 
     Returns:
@@ -71,7 +71,7 @@ def render_images(
         chosen = torch.arange(len(pixels), device=pixels.device) if live is None else live[view].nonzero()[:, 0]
         if not len(chosen):
             continue
-        rays = cast(cameras, torch.full_like(chosen, view), pixels[chosen], bounds, span=span)
+        rays = cast(cameras, torch.full_like(chosen, view), pixels[chosen], bounds, near_far=near_far)
         part = render_rays(Rays(rays.origins.float(), rays.directions.float(), rays.near.float(), rays.far.float()))
         values[view, chosen] = torch.cat([part.colour, part.opacity[:, None], part.depth[:, None]], 1).to(values)
         samples += part.samples

@@ -12,13 +12,13 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples
 
-__all__ = ["Marched", "march"]
+__all__ = ["RayMarching", "march"]
 
 CANDIDATES = 1 << 21  # samples tested against the grid at once; 12 bytes each
 
 
 @dataclass(frozen=True)
-class Marched:
+class RayMarching:
     """The default sampler: equal steps, only in occupied voxels, and in images only until the ray is opaque.
 
     Attributes:
@@ -30,7 +30,7 @@ class Marched:
     stop: float = 5e-3
 
     @property
-    def span(self) -> str:
+    def near_far(self) -> str:
         """Near and far where the ray crosses the scene's sphere."""
         return "sphere"
 
@@ -40,9 +40,9 @@ class Marched:
         return True
 
     @property
-    def for_rendering(self) -> Marched:
+    def for_rendering(self) -> RayMarching:
         """5 samples for 3 in training, where they are jittered."""
-        return Marched(self.steps * 5 // 3, self.stop)
+        return RayMarching(self.steps * 5 // 3, self.stop)
 
     @property
     def summary(self) -> str:
@@ -68,7 +68,9 @@ class Marched:
             ValueError: no occupancy.
         """
         if occupancy is None:
-            raise ValueError("occupancy: expected an Occupancy for Marched sampling, got None; geometry.full makes one")
+            raise ValueError(
+                "occupancy: expected an Occupancy for RayMarching sampling, got None; geometry.full makes one"
+            )
         return march(rays, occupancy, 2 * occupancy.bounds.radius / self.steps, generator)
 
     def refine(

@@ -15,12 +15,12 @@ from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.hierarchical import Hierarchical
 from hyperplanes.rendering.images import Pictures, render_images
 from hyperplanes.rendering.integration import integrate
-from hyperplanes.rendering.marching import Marched
+from hyperplanes.rendering.marching import RayMarching
 from hyperplanes.rendering.samplers import Sampler
 from hyperplanes.rendering.scene import FieldFunction, Scene
 from hyperplanes.utilities.arguments import checked
 
-__all__ = ["FieldFunction", "Hierarchical", "Marched", "Sampler", "allow_tf32", "render"]
+__all__ = ["FieldFunction", "Hierarchical", "RayMarching", "Sampler", "allow_tf32", "render"]
 
 
 @overload
@@ -75,23 +75,25 @@ def render(
         field: any callable: world points (n, 3) and unit viewing directions (n, 3) -> colours (n, 3) in [0, 1] and
             densities (n,) per world unit.
         target: Kornia cameras of one image size, or rays.
-        sampling: where along the rays the field is evaluated. Where absent, `Marched` with the samples of images for
-            cameras; for rays `Marched` if there are bounds or an occupancy, else `Hierarchical`, which needs neither.
+        sampling: where along the rays the field is evaluated. Where absent, `RayMarching` with the samples of images
+            for cameras; for rays `RayMarching` if there are bounds or an occupancy, else `Hierarchical`, which needs
+            neither.
         bounds: the sphere of the scene, outside of which nothing is rendered. That of the occupancy where absent, and
             for cameras the unit sphere where there is none.
-        occupancy: voxels where the field can be anything but empty, for `Marched`; all within the bounds where absent.
-        proposal: the field of the coarse pass of `Hierarchical`; `field` where absent. `Marched` evaluates it only for
-            gradients, so that it learns.
+        occupancy: voxels where the field can be anything but empty, for `RayMarching`; all within the bounds where
+            absent.
+        proposal: the field of the coarse pass of `Hierarchical`; `field` where absent. `RayMarching` evaluates it only
+            for gradients, so that it learns.
         generator: jitters the samples; without one they are the same each time.
         background: grey value behind everything.
         differentiable: keep gradients to whatever the field and the rays depend on; by default for rays, not for
             cameras. Without gradients rays are rendered in chunks, so that memory does not grow with their number, and
-            `Marched` stops where they are opaque.
+            `RayMarching` stops where they are opaque.
         chunk: rays at once where no gradient is kept; as many as suit the sampler and the device where absent.
 
     Returns:
-        Pictures of cameras, pixels of rays. `Marched` for rays without occupancy and bounds, and fields with values of
-        another shape, raise ValueError.
+        Pictures of cameras, pixels of rays. `RayMarching` for rays without occupancy and bounds, and fields with values
+        of another shape, raise ValueError.
 
     >>> from hyperplanes.geometry.cameras import look_at, pinhole, symmetric_intrinsics
     >>> camera = pinhole(symmetric_intrinsics(5, 5, 0.7), look_at(torch.tensor([[0.0, 0.0, 3.0]])), 5, 5)
@@ -102,8 +104,8 @@ def render(
     bounds = bounds or (occupancy.bounds if occupancy else None)
     if isinstance(target, PinholeCamera):
         bounds = bounds or Sphere()
-        sampling = sampling or Marched().for_rendering
-    sampling = sampling or (Marched() if bounds else Hierarchical())
+        sampling = sampling or RayMarching().for_rendering
+    sampling = sampling or (RayMarching() if bounds else Hierarchical())
     device = target.origins.device if isinstance(target, Rays) else target.intrinsics.device
     if sampling.needs_occupancy and occupancy is None and bounds is not None:
         occupancy = full(bounds, 1, device)
@@ -121,7 +123,9 @@ def render(
     assert bounds is not None
     with torch.set_grad_enabled(keep and torch.is_grad_enabled()):
         seen = occupancy if sampling.needs_occupancy else None
-        return render_images(target, bounds, render_rays, occupancy=seen, span=sampling.span, background=background)
+        return render_images(
+            target, bounds, render_rays, occupancy=seen, near_far=sampling.near_far, background=background
+        )
 
 
 @torch.no_grad()

@@ -57,7 +57,7 @@ class Sampler(Protocol):
     """A sampling scheme with all that training and rendering need to know about it."""
 
     @property
-    def span(self) -> str:
+    def near_far(self) -> str:
         """How near and far of the rays are chosen, as in `geometry.cast`."""
         ...
 

@@ -59,7 +59,7 @@ def render_voxels(
     stop: float = 1e-3,
     background: float = 1.0,
 ) -> Rendered:
-    """The pixels of rays through a baked field: the same sums as `Marched` computes, in one compiled loop a ray.
+    """The pixels of rays through a baked field: the same sums as `RayMarching` computes, in one compiled loop a ray.
 
     Args:
         index: row of every voxel or -1.

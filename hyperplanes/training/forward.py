@@ -60,7 +60,7 @@ def forward(model: HyperPlanes, draw: Draw, update: Parameters, config: Training
     # random rays of the query views, and the colours and opacities seen there
     with record_function("step:rays"), prefix_errors(draw.name):
         rays, truth, opacity = episode.query.sample_masked_rays(
-            config.rays, generator=generator, among=episode.live, span=field.sampling.span
+            config.rays, generator=generator, among=episode.live, near_far=field.sampling.near_far
         )
     # samples on the rays, the field at these, and their compositing (Eq. 1)
     with record_function("step:rendering"):

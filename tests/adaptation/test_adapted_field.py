@@ -12,7 +12,7 @@ from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry.cameras import concatenate, look_at, pinhole, to
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.rendering import Hierarchical, Marched, composite
+from hyperplanes.rendering import Hierarchical, RayMarching, composite
 from hyperplanes.views import Views
 from tests.reference_rendering import ball_views, camera_at, composite_ray, ring
 
@@ -26,10 +26,10 @@ def solid_ball(points, directions):
 
 
 def adapted(sampling=None, bounds=None, side=16):
-    return AdaptedField(solid_ball, full(bounds or Sphere(), side), sampling or Marched(60))
+    return AdaptedField(solid_ball, full(bounds or Sphere(), side), sampling or RayMarching(60))
 
 
-@pytest.mark.parametrize("sampling", [Marched(60, 1e-6), Hierarchical(48, 0), Hierarchical(24, 24)])
+@pytest.mark.parametrize("sampling", [RayMarching(60, 1e-6), Hierarchical(48, 0), Hierarchical(24, 24)])
 @pytest.mark.parametrize("size", [(9, 14), (14, 9)])
 @torch.no_grad()
 def test_a_picture_is_what_its_rays_see(sampling, size):
@@ -39,7 +39,7 @@ def test_a_picture_is_what_its_rays_see(sampling, size):
     assert pictures.opacity.shape == pictures.depth.shape == (2, 1, *size)
     posed = Views(pictures.images, cameras)
     for view in range(2):
-        seen = field.trace(posed.rays(view, span=sampling.span))
+        seen = field.trace(posed.rays(view, near_far=sampling.near_far))
         torch.testing.assert_close(pictures.images[view].flatten(1).T, seen.colour, atol=1e-4, rtol=0)
         torch.testing.assert_close(pictures.opacity[view].flatten(), seen.opacity, atol=1e-4, rtol=0)
         torch.testing.assert_close(pictures.depth[view].flatten(), seen.depth, atol=1e-3, rtol=0)
@@ -48,9 +48,9 @@ def test_a_picture_is_what_its_rays_see(sampling, size):
 @torch.no_grad()
 def test_pictures_are_marched_with_five_samples_for_three():
     cameras = ring(2, (12, 12))
-    field = adapted(Marched(48, 0.0))
-    assert torch.equal(field.render(cameras).images, field.render(cameras, Marched(80, 0.0)).images)
-    assert field.render(cameras).samples > 1.5 * field.render(cameras, Marched(48, 0.0)).samples
+    field = adapted(RayMarching(48, 0.0))
+    assert torch.equal(field.render(cameras).images, field.render(cameras, RayMarching(80, 0.0)).images)
+    assert field.render(cameras).samples > 1.5 * field.render(cameras, RayMarching(48, 0.0)).samples
 
 
 @torch.no_grad()
@@ -72,7 +72,7 @@ def test_one_pixel_against_the_loop():
 def test_a_solid_ball_looks_like_one():
     # pictures of the ball by geometry alone: covered where the ray hits it, the depth that of the hit
     cameras = ring(2, (20, 20))
-    pictures, truth = adapted(Marched(150)).render(cameras), ball_views(cameras)
+    pictures, truth = adapted(RayMarching(150)).render(cameras), ball_views(cameras)
     inner = -torch.nn.functional.max_pool2d(-truth.masks, 3, 1, 1) > 0
     outer = torch.nn.functional.max_pool2d(truth.masks, 3, 1, 1) == 0
     assert inner.any()
@@ -86,7 +86,7 @@ def test_a_solid_ball_looks_like_one():
         assert error.abs().max() < 0.02
 
 
-@pytest.mark.parametrize("sampling", [Marched(60), Hierarchical(48, 16)])
+@pytest.mark.parametrize("sampling", [RayMarching(60), Hierarchical(48, 16)])
 @torch.no_grad()
 def test_a_scene_moved_and_scaled_with_its_cameras_gives_the_same_picture(sampling):
     shift, scale = torch.tensor([2.0, -1.0, 0.5]), 3.0
@@ -130,14 +130,14 @@ def test_a_camera_inside_the_bounds_sees_what_is_ahead():
 @torch.no_grad()
 def test_an_empty_hull_is_a_white_picture():
     nothing = Occupancy(torch.zeros(8, 8, 8, dtype=torch.bool), Sphere())
-    pictures = AdaptedField(solid_ball, nothing, Marched()).render(ring(2))
+    pictures = AdaptedField(solid_ball, nothing, RayMarching()).render(ring(2))
     assert (pictures.images == 1).all()
     assert pictures.samples == 0
 
 
 @torch.no_grad()
 def test_another_protocol_can_be_asked_for():
-    field = adapted(Marched(60))
+    field = adapted(RayMarching(60))
     pictures = field.render(ring(1, (8, 8)), sampling=Hierarchical(10, 6))
     assert pictures.samples == 64 * (10 + 10 + 6)
     marched = field.render(ring(1, (8, 8)))
@@ -150,7 +150,7 @@ def test_pictures_carry_no_gradients_but_traces_do():
     def field(points, directions):
         return level.expand(len(points), 3), solid_ball(points, directions)[1]
 
-    whole = AdaptedField(field, full(Sphere(), 8), Marched(40))
+    whole = AdaptedField(field, full(Sphere(), 8), RayMarching(40))
     pictures = whole.render(ring(1))
     assert not pictures.images.requires_grad
     whole.trace(Views(pictures.images, ring(1)).rays(0)).colour.sum().backward()
@@ -194,7 +194,7 @@ def test_the_hull_does_not_depend_on_the_order_of_the_views():
     assert torch.equal(hull(views, 16).occupied, hull(views[[3, 0, 5, 1, 4, 2]], 16).occupied)
 
 
-@pytest.mark.parametrize("sampling", [Marched(60), Hierarchical(24, 24)])
+@pytest.mark.parametrize("sampling", [RayMarching(60), Hierarchical(24, 24)])
 @torch.no_grad()
 def test_cameras_in_double_precision_see_the_same(sampling):
     cameras, field = ring(2, (12, 15)), adapted(sampling)

@@ -15,7 +15,7 @@ from hyperplanes.configuration.fine_tuning import FRESH, FRESH_VIEWS, FineTuning
 from hyperplanes.fields import ImageBasedConfig, TargetConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
-from hyperplanes.rendering import Marched
+from hyperplanes.rendering import RayMarching
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring
@@ -28,7 +28,7 @@ NETWORK = ImageBasedConfig(depth=2, width=16, planes=4, blended=2, point_frequen
 PLACED = TargetConfig(depth=2, width=16, planes=4, point_frequencies=2, direction_frequencies=1)
 GRID = replace(NETWORK, grid=5)
 READERS = {"images": {}, "volume": {"network": GRID, "hypernetwork": VOLUME}}
-CONFIG = ModelConfig("image_based", NETWORK, SHAPE, sampling=Marched(24), hull_resolution=16)
+CONFIG = ModelConfig("image_based", NETWORK, SHAPE, sampling=RayMarching(24), hull_resolution=16)
 
 
 def model(**changes):
@@ -202,7 +202,7 @@ class Recorder:
             self.notes.append((None if hidden is None else set(hidden.tolist()), set(sources.tolist())))
             return Rendered(torch.sigmoid(self.value).expand(len(rays), 3), torch.ones(len(rays)), rays.far, len(rays))
 
-        field = AdaptedField(lambda points, directions: (points, points[:, 0]), None, Marched())
+        field = AdaptedField(lambda points, directions: (points, points[:, 0]), None, RayMarching())
         object.__setattr__(field, "trace", trace)
         return field
 

@@ -123,7 +123,7 @@ def test_an_object_seen_from_farther_away_is_matched_by_direction(model, support
 
 def test_hyperplanes_are_spread_as_far_as_they_can_be():
     wide = small_model(network=TargetConfig(depth=1, width=8, planes=6))
-    # six standpoints on the axes; the farthest from the first is its opposite
+    # six cameras on the axes; the farthest from the first is its opposite
     eyes = 3 * torch.tensor([[0, 0, 1.0], [1, 0, 0], [0, 1, 0], [0, 0, -1], [-1, 0, 0], [0, -1, 0]])
     cameras = pinhole(torch.tensor([[20.0, 0, 7.5], [0, 20, 7.5], [0, 0, 1]]), look_at(eyes), 16, 16)
     wide.set_rig(ball_views(cameras))
@@ -188,7 +188,7 @@ def test_a_coarse_network_proposes_and_is_updated_too(support):
     assert {name.split(".")[0] for name in both.theta} == {"fine", "coarse"}
     prepared = both.prepare(support)
     assert {name.split(".")[0] for name in both.update(prepared)} == {"fine", "coarse"}
-    seen = both.adapt(support).trace(support.rays(0, span="constant"))
+    seen = both.adapt(support).trace(support.rays(0, near_far="constant"))
     assert (seen.coarse.colour - seen.colour).abs().max() > 1e-3
 
 
@@ -345,7 +345,7 @@ def test_the_seed_decides_the_weights_and_global_randomness_does_not():
 def test_a_model_that_was_never_shown_its_rig_is_refused(support):
     fresh = HyperPlanes(small_model().config)
     for call in (fresh.prepare, fresh.arrange, fresh.adapt):
-        with pytest.raises(ValueError, match="rig: expected the standpoints of the training's views, got none"):
+        with pytest.raises(ValueError, match="rig: expected the camera directions of the training's views, got none"):
             call(support)
 
 

@@ -13,12 +13,12 @@ from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.image_based import EMPTY, SOLID
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
-from hyperplanes.rendering import Marched
+from hyperplanes.rendering import RayMarching
 from tests.reference_rendering import awaken, ball_views, ring
 
 NETWORK = ImageBasedConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1)
 CONFIG = ModelConfig(
-    "image_based", NETWORK, VolumeHyperNetworkConfig(), sampling=Marched(24), hull_resolution=16, judged=True
+    "image_based", NETWORK, VolumeHyperNetworkConfig(), sampling=RayMarching(24), hull_resolution=16, judged=True
 )
 
 

@@ -1,4 +1,4 @@
-"""Source of truth: the support images themselves, copied; angles between standpoints by hand."""
+"""Source of truth: the support images themselves, copied; angles between camera directions by hand."""
 
 import torch
 
@@ -39,8 +39,8 @@ def test_a_distance_does_not_matter():
     views = support()
     picture = NearestView().adapt(views).render(near).images
     unit = torch.tensor([0.0, 0.3, 9.0]) / torch.tensor([0.0, 0.3, 9.0]).norm()
-    standpoints = torch.linalg.inv(views.cameras.extrinsics)[:, :3, 3]
-    expected = (standpoints / standpoints.norm(dim=1, keepdim=True) @ unit).argmax()
+    centres = torch.linalg.inv(views.cameras.extrinsics)[:, :3, 3]
+    expected = (centres / centres.norm(dim=1, keepdim=True) @ unit).argmax()
     assert torch.equal(picture[0], views.images[expected])
 
 

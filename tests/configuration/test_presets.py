@@ -11,7 +11,7 @@ from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.presets import PRESETS, preset
 from hyperplanes.fields import find_targets
 from hyperplanes.hypernetwork import ConvNet, ResNet101
-from hyperplanes.rendering import Hierarchical, Marched
+from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.training import Trainer
 from tests.reference_rendering import Balls, ring
 
@@ -57,8 +57,8 @@ def test_the_papers_protocol_and_training(name):
     chosen = preset(name)
     assert chosen.model.sampling == Hierarchical(64, 128)  # Appendix B: samples 64, importance 128
     assert chosen.model.coarse_network
-    assert chosen.by_protocol("fast").model == replace(chosen.model, sampling=Marched())
-    assert chosen.by_protocol("fast").by_protocol("paper") == chosen
+    assert chosen.by_protocol("ray_marching").model == replace(chosen.model, sampling=RayMarching())
+    assert chosen.by_protocol("ray_marching").by_protocol("paper") == chosen
     training = chosen.training
     assert (training.tasks, training.rays, training.learning_rate) == (1, 512, 1e-4)
     assert training.hypernetwork_learning_rate == 1e-4
@@ -99,8 +99,10 @@ def test_a_preset_trains_and_renders_at_toy_resolution(name):
 
 def test_the_fast_protocol_leaves_a_fast_preset_as_it_is():
     for name in ("quick", "small", "paper-128-brief"):
-        assert preset(name).by_protocol("fast") == preset(name)
-    assert isinstance(preset("paper-128-brief").model.sampling, Marched)  # what the benchmarks' weights were trained by
+        assert preset(name).by_protocol("ray_marching") == preset(name)
+    assert isinstance(
+        preset("paper-128-brief").model.sampling, RayMarching
+    )  # what the benchmarks' weights were trained by
 
 
 @pytest.mark.parametrize("method", ["image_based", "mv_meta", "maml"])

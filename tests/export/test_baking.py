@@ -14,7 +14,7 @@ from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.rendering.renderer import Marched
+from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.rendering.transmittance import transmittance, transmittance_torch
 from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
 from hyperplanes.utilities.checkpoints import CheckpointError
@@ -33,7 +33,7 @@ def soft_ball(points, directions):
 
 @pytest.fixture(scope="module")
 def adapted():
-    return AdaptedField(soft_ball, full(Sphere(), 48), Marched(128))
+    return AdaptedField(soft_ball, full(Sphere(), 48), RayMarching(128))
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_baked_pictures_are_those_of_the_field(adapted, baked):
 def test_the_compiled_caster_agrees_with_packed_torch(baked):
     # Source of truth: the same voxels as a callable through the generic renderer, at the same steps.
     scene = BakedScene(baked)
-    sampling = Marched(scene.steps, 1e-3)
+    sampling = RayMarching(scene.steps, 1e-3)
     generic = AdaptedField(baked, baked.occupancy, sampling).render(CAMERAS, sampling)
     compiled = scene.render(CAMERAS)
     assert float((generic.images - compiled.images).abs().max()) < 5e-3
@@ -124,7 +124,7 @@ def test_wrong_arguments_are_refused(adapted):
         bake(adapted, side=16, directions=4)
     with pytest.raises(ValueError, match="side: expected a multiple of 2 from 8 to 512, got 15"):
         bake(adapted, side=15)
-    empty = AdaptedField(lambda p, d: (torch.zeros_like(p), p.new_zeros(len(p))), full(Sphere(), 16), Marched())
+    empty = AdaptedField(lambda p, d: (torch.zeros_like(p), p.new_zeros(len(p))), full(Sphere(), 16), RayMarching())
     with pytest.raises(ValueError, match="empty everywhere"):
         bake(empty, side=16)
 

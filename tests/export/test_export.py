@@ -24,7 +24,7 @@ from hyperplanes.export.mesh import (
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.rendering.renderer import Marched
+from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.views import Views
 
 CENTRE, RADIUS = (0.3, -0.2, 0.1), 0.8
@@ -40,7 +40,7 @@ def ball():
         right = (local[:, :1] > 0).float()
         return torch.cat([right, torch.zeros_like(right), 1 - right], -1), density
 
-    return AdaptedField(field, full(BOUNDS, 16), Marched(steps=64))
+    return AdaptedField(field, full(BOUNDS, 16), RayMarching(steps=64))
 
 
 def views(count=6, size=16, up=(0.0, 1.0, 0.0)):
@@ -70,7 +70,9 @@ def test_the_mesh_of_a_ball():
 
 def test_a_surface_that_leaves_the_cube_is_closed_there():
     everywhere = AdaptedField(
-        lambda points, _: (torch.ones_like(points), points.new_full((len(points),), 99.0)), full(BOUNDS, 8), Marched()
+        lambda points, _: (torch.ones_like(points), points.new_full((len(points),), 99.0)),
+        full(BOUNDS, 8),
+        RayMarching(),
     )
     surface = extract_mesh(everywhere, voxels=12, level=10.0)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces)
@@ -89,7 +91,7 @@ def test_the_level_is_the_one_with_the_rendered_silhouettes():
         distance = (points - points.new_tensor(CENTRE)).norm(dim=-1)
         return torch.ones_like(points), 8.0 * (distance < 0.5) + 0.3 * ((distance >= 0.5) & (distance < RADIUS))
 
-    adapted = AdaptedField(field, full(BOUNDS, 16), Marched(steps=96))
+    adapted = AdaptedField(field, full(BOUNDS, 16), RayMarching(steps=96))
     density, cameras = density_grid(adapted, 64), views(3, 32).cameras
     level = choose_level(adapted, density, cameras)
     assert 0.3 < level < 8.0
@@ -117,7 +119,7 @@ def test_a_hole_with_a_wall_behind_it_is_noticed_by_depth_and_closed_by_the_leve
         shell = (distance < RADIUS) & (distance > RADIUS - 0.3)
         return torch.ones_like(points), shell * torch.where(weak, 30.0, 300.0)
 
-    adapted = AdaptedField(field, full(Sphere(CENTRE, 1.0), 16), Marched(steps=128))
+    adapted = AdaptedField(field, full(Sphere(CENTRE, 1.0), 16), RayMarching(steps=128))
     pose = camera.look_at(torch.tensor(CENTRE) + torch.tensor([[20.0, 0.0, 0.0]]), CENTRE, (0.0, 1.0, 0.0))
     cameras = camera.pinhole(camera.symmetric_intrinsics(64, 64, 0.1), pose, 64, 64)
     density = density_grid(adapted, 64)
@@ -145,7 +147,7 @@ def test_what_no_camera_sees_into_is_filled_and_what_one_sees_through_is_not(fog
         dense = torch.where(local[:, 1:].norm(dim=-1) < 0.3, fog, 300.0)
         return torch.ones_like(points), dense * (local.norm(dim=-1) < RADIUS)
 
-    adapted = AdaptedField(field, full(Sphere(CENTRE, 1.0), 16), Marched(steps=64))
+    adapted = AdaptedField(field, full(Sphere(CENTRE, 1.0), 16), RayMarching(steps=64))
     eyes = torch.tensor(CENTRE) + 8 * torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0.1], [0, -1, 0.1], [0.1, 0.1, 1]])
     pose = camera.look_at(eyes, CENTRE, (0.0, 0.0, 1.0))
     cameras = camera.pinhole(camera.symmetric_intrinsics(64, 64, 0.3), pose, 64, 64)

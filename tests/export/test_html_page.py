@@ -17,7 +17,7 @@ from hyperplanes.export.page import address_of, page_of, save_page, turning_pict
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
-from hyperplanes.rendering.renderer import Marched
+from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 
@@ -50,7 +50,7 @@ def views():
 
 @pytest.fixture(scope="module")
 def baked():
-    return bake(AdaptedField(two_balls, full(SPHERE, 32), Marched(96)), side=64)
+    return bake(AdaptedField(two_balls, full(SPHERE, 32), RayMarching(96)), side=64)
 
 
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")

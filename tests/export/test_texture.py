@@ -15,7 +15,7 @@ from hyperplanes.export.texture import render_surface, save_textured, texture_su
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.rendering.renderer import Marched
+from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 
@@ -31,7 +31,7 @@ def striped(points, directions):
 
 @pytest.fixture(scope="module")
 def field():
-    return AdaptedField(striped, full(Sphere(), 24), Marched(160))
+    return AdaptedField(striped, full(Sphere(), 24), RayMarching(160))
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from hyperplanes.geometry import carve
 from hyperplanes.geometry.cameras import camera_from_world
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.parameters import Parameters
-from hyperplanes.rendering import Marched, render
+from hyperplanes.rendering import RayMarching, render
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views, join_views
 from tests.reference_rendering import ball_views, camera_at, ring
@@ -77,7 +77,7 @@ def test_a_view_that_sees_nothing_changes_nothing():
 def test_a_hidden_view_is_as_good_as_absent():
     target, views, (points, directions) = network(), coloured(5), queries()
     occupancy = carve(views.masks, views.cameras, views.bounds, 32)
-    hidden = target.planes_of(views, occupancy).hiding(torch.tensor([1, 4]))
+    hidden = target.planes_of(views, occupancy).mask_views(torch.tensor([1, 4]))
     expected = bound(target, views[[0, 2, 3]], occupancy=occupancy)(points, directions)
     found = target.bind(Parameters.of(target), hidden)(points, directions)
     for one, other in zip(found, expected, strict=True):
@@ -92,7 +92,7 @@ def test_hidden_views_show_nothing_even_where_too_few_others_are_left():
     images[1] = torch.rand(images[1].shape)
 
     def seen(views):
-        planes = target.planes_of(views, occupancy).hiding(hidden).hiding(torch.tensor([2]))
+        planes = target.planes_of(views, occupancy).mask_views(hidden).mask_views(torch.tensor([2]))
         return target.bind(Parameters.of(target), planes)(points, directions)
 
     for one, other in zip(seen(views), seen(replace(views, images=images)), strict=True):
@@ -132,7 +132,7 @@ def test_its_first_weights_are_the_visual_hull_in_the_colours_of_the_views():
     occupancy = carve(views.masks, views.cameras, views.bounds, 64)
     target = network(config=ImageBasedConfig(depth=3, width=32, planes=4))
     field = bound(target, views, occupancy=occupancy)
-    pictures = render(field, query.cameras, Marched(128), occupancy=occupancy)
+    pictures = render(field, query.cameras, RayMarching(128), occupancy=occupancy)
     assert psnr(pictures.images, query.images).min() > 25  # measured: 26.2 and more
     assert (pictures.opacity - query.masks).abs().mean() < 0.02
     inside, outside = field.density(torch.tensor([[0.0, 0.0, 0.0], [0.62, 0.0, 0.0]]))
@@ -158,7 +158,7 @@ def test_the_kernel_reads_what_plain_pytorch_does(count, grid, monkeypatch):
     if grid:
         parameters["grid.weight"].normal_(generator=torch.Generator().manual_seed(2))
     field, points = bound(target, views, parameters), 2.5 * points
-    hiding = replace(field, planes=field.planes.hiding(torch.tensor([0])))
+    hiding = replace(field, planes=field.planes.mask_views(torch.tensor([0])))
     surface = field.planes.depth_opacity[..., 0] + 0.1
     second = replace(field, planes=field.planes.with_surface(surface, torch.ones_like(surface)))
 

@@ -237,7 +237,7 @@ def test_a_hidden_plane_is_five_zeros():
     points, _ = queries()
     target, shown = make("multiplane"), planes()
     before = target.inputs(points, shown, Sphere())
-    found = target.inputs(points, shown.hiding(torch.tensor([1])), Sphere())
+    found = target.inputs(points, shown.mask_views(torch.tensor([1])), Sphere())
     gone = torch.tensor([3, 4, 5, 9 + 2, 9 + 3])  # three colours a plane, then two coordinates a plane
     assert before[:, gone].abs().amin() > 0
     assert torch.equal(found[:, gone], torch.zeros(len(points), 5))

@@ -19,7 +19,7 @@ from hyperplanes.geometry.distortion import (
 )
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import pixel_grid
-from hyperplanes.rendering import Marched, render
+from hyperplanes.rendering import RayMarching, render
 from hyperplanes.views import Views
 from tests.reference_rendering import ring
 from tests.test_conventions import HEIGHT, WIDTH, K, opencv_pixels, poses, some_points
@@ -84,7 +84,7 @@ def test_pixels_beyond_the_fold_have_no_ray():
     rays = cast(ours, torch.zeros(4, dtype=torch.long), pixels, Sphere((0.0, 0.0, 1.0), 0.9))
     assert (rays.far > rays.near).tolist()[2:] == [False, False]
     assert rays.directions[3] @ torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64) < 0  # not cast to the other side
-    constant = cast(ours, torch.zeros(4, dtype=torch.long), pixels, span="constant")
+    constant = cast(ours, torch.zeros(4, dtype=torch.long), pixels, near_far="constant")
     assert (constant.far > constant.near).tolist() == [True, True, False, False]
     points = ours.unproject(pixels[None], torch.ones(1, 4, 1, dtype=torch.float64))[0]
     assert points.isnan().any(1).tolist() == [False, False, True, True]
@@ -196,12 +196,12 @@ def test_pictures_through_a_lens_lose_no_pixel():
     def ball(points, directions):
         return points.abs(), 30.0 * (points.norm(dim=-1) < 0.9)
 
-    picture = render(ball, ours, Marched(40), occupancy=grid)
+    picture = render(ball, ours, RayMarching(40), occupancy=grid)
     views = Views(picture.images, ours)
     for view in range(2):
-        seen = render(ball, views.rays(view), Marched(40), occupancy=grid, differentiable=False)
+        seen = render(ball, views.rays(view), RayMarching(40), occupancy=grid, differentiable=False)
         torch.testing.assert_close(picture.images[view].flatten(1).T, seen.colour)
-    assert (render(ball, bare, Marched(40), occupancy=grid).opacity - picture.opacity).abs().max() > 0.9
+    assert (render(ball, bare, RayMarching(40), occupancy=grid).opacity - picture.opacity).abs().max() > 0.9
 
 
 def test_turned_worlds_keep_their_lenses():

@@ -10,7 +10,7 @@ from hyperplanes.geometry.lookup import lookup
 from hyperplanes.geometry.lookup_torch import interpolate, project
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.rendering.compositing import composite
-from hyperplanes.rendering.renderer import Hierarchical, Marched, render
+from hyperplanes.rendering.renderer import Hierarchical, RayMarching, render
 
 
 def small_scene(dtype=torch.float64):
@@ -113,11 +113,11 @@ def test_compositing():
 
 
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
-@pytest.mark.parametrize("sampling", [Hierarchical(5, 0), Marched(6)])
+@pytest.mark.parametrize("sampling", [Hierarchical(5, 0), RayMarching(6)])
 def test_the_whole_renderer(sampling, backend):
     """A field that looks colours up and has parameters: pixels with respect to cameras, images and parameters.
 
-    Marched places samples at fixed distances: its step is the occupancy's, and where a ray meets the sphere decides
+    RayMarching places samples at fixed distances: its step is the occupancy's, and where a ray meets the sphere decides
     without a gradient where the first one is. So rays keep their near and far there, while origins and directions move
     with the cameras.
     """
@@ -129,7 +129,7 @@ def test_the_whole_renderer(sampling, backend):
         ours = cameras.pinhole(grown(matrix, change), moved(pose, shift), 6, 7)
         planes = ImagePlanes(images, ours, backend=backend)
         rays = cast(ours, view, pixels)
-        if isinstance(sampling, Marched):
+        if isinstance(sampling, RayMarching):
             rays = Rays(rays.origins, rays.directions, still.near, still.far)
 
         def field(points, directions):

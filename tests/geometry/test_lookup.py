@@ -244,7 +244,7 @@ def test_hidden_planes_show_no_point_and_the_others_what_they_did(chosen):
     points, ours, images = scene()
     planes = ImagePlanes(images, ours, 0.25)
     views = torch.randint(0, 5, (len(points), 3), generator=torch.Generator().manual_seed(0)) if chosen else None
-    before, found = planes.lookup(points, views), planes.hiding(torch.tensor([1, 4])).lookup(points, views)
+    before, found = planes.lookup(points, views), planes.mask_views(torch.tensor([1, 4])).lookup(points, views)
     gone = torch.isin(views if chosen else torch.arange(5).expand(len(points), 5), torch.tensor([1, 4]))
     assert before.valid[gone].any()
     assert torch.equal(found.valid, before.valid & ~gone)

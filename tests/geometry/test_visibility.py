@@ -94,7 +94,7 @@ def slow_penalties(shown, points, hidden=()):
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_the_chosen_views_are_those_of_the_definition(monkeypatch, compiled):
-    shown, (points, directions) = planes().hiding(torch.tensor([2])), queries(60)
+    shown, (points, directions) = planes().mask_views(torch.tensor([2])), queries(60)
     if not compiled:
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     found = shown.choose(points, directions, best=3, nearest=2)
@@ -151,8 +151,10 @@ def test_the_nearest_views_are_judged_by_the_surface_that_is_given_and_the_best_
     )
     surface, everywhere = tight.depth_opacity[..., 0], torch.ones(len(views), *SIZE)
     hidden = torch.tensor([2])
-    wanted = loose.with_surface(surface, everywhere).hiding(hidden).choose(points, directions, best=3, nearest=2)
-    by_hull, by_ball = (each.hiding(hidden).choose(points, directions, best=3, nearest=2) for each in (loose, tight))
+    wanted = loose.with_surface(surface, everywhere).mask_views(hidden).choose(points, directions, best=3, nearest=2)
+    by_hull, by_ball = (
+        each.mask_views(hidden).choose(points, directions, best=3, nearest=2) for each in (loose, tight)
+    )
     assert not torch.equal(by_hull.nearest.behind, by_ball.nearest.behind)
     for found, expected in ((wanted.nearest, by_ball.nearest), (wanted.best, by_hull.best)):
         assert torch.equal(found.views, expected.views)
@@ -160,7 +162,7 @@ def test_the_nearest_views_are_judged_by_the_surface_that_is_given_and_the_best_
         torch.testing.assert_close(found.penalty, expected.penalty)
     assert torch.equal(wanted.number, by_hull.number)
     for distances, opacity in ((surface, 0.0), (0 * surface, 1.0)):  # nothing found, or before the hull's
-        same = loose.with_surface(distances, opacity * everywhere).hiding(hidden)
+        same = loose.with_surface(distances, opacity * everywhere).mask_views(hidden)
         assert torch.equal(same.choose(points, directions, best=3, nearest=2).nearest.behind, by_hull.nearest.behind)
 
 

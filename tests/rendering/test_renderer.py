@@ -12,12 +12,12 @@ import hyperplanes
 from hyperplanes.geometry.cameras import pinhole, symmetric_intrinsics
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
-from hyperplanes.rendering import Hierarchical, Marched, Sampler, march, render
+from hyperplanes.rendering import Hierarchical, RayMarching, Sampler, march, render
 from tests.reference_rendering import ball_hit, composite_ray, ring, soft_ball, some_rays
 
 DOUBLE = torch.float64
 GRID = full(Sphere(), 8)
-PROTOCOLS = [Hierarchical(16, 0), Hierarchical(16, 32), Marched(64)]
+PROTOCOLS = [Hierarchical(16, 0), Hierarchical(16, 32), RayMarching(64)]
 
 
 def fog(sigma):
@@ -42,8 +42,8 @@ def test_fog_in_a_sphere_in_closed_form(sampling):
     sigma, bounds = 0.7, Sphere((0.2, -0.1, 0.3), 0.8)
     rays = clipped(ring(2, (9, 7)), bounds)
     seen = render(fog(sigma), rays, sampling, occupancy=full(bounds, 8))
-    # Marched counts whole steps: the length is off by at most half a step of 2 r / 64
-    slack = sigma * bounds.radius / 64 if isinstance(sampling, Marched) else 0
+    # RayMarching counts whole steps: the length is off by at most half a step of 2 r / 64
+    slack = sigma * bounds.radius / 64 if isinstance(sampling, RayMarching) else 0
     assert (rays.far > rays.near).any()
     assert (rays.far == rays.near).any()
     for ray in range(len(rays)):
@@ -58,7 +58,7 @@ def test_fog_in_a_sphere_in_closed_form(sampling):
 def test_marched_equals_the_loop_over_its_samples():
     grid = Occupancy(torch.rand(6, 6, 6, generator=torch.Generator().manual_seed(0)) < 0.4, Sphere())
     rays = some_rays(30)
-    seen = render(soft_ball, rays, Marched(50, 1e-12), occupancy=grid, background=0.2)
+    seen = render(soft_ball, rays, RayMarching(50, 1e-12), occupancy=grid, background=0.2)
     samples = march(rays, grid, 2 / 50)
     for index in range(len(rays)):
         t = samples.distances[samples.ray == index]
@@ -76,12 +76,12 @@ def test_marched_converges_to_hierarchical():
     truth = render(soft_ball, rays, Hierarchical(400, 0))
     errors = []
     for steps in (24, 96, 384):
-        seen = render(soft_ball, rays, Marched(steps, 1e-9), occupancy=GRID)
+        seen = render(soft_ball, rays, RayMarching(steps, 1e-9), occupancy=GRID)
         errors.append((seen.colour - truth.colour).abs().max().item())
     # the midpoint rule: four times the steps, at least four times nearer
     assert errors[1] < errors[0] / 4
     assert errors[2] < 1e-4
-    seen = render(soft_ball, rays, Marched(384, 1e-9), occupancy=GRID)
+    seen = render(soft_ball, rays, RayMarching(384, 1e-9), occupancy=GRID)
     thick = truth.opacity > 0.05
     assert (seen.depth - truth.depth)[thick].abs().max() < 1e-3
 
@@ -97,7 +97,7 @@ def test_fine_samples_bring_the_coarse_picture_nearer():
 @torch.no_grad()
 def test_pixels_over_a_colour_are_what_is_rendered_over_it_in_both_passes():
     rays = some_rays(40)
-    for sampling in (Hierarchical(12, 40), Marched(64)):
+    for sampling in (Hierarchical(12, 40), RayMarching(64)):
         proposal = None if isinstance(sampling, Hierarchical) else fog(0.4)
         grey, white = (
             render(soft_ball, rays, sampling, occupancy=GRID, proposal=proposal, background=background)
@@ -113,8 +113,8 @@ def test_pixels_over_a_colour_are_what_is_rendered_over_it_in_both_passes():
 @torch.no_grad()
 def test_stopping_changes_a_colour_by_less_than_the_threshold(stop):
     rays = some_rays(100)
-    whole = render(soft_ball, rays, Marched(64, 1e-12), occupancy=GRID, differentiable=False)
-    stopped = render(soft_ball, rays, Marched(64, stop), occupancy=GRID, differentiable=False)
+    whole = render(soft_ball, rays, RayMarching(64, 1e-12), occupancy=GRID, differentiable=False)
+    stopped = render(soft_ball, rays, RayMarching(64, stop), occupancy=GRID, differentiable=False)
     assert (stopped.colour - whole.colour).abs().max() < stop
     assert (stopped.opacity - whole.opacity).abs().max() < stop
     assert stopped.samples < whole.samples
@@ -122,8 +122,8 @@ def test_stopping_changes_a_colour_by_less_than_the_threshold(stop):
 
 def test_the_picture_is_the_same_with_and_without_gradients():
     rays = some_rays(50)
-    with_gradients = render(soft_ball, rays, Marched(64, 1e-9), occupancy=GRID)
-    without = render(soft_ball, rays, Marched(64, 1e-9), occupancy=GRID, differentiable=False)
+    with_gradients = render(soft_ball, rays, RayMarching(64, 1e-9), occupancy=GRID)
+    without = render(soft_ball, rays, RayMarching(64, 1e-9), occupancy=GRID, differentiable=False)
     assert not without.colour.requires_grad
     torch.testing.assert_close(with_gradients.colour, without.colour, atol=1e-8, rtol=0)
     torch.testing.assert_close(with_gradients.depth, without.depth, atol=1e-6, rtol=0)
@@ -209,7 +209,7 @@ def test_the_proposal_draws_the_coarse_picture_and_learns_from_it():
 def test_rays_that_meet_nothing_are_background(background):
     empty = Occupancy(torch.zeros(4, 4, 4, dtype=torch.bool), Sphere())
     for differentiable in (False, True):
-        sampling = {"sampling": Marched(), "occupancy": empty, "differentiable": differentiable}
+        sampling = {"sampling": RayMarching(), "occupancy": empty, "differentiable": differentiable}
         seen = render(soft_ball, some_rays(3), background=background, **sampling)
         assert (seen.colour == background).all()
         assert (seen.opacity == 0).all()
@@ -226,7 +226,7 @@ def test_no_rays_make_no_pixels():
 
 def test_marched_needs_an_occupancy():
     with pytest.raises(ValueError, match="occupancy: expected an Occupancy .* got None"):
-        render(soft_ball, some_rays(2), Marched())
+        render(soft_ball, some_rays(2), RayMarching())
 
 
 def parametric(weight, bias):
@@ -240,7 +240,7 @@ def parametric(weight, bias):
     return field
 
 
-@pytest.mark.parametrize("sampling", [Hierarchical(5, 0), Hierarchical(4, 3), Marched(6)])
+@pytest.mark.parametrize("sampling", [Hierarchical(5, 0), Hierarchical(4, 3), RayMarching(6)])
 def test_gradients_of_parameters(sampling):
     generator = torch.Generator().manual_seed(0)
     weight = torch.randn(6, 4, generator=generator, dtype=DOUBLE, requires_grad=True)
@@ -254,7 +254,7 @@ def test_gradients_of_parameters(sampling):
     assert torch.autograd.gradcheck(pixels, (weight, bias))
 
 
-@pytest.mark.parametrize("sampling", [Hierarchical(5, 0), Marched(6)])
+@pytest.mark.parametrize("sampling", [Hierarchical(5, 0), RayMarching(6)])
 def test_gradients_of_rays(sampling):
     rays = some_rays(3)
     generator = torch.Generator().manual_seed(1)
@@ -281,7 +281,7 @@ def test_gradients_of_cameras():
         pose = torch.cat([torch.cat([torch.matrix_exp(cross), shift[:, None]], 1), pose[3:]])
         scale = torch.stack([focal, focal, torch.ones_like(focal)])
         cameras = pinhole(matrix * scale[:, None], (pose @ straight)[None], 2, 3)
-        rays = cast(cameras, torch.zeros(6, dtype=torch.long), pixel_grid(2, 3), span="constant")
+        rays = cast(cameras, torch.zeros(6, dtype=torch.long), pixel_grid(2, 3), near_far="constant")
         return render(field, rays, Hierarchical(5, 0)).colour
 
     turn, shift = torch.full((3,), 0.1, dtype=DOUBLE), torch.full((3,), 0.05, dtype=DOUBLE)
@@ -295,7 +295,7 @@ def test_jittered_pictures_of_fog_are_those_of_fog(sampling):
     rays = some_rays(20)
     still = render(fog(0.7), rays, sampling, occupancy=GRID)
     jittered = render(fog(0.7), rays, sampling, occupancy=GRID, generator=torch.Generator().manual_seed(0))
-    slack = 0.7 * 2 / 64 if isinstance(sampling, Marched) else 1e-9
+    slack = 0.7 * 2 / 64 if isinstance(sampling, RayMarching) else 1e-9
     assert (still.opacity - jittered.opacity).abs().max() < slack
 
 
@@ -311,7 +311,7 @@ def test_a_proposal_sees_each_ray_by_itself_and_its_whole_length():
         asked.append(len(points))
         return fog(0.9)(points, directions)
 
-    seen = render(fog(0.5), rays, Marched(20), occupancy=GRID, proposal=proposal, background=0.0)
+    seen = render(fog(0.5), rays, RayMarching(20), occupancy=GRID, proposal=proposal, background=0.0)
     assert asked == [1 + 1 + 2 + 4]
     opacity = 1 - torch.exp(-0.9 * count * step)
     torch.testing.assert_close(seen.coarse.colour[:, 0], 0.2 * opacity.double())
@@ -341,9 +341,9 @@ class SplitBall:
 def test_colours_that_hardly_count_are_not_asked_for(share):
     # Another implementation: the same field as a function, all of whose colours are. In haze all samples count alike.
     rays, split = some_rays(300), SplitBall(share)
-    plain = render(lambda *given: split(*given), rays, Marched(96, 1e-3), occupancy=GRID, differentiable=False)
+    plain = render(lambda *given: split(*given), rays, RayMarching(96, 1e-3), occupancy=GRID, differentiable=False)
     split.coloured = 0
-    found = render(split, rays, Marched(96, 1e-3), occupancy=GRID, differentiable=False)
+    found = render(split, rays, RayMarching(96, 1e-3), occupancy=GRID, differentiable=False)
     error = found.colour - plain.colour
     assert error.abs().max() < 0.05 * 0.25  # the share that is left out, by how far its colours can be from the mean
     torch.testing.assert_close(found.opacity, plain.opacity)
@@ -355,9 +355,9 @@ def test_colours_that_hardly_count_are_not_asked_for(share):
 @torch.no_grad()
 def test_a_threshold_of_zero_never_stops():
     rays = some_rays(30)
-    whole = render(fog(50.0), rays, Marched(64, 0.0), occupancy=GRID, differentiable=False)
+    whole = render(fog(50.0), rays, RayMarching(64, 0.0), occupancy=GRID, differentiable=False)
     assert whole.samples == len(march(rays, GRID, 2 / 64))
-    stopped = render(fog(50.0), rays, Marched(64, 1e-3), occupancy=GRID, differentiable=False)
+    stopped = render(fog(50.0), rays, RayMarching(64, 1e-3), occupancy=GRID, differentiable=False)
     torch.testing.assert_close(whole.colour, stopped.colour, atol=1e-3, rtol=0)
 
 
@@ -388,7 +388,7 @@ def test_a_lambda_and_a_kornia_camera_make_a_picture():
 def test_a_picture_is_the_pixels_of_its_rays(sampling):
     cameras, bounds = ring(1, (6, 5)), Sphere((0.1, 0.0, -0.1), 0.9)
     picture = render(soft_ball, cameras, sampling, bounds=bounds, background=0.3)
-    rays = cast(cameras, torch.zeros(30, dtype=torch.long), pixel_grid(6, 5), bounds, span=sampling.span)
+    rays = cast(cameras, torch.zeros(30, dtype=torch.long), pixel_grid(6, 5), bounds, near_far=sampling.near_far)
     seen = render(soft_ball, rays, sampling, bounds=bounds, background=0.3, differentiable=False)
     torch.testing.assert_close(picture.images[0].flatten(1).T, seen.colour)
     torch.testing.assert_close(picture.depth.flatten(), seen.depth)
@@ -399,7 +399,7 @@ def test_rays_alone_are_rendered_by_the_papers_sampler():
     rays = some_rays(4)
     assert torch.equal(render(soft_ball, rays).colour, render(soft_ball, rays, Hierarchical()).colour)
     marched = render(soft_ball, rays, bounds=Sphere()).colour
-    assert torch.equal(marched, render(soft_ball, rays, Marched(), occupancy=full(Sphere(), 1)).colour)
+    assert torch.equal(marched, render(soft_ball, rays, RayMarching(), occupancy=full(Sphere(), 1)).colour)
 
 
 @pytest.mark.parametrize("sampling", PROTOCOLS)
@@ -424,7 +424,7 @@ def test_a_field_with_values_of_another_shape_is_named():
 def test_samplers_say_what_they_need():
     for sampling in PROTOCOLS:
         assert isinstance(sampling, Sampler)
-    assert Marched(60, 0.1).for_rendering == Marched(100, 0.1)
+    assert RayMarching(60, 0.1).for_rendering == RayMarching(100, 0.1)
     assert Hierarchical(3, 4).for_rendering == Hierarchical(3, 4)
-    assert Marched().needs_occupancy
+    assert RayMarching().needs_occupancy
     assert not Hierarchical().needs_occupancy

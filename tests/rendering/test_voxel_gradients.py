@@ -6,7 +6,7 @@ import torch
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
-from hyperplanes.rendering.renderer import Marched, render
+from hyperplanes.rendering.renderer import RayMarching, render
 from hyperplanes.rendering.voxels import distance_to_filled, voxel_gradients
 
 
@@ -34,7 +34,7 @@ def test_the_compiled_gradient_is_that_of_autograd():
     )
     wanted = values.clone().requires_grad_()
     field = BakedField(index, wanted, Sphere())
-    expected = (render(field, rays, Marched(24, 1e-3), occupancy=field.occupancy).colour - truth).square().mean()
+    expected = (render(field, rays, RayMarching(24, 1e-3), occupancy=field.occupancy).colour - truth).square().mean()
     expected.backward()
     assert error == pytest.approx(float(expected.detach()), rel=1e-4)
     assert wanted.grad is not None

@@ -9,7 +9,7 @@ import torch
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.rendering import Marched
+from hyperplanes.rendering import RayMarching
 from hyperplanes.training.losses import EmptinessLoss
 
 DENSITY = 2.5
@@ -28,7 +28,7 @@ def test_a_constant_density_counts_outside_the_hull_alone_in_every_unit(occupied
         assert ((points - torch.tensor(bounds.centre)).norm(dim=1) <= bounds.radius * 1.001).all()
         return scale * torch.full((len(points),), DENSITY / unit)
 
-    field = AdaptedField(None, Occupancy(voxels, bounds), Marched(), densities=(density,) * networks)
+    field = AdaptedField(None, Occupancy(voxels, bounds), RayMarching(), densities=(density,) * networks)
     emptiness = EmptinessLoss(4000)
     loss = emptiness(SimpleNamespace(field=field, generator=torch.Generator().manual_seed(0)))
     expected = networks * share * emptiness.weight * (1 - math.exp(-DENSITY * 2 / 10))

@@ -28,7 +28,7 @@ def quality(model, hidden):
     found = []
     for name in ("test0", "test1"):
         task = Balls(train=8, test=2).task(name)
-        prepared = model.prepare(task.support).hiding(torch.tensor(hidden, dtype=torch.long))
+        prepared = model.prepare(task.support).mask_views(torch.tensor(hidden, dtype=torch.long))
         with torch.no_grad():
             pictures = model.field(prepared, model.theta).render(task.query.cameras)
         found.append(psnr(pictures.images, task.query.images).mean())
@@ -54,7 +54,7 @@ def test_where_there_are_fewer_views_than_planes_each_stands_at_one_plane_and_th
         == {"matched": [False, True, False, True], "file": [False, False, True, True]}[order]
     )
     assert torch.equal(filled.views.images, dropped.views.images)
-    both = dropped.hiding(torch.tensor([0]))  # what is hidden stays so
+    both = dropped.mask_views(torch.tensor([0]))  # what is hidden stays so
     assert both.planes.hidden.sum() == 3
     assert small_model(hypernetwork=None, plane_dropout=0.3, order=order).prepare(support).planes.hidden is None
 

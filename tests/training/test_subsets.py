@@ -10,7 +10,7 @@ from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
-from hyperplanes.rendering import Marched
+from hyperplanes.rendering import RayMarching
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.episodes.drawing import episode_object
 from hyperplanes.training.episodes.episode import QUERIES, prepare_subset
@@ -21,7 +21,7 @@ MODEL = ModelConfig(
     "image_based",
     ImageBasedConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=2, direction_frequencies=1),
     ImageHyperNetworkConfig(views=2, normalisation="group", code=8, depth=2, width=16, join="mean"),
-    sampling=Marched(24),
+    sampling=RayMarching(24),
     hull_resolution=16,
 )
 TRAINING = TrainingConfig(

@@ -18,7 +18,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.train import follow
 from hyperplanes.geometry import occupancy
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
-from hyperplanes.rendering import Hierarchical, Marched
+from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.training import Trainer, TrainingConfig, train
 from hyperplanes.training.monitoring import TensorBoard
 from hyperplanes.utilities import checkpoints, files
@@ -392,7 +392,7 @@ def test_checkpoints_are_written_when_they_are_due_and_not_only_with_a_report(tm
 @pytest.mark.parametrize(
     ("change", "name"),
     [
-        ({"sampling": Marched(25)}, "sampling.steps"),
+        ({"sampling": RayMarching(25)}, "sampling.steps"),
         ({"sampling": Hierarchical(4, 4)}, "protocol"),
         ({"hull_resolution": 17}, "hull_resolution"),
         ({"network": replace(small_model().config.network, density_scale=3.0)}, "network.density_scale"),

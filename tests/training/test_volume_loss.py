@@ -10,7 +10,7 @@ from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.parameters import Parameters
-from hyperplanes.rendering import Marched
+from hyperplanes.rendering import RayMarching
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.episodes.episode import prepare_subset, volume_of_all_views
 from hyperplanes.training.losses import VolumeLoss
@@ -20,7 +20,7 @@ MODEL = ModelConfig(
     "image_based",
     ImageBasedConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1),
     VolumeHyperNetworkConfig(),
-    sampling=Marched(24),
+    sampling=RayMarching(24),
     hull_resolution=32,
 )
 TRAINING = TrainingConfig(

@@ -19,7 +19,7 @@ from hyperplanes.configuration.presets import PRESETS, configure, preset
 from hyperplanes.configuration.settings_file import changed, document, parse_options, read_experiment, write_experiment
 from hyperplanes.fields import NeRF, TargetConfig, find_targets
 from hyperplanes.methods import Method, describe_method, make_method
-from hyperplanes.rendering import Hierarchical, Marched
+from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.utilities import entry_points
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.settings import SettingsError, structure
@@ -46,7 +46,13 @@ def other(value):
         "group": "batch",
         "silu": "relu",
     }
-    known |= {"none": "relu", "running": "layer", "concatenate": "mean", "low_rank": "full", "marched": "hierarchical"}
+    known |= {
+        "none": "relu",
+        "running": "layer",
+        "concatenate": "mean",
+        "low_rank": "full",
+        "ray_marching": "hierarchical",
+    }
     known |= {
         "all": "updated",
         "intervals": "samples",
@@ -72,7 +78,7 @@ def other(value):
         preset("quick").by_method("autoencoder"),
         preset("quick").by_method("mv_meta"),
     ],
-    ids=["marched", "hierarchical", "autoencoder", "initialisation"],
+    ids=["ray_marching", "hierarchical", "autoencoder", "initialisation"],
 )
 def test_every_field_of_every_configuration_can_be_set_by_an_option(base):
     entries = dict(leaves({"model": base.model.as_json(), "training": asdict(base.training)}))
@@ -127,7 +133,10 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
     assert chosen.model.sampling == Hierarchical(8, 5)
     of_subsets = {"views": (), "rotations": 0.0, "volume_loss": 0.0}
     assert chosen.training == replace(small.training, learning_rate=1e-3, steps=11, rays=13, **of_subsets)
-    assert resolve(replace(given, method="multiplane", protocol="fast", settings=()))[1].model.sampling == Marched()
+    assert (
+        resolve(replace(given, method="multiplane", protocol="ray_marching", settings=()))[1].model.sampling
+        == RayMarching()
+    )
     assert resolve(replace(given, cache_size=0.5))[1].training.memory == 2**29
     with pytest.raises(ValueError, match="^--cache-size: "):
         resolve(replace(given, cache_size=-1))

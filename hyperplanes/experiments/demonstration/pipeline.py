@@ -18,7 +18,7 @@ from hyperplanes.experiments.demonstration.first_page import COUNTS
 from hyperplanes.experiments.stages import Stage
 from hyperplanes.export.images import save_images
 from hyperplanes.methods import at_steps, describe_method, make_method
-from hyperplanes.rendering.renderer import Marched
+from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.files import write_json
 from hyperplanes.views import Task, Tasks
@@ -152,7 +152,7 @@ def _tiny(chosen: Preset, views: int) -> Preset:
             model,
             network=replace(model.network, depth=2, width=16, planes=planes),
             hypernetwork=hyper and replace(hyper, views=min(3, planes), code=8, depth=1, width=16),
-            sampling=Marched(steps=16),
+            sampling=RayMarching(steps=16),
             hull_resolution=16,
         ),
         training=replace(chosen.training, rays=32, warmup=0, checkpoint_every=10),

@@ -66,7 +66,7 @@ def drop_planes(prepared: SupportContext, chance: float, generator: torch.Genera
     if not chance:
         return prepared
     hidden = torch.rand(len(prepared.views), generator=generator) < chance
-    return prepared.hiding(hidden.nonzero()[:, 0])
+    return prepared.mask_views(hidden.nonzero()[:, 0])
 
 
 def over_random_colour(

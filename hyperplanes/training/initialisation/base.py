@@ -69,4 +69,4 @@ def draw_rays(
 ) -> tuple[Rays, Tensor]:
     """Rays of the query views or of the planes of an object, and their colours."""
     views, live = (episode.prepared.views, episode.support_live) if of_support else (episode.query, episode.live)
-    return views.sample_rays(count, generator=generator, among=live, span=field.sampling.span)
+    return views.sample_rays(count, generator=generator, among=live, near_far=field.sampling.near_far)
