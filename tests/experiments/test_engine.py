@@ -13,6 +13,7 @@ from hyperplanes.data.support import WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.experiments import EXPERIMENTS, SCALES
 from hyperplanes.methods import make_method
+from hyperplanes.rendering import Hierarchical
 
 CLASSES = ("car", "chair", "lamp", "plane")
 
@@ -117,6 +118,25 @@ def test_every_row_of_an_ablation_is_another_model(out, given):
         table = json.loads((out / name / "results.json").read_text())["table"]
         values = [cell["value"] for row in table.values() for cell in row.values()]
         assert len(set(values)) == len(values), name
+
+
+def test_what_the_paper_has_of_other_sources_reaches_trainings_and_evaluations(out, given, monkeypatch):
+    # The scale of the paper, made as small as `smoke`: the field and the samples of learnit, the sphere, --legacy.
+    smoke, paper = SCALES["smoke"], SCALES["paper"]
+    small = {**paper.learned, "model.network.depth": 1, "model.sampling": Hierarchical(4, 0), "training.steps": 1}
+    kept = {name: getattr(paper, name) for name in ("learned_target", "fine_tuning", "scratch", "bounds")}
+    monkeypatch.setitem(SCALES, "paper", replace(smoke, learned=small, **kept))
+    command = ["reproduce", "shapenet", "--scale", "paper", "--only", "Cars", "MV Meta, 25 views", "--legacy", *given]
+    assert main([*command, "--out", str(out)]) == 0
+    models = [json.loads(path.read_text()) for path in (out / "trainings").glob("car-*-mv_meta-0-*/model.json")]
+    (learned,) = (model for model in models if model["target"] == "simplified_nerf")
+    assert (learned["protocol"], learned["sampling"]["coarse"], learned["coarse_network"]) == ("hierarchical", 4, False)
+    written = [json.loads(path.read_text())["settings"] for path in (out / "evaluations").glob("car-*.json")]
+    (found,) = (settings for settings in written if "legacy" in settings)
+    assert found["bounds"] == {"centre": [0.0, 0.0, 0.0], "radius": 2.0}
+    results = json.loads((out / "shapenet" / "results.json").read_text())
+    assert list(results["table"]) == ["MV Meta, 25 views"]
+    assert "--only Cars 'MV Meta, 25 views' --legacy" in results["command"]
 
 
 def test_seeds_are_of_trainings(out, given):
