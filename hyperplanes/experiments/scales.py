@@ -199,7 +199,7 @@ SCALES: dict[str, Scale] = {
             "gpu",
             "all ten in about a day on one card: data sets as they were published, samples in the visual hull alone",
             {128: "paper-128", 200: "paper-200"},
-            "fast",
+            "ray_marching",
             None,
             0,
             0,

@@ -37,7 +37,7 @@ def test_a_sphere_of_radius_2_seen_from_4_is_near_2_and_far_6():
     data = WithBounds(Balls(), Sphere((0.0, 0.0, 0.0), 2.0))
     for views in (data.task("train1").support, data.task("train1").query):
         distance = centres(views.cameras).norm(dim=1)
-        rays = views.rays(0, span="constant")
+        rays = views.rays(0, near_far="constant")
         torch.testing.assert_close(rays.near, (distance[0] - 2).expand_as(rays.near))
         torch.testing.assert_close(rays.far, (distance[0] + 2).expand_as(rays.far))
 

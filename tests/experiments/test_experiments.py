@@ -123,6 +123,15 @@ def test_the_scale_of_the_paper_is_the_paper(name, size):
     assert configuration(cross, plane, small, objects=7, seed=0).training.steps == small.steps
 
 
+@pytest.mark.parametrize("scale", SCALES.values(), ids=SCALES)
+def test_every_scale_configures_every_model(scale):
+    for experiment in EXPERIMENTS.values():
+        for trained in scale.applied(experiment).trainings:
+            made = configuration(experiment, trained, scale, objects=3, seed=1)
+            assert made.training.seed == 1
+            assert made.training.steps > 0
+
+
 def test_what_is_not_as_the_paper_says_is_known():
     # Eq. 7 reads theta, the presets of the paper the weights of the updated layers: docs/paper.md
     for experiment in EXPERIMENTS.values():
