@@ -48,9 +48,10 @@ def _render(renderer: Any, item: Item, config: RenderConfig, meshes: Path | None
     if item.path is not None:
         mesh = load_mesh(item.path, up=item.up, name=item.name, within=meshes)
     else:
-        from data_gen.shapes import make
+        from data_gen.shapes import ONE_SIDED, make
 
-        mesh = prepare_scene(make(str(item.class_name), int(item.seed or 0)), item.name, closed=True)
+        scene = make(str(item.class_name), int(item.seed or 0))
+        mesh = prepare_scene(scene, item.name, closed=item.class_name in ONE_SIDED)
     rig = config.make_rig(item.name, item.class_name)
     channels = [channel for channel in config.channels if channel != "mesh"]
     rendering = renderer.render(

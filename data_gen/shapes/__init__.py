@@ -21,10 +21,13 @@ from data_gen.shapes.random import composition
 from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.errors import did_you_mean
 
-__all__ = ["CLASSES", "assemble", "find_classes", "make"]
+__all__ = ["CLASSES", "ONE_SIDED", "assemble", "find_classes", "make"]
 
 CLASSES: tuple[str, ...] = ("car", "chair", "plane", "lamp", "random")
 """Names of the classes of this package; the position of a name is part of its objects' seed, so the order is fixed."""
+
+ONE_SIDED: tuple[str, ...] = ("car", "chair", "plane", "lamp")
+"""Classes whose solids never cross themselves, so that nobody sees their inner sides: those need not be drawn."""
 
 _MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
     "car": car,
