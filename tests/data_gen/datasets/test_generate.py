@@ -309,7 +309,7 @@ def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
     assert float(camera.centres(support.cameras).norm(dim=-1)) == pytest.approx(4.0, abs=1e-5)
     manifest = json.loads((tmp_path / "128" / "manifest.json").read_text())
     assert (manifest["near"], manifest["far"]) == (3.0, 5.0)
-    with pytest.raises(ValueError, match="rig: expected one of .*paper-200, got 'paper-64'"):
+    with pytest.raises(ValueError, match="rig: expected one of .*paper-200, srn, got 'paper-64'"):
         generate(car, tmp_path / "64", GenerationConfig(rig="paper-64"))
 
 
