@@ -134,12 +134,12 @@ def test_swapping_updates_of_cars_costs_decibels():
 def test_swapping_updates_of_cars_costs_decibels_with_few_views_and_with_many(count):
     model = HyperPlanes.from_pretrained("small")
     prepared = [model.prepare(task.support[:: 25 // count][:count]) for task in cars()]
-    assert swap_gap(model, prepared, [task.query[::8] for task in cars()])[1] > 1  # measured: 2.4 and 1.9
+    assert swap_gap(model, prepared, [task.query[::8] for task in cars()])[1] > 1.5  # measured: 2.4 and 1.9
 
 
 @pytest.mark.parametrize("count", [3, 25])
 def test_a_lamp_with_the_update_of_a_car_is_worse(count):
-    assert lamp_with_the_update_of_a_car(HyperPlanes.from_pretrained("small"), count) > 3  # measured: 5.0 and 5.3
+    assert lamp_with_the_update_of_a_car(HyperPlanes.from_pretrained("small"), count) > 4  # measured: 5.0 and 5.3
 
 
 def test_a_lamp_with_the_update_of_a_car_is_worse_with_25_planes_too():

@@ -12,19 +12,22 @@ from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.renderer import render
 from hyperplanes.views import Views
 
-__all__ = ["FEWEST", "STRENGTHS", "judge_strength", "judged_weights"]
+__all__ = ["FEWEST", "MARGIN", "STRENGTHS", "judge_strength", "judged_weights"]
 
 STRENGTHS = (1.0, 0.5, 0.0)
 """What is compared: the trained field, halfway to the plain visual hull in blended colours, and that alone."""
 
 FEWEST = 5  # views, of which some can be left out
 LEFT_OUT = 2
+MARGIN = (
+    0.25  # of the squared error, by which less learned has to be better: two views tell smaller differences wrongly
+)
 RAYS = 2048  # of the views that are left out
 
 
 @torch.no_grad()
 def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
-    """The strength, of STRENGTHS, with which views that are left out are shown best.
+    """The strength, of STRENGTHS, with which views that are left out are shown best; less than 1 only by a MARGIN.
 
     A trained field has expectations of its objects, and an object of another kind may be shown worse with them than
     without. Left out are the LEFT_OUT views that the others stand closest around, and the squared error of RAYS of
@@ -36,7 +39,7 @@ def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
         support: the views of an object, where the model is.
 
     Returns:
-        The strength; of equally good ones the greatest, and 1 with fewer than FEWEST views.
+        The strength; 1 with fewer than FEWEST views.
     """
     if len(support) < FEWEST:
         return STRENGTHS[0]
@@ -54,7 +57,8 @@ def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
     )
     seen = [render(each.field, rays, each.sampling, occupancy=each.occupancy, differentiable=False) for each in fields]
     errors = [float((each.colour - truth).square().mean()) for each in seen]
-    return STRENGTHS[errors.index(min(errors))]
+    best = min(errors)
+    return STRENGTHS[errors.index(best)] if best < (1 - MARGIN) * errors[0] else STRENGTHS[0]
 
 
 @torch.no_grad()
