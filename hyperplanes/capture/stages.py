@@ -46,7 +46,7 @@ class Stages:
             What `finish` was given; None where the stage has to be done, or done to its end.
         """
         record = self._read(name)
-        if record.get("key") == key and record.get("done"):
+        if record.get("key") == key and record.get("done") and isinstance(record.get("result"), dict):
             return record["result"]
         if record.get("key") != key:
             shutil.rmtree(self.folder / name, ignore_errors=True)

@@ -39,10 +39,12 @@ class Stages:
         self.path = folder / record
         self._known: dict[str, Any] = {}
         if self.path.exists():
-            try:
-                self._known = read_json(self.path)
-            except CheckpointError as error:
-                raise ValueError(f"{error} or remove the folder to start afresh") from None
+            self._known = read_json(self.path)
+            if wrong := sorted(name for name, entry in self._known.items() if not _is_entry(entry)):
+                raise CheckpointError(
+                    f"{self.path}: expected settings, done and seconds of every stage, found others of {wrong[0]!r}; "
+                    "remove the file, and all stages are done again"
+                )
 
     def done(self, stage: Stage) -> bool:
         """Whether the stage was finished with these settings and its outputs are still there."""
@@ -77,6 +79,11 @@ class Stages:
         finally:
             entry["seconds"] += time.perf_counter() - started
             write_json(self.path, self._known)
+
+
+def _is_entry(entry: object) -> bool:
+    kinds = {"settings": dict, "done": bool, "seconds": int | float}
+    return isinstance(entry, dict) and all(isinstance(entry.get(name), kind) for name, kind in kinds.items())
 
 
 def _remove(path: Path) -> None:

@@ -8,16 +8,24 @@ import numpy as np
 import torch
 from PIL import Image
 
-from data_gen.datasets.manifest import verify
+from data_gen.datasets.manifest import GenerationState, verify
 from data_gen.meshes.mesh import load_mesh, mesh_parts
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.kept import keep_field, recall_field
+from hyperplanes.capture.sparse_model import SparseModel
+from hyperplanes.capture.stages import Stages
 from hyperplanes.configuration.presets import configure
+from hyperplanes.configuration.settings_file import read_experiment
 from hyperplanes.data import open_dataset, read_channel, read_task, read_views
+from hyperplanes.experiments.stages import Stage
+from hyperplanes.experiments.stages import Stages as ExperimentStages
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import Sphere, cameras
 from hyperplanes.training.state import load_state, save_state
 from hyperplanes.utilities.encoding import encode_json, sha256
+from hyperplanes.utilities.files import write_json
+from tests.fuzz.published import Published
 
 VIEWS, HEIGHT, WIDTH = 4, 10, 12
 CONFIG = {"steps": 3, "seed": 0}
@@ -127,6 +135,65 @@ def archive(folder):
     opengl = np.stack([np.linalg.inv(pose) * [1, -1, -1, 1] for pose in poses()])
     np.savez_compressed(folder / "4_a.npz", rgba=np.stack(pictures()), cam_poses=opengl, focal=16.0)
     np.savez(folder / "depth.npz", depth=np.ones((VIEWS, HEIGHT, WIDTH), np.float32))
+
+
+def published():
+    return Published(pictures(), poses())
+
+
+def progress(folder):
+    """A data set of which one object is finished, and one only noted."""
+    with GenerationState(folder, {"count": 2}) as state:
+        posed_scene(folder / "a")
+        files = {f"a/{path.name}": sha256(path.read_bytes()) for path in (folder / "a").glob("*.json")}
+        write_json(state.folder / "done" / "a.json", {"name": "a", "record": {}, "files": files})
+
+
+def go_on_generating(folder):
+    with GenerationState(folder, {"count": 2}) as state:
+        state.done()
+
+
+def stages(folder):
+    work = ExperimentStages(folder)
+    with work.work(STAGE):
+        pass
+
+
+def go_on_in_stages(folder):
+    work = ExperimentStages(folder)
+    if not work.done(STAGE):
+        with work.work(STAGE):
+            pass
+    work.seconds(STAGE)
+
+
+STAGE = Stage("data", {"count": 2}, ())
+
+
+def settings(folder):
+    folder.mkdir(parents=True)
+    text = "preset: quick\nmethod: hyperplanes\nmodel:\n  network: {depth: 2, width: 8}\n"
+    (folder / "config.yaml").write_text(text + "training:\n  steps: 10\n  learning_rate: 1.0e-3\n")
+
+
+def kept(folder):
+    """A field that was adapted to the posed scene beside it."""
+    posed_scene(folder / "scene")
+    model, views = small_model(), read_views(folder / "scene")
+    keep_field(model, model.adapt(views), folder / "kept" / "a")
+
+
+def recall(folder):
+    found = recall_field(folder / "kept" / "a", read_views(folder / "scene"))
+    if found is not None:
+        found.density(torch.zeros(1, 3))
+
+
+def read_capture(folder):
+    read_task(folder / "scene")
+    SparseModel.load(folder / "work/model.npz")
+    Stages(folder / "work").begin("poses", "key")
 
 
 def small_model():
@@ -293,6 +360,15 @@ CORPUS = {  # how each is made, which of its files are damaged, and what reads i
     "NSVF": (nsvf, "**/*.*", read_views),
     "LLFF": (llff, "**/*.*", read_views),
     "NeuS": (neus, "**/*.*", read_views),
+    "NMR": (lambda folder: published().nmr(folder), "**/*.*", read_all),
+    "CO3D": (lambda folder: published().co3d(folder), "**/*.*", read_all),
+    "Objaverse": (lambda folder: published().objaverse(folder), "**/*.*", read_all),
+    "OmniObject3D": (lambda folder: published().omniobject(folder), "**/*.*", read_all),
+    "capture": (lambda folder: published().capture(folder), "[sw][co]*/**/*.*", read_capture),
+    "generation": (progress, "**/*.json", go_on_generating),
+    "stages": (stages, "*", go_on_in_stages),
+    "settings": (settings, "*", lambda folder: read_experiment(folder / "config.yaml")),
+    "kept": (kept, "kept/*/*", recall),
     "archive": (archive, "4_a.npz", lambda folder: read_views(folder / "4_a.npz")),
     "channel": (archive, "depth.npz", lambda folder: read_channel(folder, "depth")),
     "model": (training, "model.*", lambda path: HyperPlanes.from_pretrained(find_checkpoint(path))),

@@ -1,8 +1,15 @@
 """Damage to files: of their bytes, of numbers and values in their text, of members of their archives."""
 
+import gzip
 import io
 import re
 import zipfile
+from pathlib import Path
+
+import torch
+from safetensors.torch import load, save
+
+from hyperplanes.utilities.checkpoints import CHECKSUM, _checksum
 
 NUMBERS = ["-1", "0", "1e309", "-1e-300", "NaN", "9223372036854775808", "4294967296", "1" * 400, "0.5", "2"]
 VALUES = [*NUMBERS, "null", "true", '""', "[]", "{}", '"../../x"', '"\\u0000"', "[[[[1]]]]", '{"a": 1}']
@@ -84,13 +91,50 @@ def change_member(data, draw):
     return out.getvalue()
 
 
+def change_unpacked(data, draw):
+    """What gzip has packed, damaged as a text."""
+    try:
+        content = gzip.decompress(data)
+    except Exception:  # damaged before
+        return flip(data, draw)
+    return gzip.compress(draw.choice([change_value, change_number, cut, repeat])(content, draw)) if content else data
+
+
+def change_tensor(data, draw):
+    """One tensor by another of other numbers, shape or type, under a checksum that is right."""
+    try:
+        tensors = load(data)
+    except Exception:  # damaged before
+        return overwrite(data, draw)
+    if not tensors:
+        return data
+    name = draw.choice(sorted(tensors))
+    value = tensors[name]
+    ways = [
+        lambda: torch.full_like(value, draw.choice([0, 1, -1, 127])),
+        lambda: value.double() * 1e30,
+        lambda: value.flip(0) if value.ndim else value + 1,
+        lambda: value.flatten(),
+        lambda: value[:0] if value.ndim else value[None],
+        lambda: value.half(),
+        lambda: value.int() - 1,
+        lambda: torch.full(value.shape, float("nan")),
+    ]
+    tensors[name] = draw.choice(ways)().contiguous()
+    return save(tensors, {CHECKSUM: _checksum(tensors)})
+
+
 TEXT = (flip, cut, repeat, empty, change_value, change_value, change_value, change_number, change_number)
 BINARY = (flip, overwrite, overwrite, cut, repeat, empty, change_number, change_member, change_member)
 
 
+TEXTS = (".json", ".txt", ".obj", ".off", ".mtl", ".ply", ".gltf", ".dae", ".lst", ".yaml")
+
+
 def mutate(data, name, draw):
     """The content of a file with one to three damages that suit its kind."""
-    kinds = TEXT if name.endswith((".json", ".txt", ".obj", ".off", ".mtl", ".ply", ".gltf", ".dae")) else BINARY
+    kinds = TEXT if name.endswith(TEXTS) else BINARY
+    kinds += {".jgz": (change_unpacked,) * 6, ".safetensors": (change_tensor,) * 6}.get(Path(name).suffix, ())
     for _ in range(draw.choice([1, 1, 1, 2, 3])):
         if data:
             data = draw.choice(kinds)(data, draw)
