@@ -1,4 +1,7 @@
-"""The fuzz campaign at any length: `make fuzz`, or `python -m tests.fuzz --files 10000 --seed 1`."""
+"""The fuzz campaigns at any length: `make fuzz`, or `python -m tests.fuzz --files 10000 --seed 1`.
+
+Beside damaged files, wrong command lines and wrong calls: `python -m tests.fuzz --commands 500 --calls 300`.
+"""
 
 import argparse
 import faulthandler
@@ -6,33 +9,49 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
+from tests.fuzz.calls import run_calls
 from tests.fuzz.campaign import run_campaign
+from tests.fuzz.commands import run_commands
 from tests.fuzz.corpus import CORPUS
 
 
 def main():
-    """Run it; the exit code is 1 where a file was neither read nor refused in one line."""
+    """Run them; the exit code is 1 where something ended as nothing should."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("--files", type=int, default=10_000, help="how many damaged files")
+    parser.add_argument("--files", type=int, default=0, help="how many damaged files")
+    parser.add_argument("--commands", type=int, default=0, help="how many command lines")
+    parser.add_argument("--calls", type=int, default=0, help="how many calls of public functions")
     parser.add_argument("--seed", type=int, default=0, help="of all damages")
     parser.add_argument("--only", type=int, help="the number of a single case")
     parser.add_argument("--kinds", nargs="+", choices=CORPUS, help="of files; all when not given")
     options = parser.parse_args()
     faulthandler.enable()
-    cases = range(options.files) if options.only is None else [options.only]
-    started, home = time.monotonic(), Path(tempfile.mkdtemp(prefix="hyperplanes-fuzz-"))
-    failures = run_campaign(cases, options.seed, home, options.kinds)
-    for failure in failures:
-        print(failure)
-    kinds = ", ".join(f"{count} of {kind}" for kind, count in Counter(each.kind for each in failures).items())
-    print(
-        f"{len(cases)} files, seed {options.seed}, {time.monotonic() - started:.0f} s: {len(failures)} failures {kinds}"
-    )
-    if failures:
-        print(f"the damaged files are in {home}")
-    return int(bool(failures))
+    home = Path(tempfile.mkdtemp(prefix="hyperplanes-fuzz-"))
+    campaigns = {
+        "files": partial(run_campaign, kinds=options.kinds),
+        "commands": run_commands,
+        "calls": run_calls,
+    }
+    found = 0
+    for name, run in campaigns.items():
+        count = getattr(options, name)
+        if not count:
+            continue
+        (home / name).mkdir()
+        started, cases = time.monotonic(), range(count) if options.only is None else [options.only]
+        failures = run(cases, options.seed, home / name)
+        for failure in failures:
+            print(failure)
+        kinds = ", ".join(f"{count} of {kind}" for kind, count in Counter(each.kind for each in failures).items())
+        took = f"{time.monotonic() - started:.0f} s"
+        print(f"{len(cases)} {name}, seed {options.seed}, {took}: {len(failures)} failures {kinds}", flush=True)
+        found += len(failures)
+    if found:
+        print(f"what they left is in {home}")
+    return int(bool(found))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,2 @@
+def run_calls(cases, seed, home):
+    return []
