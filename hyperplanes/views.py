@@ -15,7 +15,7 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
-from hyperplanes.utilities.arguments import kind_of
+from hyperplanes.utilities.arguments import checked, kind_of
 
 __all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views"]
 
@@ -97,8 +97,10 @@ class Views:
         return show_views(repr(self), self.images, self.cameras, self.bounds)
 
     def __getitem__(self, index: slice | list[int] | Int[Tensor, " chosen"]) -> Views:
-        if isinstance(index, int):
-            raise ValueError(f"views: expected a slice, a list or a tensor of indices, got {index}; use [[{index}]]")
+        whole = isinstance(index, Tensor) and not (index.is_floating_point() or index.is_complex())
+        if not (isinstance(index, slice | list) or whole):
+            remedy = f"; use [[{index}]]" if isinstance(index, int) else ""
+            raise ValueError(f"views: expected a slice, a list or a tensor of indices, got {kind_of(index)}{remedy}")
         names = self.names
         if names:
             chosen = torch.arange(len(self))[index.cpu() if isinstance(index, Tensor) else index]
@@ -120,6 +122,7 @@ class Views:
         """(height, width) of every image."""
         return self.images.shape[2], self.images.shape[3]
 
+    @checked
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Views:
         """The views on another device or in another precision, cameras included."""
         return self._derived(
@@ -134,6 +137,7 @@ class Views:
         views.__dict__.update({**self.__dict__, **changes})
         return views
 
+    @checked
     def rays(self, view: int, *, near_far: str = "sphere") -> Rays:
         """The rays through all pixels of one view, row by row."""
         pixels = pixel_grid(*self.size, device=self.images.device)

@@ -1,5 +1,6 @@
 """Every convention of the package against an independent source: OpenCV, SciPy, Kornia, or a closed form."""
 
+import inspect
 import math
 
 import cv2
@@ -193,4 +194,4 @@ def test_storage_that_breaks_kornia_is_not_made():
 def test_wrong_cameras_are_stopped(change, message):
     matrix, pose = change(K, poses())
     with pytest.raises((ValueError, TypeError), match=message):
-        cameras.pinhole.__wrapped__(matrix, pose, HEIGHT, WIDTH)
+        inspect.unwrap(cameras.pinhole)(matrix, pose, HEIGHT, WIDTH)

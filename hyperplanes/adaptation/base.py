@@ -20,6 +20,7 @@ from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.images import Pictures
 from hyperplanes.rendering.refinement import refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
@@ -104,6 +105,7 @@ class AdaptedField:
             self.field, rays, self.sampling, occupancy=self.occupancy, proposal=self.proposal, generator=generator
         )
 
+    @checked
     @torch.no_grad()
     def render(self, cameras: PinholeCamera, sampling: Sampler | None = None) -> Pictures:
         """The pictures of cameras, without gradients; rays and pixels in single precision, whatever the field's.

@@ -12,6 +12,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.fields import find_targets
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = ["SCRATCH_RATES", "FieldFromScratch", "FineTuned", "FromScratch", "random_model", "shuffled"]
@@ -35,6 +36,7 @@ class FineTuned:
     steps: Steps
     settings: FineTuning = field(default_factory=FineTuning)
 
+    @checked
     def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
         """The field after fine-tuning on the support views."""
         return self.model.fine_tune(support, self.steps, self.settings, on_step=on_step)
@@ -57,6 +59,7 @@ class FromScratch:
     steps: Steps
     settings: FineTuning = field(default_factory=FineTuning)
 
+    @checked
     def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
         """The field after so many steps from random weights."""
         fresh = random_model(self.model.config, self.settings.seed)
@@ -83,6 +86,7 @@ class FieldFromScratch:
     settings: FineTuning = field(default_factory=FineTuning)
     device: torch.device | str = "cpu"
 
+    @checked
     def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
         """The field after so many steps from random weights."""
         planes = (

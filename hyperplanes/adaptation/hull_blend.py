@@ -13,6 +13,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering.renderer import RayMarching
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = ["HullBlend"]
@@ -42,6 +43,7 @@ class HullBlend:
     side: int = 96
     steps: int = 256
 
+    @checked
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The hull and its colours; the distance of the hull is rendered once for every support view.

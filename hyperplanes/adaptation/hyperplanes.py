@@ -40,6 +40,7 @@ class HyperPlanes(HyperPlanesNetwork):
         ValueError: parts that do not go together (`configuration.compatibility`).
     """
 
+    @checked
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6).
@@ -118,6 +119,7 @@ class HyperPlanes(HyperPlanesNetwork):
         result.config = replace(self.config, second_pass=True)
         return result
 
+    @checked
     def save(self, folder: Path | str, dtype: torch.dtype | None = None) -> None:
         """Write model.json and model.safetensors.
 
@@ -147,6 +149,7 @@ class HyperPlanes(HyperPlanesNetwork):
         return upload_checkpoint(self.save, repository, private=private, message=message)
 
     @classmethod
+    @checked
     def from_pretrained(cls, name: Path | str) -> HyperPlanes:
         """The model that `save` wrote.
 

@@ -9,6 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from hyperplanes.adaptation.base import Pictures
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = ["NearestView"]
@@ -40,6 +41,7 @@ class _Copies:
 class NearestView:
     """No learning at all."""
 
+    @checked
     def adapt(self, support: Views) -> _Copies:
         """Remember the support views."""
         return _Copies(support)

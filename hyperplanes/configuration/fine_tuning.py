@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 from hyperplanes.hypernetwork.choices import check_choices
+from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = ["FRESH", "FRESH_VIEWS", "RATES", "FineTuning", "Steps"]
 
@@ -28,6 +29,7 @@ FRESH_VIEWS = 10
 """Support views from which on it does; with fewer, what was learned is worth more than what the steps learn."""
 
 
+@checked_fields
 @dataclass(frozen=True)
 class FineTuning:
     """How a field is fine-tuned.

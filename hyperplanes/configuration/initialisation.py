@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = ["LEARNED", "InitialisationConfig"]
 
@@ -19,6 +20,7 @@ LEARNED: dict[str, str] = {
 """The initialisations that are trained, by the names of their methods."""
 
 
+@checked_fields
 @dataclass(frozen=True)
 class InitialisationConfig:
     """How an initialisation is learned, and how a field is optimised from it.

@@ -12,6 +12,7 @@ from hyperplanes.configuration.upgrade import upgrade_model
 from hyperplanes.fields import TargetConfig, find_targets
 from hyperplanes.hypernetwork import KINDS, AutoencoderConfig, HyperNetworkConfig, ImageHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
+from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.settings import SettingsError, choose_by_tag, structure, tagged
 
@@ -26,6 +27,7 @@ choose_by_tag(Hierarchical | RayMarching, "protocol", PROTOCOLS)
 choose_by_tag(HyperNetworkConfig | None, "kind", KINDS)
 
 
+@checked_fields
 @dataclass(frozen=True)
 class ModelConfig:
     """What a model is made of; saved beside its weights.

@@ -11,6 +11,7 @@ from hyperplanes.configuration.upgrade import TARGETS as FORMER_TARGETS
 from hyperplanes.fields import TARGETS, ImageBasedConfig, TargetConfig, find_targets
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.errors import did_you_mean
 
 __all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]
@@ -268,6 +269,7 @@ PRESETS: dict[str, Preset] = {
 }
 
 
+@checked
 def preset(name: str) -> Preset:
     """The preset of that name.
 

@@ -6,9 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
+from hyperplanes.utilities.arguments import checked_fields
+
 __all__ = ["TrainingConfig"]
 
 
+@checked_fields
 @dataclass(frozen=True)
 class TrainingConfig:
     """How a model is trained (HyperPlanes, Appendix B: one task a step, 512 rays, learning rates 1e-4, no schedule).

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.data.formats.npz import read_arrays
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.files import DataError
 
 __all__ = ["CHANNELS", "mesh_path", "read_channel"]
@@ -19,6 +20,7 @@ CHANNELS = {"depth": 3, "normals": 4, "coordinates": 4}
 _REMEDY = "generate the data set with this channel"
 
 
+@checked
 def read_channel(folder: str | Path, channel: str) -> Tensor:
     """One channel of all views of an object, in the order of its frames (not split into support and query).
 

@@ -14,6 +14,7 @@ from hyperplanes.data.formats.recognise import find_catalogue, read_posed, read_
 from hyperplanes.data.pictures.posed import PosedTask
 from hyperplanes.data.upright import guess_up, upright, upright_task
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.files import DataError, malformed
 from hyperplanes.utilities.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
@@ -60,6 +61,7 @@ class Dataset:
         """The name of the layout."""
         return self._catalogue.layout
 
+    @checked
     def names(self, split: str = "all") -> list[str]:
         """The names of the objects of a split.
 
@@ -85,6 +87,7 @@ class Dataset:
         stated = record.get("class") if isinstance(record, dict) else None
         return stated if isinstance(stated, str) else ""
 
+    @checked
     def task(self, name: str) -> Task:
         """The support and query views of one object, as float images over white.
 
@@ -96,6 +99,7 @@ class Dataset:
         """
         return self.posed(name).task()
 
+    @checked
     def posed(self, name: str) -> PosedTask:
         """The support and query pictures of one object, 8 bits, shared between calls: not to be changed.
 
@@ -142,6 +146,7 @@ def _check_apart(folder: Path, splits: Mapping[str, Sequence[str]]) -> None:
             seen[name] = split
 
 
+@checked
 def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET, *, legacy: bool = False) -> Dataset:
     """A data set in any layout, or a single posed scene presented as one with one test task.
 
@@ -171,6 +176,7 @@ class Datasets:
         """As `Dataset.skipped`, of all data sets."""
         return tuple(line for data in self.parts.values() for line in data.skipped)
 
+    @checked
     def names(self, split: str = "all") -> list[str]:
         """The names of the objects of a split of all data sets, one after the other."""
         return [f"{part}/{name}" for part, data in self.parts.items() for name in data.names(split)]
@@ -180,6 +186,7 @@ class Datasets:
         part, _, own = name.partition("/")
         return self.parts[part].class_of(own) or part
 
+    @checked
     def task(self, name: str) -> Task:
         """One object; as `Dataset.task`.
 
@@ -218,6 +225,7 @@ def open_datasets(
     return Datasets({name: open_dataset(path, share, legacy=legacy) for name, path in zip(names, paths, strict=True)})
 
 
+@checked
 def read_views(path: str | Path, downscale: int | None = None, *, up: str | None = None) -> Views:
     """All posed images of one scene, over white.
 
@@ -255,6 +263,7 @@ def locate_scene(path: str | Path) -> Path:
     return packaged if len(path.parts) == 1 and not path.exists() and packaged.is_dir() else path
 
 
+@checked
 def read_task(path: str | Path, downscale: int | None = None, *, up: str | None = None) -> Task:
     """The support and query views of one scene.
 

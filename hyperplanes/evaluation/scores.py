@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import Adapter, Pictures
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 from hyperplanes.views import Task, Tasks
@@ -143,6 +144,7 @@ def merge_seeds(scores: Sequence[Score]) -> Score:
     return Score(scores[0].method, tuple(objects), tuple(scores))
 
 
+@checked
 def evaluate(
     method: str,
     adapter: Adapter,

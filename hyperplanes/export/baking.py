@@ -23,6 +23,7 @@ from hyperplanes.rendering.images import render_images
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.rendering.transmittance import transmittance
 from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
+from hyperplanes.utilities.arguments import checked
 
 __all__ = ["BakedScene", "bake", "coarsening", "default_side"]
 
@@ -45,6 +46,7 @@ class BakedScene:
     field: BakedField
     steps: int = 192
 
+    @checked
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Pictures:
         """The pictures of the cameras, by a kernel on a CPU and by `RayMarching` elsewhere."""
@@ -81,6 +83,7 @@ class BakedScene:
         return _resampled(self.field.occupancy, max(8, self.field.side // 4))
 
 
+@checked
 @torch.no_grad()
 def bake(
     adapted: AdaptedField,

@@ -46,6 +46,7 @@ def to_pixels(images: Float[Tensor, "view 3 height width"]) -> npt.NDArray[np.ui
     return (images.detach().clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
 
 
+@checked
 def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds: float = 4.0) -> bytes:
     """An animation that repeats for ever, or a video, which needs imageio-ffmpeg: the extra `video`.
 
@@ -64,8 +65,13 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
 
     if kind not in TURNTABLE_FORMATS:
         raise ValueError(f"kind: expected one of {', '.join(TURNTABLE_FORMATS)}, got {kind!r}")
-    if not len(frames):
-        raise ValueError("frames: expected at least one, got none")
+    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or not frames.size:
+        raise ValueError(
+            f"frames: expected 8-bit pixels (frame, height, width, 3), got {frames.dtype} {frames.shape}; "
+            "`to_pixels` makes them of images"
+        )
+    if not 0 < seconds < math.inf:
+        raise ValueError(f"seconds: expected a time above 0, got {seconds}")
     if kind in CODECS:
         return _video(frames, kind, max(1.0, len(frames) / seconds))
     first, *others = [Image.fromarray(frame) for frame in frames]

@@ -29,6 +29,7 @@ from hyperplanes.utilities.files import format_of, write_whole
 
 if TYPE_CHECKING:
     import trimesh
+from hyperplanes.utilities.arguments import checked
 
 __all__ = [
     "MESH_FORMATS",
@@ -244,6 +245,7 @@ def agreement(surface: Surface, field: AdaptedField, cameras: PinholeCamera) -> 
     return Agreement(float(overlap), float(near.float().mean()) if len(near) else 0.0)
 
 
+@checked
 @torch.no_grad()
 def extract_mesh(
     field: AdaptedField,
@@ -347,6 +349,7 @@ def _colours(field: AdaptedField, mesh: trimesh.Trimesh, device: torch.device) -
     return torch.cat([field(here, along)[0] for here, along in parts]).cpu().numpy()
 
 
+@checked
 def save_mesh(surface: Surface, path: str | Path) -> Path:
     """Write a surface as PLY, GLB or OBJ, vertex colours included.
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from hyperplanes.fields.baked import HARMONICS, BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.splats import render_splats, splat_gradients
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.files import format_of, write_whole
 from hyperplanes.views import Views
 
@@ -62,6 +63,7 @@ class Splats:
         return torch.stack([render_splats(self.means, self.sizes, opacities, self.colours(one), one) for one in ones])
 
 
+@checked
 def splats_of(baked: BakedField) -> Splats:
     """One splat a voxel, as opaque as the voxel is and with its colours."""
     places = (baked.index >= 0).nonzero()
@@ -72,6 +74,7 @@ def splats_of(baked: BakedField) -> Splats:
     return Splats(means, torch.full((len(means),), SIZE * voxel), torch.logit(opacity), rows[:, 1:].clone())
 
 
+@checked
 def fit_splats(
     splats: Splats, views: Views, *, steps: int = STEPS, seed: int = 0, on_step: Callable[[int], None] | None = None
 ) -> Splats:
@@ -111,6 +114,7 @@ def fit_splats(
     return replace(splats, coefficients=coefficients.detach(), logits=logits.detach())
 
 
+@checked
 def save_splats(splats: Splats, path: str | Path) -> Path:
     """Write splats as PLY, which every viewer reads, or in the smaller format .splat, which has no colour by direction.
 

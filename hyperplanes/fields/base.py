@@ -17,11 +17,13 @@ from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.parameters import Parameters
+from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.views import Views
 
 __all__ = ["Field", "MLPField", "Target", "TargetConfig"]
 
 
+@checked_fields
 @dataclass(frozen=True)
 class TargetConfig:
     """The shape of a target network (HyperPlanes, Appendix B, has depth 8 and width 256).

@@ -26,6 +26,7 @@ from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility import ANGLE, ChosenViews, Described, Reading, Visibility, VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
 from hyperplanes.parameters import Parameters
+from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.views import Views
 
 __all__ = ["ImageBasedConfig", "ImageBasedField", "ImageBasedNeRF", "FeatureGrid"]
@@ -61,6 +62,7 @@ class FeatureGrid(nn.Module):
         self.weight = nn.Parameter(torch.zeros(channels, SIDE, SIDE, SIDE))
 
 
+@checked_fields
 @dataclass(frozen=True)
 class ImageBasedConfig(TargetConfig):
     """The shape of a field of any number of views.

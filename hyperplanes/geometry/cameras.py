@@ -18,6 +18,7 @@ from torch import Tensor
 
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.poses import fibonacci_sphere, look_at, opencv_from_opengl, opengl_from_opencv, orbit
+from hyperplanes.utilities.arguments import checked
 
 __all__ = [
     "camera_from_world",
@@ -46,6 +47,7 @@ __all__ = [
 ROTATION_TOLERANCE = 1e-3
 
 
+@checked
 def pinhole(
     intrinsics: Float[Tensor, "*view 3 3"],
     camera_from_world: Float[Tensor, "view 4 4"],
@@ -116,6 +118,7 @@ def _check_numbers(calibration: Tensor, pose: Tensor) -> None:
         raise ValueError("camera_from_world: expected the last row 0 0 0 1")
 
 
+@checked
 def symmetric_intrinsics(height: int, width: int, field_of_view: float) -> Float[Tensor, "3 3"]:
     """Calibration of a camera that looks through its image centre.
 
@@ -212,6 +215,7 @@ def _rebuilt(cameras: PinholeCamera, change: Callable[[Tensor], Tensor]) -> Pinh
     return DistortedCamera(bare, change(cameras.distortion)) if isinstance(cameras, DistortedCamera) else bare
 
 
+@checked
 def select(cameras: PinholeCamera, index: slice | list[int] | Int[Tensor, " chosen"]) -> PinholeCamera:
     """The cameras at `index`, in that order."""
     return _rebuilt(cameras, lambda value: value[index])
@@ -240,6 +244,7 @@ def concatenate(batches: list[PinholeCamera]) -> PinholeCamera:
     return DistortedCamera(bare, torch.cat(lenses))
 
 
+@checked
 def to(
     cameras: PinholeCamera, device: torch.device | str | None = None, dtype: torch.dtype | None = None
 ) -> PinholeCamera:
@@ -247,12 +252,14 @@ def to(
     return _rebuilt(cameras, lambda value: value.to(device=device, dtype=dtype))
 
 
+@checked
 def with_poses(cameras: PinholeCamera, camera_from_world: Float[Tensor, "view 4 4"]) -> PinholeCamera:
     """The cameras at other poses, with the same calibration and distortion."""
     bare = pinhole(intrinsics(cameras), camera_from_world, *image_size(cameras))
     return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
 
 
+@checked
 def cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     """The cameras of images whose right and lower borders were moved; calibration and distortion stay."""
     bare = PinholeCamera(
@@ -264,6 +271,7 @@ def cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
 
 
+@checked
 def resized(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     """The cameras of the same images scaled to another size.
 

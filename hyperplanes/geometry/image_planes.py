@@ -18,6 +18,7 @@ from hyperplanes.geometry.lookup import Lookup, choose, lookup
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.packed_images import PackedImages, pack
+from hyperplanes.utilities.arguments import checked
 
 __all__ = ["MIN_Z", "ImagePlanes", "Lookup"]
 
@@ -28,6 +29,7 @@ class ImagePlanes:
     A batch of several objects is one set of planes; `views` holds the indices of the planes of each point's object.
     """
 
+    @checked
     def __init__(
         self,
         images: ArrayLike,
@@ -51,7 +53,7 @@ class ImagePlanes:
         Raises:
             ValueError: images of another number or size than the cameras, or of another number of dimensions.
         """
-        images = as_images(images)
+        images = as_images(images, size=camera.image_size(cameras) if cameras.batch_size else None)
         if len(images) != cameras.batch_size:
             raise ValueError(f"images: expected one a camera, {cameras.batch_size}, got {len(images)}")
         if len(images) and camera.image_size(cameras) != tuple(images.shape[2:]):

@@ -11,6 +11,9 @@ from torch import Tensor
 
 __all__ = ["ArrayLike", "as_images", "as_indices", "as_matrices", "as_points", "as_tensor", "check_indices"]
 
+SLIM = 4
+"""Heights of an image in its widths above which it is more likely none."""
+
 ArrayLike: TypeAlias = Tensor | npt.NDArray[Any]
 """A tensor, or a NumPy array of the same shape."""
 
@@ -66,12 +69,14 @@ def as_matrices(matrices: ArrayLike, views: int) -> Tensor:
     return matrices
 
 
-def as_images(images: ArrayLike, name: str = "images") -> Tensor:
+def as_images(images: ArrayLike, name: str = "images", size: tuple[int, int] | None = None) -> Tensor:
     """Images (view, channel, height, width) in a floating-point type; 8-bit ones are divided by 255.
 
     Args:
         images: what was given.
         name: of the argument, for messages.
+        size: (height, width) of their cameras, which tells rows from channels. Without it, images that would be 1, 3
+            or 4 pixels wide and more than SLIM times as high are taken for ones with their channels last.
 
     Raises:
         ValueError: another number of dimensions, channels last, no pixel, or whole numbers of more than 8 bits.
@@ -83,7 +88,7 @@ def as_images(images: ArrayLike, name: str = "images") -> Tensor:
     images = as_tensor(name, images)
     if images.ndim != 4:
         raise ValueError(f"{name}: expected shape (view, channel, height, width), got {tuple(images.shape)}")
-    if images.shape[3] in (1, 3, 4) and images.shape[1] > 4 and images.shape[2] > 4:
+    if images.shape[3] in (1, 3, 4) and _channels_last(images, size):
         raise ValueError(
             f"{name}: expected channels before rows, (view, channel, height, width), got {tuple(images.shape)}; "
             f"write {name}.{axes}(0, 3, 1, 2)"
@@ -95,6 +100,13 @@ def as_images(images: ArrayLike, name: str = "images") -> Tensor:
     if not images.is_floating_point() and images.dtype != torch.bool:
         raise ValueError(f"{name}: expected floating-point numbers or 8-bit ones, got {images.dtype}")
     return _floating(images)
+
+
+def _channels_last(images: Tensor, size: tuple[int, int] | None) -> bool:
+    if size is not None:
+        return tuple(images.shape[1:3]) == size != tuple(images.shape[2:])
+    _, channels, height, width = images.shape
+    return channels > 4 and height > SLIM * width
 
 
 def as_indices(views: ArrayLike, points: Tensor) -> Tensor:

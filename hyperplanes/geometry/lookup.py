@@ -21,6 +21,7 @@ from hyperplanes.geometry.inputs import (
 )
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.packed_images import PackedImages
+from hyperplanes.utilities.arguments import kind_of
 
 __all__ = ["Backend", "Lookup", "backends", "choose", "lookup", "sample"]
 
@@ -133,6 +134,8 @@ def lookup(
     >>> found.colours.item(), found.valid.item()
     (2.0, True)
     """
+    if not isinstance(background, int | float):
+        raise ValueError(f"background: expected a number, got {kind_of(background)}")
     points, images = as_points(points), as_images(images)
     matrices, images = as_matrices(matrices, len(images)).to(points), images.to(points)
     views = None if views is None else as_indices(views, points)
@@ -190,6 +193,8 @@ def sample(
     >>> sample(ramp, torch.tensor([[[0.0, 0.0]], [[1.0, -1.0]], [[1.1, 0.0]]]), background=9.0).flatten().tolist()
     [1.5, 3.0, 9.0]
     """
+    if not isinstance(background, int | float):
+        raise ValueError(f"background: expected a number, got {kind_of(background)}")
     images, coordinates = as_images(images), as_tensor("coordinates", coordinates)
     if not coordinates.is_floating_point():
         coordinates = coordinates.to(torch.get_default_dtype())

@@ -19,6 +19,7 @@ from hyperplanes.geometry.inputs import ArrayLike, as_images
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.arguments import checked
 
 __all__ = ["Occupancy", "ball_extent", "carve", "full"]
 
@@ -83,6 +84,7 @@ def _middle(axis: int) -> tuple[slice, ...]:
     return tuple(slice(None) if each == axis else slice(1, -1) for each in range(3))
 
 
+@checked
 def full(bounds: Sphere, side: int = 64, device: torch.device | str | None = None) -> Occupancy:
     """A grid with every voxel occupied.
 
@@ -94,6 +96,7 @@ def full(bounds: Sphere, side: int = 64, device: torch.device | str | None = Non
     return Occupancy(torch.ones(side, side, side, dtype=torch.bool, device=device), bounds)
 
 
+@checked
 @torch.no_grad()
 def carve(masks: ArrayLike, cameras: PinholeCamera, bounds: Sphere, side: int = 64, votes: int = 1) -> Occupancy:
     """The visual hull: voxels that no mask rules out, or fewer masks than `votes`.

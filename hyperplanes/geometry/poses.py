@@ -6,14 +6,19 @@ OpenCV axes (x right, y down, z forward) unless a name says otherwise.
 from __future__ import annotations
 
 import math
+from typing import Annotated, TypeAlias
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.axes import flip_camera_axes
 
 __all__ = ["farthest_first", "fibonacci_sphere", "look_at", "opencv_from_opengl", "opengl_from_opencv", "orbit"]
+
+Count: TypeAlias = Annotated[int, range(1, 2**24)]
+"""Of cameras."""
 
 
 def opencv_from_opengl(world_from_camera: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
@@ -29,6 +34,7 @@ def opengl_from_opencv(camera_from_world: Float[Tensor, "view 4 4"]) -> Float[Te
     return flip_camera_axes(torch.linalg.inv(camera_from_world))
 
 
+@checked
 def look_at(
     eyes: Float[Tensor, "view 3"],
     target: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -49,6 +55,8 @@ def look_at(
         raise ValueError(f"up: expected a direction, got {up}")
     forward = aim - eyes
     distance = forward.norm(dim=-1, keepdim=True)
+    if not torch.isfinite(distance).all():
+        raise ValueError(f"eyes: expected distances to the target {target} that are finite when squared, got infinity")
     if (distance <= 1e-7 * (eyes.norm(dim=-1, keepdim=True) + aim.norm())).any():
         raise ValueError(f"eyes: expected every eye away from the target {target}, got one at it")
     forward, upward = forward / distance, upward / length
@@ -65,7 +73,8 @@ def look_at(
     return torch.cat([torch.cat([rotation, translation], dim=2), last], dim=1)
 
 
-def orbit(views: int, distance: float, elevation: float = math.radians(20.0)) -> Float[Tensor, "view 4 4"]:
+@checked
+def orbit(views: Count, distance: float, elevation: float = math.radians(20.0)) -> Float[Tensor, "view 4 4"]:
     """camera_from_world of `views` cameras evenly around the y axis, looking at the origin.
 
     Args:
@@ -79,7 +88,8 @@ def orbit(views: int, distance: float, elevation: float = math.radians(20.0)) ->
     return look_at(distance * torch.stack([flat * azimuth.sin(), up, flat * azimuth.cos()], -1))
 
 
-def fibonacci_sphere(views: int, distance: float, lowest: float = -1.0, highest: float = 1.0) -> Tensor:
+@checked
+def fibonacci_sphere(views: Count, distance: float, lowest: float = -1.0, highest: float = 1.0) -> Tensor:
     """camera_from_world of cameras spread evenly over a band of the sphere, looking at the origin.
 
     Args:

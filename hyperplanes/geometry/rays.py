@@ -13,10 +13,12 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera, undistorted_pixels
 from hyperplanes.geometry.inputs import ArrayLike, as_tensor
+from hyperplanes.utilities.arguments import checked, checked_fields, kind_of
 
 __all__ = ["Rays", "Sphere", "cast", "pixel_grid"]
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Sphere:
     """The bounding sphere of a scene; nothing outside it is rendered.
@@ -33,6 +35,8 @@ class Sphere:
     radius: float = 1.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.centre, tuple) or len(self.centre) != 3:
+            raise ValueError(f"centre: expected a tuple of three numbers, got {kind_of(self.centre)}")
         if not (all(map(math.isfinite, self.centre)) and 0 <= self.radius < math.inf):
             raise ValueError(
                 f"sphere: expected finite numbers and no negative radius, got {self.centre}, {self.radius}"
@@ -83,6 +87,7 @@ def pixel_grid(height: int, width: int, device: torch.device | str | None = None
     return torch.stack([columns, rows], -1).reshape(-1, 2).float()
 
 
+@checked
 def cast(
     cameras: PinholeCamera,
     view: ArrayLike,

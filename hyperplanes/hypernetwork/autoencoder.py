@@ -15,10 +15,12 @@ from hyperplanes.hypernetwork.base import HyperNetwork, Observed
 from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS, encode_objects
 from hyperplanes.parameters import Parameters
+from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = ["Autoencoder", "AutoencoderConfig"]
 
 
+@checked_fields
 @dataclass(frozen=True)
 class AutoencoderConfig:
     """The shape of an encoder whose code the field reads (HyperPlanes, Table 5, names it and says no more about it).

@@ -12,6 +12,7 @@ from torch.nn.functional import relu, silu
 from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
 from hyperplanes.hypernetwork.updates import UPDATES
+from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = [
     "ACTIVATIONS",
@@ -67,6 +68,7 @@ class HeadConfig:
         check_choices(self, {"code_normalisation": CODE_NORMALISATIONS, **known})
 
 
+@checked_fields
 @dataclass(frozen=True)
 class ImageHyperNetworkConfig(HeadConfig):
     """A hypernetwork that reads images, as in the paper (`ImageHyperNetwork`).
@@ -98,6 +100,7 @@ class ImageHyperNetworkConfig(HeadConfig):
         check_choices(self, known)
 
 
+@checked_fields
 @dataclass(frozen=True)
 class VolumeHyperNetworkConfig:
     """A hypernetwork that reads what all views show on a grid over the scene (`VolumeHyperNetwork`); no settings."""

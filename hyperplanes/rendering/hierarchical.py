@@ -16,12 +16,14 @@ from torch import Tensor
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.samplers import DenseSamples
+from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = ["PLACEMENTS", "Hierarchical", "importance", "intervals", "stratified"]
 
 PLACEMENTS = ("intervals", "samples")
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Hierarchical:
     """The paper's sampler: the same number of samples on every ray, of a coarse and of a fine pass.

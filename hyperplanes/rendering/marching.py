@@ -11,12 +11,14 @@ from torch import Tensor
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples
+from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = ["RayMarching", "march"]
 
 CANDIDATES = 1 << 21  # samples tested against the grid at once; 12 bytes each
 
 
+@checked_fields
 @dataclass(frozen=True)
 class RayMarching:
     """The default sampler: equal steps, only in occupied voxels, and in images only until the ray is opaque.

@@ -138,10 +138,13 @@ def _compare_data(path: Path, before: object, now: Mapping[str, Any] | None) -> 
         return
     before = before if isinstance(before, dict) else {}
     counts = before.get("objects"), now.get("objects")
-    differing = [name for name in now if before.get(name) != now[name]]
+    differing = [name for name in now if name in before and before[name] != now[name]]
+    if not differing:  # of an earlier version, which noted less
+        return
     found = f"{counts[1]} with other {' and '.join(differing)}"
+    remedy = "give --legacy as before" if differing == ["calibration"] else "give the same --data"
     raise CheckpointError(
-        f"{path}: expected the {counts[0]} objects that the training began with, found {found}; give the same --data, "
+        f"{path}: expected the {counts[0]} objects that the training began with, found {found}; {remedy}, "
         f"or another --out with --checkpoint {path.parent} to begin with these weights"
     )
 

@@ -22,6 +22,7 @@ from hyperplanes.training.monitoring import Progress, Samples, Speed, gradient_n
 from hyperplanes.training.objective import Objective, RenderingObjective
 from hyperplanes.training.optimisation import Optimisation
 from hyperplanes.training.validation import Validation, Validator
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.utilities.files import write_whole
@@ -54,6 +55,7 @@ class Trainer:
         ValueError: no object to train on, or objects that the processes cannot share evenly.
     """
 
+    @checked
     def __init__(
         self,
         model: HyperPlanes,

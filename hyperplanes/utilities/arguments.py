@@ -7,11 +7,11 @@ import types
 from collections.abc import Callable
 from functools import cache, wraps
 from numbers import Integral, Real
-from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from torch import Tensor
 
-__all__ = ["checked", "kind_of"]
+__all__ = ["checked", "checked_fields", "kind_of"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -20,17 +20,42 @@ R = TypeVar("R")
 def checked(function: Callable[P, R]) -> Callable[P, R]:
     """A decorator: arguments of another class than annotated are a ValueError that names the argument.
 
-    Looked at are annotations that are classes, unions of them, and jaxtyping's arrays, of which the kind of numbers and
-    the number of dimensions count; all others are taken as they come.
+    Looked at are annotations that are classes, generic ones such as `Sequence[str]`, of which the class counts, tuples
+    of a fixed length, `Literal`, `Annotated[int, range(...)]`, unions of all these, and jaxtyping's arrays, of which
+    the kind of numbers and the number of dimensions count; all others are taken as they come.
 
     Args:
         function: with annotations that its module can resolve.
     """
+    return _checking(function, function)
+
+
+def checked_fields(settings: type[R]) -> type[R]:
+    """A decorator of a dataclass, whose fields are checked as the arguments of a function are.
+
+    >>> from dataclasses import dataclass
+    >>> @checked_fields
+    ... @dataclass(frozen=True)
+    ... class Network:
+    ...     depth: Annotated[int, range(1, 257)] = 8
+    >>> Network(depth=0)
+    Traceback (most recent call last):
+    ValueError: depth: expected a whole number from 1 to 256, got 0
+
+    Args:
+        settings: the dataclass.
+    """
+    setattr(settings, "__init__", _checking(settings.__init__, settings))  # noqa: B010 - no assignment to a method
+    return settings
+
+
+def _checking(function: Callable[P, R], annotated: Any) -> Callable[P, R]:
+    """A function that looks at its arguments first, by the annotations of itself or of a class."""
     signature = inspect.signature(function)
 
     @cache
     def hints() -> dict[str, Any]:
-        found = get_type_hints(function)
+        found = get_type_hints(annotated, include_extras=True)
         return {name: hint for name, hint in found.items() if name != "return" and _is_checkable(hint)}
 
     @wraps(function)
@@ -66,8 +91,19 @@ def _is_array(hint: Any) -> bool:
     return hasattr(hint, "array_type") and hasattr(hint, "dims")
 
 
+def _range(hint: Any) -> range | None:
+    """The values of a whole number that is annotated with them."""
+    if get_origin(hint) is not Annotated:
+        return None
+    return next((note for note in get_args(hint)[1:] if isinstance(note, range)), None)
+
+
 def _is_checkable(hint: Any) -> bool:
-    return all(_is_array(part) or isinstance(part, type) for part in _parts(hint))
+    return all(
+        _is_array(part) or isinstance(part, type) or _range(part) is not None or isinstance(get_origin(part), type)
+        or get_origin(part) is Literal
+        for part in _parts(hint)
+    )  # fmt: skip
 
 
 def _fits(value: object, hint: Any) -> bool:
@@ -83,19 +119,36 @@ def _fits_one(value: object, hint: Any) -> bool:
         named = not isinstance(kinds, list | tuple) or name in kinds
         variadic = any("Variadic" in type(each).__name__ for each in dimensions)
         return named and (variadic or len(dimensions) == getattr(value, "ndim", -1))
+    if (allowed := _range(hint)) is not None:
+        return _fits_one(value, int) and value in allowed
     if hint is float:
-        return (isinstance(value, Real) and not isinstance(value, bool)) or isinstance(value, Tensor)
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        return number or (isinstance(value, Tensor) and value.numel() == 1)
     if hint is int:
         return isinstance(value, Integral) and not isinstance(value, bool)
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return value in arguments
+    if origin is tuple and Ellipsis not in arguments:
+        right = isinstance(value, tuple) and len(value) == len(arguments)
+        return right and all(_fits(each, part) for each, part in zip(value, arguments, strict=True))
     try:
-        return isinstance(value, hint)
+        return isinstance(value, origin or hint)
     except TypeError:  # a protocol that cannot be asked
         return True
 
 
 def _shown(hint: Any) -> str:
-    names = [
-        f"a tensor ({part.dim_str.strip()})" if _is_array(part) else "None" if part is type(None) else part.__name__
-        for part in _parts(hint)
-    ]
-    return " or ".join(names)
+    return " or ".join(_shown_one(part) for part in _parts(hint))
+
+
+def _shown_one(part: Any) -> str:
+    if _is_array(part):
+        return f"a tensor ({part.dim_str.strip()})"
+    if (allowed := _range(part)) is not None:
+        return f"a whole number from {allowed[0]} to {allowed[-1]}"
+    if get_origin(part) is Literal:
+        return " or ".join(map(repr, get_args(part)))
+    if get_origin(part) is tuple:
+        return f"a tuple of {len(get_args(part))} numbers"
+    return "None" if part is type(None) else getattr(get_origin(part) or part, "__name__", str(part))

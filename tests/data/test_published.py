@@ -84,6 +84,11 @@ def test_co3d(tmp_path, kind):
     np.testing.assert_allclose(found(views), expected((14.0, 9.0)), atol=1e-3)
     assert views.masks is not None
     assert views.names[1] == "frame000001.jpg"
+    (tmp_path / "car/frame_annotations.jgz").rename(tmp_path / "elsewhere.jgz")
+    (tmp_path / "car/frame_annotations.jgz").symlink_to(tmp_path / "elsewhere.jgz")
+    with pytest.raises(DataError, match=r"frame_annotations.jgz: expected a file inside .*a symbolic link to"):
+        read_views(tmp_path / "car/110_1_2")
+    (tmp_path / "car/frame_annotations.jgz").unlink()
     (tmp_path / "car/frame_annotations.jgz").write_bytes(b"no gzip")
     with pytest.raises(DataError, match="frame_annotations.jgz: expected a list of frames, compressed by gzip"):
         open_dataset(tmp_path / "car")

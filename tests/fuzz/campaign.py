@@ -33,7 +33,7 @@ class Failure:
     what: str
 
     def __str__(self):
-        return f"case {self.case}: {self.kind}, {self.file}: {self.what}"
+        return f"case {self.case}: {self.kind}, {self.file}: {self.what:.300}"
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from PIL import Image
 from hyperplanes.adaptation import Diagnostics, HyperPlanes, base, diagnose
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.train import follow
-from hyperplanes.geometry import occupancy
+from hyperplanes.geometry import cameras, occupancy
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.training import Trainer, TrainingConfig, train
@@ -583,7 +583,19 @@ def test_a_training_does_not_go_on_with_other_data(tmp_path):
             task = super().task(name)
             return replace(task, support=replace(task.support, images=task.support.images / 2))
 
+    class Shifted(Balls):
+        """As --legacy reads them: the same pictures with the principal point half a pixel further."""
+
+        def task(self, name):
+            task = super().task(name)
+            matrix = cameras.intrinsics(task.support.cameras).clone()
+            matrix[:, :2, 2] += 0.5
+            shifted = cameras.pinhole(matrix, cameras.camera_from_world(task.support.cameras), *task.support.size)
+            return replace(task, support=replace(task.support, cameras=shifted))
+
     assert Trainer(small_model(), Balls(test=0), with_(steps=2), tmp_path).step == 0
+    with pytest.raises(ValueError, match="with other calibration; give --legacy as before"):
+        Trainer(small_model(), Shifted(test=0), with_(steps=2), tmp_path)
     for data, found in ((Balls(train=4, test=0), "4 with other objects and names"), (Darker(test=0), "other pictures")):
         with pytest.raises(ValueError, match=f"objects that the training began with, found .*{found}.*--checkpoint"):
             Trainer(small_model(), data, with_(steps=2), tmp_path)

@@ -5,8 +5,12 @@ import numpy as np
 import pytest
 import torch
 
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.export.images import orbit_cameras, save_images
-from hyperplanes.rendering.renderer import render
+from hyperplanes.geometry import ImagePlanes, cameras
+from hyperplanes.rendering.renderer import Marched, render
+from hyperplanes.training import TrainingConfig
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import ring
@@ -37,6 +41,16 @@ def field(points, directions):
         (lambda: psnr(PICTURES, PICTURES.byte()), "truth: expected a tensor .*, got a tensor of uint8"),
         (lambda: orbit_cameras(None, 3), "views: expected Views, got None"),
         (lambda: orbit_cameras("example-car", 3), "views: expected Views, got 'example-car'"),
+        (lambda: TrainingConfig(evaluate_every=0), "evaluate_every: expected a whole number from 1 to .*, got 0"),
+        (lambda: Marched(steps=2.5), "steps: expected a whole number from 1 to .*, got 2.5"),
+        (lambda: cameras.orbit(-1, 2.0), "views: expected a whole number from 1 to .*, got -1"),
+        (
+            lambda: cameras.look_at(PICTURES[0, :, 0, :3], (0.0, 1.0)),
+            "target: expected a tuple of 3 numbers, got a tuple",
+        ),
+        (lambda: ImagePlanes(PICTURES, PICTURES), "cameras: expected PinholeCamera, got a tensor of float32"),
+        (lambda: FineTuning(optimiser="lion"), "optimiser: expected 'adam' or 'muon' or"),
+        (lambda: HyperPlanes.from_pretrained(3), "name: expected Path or str, got 3"),
         (lambda: render(field, None), "target: expected PinholeCamera or Rays, got None"),
         (lambda: render(field, ring(1, (4, 4)), background="white"), "background: expected float, got 'white'"),
     ],

@@ -9,7 +9,7 @@ from typing import Any
 
 from hyperplanes.data.formats.transforms_json import read_transforms_task
 from hyperplanes.data.pictures.posed import PosedTask
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files import LONGEST_NAME, DataError
 
 __all__ = ["FORMAT", "SPLITS", "Catalogue", "is_plain", "native"]
 
@@ -87,4 +87,6 @@ def is_plain(name: str) -> bool:
     >>> is_plain("car_0001"), is_plain("../car"), is_plain("")
     (True, False, False)
     """
-    return PurePosixPath(name).name == name and name not in {"", ".", ".."} and "\\" not in name and "\0" not in name
+    if not 0 < len(name.encode(errors="replace")) <= LONGEST_NAME:
+        return False
+    return PurePosixPath(name).name == name and name not in {".", ".."} and "\\" not in name and "\0" not in name

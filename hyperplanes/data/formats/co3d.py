@@ -52,7 +52,11 @@ def read_sequence(folder: str | Path, *, downscale: int | None = None, root: Pat
     """
     folder = Path(folder)
     whole = folder.resolve()
-    frames = _annotations(whole.parent / ANNOTATIONS).get(whole.name, [])
+    category = whole.parent
+    check_link(
+        category / ANNOTATIONS, root if root is not None and category.is_relative_to(root.resolve()) else category
+    )
+    frames = _annotations(category / ANNOTATIONS).get(whole.name, [])
     return _read(whole, frames, downscale, folder if root is None else root)
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.training import TrainingConfig
+from hyperplanes.geometry import cameras as camera
 from hyperplanes.training.distributed import Processes
 from hyperplanes.training.episodes.augmentation import draw_rotation
 from hyperplanes.training.episodes.drawing import (
@@ -112,12 +113,15 @@ class EpisodeLoader:
 
     @cached_property
     def fingerprint(self) -> dict[str, Any]:
-        """What tells the objects that are trained on from others: their names, and the pictures of the first."""
-        first = (self.data.task(self.names[0]).support.images * 255).round().to(torch.uint8).cpu().contiguous()
+        """What tells the objects that are trained on from others: names, and pictures and calibration of the first."""
+        support = self.data.task(self.names[0]).support
+        first = (support.images * 255).round().to(torch.uint8).cpu().contiguous()
+        matrix = camera.intrinsics(support.cameras)[0].double().cpu()
         return {
             "objects": len(self.names),
             "names": sha256("\n".join(self.names).encode()),
             "pictures": sha256(first.numpy().tobytes()),
+            "calibration": [round(float(matrix[place]), 2) for place in ((0, 0), (1, 1), (0, 2), (1, 2))],
         }
 
     def names_of(self, step: int) -> list[str]:
