@@ -42,9 +42,7 @@ def main():
             continue
         (home / name).mkdir()
         started, cases = time.monotonic(), range(count) if options.only is None else [options.only]
-        failures = run(cases, options.seed, home / name)
-        for failure in failures:
-            print(failure)
+        failures = run(cases, options.seed, home / name, report=partial(print, flush=True))
         kinds = ", ".join(f"{count} of {kind}" for kind, count in Counter(each.kind for each in failures).items())
         took = f"{time.monotonic() - started:.0f} s"
         print(f"{len(cases)} {name}, seed {options.seed}, {took}: {len(failures)} failures {kinds}", flush=True)

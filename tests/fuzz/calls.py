@@ -14,6 +14,7 @@ import torch
 
 import hyperplanes as hp
 from hyperplanes.adaptation.hull_blend import HullBlend
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.data import read_channel
 from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
@@ -21,7 +22,6 @@ from hyperplanes.export.splats import fit_splats, save_splats, splats_of
 from hyperplanes.geometry import Sphere, cameras, occupancy, poses, rays
 from hyperplanes.geometry import lookup as lookups
 from hyperplanes.rendering.renderer import Hierarchical, Marched
-from hyperplanes.training import TrainingConfig
 from hyperplanes.utilities.checkpoints import CheckpointError
 from tests.fuzz.campaign import Failure, Hang, time_limit
 from tests.fuzz.corpus import archive, baked, data_set, posed_scene, small_model
@@ -207,13 +207,14 @@ def judge_call(function, arguments, finite=True):
     return None
 
 
-def run_calls(cases, seed, home):
+def run_calls(cases, seed, home, report=lambda failure: None):
     """Failures of these cases, without the type checks of the tests, as users run them.
 
     Args:
         cases: their numbers.
         seed: of the campaign.
         home: an empty folder to work in.
+        report: told of each failure when it is found.
 
     Returns:
         One `Failure` for each call that ended as none should.
@@ -235,6 +236,7 @@ def run_calls(cases, seed, home):
             if wrong is not None:
                 shown = " ".join(repr(value).split())[:80]
                 failures.append(Failure(case, "call", f"{name}({which}={shown})", wrong))
+                report(failures[-1])
         return failures
     finally:
         jaxtyping.config.update("jaxtyping_disable", before)

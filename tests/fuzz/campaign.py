@@ -91,7 +91,7 @@ def judge_whole(read, folder):
     return None
 
 
-def run_campaign(cases, seed, home: Path, kinds=None):
+def run_campaign(cases, seed, home: Path, kinds=None, report=lambda failure: None):
     """Failures of these cases.
 
     Args:
@@ -99,6 +99,7 @@ def run_campaign(cases, seed, home: Path, kinds=None):
         seed: of the campaign.
         home: an empty folder to work in.
         kinds: of files, as the corpus names them; all when None.
+        report: told of each failure when it is found.
 
     Returns:
         One `Failure` for each case that went wrong.
@@ -115,6 +116,7 @@ def run_campaign(cases, seed, home: Path, kinds=None):
         wrong = judge(read, folder)
         if wrong is not None:
             failures.append(Failure(case, kind, str(file), wrong))
+            report(failures[-1])
             shutil.copy(folder / file, home / f"case-{case}-{file.name}")
         (folder / file).write_bytes(before)
     return failures

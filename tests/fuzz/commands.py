@@ -215,13 +215,14 @@ def run_line(line, home, report):
     return None
 
 
-def run_commands(cases, seed, home: Path):
+def run_commands(cases, seed, home: Path, report=lambda failure: None):
     """Failures of these cases.
 
     Args:
         cases: their numbers.
         seed: of the campaign.
         home: an empty folder to work in.
+        report: told of each failure when it is found.
 
     Returns:
         One `Failure` for each line that ended as none should.
@@ -243,6 +244,7 @@ def run_commands(cases, seed, home: Path):
             wrong = f"changed {', '.join(changed[:3])}"
         if wrong is not None:
             failures.append(Failure(case, "command", shlex.join(line), wrong))
+            report(failures[-1])
         else:
             (home / f"case-{case}.txt").unlink(missing_ok=True)
     return failures

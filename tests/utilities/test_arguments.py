@@ -7,10 +7,10 @@ import torch
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.export.images import orbit_cameras, save_images
 from hyperplanes.geometry import ImagePlanes, cameras
 from hyperplanes.rendering.renderer import Marched, render
-from hyperplanes.training import TrainingConfig
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import ring
