@@ -21,7 +21,7 @@ from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.export.splats import fit_splats, save_splats, splats_of
 from hyperplanes.geometry import Sphere, cameras, occupancy, poses, rays
 from hyperplanes.geometry import lookup as lookups
-from hyperplanes.rendering.renderer import Hierarchical, Marched
+from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.utilities.checkpoints import CheckpointError
 from tests.fuzz.campaign import Failure, Hang, time_limit
 from tests.fuzz.corpus import archive, baked, data_set, posed_scene, small_model
@@ -61,7 +61,7 @@ def make_calls(home):
         "read_channel": (read_channel, {"folder": home / "archive", "channel": "depth"}),
         "Views": (hp.Views, {"images": images, "cameras": batch, "masks": views.masks, "bounds": views.bounds}),
         "Views[]": (views.__getitem__, {"index": [0, 1]}),
-        "Views.rays": (views.rays, {"view": 0, "span": "sphere"}),
+        "Views.rays": (views.rays, {"view": 0, "near_far": "sphere"}),
         "Views.sample_rays": (views.sample_rays, {"count": 3, "among": torch.arange(5)}),
         "Views.to": (views.to, {"device": "cpu", "dtype": torch.float32}),
         "Task": (hp.Task, {"support": task.support, "query": task.query, "name": "a"}),
@@ -84,7 +84,7 @@ def make_calls(home):
         "lookup": (lookups.lookup, {"points": points, "matrices": cameras.projection_matrices(batch),
                                     "images": images, "background": 1.0}),
         "sample": (lookups.sample, {"images": images, "coordinates": torch.zeros(3, len(images), 2)}),
-        "render": (hp.render, {"field": fog, "target": batch, "sampling": Marched(8), "bounds": Sphere(),
+        "render": (hp.render, {"field": fog, "target": batch, "sampling": RayMarching(8), "bounds": Sphere(),
                                "background": 1.0, "chunk": 100}),
         "render rays": (hp.render, {"field": fog, "target": traced, "sampling": Hierarchical(4, 4), "chunk": 2}),
         "psnr": (hp.psnr, {"predicted": images, "truth": images * 0.9}),
@@ -96,13 +96,13 @@ def make_calls(home):
         "save": (model.save, {"folder": out, "dtype": torch.float32}),
         "NearestView": (hp.NearestView().adapt, {"support": views}),
         "HullBlend": (HullBlend().adapt, {"support": views}),
-        "AdaptedField.render": (field.render, {"cameras": batch, "sampling": Marched(8)}),
+        "AdaptedField.render": (field.render, {"cameras": batch, "sampling": RayMarching(8)}),
         "evaluate": (hp.evaluate, {"method": "nearest", "adapter": hp.NearestView(), "data": data, "names": ["a"]}),
         "FineTuning": (hp.FineTuning, {"rays": 16, "optimiser": "adam", "learning_rate": 1e-3, "holdout": 2,
                                        "final_rate_factor": 0.1, "fresh": 0.5, "seed": 0, "max_steps": 3}),
         "TrainingConfig": (TrainingConfig, {"steps": 1, "rays": 8, "evaluate_every": 1, "learning_rate": 1e-3,
                                             "rotations": 0.5, "views": (2,), "optimiser": "adam", "seed": 1}),
-        "Marched": (Marched, {"steps": 8, "stop": 0.1}),
+        "RayMarching": (RayMarching, {"steps": 8, "stop": 0.1}),
         "Hierarchical": (Hierarchical, {"coarse": 8, "fine": 8, "placement": "samples"}),
         "Trainer": (hp.Trainer, {"model": model, "data": data, "config": TrainingConfig(steps=1, rays=8, tasks=1)}),
         "save_images": (hp.save_images, {"images": images, "folder": out, "names": ["a", "b", "c", "d"]}),

@@ -10,7 +10,7 @@ from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.export.images import orbit_cameras, save_images
 from hyperplanes.geometry import ImagePlanes, cameras
-from hyperplanes.rendering.renderer import Marched, render
+from hyperplanes.rendering.renderer import RayMarching, render
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import ring
@@ -42,7 +42,7 @@ def field(points, directions):
         (lambda: orbit_cameras(None, 3), "views: expected Views, got None"),
         (lambda: orbit_cameras("example-car", 3), "views: expected Views, got 'example-car'"),
         (lambda: TrainingConfig(evaluate_every=0), "evaluate_every: expected a whole number from 1 to .*, got 0"),
-        (lambda: Marched(steps=2.5), "steps: expected a whole number from 1 to .*, got 2.5"),
+        (lambda: RayMarching(steps=2.5), "steps: expected a whole number from 1 to .*, got 2.5"),
         (lambda: cameras.orbit(-1, 2.0), "views: expected a whole number from 1 to .*, got -1"),
         (
             lambda: cameras.look_at(PICTURES[0, :, 0, :3], (0.0, 1.0)),
