@@ -32,23 +32,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0 done, 1 done but something is wrong, 2 wrong input, 130 interrupted, 143 terminated,
-        129 its terminal closed.
-
-    Raises:
-        ValueError: wrong input, only where a traceback was asked for.
-        OSError: a file that cannot be read or written, only where a traceback was asked for.
+        129 its terminal closed. An unknown option, and the help of a verb, end in SystemExit.
     """
+    ended = None
+    try:
+        code = _main(arguments)
+    except SystemExit as end:
+        code, ended = 0, end
+    written = _flush()
+    if written is not None and code == 0:
+        return _complain(f"hyperplanes: standard output: {_one_line(written)}")
+    if ended is not None:
+        raise ended
+    return code
+
+
+def _flush() -> OSError | None:
+    """Write what is left of our output; what went wrong where that cannot be done."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        sys.stdout = None  # whoever read our output has gone; nothing is left to be flushed to
+    except OSError as error:
+        sys.stdout = None
+        return error
+    return None
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     traceback = "--traceback" in given or os.environ.get(TRACEBACK_VARIABLE, "") not in ("", "0")
     given = [argument for argument in given if argument != "--traceback"]
     if not given or given[0] in ("-h", "--help", "help"):
-        _say(_overview())
-        return 0 if given else 2
+        return _say(_overview()) or (0 if given else 2)
     if given[0] == "--version":
         from importlib.metadata import version
 
-        _say(f"hyperplanes {version('hyperplanes')}")
-        return 0
+        return _say(f"hyperplanes {version('hyperplanes')}")
     verb, *rest = given
     try:
         module = find_verb(verb).module
@@ -64,10 +85,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _complain(f"hyperplanes {verb}: {'interrupted' if code == 130 else 'terminated'}; {advice}")
         return code
     except BrokenPipeError:
-        sys.stdout = None  # whoever read our output has gone; nothing is left to be flushed to
+        sys.stdout = None  # as in `_flush`
         return 0
-    except (ValueError, OSError) as error:
-        if traceback:
+    except (ValueError, OSError, MemoryError, RuntimeError) as error:
+        if traceback or not (isinstance(error, ValueError | OSError) or _is_memory(error)):
             raise
         return _complain(f"hyperplanes {verb}: {_one_line(error)}")
 
@@ -96,7 +117,14 @@ def _brought(module: ModuleType) -> list[str]:
     return [f"{what} of other packages: {', '.join(names)}." for what, names in found.items() if names]
 
 
+def _is_memory(error: Exception) -> bool:
+    return isinstance(error, MemoryError) or "can't allocate memory" in str(error) or "out of memory" in str(error)
+
+
 def _one_line(error: Exception) -> str:
+    if _is_memory(error):
+        found = " ".join(str(error).split("\n")[0].split()) or "none left"
+        return f"expected enough memory, found {found}; ask for smaller or fewer pictures, voxels or processes"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}expected room to write, found a full disk; free some and run the same command again"
@@ -105,11 +133,16 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _say(text: str) -> None:
+def _say(text: str) -> int:
+    """Print; the exit code."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        sys.stdout = None  # as in `main`
+        sys.stdout = None  # as in `_flush`
+    except OSError as error:
+        sys.stdout = None
+        return _complain(f"hyperplanes: standard output: {_one_line(error)}")
+    return 0
 
 
 def _complain(line: str) -> int:

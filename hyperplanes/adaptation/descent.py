@@ -130,6 +130,16 @@ class Descent:
                     optimiser.step()
             yield step + 1
 
+    @torch.no_grad()
+    def errors(self) -> tuple[float, float]:
+        """Squared errors on the same `settings.rays` rays of the views: of the field as it is, of an empty picture."""
+        field, generator = self.field(None), torch.Generator().manual_seed(self.settings.seed + 2)
+        near_far = field.sampling.near_far
+        rays, truth = self.views.sample_rays(
+            self.settings.rays, generator=generator, among=self.pixels, near_far=near_far
+        )
+        return float((field.trace(rays).colour - truth).square().mean()), float((1 - truth).square().mean())
+
     def best_stop(
         self,
         holdout: Views,

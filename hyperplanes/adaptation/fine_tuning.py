@@ -20,6 +20,8 @@ from hyperplanes.views import Views
 
 __all__ = ["fine_tune", "fine_tune_to", "make_descent"]
 
+NEARLY = 0.99  # of the error of an empty picture, which a field that has lost everything may miss by rounding
+
 
 def fine_tune(
     network: HyperPlanesNetwork,
@@ -84,13 +86,28 @@ def fine_tune_to(
         with torch.no_grad():
             return network.rendering_field(context, judged_weights(network, context))
     descent, variables = make_descent(network, context, settings, views)
+    before, _ = descent.errors()
     for done in descent.run(steps if schedule is None else schedule):
         if on_step is not None:
             on_step(done)
         if done == steps:
             break
+    _check_progress(before, *descent.errors(), steps)
     with torch.no_grad():
         return network.rendering_field(context, variables.weights())
+
+
+def _check_progress(before: float, after: float, empty: float, steps: int) -> None:
+    """Refuse what steps at a wild rate make: numbers that are not finite, or pictures that are empty or worse.
+
+    Raises:
+        ValueError: the squared error is no number, or neither below that before the steps nor below an empty picture's.
+    """
+    if not after < max(before, empty * NEARLY):
+        raise ValueError(
+            f"fine-tuning: expected {steps} steps to lower the squared error, {before:.3g}, got {after:.3g}, where an "
+            f"empty picture has {empty:.3g}; lower learning_rate and muon_learning_rate, or take the field of 0 steps"
+        )
 
 
 def make_descent(

@@ -22,6 +22,7 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
+from hyperplanes.utilities.environment import cache_folder
 from hyperplanes.views import Views
 
 __all__ = ["keep_field", "kept_folder", "recall_field"]
@@ -44,8 +45,8 @@ def kept_folder(model: HyperPlanes, views: Views, steps: Steps, settings: FineTu
     for part in _tensors(model, views):
         digest.update(f"{part.dtype}{tuple(part.shape)}".encode())
         digest.update(part.detach().cpu().contiguous().numpy().tobytes())
-    base = os.environ.get("HYPERPLANES_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "hyperplanes"
-    return Path(base).expanduser() / "adapted" / digest.hexdigest()[:32]
+    base = Path(os.environ.get("HYPERPLANES_CACHE") or cache_folder() / "hyperplanes")
+    return base / "adapted" / digest.hexdigest()[:32]
 
 
 def _tensors(model: HyperPlanes, views: Views) -> Iterator[Tensor]:

@@ -78,11 +78,15 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.baking import coarsening, default_side
     from hyperplanes.export.images import save_images, save_turntable
+    from hyperplanes.export.mesh import check_voxels
     from hyperplanes.export.page import page_of, save_page, turning_picture
     from hyperplanes.utilities.errors import prefix_errors
 
     if arguments.level is not None and not arguments.level > 0:
         raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")
+    if "mesh" in arguments.what:
+        with prefix_errors("--voxels"):
+            check_voxels(arguments.voxels)
     if arguments.page_voxels is not None:
         with prefix_errors("--page-voxels"):
             coarsening(arguments.page_voxels)

@@ -142,7 +142,10 @@ def adapt_to(
 
         field = source.fine_tune(shown, steps, settings, on_step=count, on_trial=count_trials)
     if time.perf_counter() - started > WORTH_KEEPING:
-        keep_field(source, field, folder)
+        try:
+            keep_field(source, field, folder)
+        except OSError as error:  # the field is there, and what is asked of it can be done
+            console.warn(f"{folder}: not kept for another time: {error}")
     how = f", {taken[-1]} fine-tuning steps" if any(taken) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")

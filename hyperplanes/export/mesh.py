@@ -26,6 +26,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.utilities.colour import linear_from_srgb
 from hyperplanes.utilities.files import format_of, write_whole
+from hyperplanes.utilities.memory import require_memory
 
 if TYPE_CHECKING:
     import trimesh
@@ -36,6 +37,7 @@ __all__ = [
     "Agreement",
     "Surface",
     "agreement",
+    "check_voxels",
     "choose_level",
     "density_grid",
     "extract_mesh",
@@ -56,6 +58,8 @@ leaves dents in walls of fog. Of two cars after one step, seen from seven places
 as rendered, 94 % with 0.5, 90 % with 0.2, and 93 % by a level alone, which left holes; a chair that was fine-tuned for
 60 steps stayed as it was (94.6 %)."""
 
+BYTES_OF_POINT = 64  # of a grid, while its density is computed
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -72,6 +76,20 @@ class Surface:
     colours: npt.NDArray[np.float32]
 
 
+def check_voxels(voxels: int) -> None:
+    """Refuse a grid that is none, or too large for `density_grid`.
+
+    Args:
+        voxels: points along each side.
+
+    Raises:
+        ValueError: fewer than 8, or more than fit into memory.
+    """
+    if voxels < 8:
+        raise ValueError(f"voxels: expected at least 8, got {voxels}")
+    require_memory("voxels", voxels, BYTES_OF_POINT * voxels**3, "take fewer")
+
+
 @torch.no_grad()
 def density_grid(field: AdaptedField, voxels: int = 128) -> Float[Tensor, "x y z"]:
     """The density of a field at the corners of a grid, zero where its occupancy is empty.
@@ -81,13 +99,9 @@ def density_grid(field: AdaptedField, voxels: int = 128) -> Float[Tensor, "x y z
         voxels: points along each side of the cube around the scene; the outer ones lie on its faces.
 
     Returns:
-        Density per world unit.
-
-    Raises:
-        ValueError: fewer than 8 voxels.
+        Density per world unit. `check_voxels` says how many voxels they may be.
     """
-    if voxels < 8:
-        raise ValueError(f"voxels: expected at least 8, got {voxels}")
+    check_voxels(voxels)
     occupancy = field.occupancy
     bounds, device = occupancy.bounds, occupancy.occupied.device
     axis = torch.linspace(-1, 1, voxels, device=device)

@@ -15,8 +15,12 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
+from hyperplanes.utilities.memory import require_memory
 
 __all__ = ["Pictures", "render_images"]
+
+BYTES_OF_VIEW, BYTES_KEPT = 200, 32
+"""That a pixel takes: of rays, while its view is rendered, and of the pictures of all views."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ def render_images(
         One picture a camera.
     """
     height, width = camera.image_size(cameras)
+    needed = height * width * (BYTES_OF_VIEW + BYTES_KEPT * cameras.batch_size)
+    require_memory("cameras", f"{cameras.batch_size} of {width}x{height}", needed, "render fewer or smaller pictures")
     pixels = pixel_grid(height, width, cameras.intrinsics.device)
     live = None if occupancy is None else footprint(occupancy, cameras).flatten(1)
     values = pixels.new_zeros(cameras.batch_size, height * width, 5)

@@ -66,7 +66,7 @@ def evaluate(
         Colours (n, 3) and densities (n,).
 
     Raises:
-        ValueError: values of another shape.
+        ValueError: values of another shape, or densities below 0.
     """
     size = len(points) if differentiable else points_per_batch(points.device)
     parts = [field(*part) for part in zip(points.split(max(1, size)), directions.split(max(1, size)), strict=True)]
@@ -76,7 +76,19 @@ def evaluate(
             f"field: expected colours {tuple(points.shape)} and densities {tuple(points.shape[:1])}, "
             f"got {tuple(colour.shape)} and {tuple(density.shape)}"
         )
+    if _is_negative(density):
+        raise ValueError(
+            f"field: expected densities of 0 or more, got {float(density.detach().min()):.3g}; "
+            "torch.nn.functional.softplus or relu makes them so"
+        )
     return colour, density
+
+
+def _is_negative(density: Tensor) -> bool:
+    """Whether a density is below 0; values cannot be looked at under `torch.compile` and `torch.func`."""
+    if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
+        return False
+    return bool((density.detach() < 0).any())
 
 
 def points_per_batch(device: torch.device) -> int:

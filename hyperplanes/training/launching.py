@@ -37,8 +37,12 @@ def count_processes(devices: int, nodes: int) -> tuple[int, int]:
         Both.
 
     Raises:
-        ValueError: torchrun has started other numbers, or several nodes without a word on how they find each other.
+        ValueError: less than one, torchrun has started other numbers, or several nodes without a word on how they find
+            each other.
     """
+    for name, count in (("--devices", devices), ("--nodes", nodes)):
+        if count < 1:
+            raise ValueError(f"{name}: expected at least 1, got {count}")
     if _by_torchrun():
         local, total = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
         if (devices, nodes) not in ((1, 1), (local, total // local)):

@@ -5,11 +5,25 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+import tempfile
 from pathlib import Path
 
-__all__ = ["environment", "find_commit", "find_processor"]
+__all__ = ["cache_folder", "environment", "find_commit", "find_processor"]
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def cache_folder() -> Path:
+    """Where programs of this user keep what may be deleted: `$XDG_CACHE_HOME`, `~/.cache`, or a temporary folder.
+
+    A user whom the system does not know, as in a container started by number, may have no home.
+    """
+    if base := os.environ.get("XDG_CACHE_HOME"):
+        return Path(base)
+    try:
+        return Path.home() / ".cache"
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"cache-of-{os.getuid()}"
 
 
 def find_commit() -> str:

