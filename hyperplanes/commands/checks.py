@@ -22,6 +22,7 @@ REQUIRED = {
     "trimesh": "trimesh",
     "manifold3d": "manifold3d",
     "mapbox_earcut": "mapbox-earcut",
+    "xatlas": "xatlas",
     "safetensors": "safetensors",
     "jaxtyping": "jaxtyping",
     "PIL": "pillow",
