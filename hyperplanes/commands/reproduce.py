@@ -142,12 +142,12 @@ def run(arguments: Arguments) -> int:
     folder = arguments.out / experiment.name
     command = _command(arguments, seeds)
     write_json(folder / "results.json", report.as_json(outcome, command))
-    write_whole(folder / "table.md", report.as_markdown(outcome, command).encode())
     write_whole(folder / "table.csv", report.as_csv(outcome).encode())
     made = {"figure": figure_of(outcome), "curves": curves_of(outcome), "pictures": pictures_of(runner, outcome)}
     names = {f"{name}.png": figure for name, figure in made.items() if figure is not None}
     for name, figure in names.items():
         save_figure(figure, folder / name)
+    write_whole(folder / "table.md", report.as_markdown(outcome, command, [*names]).encode())
     console.say(f"{experiment.title}; HyperPlanes (arXiv 2402.01524), {experiment.where}")
     console.table(report.headings(outcome), report.rows(outcome))
     for line in report.what_differs(outcome):

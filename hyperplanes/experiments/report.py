@@ -136,21 +136,23 @@ def sources() -> list[str]:
     return [f"{source.name}: {source.where}" for source in SOURCES]
 
 
-def as_markdown(outcome: Outcome, command: str) -> str:
+def as_markdown(outcome: Outcome, command: str, figures: Sequence[str] = ("figure.png",)) -> str:
     """The table with all that one must know to read it.
 
     Args:
         outcome: what was found.
         command: what makes it again.
+        figures: the names of those that lie beside it.
     """
     experiment, where = outcome.experiment, environment()
     machine = f"{where['gpu'] or where['processor']}, {where['cores']} cores, torch {where['torch']}"
     notes = "\n".join(f"- {line}" for line in what_differs(outcome))
+    shown = "\n\n".join(f"![{name.partition('.')[0]}]({name})" for name in figures)
     columns = "\n".join(f"- {line}" for line in sources())
     return (
         f"# {experiment.title}\n\nHyperPlanes (arXiv 2402.01524), {experiment.where}.\n\n"
         f"{markdown_table(headings(outcome), rows(outcome))}\n"
-        f"![figure](figure.png)\n\n## What differs\n\n{notes}\n\n"
+        f"{shown}\n\n## What differs\n\n{notes}\n\n"
         f"Settings that a source states otherwise (preset {outcome.scale.presets[experiment.size]}); - where it states "
         f"nothing:\n\n{markdown_table(DIFFERENCE_HEADINGS, settings(outcome))}\n{columns}\n\n## How it was made\n\n"
         f"    {command}\n\nCommit {where['commit']}; {machine}.\n"
