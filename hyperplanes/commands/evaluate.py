@@ -23,8 +23,7 @@ Example:
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,17 +32,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, ViewsUp, optional
 from hyperplanes.commands.writing import check_output
-from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from hyperplanes.data import Dataset
-    from hyperplanes.evaluation import ObjectScore, Score
+    from hyperplanes.evaluation import Score
     from hyperplanes.evaluation.comparison import Comparison
     from hyperplanes.views import Tasks, Views
 
-__all__ = ["Arguments", "as_json", "compared_rows", "headings", "rows", "run", "with_seed"]
+__all__ = ["Arguments", "run", "with_seed"]
 
 BROUGHT = {"Methods": "hyperplanes.methods", "Fields": "hyperplanes.fields"}
 """Groups of entry points whose names are methods."""
@@ -113,53 +109,6 @@ class Arguments:
 OUTPUTS = ("curve", "boxes", "grid", "csv", "markdown", "json")
 """Options that name files to write."""
 
-COLUMNS = {"psnr": "PSNR", "psnr_foreground": "inside mask", "psnr_pooled": "pooled", "ssim": "SSIM", "lpips": "LPIPS"}
-
-
-def headings(scores: Sequence[Score]) -> list[str]:
-    """Those of `rows`: of the numbers that every method has."""
-    found = ["method", "PSNR", "over objects"]
-    found += [label for name, label in COLUMNS.items() if name != "psnr" and _all_have(scores, name)]
-    return [*found, "to adapt", "to render a view"]
-
-
-def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
-    """The table as text, one row a method; ± is over seeds, "over objects" the standard deviation over them."""
-    table = []
-    for score in scores:
-        row = [score.method, _shown(score, "psnr"), f"± {score.spread('psnr'):.2f} dB"]
-        row += [_shown(score, name) for name in COLUMNS if name != "psnr" and _all_have(scores, name)]
-        row += [format_duration(score.mean(name)) for name in ("adapt_seconds", "render_seconds")]
-        table.append(tuple(row))
-    return table
-
-
-def _all_have(scores: Sequence[Score], quantity: str) -> bool:
-    return all(quantity in score.quantities for score in scores)
-
-
-def _shown(score: Score, quantity: str) -> str:
-    decimals, unit = (2, " dB") if quantity.startswith("psnr") else (3, "")
-    deviation = score.deviation(quantity)
-    spread = "" if deviation is None else f" ± {deviation:.{decimals}f}"
-    return f"{score.mean(quantity):.{decimals}f}{spread}{unit}"
-
-
-def compared_rows(pairs: Sequence[Comparison]) -> list[tuple[str, ...]]:
-    """Pairs of methods as text."""
-    return [
-        (
-            f"{pair.first} - {pair.second}",
-            f"{pair.mean:+.2f} dB",
-            "-" if pair.low is None or pair.high is None else f"{pair.low:+.2f} to {pair.high:+.2f}",
-            "-" if pair.p is None else f"{pair.p:.2g}",
-        )
-        for pair in pairs
-    ]
-
-
-PAIR_HEADINGS = ("paired over objects, PSNR", "difference", "95 % interval", "p")
-
 
 def with_seed(folders: Sequence[Path], seed: int) -> list[Path]:
     """Checkpoints of one seed."""
@@ -177,7 +126,10 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.data.support import WithSupport
     from hyperplanes.evaluation import evaluate_all
     from hyperplanes.evaluation.comparison import compare_all
+    from hyperplanes.evaluation.figures import PictureGrid
+    from hyperplanes.evaluation.partial_results import PartialResults
     from hyperplanes.evaluation.perceptual import LPIPS
+    from hyperplanes.evaluation.tables import PAIR_HEADINGS, compared_rows, headings, rows
     from hyperplanes.methods import WithSampler, at_steps, make_method
     from hyperplanes.utilities.plots import figure_kind
 
@@ -220,7 +172,7 @@ def run(arguments: Arguments) -> int:
 
     chosen = list(dict.fromkeys(each for name in arguments.method for each in at_steps(name, arguments.steps)))
     first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to
-    pictures, failures, kept = _Pictures(), {}, _Kept(arguments.json)
+    pictures, failures, kept = PictureGrid(), {}, PartialResults(arguments.json)
 
     def failed(method: str, seed: int, name: str, error: Exception) -> None:
         failures[name] = f"{method}: {error}"
@@ -233,7 +185,7 @@ def run(arguments: Arguments) -> int:
             names,
             bar.show,
             seeds=arguments.seeds,
-            on_object=pictures.keep if arguments.grid is not None else None,
+            on_object=pictures.add if arguments.grid is not None else None,
             on_score=kept.add,
             on_failure=failed if len(names) > 1 else None,
             lpips=lpips,
@@ -245,7 +197,7 @@ def run(arguments: Arguments) -> int:
     console.say(f"{count} objects of {arguments.data}{_of_seeds(arguments)}")
     _write(arguments, scores, pairs)
     if arguments.grid is not None:
-        pictures.draw(arguments.grid)
+        pictures.save(arguments.grid)
     kept.remove()
     for option in OUTPUTS:
         if (path := getattr(arguments, option)) is not None:
@@ -295,113 +247,24 @@ def _of_seeds(arguments: Arguments) -> str:
 
 def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Comparison]) -> None:
     """Every file but the grid of pictures."""
-    from hyperplanes.evaluation import QUANTITIES
+    from hyperplanes.evaluation import figures, tables
+    from hyperplanes.methods import at_steps
     from hyperplanes.utilities.files import write_json, write_whole
-    from hyperplanes.utilities.tables import csv_table, markdown_table
 
     if arguments.json is not None:
-        write_json(arguments.json, as_json(scores, pairs))
+        write_json(arguments.json, tables.as_json(scores, pairs))
     if arguments.csv is not None:
-        lines = [
-            (score.method, seed, each.name, *(getattr(each, name) for name in QUANTITIES))
-            for score in scores
-            for seed, run in enumerate(score.seeds or (score,))
-            for each in run.objects
-        ]
-        write_whole(arguments.csv, csv_table(("method", "seed", "object", *QUANTITIES), lines).encode())
+        write_whole(arguments.csv, tables.as_csv(scores).encode())
     if arguments.markdown is not None:
-        text = markdown_table(headings(scores), rows(scores))
-        if pairs:
-            text += "\n" + markdown_table(PAIR_HEADINGS, compared_rows(pairs))
-        objects = f"{len(scores[0].objects)} objects of {arguments.data}"
-        write_whole(arguments.markdown, f"{text}\n{objects}{_of_seeds(arguments)}.\n".encode())
+        about = f"{len(scores[0].objects)} objects of {arguments.data}{_of_seeds(arguments)}."
+        write_whole(arguments.markdown, tables.as_markdown(scores, pairs, about).encode())
     if arguments.curve is not None:
-        _draw_curve(scores, arguments.method, arguments.steps, arguments.curve)
+        # a method that takes no steps is a level
+        quality = {score.method: score.mean("psnr") for score in scores}
+        curves = {
+            method: [(float(count), quality[name]) for count in arguments.steps for name in at_steps(method, [count])]
+            for method in arguments.method
+        }
+        figures.save_curves(curves, arguments.steps, arguments.curve)
     if arguments.boxes is not None:
-        _draw_boxes(scores, arguments.boxes)
-
-
-def as_json(scores: Sequence[Score], pairs: Sequence[Comparison]) -> Mapping[str, object]:
-    """What `--json` writes: the numbers by method, and under "differences" those to the methods that are worse."""
-    table = {score.method: score.as_json() for score in scores}
-    for pair in pairs:
-        table[pair.first].setdefault("differences", {})[pair.second] = pair.as_json()
-    return table
-
-
-def _draw_boxes(scores: Sequence[Score], path: Path) -> None:
-    """The objects' PSNR, a box a method."""
-    from hyperplanes.utilities.plots import draw_boxes, new_figure, save_figure
-
-    figure = new_figure(max(5.0, 1.4 * len(scores)), 4.0)
-    axes = figure.subplots()
-    draw_boxes(axes, {score.method: [each.psnr for each in score.objects] for score in scores})
-    axes.set(ylabel="PSNR of an object (dB)")
-    axes.tick_params(axis="x", labelrotation=20)
-    save_figure(figure, path)
-
-
-def _draw_curve(scores: Sequence[Score], methods: Sequence[str], steps: Sequence[int], path: Path) -> None:
-    """PSNR over fine-tuning steps of every method; of one that takes none, a level."""
-    from hyperplanes.methods import at_steps
-    from hyperplanes.utilities.plots import draw_lines, new_figure, save_figure, set_counts
-
-    quality = {score.method: score.mean("psnr") for score in scores}
-    curves = {}
-    for method in methods:
-        named = [(count, name) for count in steps for name in at_steps(method, [count])]
-        curves[method] = [(float(count), quality[name]) for count, name in named]
-    figure = new_figure(6.0, 3.6)
-    axes = figure.subplots()
-    draw_lines(axes, curves, marks=True)
-    set_counts(axes, steps)
-    axes.set(xlabel="fine-tuning steps", ylabel="PSNR (dB)")
-    save_figure(figure, path)
-
-
-class _Kept:
-    """What has been measured so far, in a file beside the one of `--json` until that is written."""
-
-    seconds = 10.0
-
-    def __init__(self, path: Path | None) -> None:
-        self.path = None if path is None else path.with_name(f"{path.stem}.partial.json")
-        self._found: dict[str, dict[str, object]] = {}
-        self._written = 0.0
-
-    def add(self, method: str, seed: int, score: ObjectScore) -> None:
-        from hyperplanes.utilities.files import write_json
-
-        row = f"{method}, seed {seed}" if seed else method
-        self._found.setdefault(row, {})[score.name] = score.as_json()
-        if self.path is not None and time.monotonic() - self._written > self.seconds:
-            write_json(self.path, {row: {"objects": objects} for row, objects in self._found.items()})
-            self._written = time.monotonic()
-
-    def remove(self) -> None:
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
-
-
-class _Pictures:
-    """A query view of each of the first objects, by the first seed of every method."""
-
-    rows = 6
-
-    def __init__(self) -> None:
-        self.seen: dict[str, dict[str, np.ndarray]] = {}
-
-    def keep(self, method: str, seed: int, task, pictures) -> None:
-        from hyperplanes.export.images import to_pixels
-
-        if seed or (task.name not in self.seen and len(self.seen) >= self.rows):
-            return
-        view = len(task.query) // 4
-        found = self.seen.setdefault(task.name, {"truth": to_pixels(task.query.images[view : view + 1])[0]})
-        found[method] = to_pixels(pictures.images[view : view + 1])[0]
-
-    def draw(self, path: Path) -> None:
-        from hyperplanes.utilities.plots import draw_grid, save_figure
-
-        columns = list(next(iter(self.seen.values())))
-        save_figure(draw_grid([list(row.values()) for row in self.seen.values()], columns, list(self.seen)), path)
+        figures.save_boxes(scores, arguments.boxes)

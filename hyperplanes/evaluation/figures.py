@@ -1,0 +1,65 @@
+"""Scores of several methods as figures: boxes over objects, PSNR over fine-tuning steps, pictures side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hyperplanes.adaptation.base import Pictures
+from hyperplanes.evaluation.scores import Score
+from hyperplanes.export.images import to_pixels
+from hyperplanes.utilities.plots import draw_boxes, draw_grid, draw_lines, new_figure, save_figure, set_counts
+from hyperplanes.views import Task
+
+__all__ = ["PictureGrid", "save_boxes", "save_curves"]
+
+
+def save_boxes(scores: Sequence[Score], path: Path) -> None:
+    """The objects' PSNR, a box a method."""
+    figure = new_figure(max(5.0, 1.4 * len(scores)), 4.0)
+    axes = figure.subplots()
+    draw_boxes(axes, {score.method: [each.psnr for each in score.objects] for score in scores})
+    axes.set(ylabel="PSNR of an object (dB)")
+    axes.tick_params(axis="x", labelrotation=20)
+    save_figure(figure, path)
+
+
+def save_curves(curves: Mapping[str, Sequence[tuple[float, float]]], steps: Sequence[int], path: Path) -> None:
+    """PSNR over fine-tuning steps of every method.
+
+    Args:
+        curves: steps and PSNR by method.
+        steps: that the axis is marked at.
+        path: of the figure.
+    """
+    figure = new_figure(6.0, 3.6)
+    axes = figure.subplots()
+    draw_lines(axes, curves, marks=True)
+    set_counts(axes, steps)
+    axes.set(xlabel="fine-tuning steps", ylabel="PSNR (dB)")
+    save_figure(figure, path)
+
+
+class PictureGrid:
+    """A query view of each of the first objects, by the first seed of every method, beside the truth."""
+
+    rows = 6
+
+    def __init__(self) -> None:
+        self.seen: dict[str, dict[str, npt.NDArray[np.uint8]]] = {}
+
+    def add(self, method: str, seed: int, task: Task, pictures: Pictures) -> None:
+        """Keep a picture, where its row is one of the first."""
+        if seed or (task.name not in self.seen and len(self.seen) >= self.rows):
+            return
+        view = len(task.query) // 4
+        found = self.seen.setdefault(task.name, {"truth": to_pixels(task.query.images[view : view + 1])[0]})
+        found[method] = to_pixels(pictures.images[view : view + 1])[0]
+
+    def save(self, path: Path) -> None:
+        """Draw the grid."""
+        columns = list(next(iter(self.seen.values())))
+        save_figure(draw_grid([list(row.values()) for row in self.seen.values()], columns, list(self.seen)), path)
