@@ -20,7 +20,7 @@ import tyro
 
 from data_gen import SUPERSAMPLE
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, choices, optional
+from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, optional
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Arguments", "remarks", "run", "source_of", "summary"]
 
-Class = Literal["car", "chair", "plane", "lamp", "random"]
+BROUGHT = {"Classes": "data_gen.shapes"}
+"""Groups of entry points whose names are classes."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Arguments:
     Attributes:
         out: The folder to write: new, empty, or one in which the same command was interrupted.
         class_name: Procedural objects of this class: car, chair, plane, lamp, or random, which composes
-            primitives that mean nothing.
+            primitives that mean nothing; or one of another installed package.
         meshes: A folder of mesh files, instead of --class.
         meshes_class: What the meshes are, where their tree does not say it: layouts of other projects name folders so.
         count: How many procedural objects, the held-out ones included.
@@ -68,7 +69,7 @@ class Arguments:
     """
 
     out: Path
-    class_name: Annotated[Class | None, choices(Class), optional("NAME", name="class")] = None
+    class_name: Annotated[str | None, optional("NAME", name="class")] = None
     meshes: OptionalFolder = None
     meshes_class: Annotated[str | None, optional("NAME", name="class-name")] = None
     count: int = 70
@@ -96,9 +97,10 @@ def source_of(arguments: Arguments) -> Procedural | MeshFolder:
     """Where the objects come from.
 
     Raises:
-        ValueError: both or none of --class and --meshes.
+        ValueError: both or none of --class and --meshes, or a class that there is not.
     """
     from data_gen.datasets.generate import MeshFolder, Procedural
+    from data_gen.shapes import check_class
 
     if (arguments.class_name is None) == (arguments.meshes is None):
         found = "none" if arguments.meshes is None else "both"
@@ -109,7 +111,9 @@ def source_of(arguments: Arguments) -> Procedural | MeshFolder:
         raise ValueError("split_file: expected with --meshes and a ShapeNetCore tree, found with --class")
     if arguments.meshes_class is not None or arguments.up_of:
         raise ValueError("class_name, up_of: expected with --meshes, found with --class")
-    return Procedural(str(arguments.class_name), arguments.count, arguments.seed)
+    name = str(arguments.class_name)
+    check_class(name)
+    return Procedural(name, arguments.count, arguments.seed)
 
 
 def summary(report: GenerationReport, out: Path) -> str:

@@ -10,6 +10,7 @@ from data_gen import SUPERSAMPLE
 from data_gen.datasets.layouts import LAYOUTS
 from data_gen.datasets.sources import seed_of
 from data_gen.rigs import DEFAULT_DISTANCE, OBJECT_RADIUS, RIG_PRESETS, RIGS, Rig, make_rig
+from hyperplanes.utilities.errors import did_you_mean
 
 __all__ = ["ENGINES", "GenerationConfig", "RenderConfig"]
 
@@ -191,7 +192,8 @@ class GenerationConfig:
         known = {"rig": RIGS, "engine": ENGINES, "layout": tuple(LAYOUTS)}
         for name, values in known.items():
             if getattr(self, name) not in values:
-                raise ValueError(f"{name}: expected one of {', '.join(values)}, got {getattr(self, name)!r}")
+                given, near = getattr(self, name), did_you_mean(getattr(self, name), values)
+                raise ValueError(f"{name}: expected one of {', '.join(values)}, got {given!r}{near}")
         channels = tuple(self.channels)
         if set(channels) - {"rgba", *EXTRA_CHANNELS} or "rgba" not in channels:
             raise ValueError(f"channels: expected rgba and any of {', '.join(EXTRA_CHANNELS)}, got {channels}")

@@ -21,7 +21,7 @@ from data_gen.shapes.random import composition
 from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.errors import did_you_mean
 
-__all__ = ["CLASSES", "ONE_SIDED", "assemble", "find_classes", "make"]
+__all__ = ["CLASSES", "ONE_SIDED", "assemble", "check_class", "find_classes", "make"]
 
 CLASSES: tuple[str, ...] = ("car", "chair", "plane", "lamp", "random")
 """Names of the classes of this package; the position of a name is part of its objects' seed, so the order is fixed."""
@@ -47,6 +47,18 @@ def find_classes() -> dict[str, Callable[[np.random.Generator], list[Part]]]:
     return _MAKERS | load_entries("data_gen.shapes", _MAKERS)
 
 
+def check_class(class_name: str) -> None:
+    """Refuse a name of no class.
+
+    Raises:
+        ValueError: such a name, with the classes that there are and the nearest one.
+    """
+    known = find_classes()
+    if class_name not in known:
+        near = did_you_mean(class_name, known)
+        raise ValueError(f"class_name: expected one of {', '.join(known)}, got {class_name!r}{near}")
+
+
 def assemble(class_name: str, seed: int) -> list[Part]:
     """The painted solids of an object, before they are joined.
 
@@ -58,16 +70,13 @@ def assemble(class_name: str, seed: int) -> list[Part]:
         Parts in metres, y up, front along +z.
 
     Raises:
-        ValueError: if the class is unknown or the seed is negative.
+        ValueError: a negative seed, or an unknown class (`check_class`).
     """
-    known = find_classes()
-    if class_name not in known:
-        near = did_you_mean(class_name, known)
-        raise ValueError(f"class_name: expected one of {', '.join(known)}, got {class_name!r}{near}")
+    check_class(class_name)
     if seed < 0:
         raise ValueError(f"seed: expected a non-negative integer, got {seed}")
     number = CLASSES.index(class_name) if class_name in CLASSES else zlib.crc32(class_name.encode())
-    return known[class_name](np.random.default_rng([number, seed]))
+    return find_classes()[class_name](np.random.default_rng([number, seed]))
 
 
 def make(class_name: str, seed: int) -> trimesh.Scene:

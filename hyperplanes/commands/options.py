@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.constructors import PrimitiveConstructorSpec
 
 __all__ = [
     "Free",
@@ -20,7 +19,6 @@ __all__ = [
     "Steps",
     "ViewsUp",
     "check_orbit",
-    "choices",
     "optional",
 ]
 
@@ -28,23 +26,6 @@ __all__ = [
 def optional(metavar: str, **options: Any) -> Any:
     """What tyro is told of an option that may be left out: no {None}, no (default: None)."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="", **options)
-
-
-def choices(literal: Any) -> PrimitiveConstructorSpec[str | None]:
-    """What tyro is told of one of some names that may be left out: an error lists them in their order, without None.
-
-    Args:
-        literal: of the names.
-    """
-    names = get_args(literal)
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="{" + ",".join(names) + "}",
-        instance_from_str=lambda words: words[0],
-        is_instance=lambda value: value is None or value in names,
-        str_from_instance=lambda value: [str(value)],
-        choices=names,
-    )
 
 
 OptionalFolder = Annotated[Path | None, optional("FOLDER")]

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -34,18 +34,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Arguments", "data_sets", "run"]
 
-Name = Literal[
-    "shapenet",
-    "cross-class",
-    "target",
-    "time",
-    "single-class",
-    "iterations",
-    "hyperplanes",
-    "imageplanes",
-    "inputs",
-    "layers",
-]
+BROUGHT = {"Tables": "hyperplanes.tables"}
+"""Groups of entry points whose names are tables."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +43,8 @@ class Arguments:
     """Which table, how large, and where to.
 
     Attributes:
-        name: The table or figure of the paper.
+        name: The table or figure of the paper: shapenet, cross-class, target, time, single-class, iterations,
+            hyperplanes, imageplanes, inputs or layers; or a table of another installed package.
         scale: How large.
         out: The folder for data, trainings, evaluations and tables, shared by all of them.
         data: Data sets by class, such as car=FOLDER, in any layout; what is not given is generated.
@@ -65,7 +56,7 @@ class Arguments:
         device: auto, cpu or cuda.
     """
 
-    name: Annotated[Name, tyro.conf.Positional]
+    name: tyro.conf.Positional[str]
     scale: Literal["smoke", "small", "gpu", "paper"] = "small"
     out: Path = Path("runs/reproduce")
     data: tuple[str, ...] = ()
@@ -100,7 +91,7 @@ def run(arguments: Arguments) -> int:
     """Run what is not done yet and print the table."""
     from hyperplanes.commands.train import follow
     from hyperplanes.data.devices import choose_device
-    from hyperplanes.experiments import EXPERIMENTS, SCALES, report
+    from hyperplanes.experiments import SCALES, find_experiment, report
     from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
     from hyperplanes.experiments.engine import Runner
     from hyperplanes.experiments.estimate import estimate
@@ -112,7 +103,7 @@ def run(arguments: Arguments) -> int:
 
     console, device = Console(), choose_device(arguments.device)
     scale = SCALES[arguments.scale]
-    experiment = scale.applied(EXPERIMENTS[arguments.name]).of(arguments.only)
+    experiment = scale.applied(find_experiment(arguments.name)).of(arguments.only)
     seeds = scale.seeds(experiment) if arguments.seeds is None else arguments.seeds
     if seeds < 1:
         raise ValueError(f"--seeds: expected at least 1, got {seeds}")

@@ -1,6 +1,6 @@
 """The tables and figures of the HyperPlanes paper, each as data and all run by one engine."""
 
 from hyperplanes.experiments.scales import SCALES
-from hyperplanes.experiments.tables import EXPERIMENTS
+from hyperplanes.experiments.tables import EXPERIMENTS, find_experiment, find_experiments
 
-__all__ = ["EXPERIMENTS", "SCALES"]
+__all__ = ["EXPERIMENTS", "SCALES", "find_experiment", "find_experiments"]

@@ -7,8 +7,10 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from hyperplanes.experiments.published import CROSS, SHAPENET, SINGLE, TARGET, TIME, PublishedTable
+from hyperplanes.utilities.entry_points import load_entries
+from hyperplanes.utilities.errors import did_you_mean
 
-__all__ = ["CLASSES", "EXPERIMENTS", "Cell", "Experiment", "Trained"]
+__all__ = ["CLASSES", "EXPERIMENTS", "Cell", "Experiment", "Trained", "find_experiment", "find_experiments"]
 
 CLASSES = {"Cars": "car", "Chairs": "chair", "Planes": "plane", "Lamps": "lamp"}
 """The paper's headings and the names of the classes of `generate`."""
@@ -480,3 +482,23 @@ EXPERIMENTS: dict[str, Experiment] = {
     )
 }
 """By the names that `hyperplanes reproduce` takes."""
+
+
+def find_experiments() -> dict[str, Experiment]:
+    """The tables of the paper, then those that entry points of the group `hyperplanes.tables` name."""
+    return EXPERIMENTS | load_entries("hyperplanes.tables", EXPERIMENTS)
+
+
+def find_experiment(name: str) -> Experiment:
+    """One table.
+
+    Args:
+        name: of `find_experiments`.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    known = find_experiments()
+    if name not in known:
+        raise ValueError(f"table: expected one of {', '.join(known)}, got {name!r}{did_you_mean(name, known)}")
+    return known[name]
