@@ -209,7 +209,7 @@ def _corner(text: str, rows: dict[str, list[str]]) -> tuple[int, int, int]:
 
 
 def _table(rows: list[str], numbers: list[int], key: str, folder: ModelFolder) -> npt.NDArray[np.float64]:
-    """ArrayLike of all lines of a kind, a row a line; missing last columns are NaN."""
+    """The numbers of all lines of a kind, a row a line; missing last columns are NaN."""
     least = 2 if key == "vt" else 3
     if not rows:
         return np.zeros((0, least))

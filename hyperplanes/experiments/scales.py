@@ -28,7 +28,7 @@ class Scale:
         resolution: pixels a side of generated images; None where data must be given.
         objects: generated a class, the held-out ones included.
         held_out: of them.
-        views: an object, half support and half query. ArrayLike of planes and of HyperPlanes are in proportion to it.
+        views: an object, half support and half query. Numbers of planes and of HyperPlanes are in proportion to it.
         steps: of every training; None for the paper's epochs, a step an object.
         tuning: the most gradient steps on the support views of an object.
         longest: the same where PSNR is drawn over their number.

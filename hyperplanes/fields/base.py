@@ -261,12 +261,14 @@ class MLPField(Field):
     def density_of(self, hidden: Float[Tensor, "point width"]) -> Float[Tensor, " point"]:
         """The opacity head. Softplus, not NeRF's ReLU: it cannot die, and a hypernetwork moves its bias."""
         raw = self.layer("density", hidden)[:, 0]
+        # per radius of the scene, so that a larger scene is no denser
         return softplus(raw) * (self.target.config.density_scale / self.bounds.radius)
 
     def colour_of(
         self, hidden: Float[Tensor, "point width"], directions: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point 3"]:
         """The colour head."""
+        # the viewing direction joins the features of the point, in a layer of half the width
         seen = encode(directions, self.target.config.direction_frequencies)
         value = relu(self.layer("view", torch.cat([self.layer("feature", hidden), seen], -1)))
         return torch.sigmoid(self.layer("colour", value))
@@ -277,6 +279,7 @@ class MLPField(Field):
         """The colour head for every point in every direction; what does not depend on both is computed once."""
         width = self.target.config.width
         weight, bias = self.parameters["view.weight"], self.parameters["view.bias"]
+        # W [h, d] + b = (W_h h + b) + W_d d: one product a point, one a direction
         here = linear(self.layer("feature", hidden), weight[:, :width], bias)
         along = linear(encode(directions, self.target.config.direction_frequencies), weight[:, width:])
         return torch.sigmoid(self.layer("colour", relu(here[:, None] + along)))

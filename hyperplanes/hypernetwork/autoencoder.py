@@ -84,6 +84,7 @@ class Autoencoder(HyperNetwork):
         """
         assert observed.images is not None
         assert observed.directions is not None
+        # z of each object, and what each layer that reads a point makes of it
         codes = self.encode(observed.images, observed.directions)
         read = [reader(codes) for reader in self.readers]
         return [
@@ -100,6 +101,7 @@ class Autoencoder(HyperNetwork):
         self, images: Float[Tensor, "object view 3 height width"], directions: Float[Tensor, "object view 3"]
     ) -> Float[Tensor, "object latent"]:
         """The code z of each object."""
+        # a code an image, with its direction; all of them make that of the object
         apart = self.config.normalisation == "batch_statistics" and not self.training
         codes = encode_objects(self.encoder, images, apart=apart)
         return silu(self.latent(torch.cat([codes, directions], -1).flatten(1)))

@@ -125,7 +125,9 @@ def encode_objects(
     """
     if present is None:
         present = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
+    # images that are missing are not encoded
     batches = [each[there] for each, there in zip(images, present, strict=True)]
     codes = [encoder(batch) for batch in (batches if apart else [torch.cat(batches)])]
+    # zeros stand where they would be
     found = torch.cat(codes)
     return found.new_zeros(*present.shape, found.shape[1]).masked_scatter(present[..., None], found)

@@ -62,6 +62,7 @@ class ImageHyperNetwork(UpdateHead):
                 f"HyperPlanes: expected {expected} images and directions, "
                 f"got {images.shape[-4]} and {directions.shape[-2]}"
             )
+        # codes of the images, joined with the directions; the head makes updates of them
         codes = self.encode(images, directions, observed.present)
         return self.updates_of(self._joined(codes, directions), theta)
 
@@ -80,6 +81,7 @@ class ImageHyperNetwork(UpdateHead):
         present: Bool[Tensor, "object view"] | None = None,
     ) -> Float[Tensor, "object ..."]:
         """The codes of the images: (object, view, code), or (object, code) of their mean."""
+        # a code an image; with statistics of the batch, objects that are evaluated are batches of their own
         apart = self.config.normalisation == "batch_statistics" and not self.training
         codes = encode_objects(self.encoder, images, present, apart=apart)
         if self.config.join == "mean":

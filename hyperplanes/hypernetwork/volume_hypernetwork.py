@@ -43,5 +43,6 @@ class VolumeHyperNetwork(HyperNetwork):
             theta: the target's parameters, which are not read.
         """
         assert observed.volume is not None
+        # one volume of features, cut into the grids by channels
         features = self.encoder(observed.volume).split([shape[0] for shape in self.grids.values()], 1)
         return [Parameters(zip(self.grids, each, strict=True)) for each in zip(*features, strict=True)]

@@ -68,12 +68,15 @@ class VolumeNetwork(nn.Module):
 
     def forward(self, volumes: Float[Tensor, "object channel x y z"]) -> Float[Tensor, "object feature x y z"]:
         """The features of every cell for each of several objects."""
+        # to half, a quarter and an eighth of the side
         folded = _fold(volumes).contiguous(memory_format=torch.channels_last_3d)
         fine = self.downwards[0](self.first(folded))
         middle = self.downwards[1](self.strided[0](fine))
         coarse = self.downwards[2](self.strided[1](middle))
+        # and back to half, each with the features of the same side added
         middle = self.upwards[1](middle + _doubled(self.widened[0](self.upwards[0](coarse))))
         fine = self.upwards[2](fine + _doubled(self.widened[1](middle)))
+        # the features of every cell, read beside what the cell showed
         return _unfold(self.last(torch.cat([silu(self.normalisation(fine)), folded], 1)), self.features)
 
 

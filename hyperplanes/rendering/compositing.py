@@ -57,12 +57,15 @@ def composite(
     Returns:
         The pixels, and the weights for importance sampling.
     """
+    # optical depth of each interval, and of all before it
     optical_depth = density * edges.diff(dim=1)
     before = torch.cat([torch.zeros_like(optical_depth[:, :1]), optical_depth.cumsum(1)], 1)
     transmittance = torch.exp(-before)
+    # what each interval takes away of the light: T_i (1 - exp(-sigma_i delta_i)) = T_i - T_{i+1}
     weights = transmittance[:, :-1] - transmittance[:, 1:]
     opacity = 1 - transmittance[:, -1]
     distances = (edges[:, 1:] + edges[:, :-1]) / 2 if distances is None else distances
+    # mean distance of what is seen; the background fills what is left of the pixel
     depth = (weights * distances).sum(1) / opacity.clamp_min(1e-10)
     pixels = (weights[..., None] * colour).sum(1) + (1 - opacity)[:, None] * background
     return Rendered(pixels, opacity, depth, density.numel()), weights
@@ -101,6 +104,7 @@ def composite_packed(
     background: float = 1.0,
 ) -> Rendered:
     """Pixels of `count` rays from weighted samples in any order."""
+    # colour, distance and weight of each sample, summed by ray
     values = torch.cat([colour, distances[:, None], torch.ones_like(distances)[:, None]], 1) * weights[:, None]
     sums = values.new_zeros(count, 5).index_add(0, ray, values)
     opacity = sums[:, 4]

@@ -159,15 +159,18 @@ def importance(
     Returns:
         Ascending distances within the edges.
     """
+    # the cumulative distribution over the intervals of each ray; no interval is impossible
     mass = weights.detach() + 1e-5
     cumulative = torch.cat([torch.zeros_like(mass[:, :1]), mass.cumsum(1)], 1)
     cumulative = cumulative / cumulative[:, -1:]
+    # as many quantiles as distances, evenly spaced, or each random within its share
     if generator is None:
         quantile = (torch.arange(count, dtype=edges.dtype, device=edges.device) + 0.5) / count
         quantile = quantile.expand(len(edges), -1).contiguous()
     else:
         offset = torch.rand(len(edges), count, generator=generator).to(edges)
         quantile = (torch.arange(count, dtype=edges.dtype, device=edges.device) + offset) / count
+    # the interval that each quantile falls into, and the place within it
     above = torch.searchsorted(cumulative, quantile, right=True).clamp(1, mass.shape[1])
     low, high = cumulative.gather(1, above - 1), cumulative.gather(1, above)
     start, end = edges.gather(1, above - 1), edges.gather(1, above)

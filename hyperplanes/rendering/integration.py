@@ -84,9 +84,11 @@ def _all_at_once(scene: Scene, rays: Rays, samples: PackedSamples) -> Rendered:
         weights = packed_weights(density * lengths, chosen.ray, len(rays))
         return composite_packed(colour, weights, chosen.distances, chosen.ray, len(rays), scene.background)
 
+    # the field at every sample
     fine = composited(scene.field, samples, samples.step)
     if scene.proposal is None:
         return fine
+    # the proposal at every second one, twice as long
     rank, total = _ranks(samples.ray, len(rays))
     even = (rank % 2 == 0).nonzero()[:, 0]
     alone = rank[even] + 1 == total[samples.ray[even]]

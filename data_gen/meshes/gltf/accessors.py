@@ -56,7 +56,7 @@ def _check_block(document: Document, block: dict[str, Any], count: Any, item: in
 
 
 def _compressed_accessors(document: Document) -> set[int]:
-    """ArrayLike of the accessors whose data is in a compressed block."""
+    """Numbers of the accessors whose data is in a compressed block."""
     found: set[int] = set()
     for mesh in document.items("meshes"):
         for primitive in mesh["primitives"]:

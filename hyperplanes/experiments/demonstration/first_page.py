@@ -21,7 +21,7 @@ __all__ = ["COUNTS", "PACKAGED", "write_first_page"]
 
 PACKAGED = "small"
 COUNTS = (3, 10, 25)
-"""ArrayLike of views that are shown of each object."""
+"""Numbers of views that are shown of each object."""
 
 QUERY_VIEWS = 2  # query views of each object on the page
 
@@ -75,7 +75,7 @@ def write_first_page(
     last = scores[f"views_{most}"]
     page = Report(
         title="New views of objects it has never seen",
-        lead=f"The packaged model {PACKAGED!r} views at posed images of an object, any number of them from anywhere, "
+        lead=f"The packaged model {PACKAGED!r} looks at posed images of an object, any number of them from anywhere, "
         "and writes the weights of a field that can be looked at from anywhere. Nothing was trained for this page.",
         figures=[
             (f"{last.mean('psnr'):.2f} dB", f"PSNR from {most} views, in a single step"),

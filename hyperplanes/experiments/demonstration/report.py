@@ -114,7 +114,7 @@ def describe(
     shown = len(exhibits[0].support)
     return Report(
         title="New views of objects it has never seen",
-        lead=f"A hypernetwork views at a few of {shown} posed images of a {settings.class_name} and writes the weights "
+        lead=f"A hypernetwork looks at a few of {shown} posed images of a {settings.class_name} and writes the weights "
         "of a field that can be looked at from anywhere.",
         figures=[
             (f"{one_step['psnr']:.2f} dB", "PSNR on held-out objects after a single step"),
