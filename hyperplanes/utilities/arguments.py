@@ -148,7 +148,7 @@ def _shown_one(part: Any) -> str:
     if (allowed := _range(part)) is not None:
         return f"a whole number from {allowed[0]} to {allowed[-1]}"
     if get_origin(part) is Literal:
-        return " or ".join(map(repr, get_args(part)))
+        return f"one of {', '.join(map(repr, get_args(part)))}"
     if get_origin(part) is tuple:
         return f"a tuple of {len(get_args(part))} numbers"
     return "None" if part is type(None) else getattr(get_origin(part) or part, "__name__", str(part))

@@ -49,7 +49,7 @@ def field(points, directions):
             "target: expected a tuple of 3 numbers, got a tuple",
         ),
         (lambda: ImagePlanes(PICTURES, PICTURES), "cameras: expected PinholeCamera, got a tensor of float32"),
-        (lambda: FineTuning(optimiser="lion"), "optimiser: expected 'adam' or 'muon' or"),
+        (lambda: FineTuning(optimiser="lion"), "optimiser: expected one of 'adam', 'muon', 'sgd' or None, got 'lion'"),
         (lambda: HyperPlanes.from_pretrained(3), "name: expected Path or str, got 3"),
         (lambda: render(field, None), "target: expected PinholeCamera or Rays, got None"),
         (lambda: render(field, ring(1, (4, 4)), background="white"), "background: expected float, got 'white'"),
