@@ -20,11 +20,19 @@ NAMES = (
     "hypernetwork",
     "lookup",
     "rendering",
+    "small",
     "training",
     "views",
     "visibility",
 )
-OF_SPEED = ("generation", "lookup", "rendering", "training", "visibility")  # "busy" measures beside a load of its own
+OF_SPEED = (
+    "generation",
+    "lookup",
+    "rendering",
+    "small",
+    "training",
+    "visibility",
+)  # "busy" measures beside a load of its own
 UNDER_LOAD = "--under-load"
 
 

@@ -20,6 +20,7 @@ COMMANDS: dict[str, list[str]] = {
     "visibility": [],
     "busy": [],
     "rendering": ["--sizes", "64", "128", "200", "400"],
+    "small": ["--second-pass"],
     "training": [],
     "generation": [],
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -20,6 +20,7 @@ from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.images import Pictures
 from hyperplanes.rendering.refinement import refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
+from hyperplanes.rendering.scene import SplitField
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
@@ -131,12 +132,32 @@ class AdaptedField:
         """The function of single-precision points that a field of another precision is."""
         if self.dtype == torch.float32:
             return field
+        return _SplitCast(field, self.dtype) if isinstance(field, SplitField) else _Cast(field, self.dtype)
 
-        def single(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-            colour, density = field(points.to(self.dtype), directions.to(self.dtype))
-            return colour.float(), density.float()
 
-        return single
+@dataclass(frozen=True)
+class _Cast:
+    """A field of some precision as a function of single-precision points."""
+
+    field: Any
+    dtype: torch.dtype
+
+    def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        colour, density = self.field(points.to(self.dtype), directions.to(self.dtype))
+        return colour.float(), density.float()
+
+
+class _SplitCast(_Cast):
+    """Likewise, of one whose colours can be asked for later than its densities."""
+
+    def hidden(self, points: Tensor) -> Any:
+        return self.field.hidden(points.to(self.dtype))
+
+    def density_of(self, hidden: Any) -> Tensor:
+        return self.field.density_of(hidden).float()
+
+    def colour_of(self, hidden: Any, directions: Tensor) -> Tensor:
+        return self.field.colour_of(hidden, directions.to(self.dtype)).float()
 
 
 def hull(support: Views, side: int) -> Occupancy:

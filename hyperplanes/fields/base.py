@@ -229,9 +229,14 @@ class Field:
         """The layers before the heads, with the skip connection of NeRF in their middle."""
         value = inputs
         for index in range(self.target.config.depth):
-            if index == self.target.skip > 0:
-                value = torch.cat([inputs, value], -1)
-            value = relu(self.layer(f"layers.{index}", value))
+            name = f"layers.{index}"
+            if index == self.target.skip > 0:  # of inputs and values side by side, without putting them there
+                weight, size = self.parameters[f"{name}.weight"], inputs.shape[-1]
+                given = linear(inputs, weight[:, :size], self.parameters[f"{name}.bias"])
+                value = torch.addmm(given, value, weight[:, size:].T)
+            else:
+                value = self.layer(name, value)
+            value = relu(value, inplace=True)
         return value
 
     def layer(self, name: str, value: Tensor) -> Tensor:

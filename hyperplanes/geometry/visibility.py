@@ -141,7 +141,7 @@ class Described:
 
     rows: Float[Tensor, "point number"]
     coverage: Float[Tensor, " covered"]
-    near_rows: Float[Tensor, "seen near_number"]
+    near_rows: Float[Tensor, "point near_number"]
     near_weights: Float[Tensor, "seen near"]
     near_colours: Float[Tensor, "seen near 3"]
 
@@ -313,7 +313,7 @@ class VisibilityPlanes:
         rows = torch.empty(count, reading.row_size + features.shape[3]) if reading.best else torch.empty(count, 0)
         coverage = torch.empty(count if reading.best else 0)
         along = points[:0] if directions is None else directions
-        near = torch.empty(len(along), reading.near_size)
+        near = torch.empty(count, 0 if directions is None else reading.near_size)
         kept = min(reading.nearest, len(self))
         weights, colours = torch.empty(len(along), kept), torch.empty(len(along), kept, 3)
         surface = points.new_zeros(0) if self._surface is None else self._surface

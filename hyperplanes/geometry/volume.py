@@ -8,13 +8,14 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, grid_sample
 
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility import Reading, VisibilityPlanes
 
 __all__ = ["CHANNELS", "SIDE", "interpolate_grid", "volume_of"]
 
 SIDE = 32  # cells an axis
 CHANNELS = 5  # of a cell: occupied share, mean colour, number of views
 BEST = 8  # views of a cell that count
+_READING = Reading(BEST, nearest=0, octaves=0, along_octaves=0, falloff=0.0, smallest_angle=0.0)
 
 
 @torch.no_grad()
@@ -34,12 +35,16 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
     cells = (share > 0).nonzero()
     unit = (cells.to(share) + 0.5) * (2 / SIDE) - 1
     points = unit * occupancy.bounds.radius + unit.new_tensor(occupancy.bounds.centre)
-    visibility = planes.choose(points, best=BEST)
-    seen = visibility.best
-    shown = planes.colours.lookup(points).colours
-    colours = 2 * shown.gather(1, seen.views[..., None].expand(-1, -1, 3)) - 1
-    mean = (seen.weights[..., None] * colours).sum(1)
-    number = visibility.number.clamp_min(1).log()
+    if planes.can_describe(points):
+        rows = planes.describe(points, None, _READING, occupancy.bounds).rows
+        mean, number = rows[:, _READING.row_size - 11 : _READING.row_size - 8], rows[:, -1]
+    else:
+        visibility = planes.choose(points, best=BEST)
+        seen = visibility.best
+        shown = planes.colours.lookup(points).colours
+        colours = 2 * shown.gather(1, seen.views[..., None].expand(-1, -1, 3)) - 1
+        mean = (seen.weights[..., None] * colours).sum(1)
+        number = visibility.number.clamp_min(1).log()
     x, y, z = cells.unbind(1)
     values = torch.cat([share[x, y, z][:, None], mean, number[:, None]], 1)
     volume = share.new_zeros(CHANNELS, SIDE, SIDE, SIDE)

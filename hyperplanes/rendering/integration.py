@@ -18,7 +18,7 @@ from hyperplanes.rendering.scene import FieldFunction, Scene, SplitField, evalua
 __all__ = ["integrate"]
 
 FIRST_ROUND = 4  # samples a ray before the first test for opaque rays
-MIN_WEIGHT = 0.01  # of a sample from which on its colour is evaluated; 2 % of the weight of a car are below
+MIN_WEIGHT = 0.003  # of a sample from which on its colour is evaluated
 KNOWN_SHARE = 0.95  # of a pixel's weight whose colours are evaluated at least, where its opacity is above
 MIN_OPACITY = 1 / 512
 GROWTH = 4  # every later round takes this fraction of the samples so far, and at least as many as the first
@@ -105,9 +105,9 @@ def _ranks(ray: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float) -> Rendered:
     """Rounds of a few samples a ray; rays whose transmittance has fallen below `stop` leave (early ray termination)."""
-    field, zeros = scene.field, samples.distances.new_zeros(len(rays))
-    optical_depth, limit = zeros, -math.log(stop) if stop > 0 else math.inf
-    split = stop > 0 and isinstance(field, SplitField)
+    split = scene.field if stop > 0 and isinstance(scene.field, SplitField) else None
+    optical_depth = samples.distances.new_zeros(len(rays))
+    limit = -math.log(stop) if stop > 0 else math.inf
     remaining = torch.arange(len(samples), device=samples.ray.device)
     rank, _ = _ranks(samples.ray, len(rays))
     colours, weights, evaluated = [rays.origins.new_zeros(0, 3)], [optical_depth[:0]], [remaining[:0]]
@@ -119,17 +119,17 @@ def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float
         chosen, remaining = remaining[now], remaining[~now]
         part = samples[chosen]
         points, directions = _packed_points(rays, part)
-        if split:
-            hidden = _in_batches(field.hidden, points)
-            density = torch.cat([field.density_of(each) for each in hidden])
+        if split is None:
+            hidden, (colour, density) = [], evaluate(scene.field, points, directions, differentiable=False)
         else:
-            colour, density = evaluate(field, points, directions, differentiable=False)
+            hidden, colour = _in_batches(split.hidden, points), torch.zeros_like(points)
+            density = torch.cat([split.density_of(each) for each in hidden])
         # Weights within the round, times the transmittance of what earlier rounds passed through.
         added = density * part.step
         weight = packed_weights(added, part.ray, len(rays)) * torch.exp(-optical_depth[part.ray])
-        seen = weight > MIN_WEIGHT if split else torch.ones_like(weight, dtype=torch.bool)
-        if split:
-            colour = _colours_where(seen, field, hidden, directions)
+        seen = weight > MIN_WEIGHT
+        if split is not None:
+            colour = _colours_where(seen, split, hidden, directions)
         weights.append(weight)
         colours.append(colour)
         known.append(seen)
@@ -137,7 +137,7 @@ def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float
         optical_depth = optical_depth.index_add(0, part.ray, added)
         remaining = remaining[optical_depth[samples.ray[remaining]] < limit]
     part, weight, colour = samples[torch.cat(evaluated)], torch.cat(weights), torch.cat(colours)
-    if split:
+    if split is not None:
         colour = _filled(scene, rays, part, weight, colour, torch.cat(known))
     return composite_packed(colour, weight, part.distances, part.ray, len(rays), scene.background)
 

@@ -43,6 +43,14 @@ def test_the_number_of_views_that_show_a_cell_is_that_of_all():
     assert volume[4].max() == pytest.approx(math.log(7))
 
 
+@pytest.mark.parametrize("count", [3, 12])
+def test_the_kernel_and_plain_pytorch_show_the_same(count, monkeypatch):
+    planes = planes_of(ball_views(ring(count, (32, 32))))
+    compiled = volume_of(planes)
+    monkeypatch.setattr(VisibilityPlanes, "can_describe", lambda planes, points: False)
+    torch.testing.assert_close(compiled, volume_of(planes), atol=1e-5, rtol=1e-4)
+
+
 def test_the_order_of_the_views_does_not_matter():
     views = ball_views(ring(9, (32, 32)))
     order = torch.randperm(9, generator=torch.Generator().manual_seed(0))

@@ -221,32 +221,32 @@ def describe(
     for point in range(start, stop):
         x, y, z = points[point, 0], points[point, 1], points[point, 2]
         place(s, pitch, total, x, y, z, cameras, shape, numbers[0])
-        if rows.shape[1]:
-            judge(s, pitch, total, maps, shape, numbers)
+        for nearest in range(2):  # what the trunk reads of the best views, then the colour head of the nearest ones
+            row = near_rows[point] if nearest else rows[point]
+            if not len(row):
+                continue
+            if not nearest or len(surface) or not rows.shape[1]:
+                judge(s, pitch, total, surface if nearest and len(surface) else maps, shape, numbers)
+            if nearest:
+                x, y, z = directions[point, 0], directions[point, 1], directions[point, 2]
+                rank(s, pitch, total, x, y, z, numbers[7])
+            else:
+                x, y, z = (x - sphere[0]) * sphere[3], (y - sphere[1]) * sphere[3], (z - sphere[2]) * sphere[3]
+            least(s, pitch, total, SCORE if nearest else PENALTY, ranked if nearest else best, chosen, scores, 0)
+            at = _encode(row, 0, x, y, z, shape[7 + nearest])
+            if nearest:
+                _describe_nearest(
+                    s, pitch, packed, shape, chosen, scores, numbers, directions[point], row, at, near_weights[point],
+                    near_colours[point], colour,
+                )  # fmt: skip
+                continue
             covered, seen = one, zero
             for view in range(total):
                 covered = min(covered, load(s, OPACITY * pitch + view))
                 seen += load(s, SHOWN * pitch + view)
             coverage[point] = covered
-            least(s, pitch, total, PENALTY, best, chosen, scores, 0)
-            x, y, z = (x - sphere[0]) * sphere[3], (y - sphere[1]) * sphere[3], (z - sphere[2]) * sphere[3]
-            row = rows[point]
-            at = _encode(row, 0, x, y, z, shape[7])
             at = _describe_best(
                 s, pitch, packed, shape, chosen, numbers, covered, seen, row, at, colours, weights, colour
             )
             if grid.shape[3]:
                 _interpolate(grid, row, at, x, y, z)
-        if len(directions):
-            if len(surface):
-                judge(s, pitch, total, surface, shape, numbers)
-            elif not rows.shape[1]:
-                judge(s, pitch, total, maps, shape, numbers)
-            direction, row = directions[point], near_rows[point]
-            rank(s, pitch, total, direction[0], direction[1], direction[2], numbers[7])
-            least(s, pitch, total, SCORE, ranked, chosen, scores, 0)
-            at = _encode(row, 0, direction[0], direction[1], direction[2], shape[8])
-            _describe_nearest(
-                s, pitch, packed, shape, chosen, scores, numbers, direction, row, at, near_weights[point],
-                near_colours[point], colour,
-            )  # fmt: skip

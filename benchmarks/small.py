@@ -1,0 +1,133 @@
+"""Views by the packaged model `small`, as they are rendered, against every sample in plain PyTorch.
+
+    python -m benchmarks small --json FILE
+    python -m benchmarks small --scene ../shared/posed/chair --views 50
+
+Of a procedural car that no training saw, or of a posed scene: the time to a field, to the voxels that hold something, a
+view at several sizes, the second pass that renders all shown views, and PSNR. The reference is the same field, whose
+inputs PyTorch looks up, gathers and concatenates, and which is asked for the colour of every sample in every voxel of
+the visual hull that is not empty. Both run in turn, in one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from benchmarks._timing import timed
+from benchmarks.objects import held_out
+from benchmarks.reporting import Row, finish
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.base import AdaptedField, Pictures
+from hyperplanes.data import read_task
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.utilities.metrics import psnr
+from hyperplanes.views import Task
+
+__all__ = ["main"]
+
+
+def main(arguments: list[str]) -> int:
+    """Measure, print, and write the rows where asked.
+
+    Args:
+        arguments: see --help.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks small", description=__doc__)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[128, 400], help="pixels a side of the car")
+    parser.add_argument("--scene", type=Path, help="a posed scene in place of the car")
+    parser.add_argument("--views", type=int, default=25, help="that are shown (default: %(default)s)")
+    parser.add_argument("--repeats", type=int, default=5, help="views of each (default: %(default)s)")
+    parser.add_argument("--second-pass", action="store_true", help="measure that too")
+    parser.add_argument("--quick", action="store_true", help="a car of 64 pixels, two views")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    chosen = parser.parse_args(arguments)
+    sizes, repeats = ([64], 2) if chosen.quick else (chosen.sizes, chosen.repeats)
+    model = HyperPlanes.from_pretrained("small")
+    rows = []
+    if chosen.scene is not None:
+        rows.append(measure(model, _shown(read_task(chosen.scene), chosen.views), repeats, chosen.second_pass))
+    else:
+        for size in sizes:
+            task = _shown(held_out(1, size, 2 * chosen.views)[0], chosen.views)
+            rows.append(measure(model, task, repeats, chosen.second_pass))
+    return finish("small", rows, chosen.json)
+
+
+def measure(model: HyperPlanes, task: Task, repeats: int, second_pass: bool) -> Row:
+    """One object: ours and the reference in turn, view by view."""
+    model.adapt(task.support)  # compiles, and fills caches
+    adapt, adapted = timed(lambda: model.adapt(task.support))
+    refine, _ = timed(lambda: adapted.refined_occupancy)
+    with _plainly():
+        adapted(*2 * (adapted.occupancy.centres()[:1],))  # compiles
+        plain_refine, _ = timed(lambda: _again(adapted).refined_occupancy)
+    views = [(7 * number + 3) % len(task.query) for number in range(repeats)]
+    seconds, reference, found, expected = [], [], [], []
+    for view in views:
+        one = camera.select(task.query.cameras, [view])
+        time, pictures = timed(lambda one=one: adapted.render(one))
+        with _plainly():
+            plain_time, plain = timed(lambda one=one: _unsplit(adapted).render(one))
+        seconds.append(time)
+        reference.append(plain_time)
+        found.append(_quality(pictures, task, view))
+        expected.append(_quality(plain, task, view))
+    height, width = task.query.size
+    row: Row = {
+        "name": f"small, {task.name}, {width}x{height}, {len(task.support)} views",
+        "threads": torch.get_num_threads(),
+        "seconds": statistics.median(seconds),
+        "reference_seconds": statistics.median(reference),
+        "speedup": statistics.median(plain / ours for plain, ours in zip(reference, seconds, strict=True)),
+        "psnr": statistics.fmean(found),
+        "psnr_loss": statistics.fmean(expected) - statistics.fmean(found),
+        "adapt_seconds": adapt,
+        "refine_seconds": refine,
+        "refine_speedup": plain_refine / refine,
+    }
+    if second_pass:
+        twice = HyperPlanes.from_pretrained("small")
+        twice.config = replace(twice.config, second_pass=True)
+        row["second_pass_seconds"] = timed(lambda: twice.adapt(task.support))[0] - adapt
+    return row
+
+
+def _shown(task: Task, count: int) -> Task:
+    """The task of which so many views are shown, as far apart in their order as that allows."""
+    return replace(task, support=task.support[:: max(1, len(task.support) // count)][:count])
+
+
+def _quality(pictures: Pictures, task: Task, view: int) -> float:
+    return float(psnr(pictures.images, task.query.images[view : view + 1]).mean())
+
+
+def _again(adapted: AdaptedField) -> AdaptedField:
+    """The same field, of which nothing is refined yet."""
+    return replace(adapted)
+
+
+def _unsplit(adapted: AdaptedField) -> AdaptedField:
+    """The same field as a mere function, all of whose colours are evaluated, in the same voxels."""
+    field: Callable = adapted.field
+    result = replace(adapted, field=lambda points, directions: field(points, directions))
+    result.__dict__["refined_occupancy"] = adapted.refined_occupancy
+    return result
+
+
+@contextmanager
+def _plainly() -> Generator[None]:
+    """The time in which no kernel describes points to the network."""
+    before = VisibilityPlanes.can_describe
+    VisibilityPlanes.can_describe = lambda planes, points: False  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        VisibilityPlanes.can_describe = before  # type: ignore[method-assign]
