@@ -228,6 +228,9 @@ def test_scales_make_things_smaller_and_say_so():
     smoke, small, paper = SCALES["smoke"], SCALES["small"], SCALES["paper"]
     assert [scale.method("hyperplanes_100") for scale in (smoke, small)] == ["hyperplanes_2", "hyperplanes_100"]
     assert [scale.planes(25) for scale in (smoke, small, paper)] == [4, 25, 25]
+    # docs/paper.md, "at which size"
+    assert (small.resolution, small.objects - small.held_out, small.steps, small.evaluated) == (32, 40, 200, 3)
+    assert (SCALES["gpu"].steps, SCALES["gpu"].evaluated, paper.steps, paper.evaluated) == (5000, 5, None, None)
     iterations = EXPERIMENTS["iterations"]
     assert small.applied(iterations).columns == ["0", "100", "300", "1000"]
     assert {c.method for c in smoke.applied(iterations).cells} == {"hyperplanes", "nerf_scratch_3"}
