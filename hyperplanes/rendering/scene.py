@@ -21,6 +21,10 @@ FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 class SplitField(Protocol):
     """A field whose colours can be asked for later than its densities, at some of the points."""
 
+    def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Both at once, as any field."""
+        ...
+
     def hidden(self, points: Tensor) -> Any:
         """What densities and colours of points (n, 3) are computed from; it can be indexed like a tensor."""
         ...

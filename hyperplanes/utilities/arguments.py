@@ -130,8 +130,9 @@ def _fits_one(value: object, hint: Any) -> bool:
     if origin is Literal:
         return value in arguments
     if origin is tuple and Ellipsis not in arguments:
-        right = isinstance(value, tuple) and len(value) == len(arguments)
-        return right and all(_fits(each, part) for each, part in zip(value, arguments, strict=True))
+        if not isinstance(value, tuple) or len(value) != len(arguments):
+            return False
+        return all(_fits(each, part) for each, part in zip(value, arguments, strict=True))
     try:
         return isinstance(value, origin or hint)
     except TypeError:  # a protocol that cannot be asked
