@@ -141,12 +141,12 @@ class _FeatureField(ImageBasedField):
     """Beside the colours, the features of a convolutional encoder are looked up."""
 
     def slots(self, points: Tensor, seen: ChosenViews, colours: Tensor) -> Tensor:
-        features = self._features.lookup(points).colours
+        features = self._feature_planes.lookup(points).colours
         features = features.gather(1, seen.views[..., None].expand(-1, -1, CHANNELS)) * seen.valid[..., None]
         return torch.cat([super().slots(points, seen, colours), features], -1)
 
     @cached_property
-    def _features(self) -> ImagePlanes:
+    def _feature_planes(self) -> ImagePlanes:
         planes, weights = self.planes.colours, self.parameters
         value = relu(conv2d(2 * planes.images - 1, weights["encoder.0.weight"], weights["encoder.0.bias"], padding=1))
         value = conv2d(value, weights["encoder.2.weight"], weights["encoder.2.bias"], padding=2, dilation=2)
