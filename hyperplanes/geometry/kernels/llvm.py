@@ -6,7 +6,9 @@ metadata (LLVM language reference, "noalias and alias.scope metadata"). None of 
 indices. `bits_of` exists because numba widens 32-bit integer arithmetic to 64 bits, which halves the lanes.
 
 Where pixels keep their channels together as numbers, `blend` and `slopes` read two neighbours at once, with vectors
-across the channels rather than across the points: a sixth of the memory accesses, and none of them a gather.
+across the channels rather than across the points: a sixth of the memory accesses, and none of them a gather. With these
+two and `spread` written as loops, exact lookups take 1.4 times as long, and 1.3 times with gradients; with `add_pixels`
+as loops, gradients take 1.3 times as long (25 planes of 200 x 200, 65,536 points, one thread).
 """
 
 from __future__ import annotations
