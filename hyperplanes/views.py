@@ -144,6 +144,7 @@ class Views:
         index = torch.full((len(pixels),), view, dtype=torch.long, device=pixels.device)
         return cast(self.cameras, index, pixels, self.bounds, near_far=near_far)
 
+    @checked
     def sample_rays(
         self,
         count: int,

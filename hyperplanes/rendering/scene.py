@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.utilities.arguments import kind_of
 
 __all__ = ["FieldFunction", "Scene", "SplitField", "evaluate", "points_per_batch"]
 
@@ -70,10 +71,13 @@ def evaluate(
         Colours (n, 3) and densities (n,).
 
     Raises:
-        ValueError: values of another shape, or densities below 0.
+        ValueError: no pair of tensors, values of another shape, or densities below 0.
     """
     size = len(points) if differentiable else points_per_batch(points.device)
     parts = [field(*part) for part in zip(points.split(max(1, size)), directions.split(max(1, size)), strict=True)]
+    for part in parts:
+        if not (isinstance(part, tuple | list) and len(part) == 2 and all(isinstance(each, Tensor) for each in part)):
+            raise ValueError(f"field: expected a pair of tensors, colours and densities, got {kind_of(part)}")
     colour, density = parts[0] if len(parts) == 1 else (torch.cat(values) for values in zip(*parts, strict=True))
     if colour.shape != points.shape or density.shape != points.shape[:1]:
         raise ValueError(

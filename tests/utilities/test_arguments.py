@@ -13,9 +13,11 @@ from hyperplanes.geometry import ImagePlanes, cameras
 from hyperplanes.rendering.renderer import RayMarching, render
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.metrics import psnr
+from hyperplanes.views import Views
 from tests.reference_rendering import ring
 
 PICTURES = torch.zeros(1, 3, 4, 4)
+VIEWS = Views(PICTURES, ring(1, (4, 4)))
 
 
 @pytest.fixture
@@ -51,6 +53,9 @@ def field(points, directions):
         (lambda: ImagePlanes(PICTURES, PICTURES), "cameras: expected PinholeCamera, got a tensor of float32"),
         (lambda: FineTuning(optimiser="lion"), "optimiser: expected one of 'adam', 'muon', 'sgd' or None, got 'lion'"),
         (lambda: HyperPlanes.from_pretrained(3), "name: expected Path or str, got 3"),
+        (lambda: cameras.orbit(10**30, 2.0), "views: expected a whole number from 1 to .*, got 1000"),
+        (lambda: VIEWS.sample_rays(3, among=np.zeros(3)), "among: expected a tensor .* or None, got a numpy.ndarray"),
+        (lambda: render(lambda *_: None, VIEWS.cameras), "field: expected a pair of tensors, .*, got None"),
         (lambda: render(field, None), "target: expected PinholeCamera or Rays, got None"),
         (lambda: render(field, ring(1, (4, 4)), background="white"), "background: expected float, got 'white'"),
     ],
