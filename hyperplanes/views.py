@@ -175,7 +175,7 @@ class Views:
         near_far: str = "sphere",
     ) -> tuple[Rays, Float[Tensor, "ray 3"], Float[Tensor, "ray 1"]]:
         """As `sample_rays`, with the opacity of the masks there; 1 without masks."""
-        if not isinstance(count, int) or count < 1:
+        if count < 1:
             raise ValueError(f"count: expected at least 1 ray, got {count!r}")
         height, width = self.size
         total = len(self) * height * width if among is None else len(among)

@@ -176,6 +176,11 @@ def test_pictures_that_are_none_are_refused_where_they_enter(images, found):
     views = Views(picture, cameras)
     with pytest.raises(ValueError, match=r"got 0; use \[\[0\]\]"):
         views[0]
-    for count in (-1, 0, None, 2.5):
-        with pytest.raises(ValueError, match="^count: expected at least 1 ray"):
+    for count, expected in (
+        (-1, "at least 1 ray"),
+        (0, "at least 1 ray"),
+        (None, "int, got None"),
+        (2.5, "int, got 2.5"),
+    ):
+        with pytest.raises(ValueError, match=f"^count: expected {expected}"):
             views.sample_rays(count)

@@ -126,7 +126,7 @@ def _fits_one(value: object, hint: Any) -> bool:
         return number or (isinstance(value, Tensor) and value.numel() == 1)
     if hint is int:
         return (
-            isinstance(value, Integral) and not isinstance(value, bool) and abs(value) < 2**63
+            isinstance(value, Integral) and not isinstance(value, bool) and abs(int(value)) < 2**63
         )  # as tensors hold them
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
