@@ -16,7 +16,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 
 from data_gen.meshes.materials import LINEAR_COLOUR, select_vertices, visual_of
 
-__all__ = ["CREASE", "clean", "decimate", "is_smooth", "smooth_normals"]
+__all__ = ["check_faces", "CREASE", "clean", "decimate", "is_smooth", "smooth_normals"]
 
 CREASE = 40.0
 """Angle between two faces, in degrees, from which an edge counts as sharp where a file has no normals."""
@@ -25,6 +25,21 @@ _MOSTLY = 0.1
 _COINCIDENT = 1e-4  # of the diagonal of its bounding box
 _HULL_FILLED = 0.7  # of the diagonal of a hull, what it is the outline of
 _MOST_FACES_TO_CLOSE = 500_000
+
+
+def check_faces(mesh: trimesh.Trimesh, label: str) -> None:
+    """Nothing, where all faces are on vertices that are there.
+
+    Args:
+        mesh: as it was read.
+        label: what messages call it.
+
+    Raises:
+        ValueError: a face refers to a vertex that is not there.
+    """
+    faces, count = np.asarray(mesh.faces, dtype=np.int64), len(mesh.vertices)
+    if len(faces) and not (0 <= faces.min() and faces.max() < count):
+        raise ValueError(f"{label}: expected faces on its {count} vertices, found one on vertex {faces.max()}")
 
 
 def clean(
@@ -41,20 +56,15 @@ def clean(
     is, and where it is the one-sided hull around others that cartoons draw their outlines with.
 
     Args:
-        mesh: a mesh whose visual is canonical; it is not changed.
+        mesh: a mesh whose visual is canonical and whose faces have their vertices (`check_faces`); it is not changed.
         label: what to call it in a warning.
         parts: all parts of the object, in the same coordinates.
 
     Returns:
         The mesh, or None if no face is left; and warnings.
-
-    Raises:
-        ValueError: if a face refers to a vertex that is not there.
     """
     warnings: list[str] = []
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    if len(faces) and not (0 <= faces.min() and faces.max() < len(vertices)):
-        raise ValueError(f"{label}: expected faces on its {len(vertices)} vertices, found one on vertex {faces.max()}")
     finite = np.isfinite(vertices[faces]).all(axis=(1, 2))
     if not finite.all():
         warnings.append(

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from data_gen.meshes.clean import clean, decimate, is_smooth, smooth_normals
+from data_gen.meshes.clean import check_faces, clean, decimate, is_smooth, smooth_normals
 from data_gen.meshes.dae import declared_up
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PARTS, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, read_bytes
 from data_gen.meshes.find import safe_name
@@ -264,14 +264,16 @@ def _clean_parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], s
         placed.append((str(key), _transformed(geometry, transform, visual)))
     parts = []
     meshes = [mesh for _, mesh in placed]
-    for label, mesh in placed:
-        try:
+    try:
+        for label, mesh in placed:
+            check_faces(mesh, label)  # of all, since each is compared with the others
+        for label, mesh in placed:
             part, lines = clean(mesh, label, meshes)
-        except ValueError as error:
-            raise MeshError(f"{source}: {error}; the file is damaged") from error
-        found += lines
-        if part is not None:
-            parts.append(part)
+            found += lines
+            if part is not None:
+                parts.append(part)
+    except ValueError as error:
+        raise MeshError(f"{source}: {error}; the file is damaged") from error
     return parts
 
 

@@ -345,6 +345,17 @@ def test_a_solid_wound_inside_out_is_turned(tmp_path):
     assert outwards(only_part(mesh)) > 0
 
 
+def test_a_face_without_its_vertex_is_told_of_whichever_part_it_is_in():
+    """Each part is compared with the others, so those that come later must have been looked at before."""
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.Trimesh(TETRAHEDRON, TETRAHEDRON_FACES[:, ::-1], process=False), geom_name="whole")
+    wrong = TETRAHEDRON_FACES.copy()
+    wrong[0, 0] = 1027
+    scene.add_geometry(trimesh.Trimesh(TETRAHEDRON, wrong, process=False), geom_name="broken")
+    with pytest.raises(MeshError, match="broken: expected faces on its 4 vertices, found one on vertex 1027; the file"):
+        prepare_scene(scene, "it")
+
+
 def test_normals_that_are_missing_zero_not_finite_or_inverted(tmp_path):
     outward = TETRAHEDRON - 0.25
     mesh = load_mesh(write_glb(tmp_path / "a.glb", normals=-outward))
