@@ -25,6 +25,8 @@ from hyperplanes.utilities.formatting import format_duration
 
 __all__ = ["Arguments", "run"]
 
+LARGEST_ORBIT = 400  # pixels of an orbit's pictures where none were asked for: time grows with their square
+
 
 @dataclass(frozen=True)
 class Arguments(ObjectArguments):
@@ -33,7 +35,8 @@ class Arguments(ObjectArguments):
     Attributes:
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         orbit: So many pictures evenly around the object, and a turntable, instead of the query poses.
-        size: Pixels along the longer side of an orbit's pictures; as the images when not given.
+        size: Pixels along the longer side of an orbit's pictures; as the images, but 400 at most,
+            when not given.
         turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
             marching through what is not empty.
@@ -69,7 +72,8 @@ def run(arguments: Arguments) -> int:
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
     cameras = asked.cameras
     if arguments.orbit is not None:
-        cameras = orbit_cameras(shown, arguments.orbit, size=arguments.size)
+        size = arguments.size or min(max(shown.size), LARGEST_ORBIT)
+        cameras = orbit_cameras(shown, arguments.orbit, size=size)
     started = time.perf_counter()
     pictures = render_views(field, cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / cameras.batch_size
