@@ -21,8 +21,8 @@ from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.data.support import WithBounds, WithSupport
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.experiments.configurations import configuration, scaled_preset
+from hyperplanes.experiments.experiment import Cell, Experiment, Trained
 from hyperplanes.experiments.scales import Scale
-from hyperplanes.experiments.tables import Cell, Experiment, Trained
 from hyperplanes.methods import WithSampler, make_method
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import encode_json

@@ -11,7 +11,7 @@ import torch
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.experiments.engine import Runner
-from hyperplanes.experiments.tables import Experiment, Trained
+from hyperplanes.experiments.experiment import Experiment, Trained
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.training import Trainer
 from hyperplanes.training.initialisation import initialisation_trainer

@@ -11,8 +11,8 @@ from typing import Any
 from hyperplanes.evaluation import Score
 from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS, differences
 from hyperplanes.experiments.engine import Outcome
+from hyperplanes.experiments.experiment import Cell
 from hyperplanes.experiments.published import SOURCES
-from hyperplanes.experiments.tables import Cell
 from hyperplanes.utilities.environment import environment
 from hyperplanes.utilities.tables import csv_table, markdown_table
 

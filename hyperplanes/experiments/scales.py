@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from hyperplanes.configuration.fine_tuning import FineTuning
-from hyperplanes.experiments.tables import Cell, Experiment
+from hyperplanes.experiments.experiment import Cell, Experiment
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering.hierarchical import Hierarchical
 

@@ -51,9 +51,8 @@ LARGEST_FILE = 2 * 2**30
 """Bytes above which any other file that is read whole is refused unread."""
 
 MALFORMED = (
-    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError,
-    NotImplementedError, RecursionError, RuntimeError, SyntaxError, TypeError, ValueError, struct.error,
-    zipfile.BadZipFile, tokenize.TokenError, zlib.error,
+    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, RuntimeError,
+    SyntaxError, TypeError, ValueError, struct.error, zipfile.BadZipFile, tokenize.TokenError, zlib.error,
 )  # fmt: skip
 """What parsers raise where content is not what they took for granted."""
 

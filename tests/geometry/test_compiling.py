@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("numba", reason="needs numba")
-
 
 @pytest.fixture
 def cache_folder(tmp_path, monkeypatch):

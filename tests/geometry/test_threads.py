@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from numba.core.dispatcher import Dispatcher
 
 from hyperplanes.geometry import ImagePlanes, cameras, kernels
 from hyperplanes.geometry.kernels import threads
@@ -49,10 +50,9 @@ def test_all_that_a_kernel_calls_is_inlined():
 
     Machine code from the cache then gave other bits than machine code just compiled.
     """
-    numba = pytest.importorskip("numba")
     names = [module.name for module in pkgutil.iter_modules(kernels.__path__, PREFIX)]
     modules = [vars(importlib.import_module(name)) for name in names if not name.endswith("_triton")]
-    functions = [it for names in modules for it in names.values() if isinstance(it, numba.core.dispatcher.Dispatcher)]
+    functions = [it for names in modules for it in names.values() if isinstance(it, Dispatcher)]
     assert functions
     assert all(function.targetoptions.get("forceinline") for function in functions)
 
