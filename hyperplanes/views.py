@@ -13,6 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.inputs import check_channels_first
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.utilities.arguments import checked, kind_of
@@ -50,7 +51,7 @@ class Views:
     """Posed images of one scene.
 
     Attributes:
-        images: RGB in [0, 1], composited over white.
+        images: RGB in [0, 1], composited over white; (N, C, H, W) by position, as everywhere in PyTorch.
         cameras: one a view, OpenCV axes, integer pixel centres.
         masks: opacity in [0, 1], or None where the images came without.
         bounds: the sphere that holds all that is to be reconstructed.
@@ -71,6 +72,8 @@ class Views:
             raise ValueError(f"cameras: expected a PinholeCamera of Kornia, got {kind_of(self.cameras)}")
         if self.masks is not None:
             check_values("masks", self.masks)
+        if self.images.ndim == 4 and len(self.images) and self.cameras.batch_size:
+            check_channels_first("images", self.images, camera.image_size(self.cameras))
         if self.images.ndim != 4 or self.images.shape[1] != 3:
             raise ValueError(f"images: expected shape (view, 3, height, width), got {tuple(self.images.shape)}")
         if len(self.images) != self.cameras.batch_size:

@@ -138,6 +138,10 @@ def unchecked():
         ),
         ({"masks": torch.ones(4, 6, 9)}, r"masks: expected \(4, 1, 6, 9\), got \(4, 6, 9\)"),
         ({"names": ("a",)}, "names: expected one a view, 4, got 1"),
+        (
+            {"images": torch.rand(4, 6, 9, 3)},
+            r"images: expected channels before rows.* got \(4, 6, 9, 3\); write images\.permute\(0, 3, 1, 2\)",
+        ),
     ],
 )
 def test_what_does_not_fit_together_is_refused(change, message):
@@ -145,6 +149,17 @@ def test_what_does_not_fit_together_is_refused(change, message):
     parts = {"images": whole.images, "cameras": whole.cameras, "masks": whole.masks, "names": NAMES}
     with pytest.raises(ValueError, match=message):
         Views(**{**parts, **change})
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("size", [(5, 1), (3, 1), (1, 3), (3, 4), (3, 3)])
+def test_dimensions_are_told_by_the_size_of_the_cameras(size):
+    """As PyTorch documents (N, C, H, W): by place, however small they are; channels last are refused where it shows."""
+    cameras, images = ring(2, size), torch.rand(2, 3, *size)
+    assert Views(images, cameras).size == size
+    if size[0] != 3 or size[1] != 3:
+        with pytest.raises(ValueError, match=r"^images: expected channels before rows, .*; write images\.permute"):
+            Views(images.permute(0, 2, 3, 1), cameras)
 
 
 def test_a_task_names_its_object():

@@ -63,6 +63,7 @@ class Arguments:
         channels: What is written of every view; more than rgba needs the native layout.
         workers: Processes; as many as there are cores when not given.
         engine: Worker processes of this machine, or a Ray cluster.
+        timeout: Seconds that an object may take; one that takes longer is skipped and named.
         supersample: Samples along a side of a pixel, each of them shaded.
         renderer: pyrender-egl, pyrender-osmesa or embree; the best that works here when not given.
         verify: Compare all files with their checksums at the end, as objects of an interrupted call always are.
@@ -88,6 +89,7 @@ class Arguments:
     channels: tuple[Literal["rgba", "depth", "normals", "coordinates", "mesh"], ...] = ("rgba",)
     workers: OptionalInt = None
     engine: Literal["local", "ray"] = "local"
+    timeout: float = 300.0
     supersample: int = SUPERSAMPLE
     renderer: OptionalName = None
     verify: bool = False

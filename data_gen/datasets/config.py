@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -184,6 +185,8 @@ class GenerationConfig:
             supersample=self.supersample,
             renderer="",
         )
+        if not 0 < self.timeout < math.inf:
+            raise ValueError(f"timeout: expected seconds above 0, got {self.timeout:g}")
         _check_sizes(config)
         config.make_rig("")  # numbers that make no sense show here, not in every worker
         return replace(config, renderer=find_renderer(self.renderer).name)

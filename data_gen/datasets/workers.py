@@ -174,7 +174,7 @@ def run_workers(
                         close_worker(worker, kill=True)
                         worker, answer = None, {"skip": f"failed {attempt} times: {error}"}
                         if isinstance(error, WorkerTimeout):
-                            answer = {"skip": f"{error}; simplify it"}
+                            answer = {"skip": f"{error}; simplify it, or allow more by --timeout"}
                             break
                 if "fatal" in answer:
                     raise WorkerError(answer["fatal"])

@@ -9,10 +9,19 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-__all__ = ["ArrayLike", "as_images", "as_indices", "as_matrices", "as_points", "as_tensor", "check_indices"]
+__all__ = [
+    "ArrayLike",
+    "as_images",
+    "as_indices",
+    "as_matrices",
+    "as_points",
+    "as_tensor",
+    "check_channels_first",
+    "check_indices",
+]
 
-SLIM = 4
-"""Heights of an image in its widths above which it is more likely none."""
+MOST_COLOURS = 4
+"""Channels of an 8-bit picture at most: red, green, blue and alpha."""
 
 ArrayLike: TypeAlias = Tensor | npt.NDArray[Any]
 """A tensor, or a NumPy array of the same shape."""
@@ -75,8 +84,7 @@ def as_images(images: ArrayLike, name: str = "images", size: tuple[int, int] | N
     Args:
         images: what was given.
         name: of the argument, for messages.
-        size: (height, width) of their cameras, which tells rows from channels. Without it, images that would be 1, 3
-            or 4 pixels wide and more than SLIM times as high are taken for ones with their channels last.
+        size: (height, width) of their cameras, where it is known.
 
     Raises:
         ValueError: another number of dimensions, channels last, no pixel, or whole numbers of more than 8 bits.
@@ -85,28 +93,50 @@ def as_images(images: ArrayLike, name: str = "images", size: tuple[int, int] | N
     tensor(1.)
     """
     axes = "transpose" if isinstance(images, np.ndarray) else "permute"
-    images = as_tensor(name, images)
-    if images.ndim != 4:
-        raise ValueError(f"{name}: expected shape (view, channel, height, width), got {tuple(images.shape)}")
-    if images.shape[3] in (1, 3, 4) and _channels_last(images, size):
+    values = as_tensor(name, images)
+    if values.ndim != 4:
+        raise ValueError(f"{name}: expected shape (view, channel, height, width), got {tuple(values.shape)}")
+    check_channels_first(name, values, size, axes)
+    if len(values) and not (values.shape[2] and values.shape[3]):
+        raise ValueError(f"{name}: expected at least one pixel, got {tuple(values.shape)}")
+    if values.dtype == torch.uint8:
+        return values.to(torch.get_default_dtype()) / 255
+    if not values.is_floating_point() and values.dtype != torch.bool:
+        raise ValueError(f"{name}: expected floating-point numbers or 8-bit ones, got {values.dtype}")
+    return _floating(values)
+
+
+def check_channels_first(name: str, images: Tensor, size: tuple[int, int] | None = None, axes: str = "permute") -> None:
+    """Check the order of the dimensions of images: that of PyTorch, (N, C, H, W), whatever their numbers are.
+
+    Dimensions are told by their place, as PyTorch does, never guessed from how small they are. What says that the
+    channels come last is the size of the cameras, where it is that of the second and third dimension and not of the
+    last two; without cameras, 8-bit images of more than four channels, which are no pictures.
+
+    Args:
+        name: of the argument, for messages.
+        images: of four dimensions.
+        size: (height, width) of their cameras, where it is known.
+        axes: the method that reorders dimensions, for messages.
+
+    Raises:
+        ValueError: channels last.
+
+    >>> check_channels_first("images", torch.zeros(2, 16, 40, 3))  # features of 40 x 3 pixels, 16 channels
+    >>> check_channels_first("images", torch.zeros(2, 16, 40, 3), (16, 40))  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ValueError: images: expected channels before rows, (view, channel, height, width), got (2, 16, 40, 3); write ...
+    """
+    shape = tuple(images.shape)
+    if size is None:
+        last = images.dtype == torch.uint8 and shape[1] > MOST_COLOURS >= shape[3]
+    else:
+        last = shape[1:3] == size != shape[2:]
+    if last:
         raise ValueError(
-            f"{name}: expected channels before rows, (view, channel, height, width), got {tuple(images.shape)}; "
+            f"{name}: expected channels before rows, (view, channel, height, width), got {shape}; "
             f"write {name}.{axes}(0, 3, 1, 2)"
         )
-    if len(images) and not (images.shape[2] and images.shape[3]):
-        raise ValueError(f"{name}: expected at least one pixel, got {tuple(images.shape)}")
-    if images.dtype == torch.uint8:
-        return images.to(torch.get_default_dtype()) / 255
-    if not images.is_floating_point() and images.dtype != torch.bool:
-        raise ValueError(f"{name}: expected floating-point numbers or 8-bit ones, got {images.dtype}")
-    return _floating(images)
-
-
-def _channels_last(images: Tensor, size: tuple[int, int] | None) -> bool:
-    if size is not None:
-        return tuple(images.shape[1:3]) == size != tuple(images.shape[2:])
-    _, channels, height, width = images.shape
-    return channels > 4 and height > SLIM * width
 
 
 def as_indices(views: ArrayLike, points: Tensor) -> Tensor:

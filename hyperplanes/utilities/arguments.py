@@ -21,8 +21,9 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     """A decorator: arguments of another class than annotated are a ValueError that names the argument.
 
     Looked at are annotations that are classes, generic ones such as `Sequence[str]`, of which the class counts, tuples
-    of a fixed length, `Literal`, `Annotated[int, range(...)]`, unions of all these, and jaxtyping's arrays, of which
-    the kind of numbers and the number of dimensions count; all others are taken as they come.
+    of a fixed length, `Callable`, `Literal`, `Annotated[int, range(...)]`, unions of all these, and jaxtyping's arrays,
+    of which the kind of numbers and the number of dimensions count; all others are taken as they come. A class is no
+    `Callable` that returns something else than its instances.
 
     Args:
         function: with annotations that its module can resolve.
@@ -80,6 +81,8 @@ def kind_of(value: object) -> str:
         return f"a tensor of {str(value.dtype).removeprefix('torch.')}, shape {tuple(value.shape)}"
     if value is None or isinstance(value, bool | int | float | str):
         return repr(value)[:60]
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
     return f"a {type(value).__module__}.{type(value).__name__}".replace("builtins.", "")
 
 
@@ -131,6 +134,9 @@ def _fits_one(value: object, hint: Any) -> bool:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
         return value in arguments
+    if origin is Callable and isinstance(value, type):
+        returned = get_origin(arguments[-1]) or arguments[-1]
+        return isinstance(returned, type) and issubclass(value, returned)
     if origin is tuple and Ellipsis not in arguments:
         if not isinstance(value, tuple) or len(value) != len(arguments):
             return False

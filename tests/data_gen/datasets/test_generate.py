@@ -161,12 +161,15 @@ def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path)
     (meshes / "empty.obj").write_text("")
     cut = "mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 1\nusemtl paint\nf 1 2 3\n"
     (meshes / "grey.obj").write_text(cut)
-    (meshes / "ball.fbx").write_text("a format that is not read")
+    for kind in ("3mf", "fbx", "usdz"):
+        (meshes / f"ball.{kind}").write_text("a format that is not read")
     report = generate(MeshFolder(meshes), tmp_path / "out", GenerationConfig(held_out=0, **SMALL))
     assert report.written == 3
-    assert [name for name, _ in report.skipped] == ["ball.fbx", "broken", "empty"]
-    assert report.skipped[0][1].endswith("found .fbx; convert it")
-    assert all(reason.startswith(f"{name}.") for name, reason in report.skipped[1:]), "no path of this machine"
+    assert [name for name, _ in report.skipped] == ["ball.3mf", "ball.fbx", "ball.usdz", "broken", "empty"]
+    assert [reason.partition("found ")[2] for _, reason in report.skipped[:3]] == [
+        f"{kind}; convert it" for kind in (".3mf", ".fbx", ".usdz")
+    ]
+    assert all(reason.startswith(f"{name}.") for name, reason in report.skipped[3:]), "no path of this machine"
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert [(entry["name"], entry["reason"]) for entry in manifest["skipped"]] == report.skipped
     assert Dataset(tmp_path / "out").names() == ["ball", "box", "grey"]
@@ -224,6 +227,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypat
         ({"resolution": 100_000}, "resolution: expected at most 16,384 samples along a side, got 100,000 pixels of 3"),
         ({"resolution": 5000}, "resolution: expected at most 4 GiB of pictures an object, got 4.7 GiB"),
         ({"views": 10**9}, "views: expected at most 10,000 an object, got 1,000,000,000"),
+        ({"timeout": 0.0}, "timeout: expected seconds above 0, got 0"),
         ({"views": 0}, "views: expected at least 1, received 0"),
         ({"held_out": 9}, "held_out: expected a fraction below 1 or a count up to 5, got 9"),
     ],

@@ -42,7 +42,9 @@ def test_every_item_has_one_outcome_and_failures_cost_only_themselves(run):
 def test_a_hanging_worker_is_ended_and_the_rest_goes_on(run):
     begun = time.monotonic()
     outcomes = {outcome.item["name"]: outcome for outcome in run(["hang", "fine", "fine"], timeout=0.5)}
-    assert outcomes["0"].reason == ("expected to be done within 0.5 s, found no answer; simplify it")
+    assert outcomes["0"].reason == (
+        "expected to be done within 0.5 s, found no answer; simplify it, or allow more by --timeout"
+    )
     assert outcomes["1"].result
     assert outcomes["2"].result
     assert time.monotonic() - begun < 60

@@ -263,6 +263,40 @@ def test_instances_are_drawn_each_in_its_place(tmp_path):
     assert np.allclose(points_in_file(mesh), np.concatenate([TETRAHEDRON + place for place in places]), atol=1e-5)
 
 
+def test_more_parts_than_can_be_drawn_in_minutes_are_refused_at_once(tmp_path, monkeypatch):
+    """Whether one node has too many instances or many nodes have a few each."""
+
+    def written(instances, nodes=1):
+        header, buffer = gltf(nodes=[{"mesh": 0} for _ in range(nodes)])
+        number, buffer = add(header, buffer, np.zeros((instances, 3), dtype=np.float32), "VEC3", 5126)
+        for node in header["nodes"]:
+            node["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": number}}}
+        header["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
+        (tmp_path / "a.glb").write_bytes(glb_bytes(header, buffer))
+        return tmp_path / "a.glb"
+
+    with pytest.raises(
+        MeshError, match=r"a\.glb: expected at most 20000 parts, found 100000 instances; leave some out"
+    ):
+        load_mesh(written(100_000))
+    monkeypatch.setattr("data_gen.meshes.gltf.read.MAX_PARTS", 5)
+    with pytest.raises(MeshError, match="expected at most 5 parts, found 6 or more; merge its nodes"):
+        load_mesh(written(2, nodes=4))
+
+
+@pytest.mark.parametrize(("factor", "metallic", "opacity"), [(0.5, 0.0, 0.7), (0.5, 1.0, 1.0), (0.0, 0.0, 1.0)])
+def test_transmission_is_drawn_as_opacity_with_a_warning(tmp_path, factor, metallic, opacity):
+    """By hand: a dielectric of colour 0.6 lets 0.5 x 0.6 through, a metal nothing."""
+    material = {
+        "pbrMetallicRoughness": {"baseColorFactor": [0.6, 0.6, 0.6, 1.0], "metallicFactor": metallic},
+        "extensions": {"KHR_materials_transmission": {"transmissionFactor": factor}},
+    }
+    mesh = load_mesh(write_glb(tmp_path / "a.glb", material=material))
+    alpha = np.asarray(mesh_parts(mesh)[0].visual.material.baseColorFactor)[3] / 255
+    assert alpha == pytest.approx(opacity, abs=1 / 255)
+    assert any("KHR_materials_transmission drawn as opacity 0.70" in said for said in mesh.warnings) == (opacity < 1)
+
+
 def test_geometry_that_draco_compressed_is_read_or_its_package_named(tmp_path, monkeypatch):
     draco = pytest.importorskip("DracoPy", reason="DracoPy is not installed")
     header, buffer = gltf()

@@ -643,9 +643,15 @@ def model(tmp_path):
 @pytest.mark.parametrize("name", ["../secret.png", "x/../../secret.png", "..\\secret.png", "%2e%2e/secret.png"])
 def test_references_that_leave_the_folder_are_refused_by_name(model, name):
     message = refusal(write_obj(model, mtl=PAINT + f"map_Kd {name}\n"))
-    assert repr(name) in message
+    assert f"expected references inside model/, found {name!r}" in message
     path = write_gltf(model, uv=SQUARE_UV, image=picture(), change=lambda header: header.update(images=[{"uri": name}]))
     assert repr(name) in refusal(path)
+
+
+def test_the_folder_is_named_where_the_mesh_is_given_without_one(model, monkeypatch):
+    write_obj(model, mtl=PAINT + "map_Kd ../secret.png\n")
+    monkeypatch.chdir(model)
+    assert "mesh.obj: expected references inside model/, found '../secret.png'" in refusal("mesh.obj")
 
 
 def test_what_an_absolute_path_names_is_not_read(model):
