@@ -187,6 +187,11 @@ class Views:
         flat = torch.randint(total, (count,), generator=generator).to(self.images.device)
         flat = flat if among is None else among[flat]
         view, pixel = flat // (height * width), flat % (height * width)
+        if among is not None and flat.device.type == "cpu":  # elsewhere it would be waited for
+            least, most = (int(value) for value in flat.aminmax())
+            if least < 0 or int(view.max()) >= len(self):
+                pixels = f"{len(self) * height * width} pixels of {len(self)} views"
+                raise ValueError(f"among: expected indices of {pixels}, got {least} to {most}")
         row, column = pixel // width, pixel % width
         rays = cast(self.cameras, view, torch.stack([column, row], -1).to(self.images), self.bounds, near_far=near_far)
         colours = self.images[view, :, row, column]

@@ -115,6 +115,9 @@ def test_views_in_another_precision_and_their_memory():
 def test_no_pixel_to_draw_from_is_refused():
     with pytest.raises(ValueError, match="among: expected at least one pixel of 4 views to draw rays from, got none"):
         views().sample_rays(3, among=torch.zeros(0, dtype=torch.long))
+    for wrong in (216, -1):
+        with pytest.raises(ValueError, match=f"among: expected indices of 216 pixels of 4 views, got {wrong} to"):
+            views().sample_rays(3, among=torch.tensor([wrong]))
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from functools import cache, wraps
 from numbers import Integral, Real
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import torch
 from torch import Tensor
 
 __all__ = ["checked", "checked_fields", "kind_of"]
@@ -110,7 +111,17 @@ def _is_checkable(hint: Any) -> bool:
 
 
 def _fits(value: object, hint: Any) -> bool:
+    if isinstance(value, str) and torch.device in _parts(hint):
+        return _is_device(value)
     return any(_fits_one(value, part) for part in _parts(hint))
+
+
+def _is_device(name: str) -> bool:
+    try:
+        torch.device(name)
+    except RuntimeError:
+        return False
+    return True
 
 
 def _fits_one(value: object, hint: Any) -> bool:
@@ -148,6 +159,8 @@ def _fits_one(value: object, hint: Any) -> bool:
 
 
 def _shown(hint: Any) -> str:
+    if torch.device in _parts(hint):
+        return "a device such as 'cpu' or 'cuda:0'"
     return " or ".join(_shown_one(part) for part in _parts(hint))
 
 

@@ -59,6 +59,7 @@ def field(points, directions):
         (lambda: render(int, VIEWS.cameras), "field: expected Callable, got the class int"),
         (lambda: render(field, ring(1, (4, 4)), proposal=HyperPlanes), "proposal: .*, got the class HyperPlanes"),
         (lambda: orbit_cameras(Views, 3), "views: expected Views, got the class Views"),
+        (lambda: VIEWS.to("../a"), "device: expected a device such as 'cpu' or 'cuda:0', got '../a'"),
         (lambda: render(field, None), "target: expected PinholeCamera or Rays, got None"),
         (lambda: render(field, ring(1, (4, 4)), background="white"), "background: expected float, got 'white'"),
     ],

@@ -292,7 +292,7 @@ def test_transmission_is_drawn_as_opacity_with_a_warning(tmp_path, factor, metal
         "extensions": {"KHR_materials_transmission": {"transmissionFactor": factor}},
     }
     mesh = load_mesh(write_glb(tmp_path / "a.glb", material=material))
-    alpha = np.asarray(mesh_parts(mesh)[0].visual.material.baseColorFactor)[3] / 255
+    alpha = np.asarray(mesh_parts(mesh)[0][0].visual.material.baseColorFactor)[3] / 255
     assert alpha == pytest.approx(opacity, abs=1 / 255)
     assert any("KHR_materials_transmission drawn as opacity 0.70" in said for said in mesh.warnings) == (opacity < 1)
 
