@@ -4,9 +4,11 @@ Case number i of a seed is always the same: `python -m tests.fuzz --calls 1 --on
 """
 
 import math
+import os
 import random
 import warnings
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 
 import jaxtyping
 import numpy as np
@@ -219,8 +221,9 @@ def run_calls(cases, seed, home, report=lambda failure: None):
     Returns:
         One `Failure` for each call that ended as none should.
     """
-    before = jaxtyping.config.jaxtyping_disable
+    before, place = jaxtyping.config.jaxtyping_disable, Path.cwd()
     jaxtyping.config.update("jaxtyping_disable", True)
+    os.chdir(home)  # some names are those of this folder
     try:
         calls, failures = make_calls(home), []
         for name, (function, arguments) in calls.items():
@@ -239,4 +242,5 @@ def run_calls(cases, seed, home, report=lambda failure: None):
                 report(failures[-1])
         return failures
     finally:
+        os.chdir(place)
         jaxtyping.config.update("jaxtyping_disable", before)
