@@ -78,11 +78,13 @@ class Arguments:
     resolution: OptionalInt = None
     views: OptionalInt = None
     held_out: OptionalNumber = None
-    rig: Literal["fixed", "random", "hemisphere", "orbit", "spiral", "paper-128", "paper-200", "srn"] = "fixed"
+    rig: Annotated[str, tyro.conf.arg(metavar="{fixed,random,hemisphere,orbit,spiral,paper-128,paper-200,srn}")] = (
+        "fixed"
+    )
     distance: Annotated[float | None, optional("RADII")] = None
     field_of_view: Annotated[float | None, optional("DEGREES")] = None
     lighting: Literal["studio", "headlight", "random"] = "studio"
-    layout: Literal["native", "srn", "learnit-128", "hyperplanes-200"] = "native"
+    layout: Annotated[str, tyro.conf.arg(metavar="{native,srn,learnit-128,hyperplanes-200}")] = "native"
     up: Literal["y", "z"] = "y"
     up_of: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[PATTERN=AXIS [...]]")] = ()
     split_file: Annotated[Path | None, optional("FILE")] = None

@@ -199,22 +199,6 @@ def test_photographs_without_poses_are_told_how_to_get_them(scene, tmp_path, pla
             action(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("files", "name"),
-    [
-        (["keyframes/cameras/1.json", "keyframes/images/1.jpg"], "an export of Polycam; .*ns-process-data polycam"),
-        (["metadata", "rgbd/0.jpg"], "an export of Record3D; .*ns-process-data record3d"),
-        (["scan.r3d"], "an export of Record3D"),
-    ],
-)
-def test_capture_apps_are_named(tmp_path, files, name):
-    for file in files:
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / file).write_text("{}")
-    with pytest.raises(DataError, match=name):
-        read_task(tmp_path)
-
-
 def test_a_linked_folder_of_pictures_inside_the_tree_is_followed(scene, tmp_path):
     """The tree given holds scenes; the pictures of one lie beside it. Given alone, the scene's link leads out of it."""
     from hyperplanes.data import open_dataset

@@ -18,6 +18,7 @@ from tests.fuzz.campaign import time_limit
 from tests.fuzz.corpus import CORPUS
 
 LAYOUTS = ("posed", "COLMAP text", "COLMAP binary", "SRN", "NSVF", "LLFF", "NeuS", "data set")
+LAYOUTS += ("Polycam", "Record3D", "RealityCapture", "Metashape")
 SECRET = "root:x:0:0"
 
 

@@ -1,10 +1,11 @@
-"""Whole inputs in the layouts of published data sets, and a scene as `capture` writes it."""
+"""Whole inputs in the layouts of published data sets and of apps, and a scene as `capture` writes it."""
 
 import gzip
 import json
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from hyperplanes.capture.scene import write_scene
 from hyperplanes.capture.sparse_model import SparseModel
@@ -67,6 +68,46 @@ class Published:
         opengl = [(np.linalg.inv(pose) * [1, -1, -1, 1]).tolist() for pose in self.poses]
         frames = [{"file_path": f"r_{index}", "transform_matrix": pose} for index, pose in enumerate(opengl)]
         (home / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+
+    def opengl(self):
+        """world_from_camera (4, 4), x right, y up, z backwards."""
+        return [np.linalg.inv(pose) * [1, -1, -1, 1] for pose in self.poses]
+
+    def polycam(self, folder):
+        for index, pose in enumerate(self.opengl()):
+            stated = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+            stated |= {"fx": 16.0, "fy": 16.0, "cx": 6.0, "cy": 5.0, "width": self.width, "height": self.height}
+            (folder / "keyframes/cameras").mkdir(parents=True, exist_ok=True)
+            (folder / f"keyframes/cameras/{index}.json").write_text(json.dumps(stated))
+        self.save(folder / "keyframes/images", "{}.jpg")
+
+    def record3d(self, folder):
+        self.save(folder / "rgbd", "{}.jpg")
+        poses = [[*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]] for pose in self.opengl()]
+        stated = {"poses": poses, "K": [16, 0, 0, 0, 16, 0, 6, 5, 1], "w": self.width, "h": self.height}
+        (folder / "metadata").write_text(json.dumps(stated))
+
+    def realitycapture(self, folder):
+        self.save(folder / "images", "{}.jpg")
+        rows = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+        for index, pose in enumerate(self.opengl()):
+            angles = Rotation.from_matrix(pose[:3, :3]).as_euler("ZXY", degrees=True) * [-1, 1, 1]
+            rows.append(",".join(map(str, [f"{index}.jpg", *pose[:3, 3], *angles, 48, 0, 0, 0.01, 0, 0, 0.001, 0, 0])))
+        (folder / "cameras.csv").write_text("\n".join(rows))
+
+    def metashape(self, folder):
+        self.save(folder / "images", "{}.jpg")
+        cameras = [
+            f'<camera id="{index}" sensor_id="0" label="{index}"><transform>{" ".join(map(str, pose.ravel()))}'
+            "</transform></camera>"
+            for index, pose in enumerate(map(np.linalg.inv, self.poses))
+        ]
+        (folder / "cameras.xml").write_text(
+            '<document version="2.0.0"><chunk><transform><rotation>1 0 0 0 1 0 0 0 1</rotation><translation>0 0 1'
+            '</translation><scale>2</scale></transform><sensors><sensor id="0" type="frame"><calibration type="frame" '
+            f'class="adjusted"><resolution width="{self.width}" height="{self.height}"/><f>16</f><cx>0.5</cx><k1>0.01'
+            f"</k1></calibration></sensor></sensors><cameras>{''.join(cameras)}</cameras></chunk></document>"
+        )
 
     def sparse_model(self):
         count = len(self.poses)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.frames import Frame, assemble, scaled_matrix
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, check_pose
 from hyperplanes.geometry.rays import Sphere
@@ -125,7 +125,7 @@ def read_colmap(
                 _picture(home, image.name, paths[1], root or folder),
                 image.name,
                 check_pose(image.camera_from_world, paths[1], image.name),
-                partial(_scaled, seen),
+                partial(scaled_matrix, seen.matrix, seen.size),
                 seen.size,
                 seen.coefficients,
             )
@@ -164,15 +164,6 @@ def _pictures_folder(folder: Path, model: Path, images: list[_Image], source: Pa
         return sum(_picture(home, name, source, root).is_file() for name in chosen)
 
     return max(homes, key=present)
-
-
-def _scaled(seen: _Camera, size: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """The calibration of a camera for pictures of another size: the borders stay in place."""
-    scale = np.array([size[1] / seen.size[1], size[0] / seen.size[0]])
-    matrix = seen.matrix.copy()
-    matrix[[0, 1], [0, 1]] *= scale
-    matrix[:2, 2] = scale * (matrix[:2, 2] + 0.5) - 0.5
-    return matrix
 
 
 def _camera(model: str, width: int, height: int, values: list[float], path: Path) -> _Camera:

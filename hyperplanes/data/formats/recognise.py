@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyperplanes.data.formats import co3d, colmap, idr, llff, nmr, npz, nsvf, objaverse, srn
+from hyperplanes.data.formats.apps import metashape, polycam, realitycapture, record3d
 from hyperplanes.data.formats.catalogue import FORMAT, Catalogue, native
 from hyperplanes.data.formats.transforms_json import find_transforms, read_transforms, read_transforms_task
 from hyperplanes.data.formats.unposed import refuse_unposed
@@ -70,6 +71,22 @@ LAYOUTS = (
     ),
     Layout(
         co3d.is_sequence, lambda folder, downscale, root: co3d.read_sequence(folder, downscale=downscale, root=root)
+    ),
+    Layout(
+        polycam.is_polycam,
+        lambda folder, downscale, root: polycam.read_polycam(folder, downscale=downscale, root=root),
+    ),
+    Layout(
+        record3d.is_record3d,
+        lambda folder, downscale, root: record3d.read_record3d(folder, downscale=downscale, root=root),
+    ),
+    Layout(
+        lambda folder: bool(metashape.find_cameras_files(folder)),
+        lambda folder, downscale, root: metashape.read_metashape(folder, downscale=downscale, root=root),
+    ),
+    Layout(
+        lambda folder: bool(realitycapture.find_tables(folder)),
+        lambda folder, downscale, root: realitycapture.read_realitycapture(folder, downscale=downscale, root=root),
     ),
 )
 
@@ -190,6 +207,6 @@ def _format(folder: Path) -> Layout:
     refuse_unposed(folder)
     if not folder.is_dir():
         found = "a file of another kind" if folder.exists() else "nothing"
-        raise DataError(folder, "a transforms*.json or a folder that holds one", found, "check the path")
+        raise DataError(folder, "a transforms*.json or the folder of a scene", found, "check the path")
     names = ", ".join(sorted(child.name for child in folder.iterdir())[:5]) or "an empty folder"
     raise DataError(folder, "transforms.json or another layout of one scene", names, "give one object's folder")

@@ -1,4 +1,4 @@
-"""What is not posed images yet, and how it becomes so: photographs alone, and the exports of capture apps."""
+"""What is not posed images yet, and how it becomes so: photographs alone, videos, and packed exports of apps."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from hyperplanes.utilities.files import DataError
 
 __all__ = ["photographs_folder", "refuse_unposed"]
 
-_HOMES = (".", "images", "input", "rgb", "photos", "image")
+_HOMES = (".", "images", "input", "rgb", "photos", "image", "rgbd", "keyframes/images")
 _COUNTED = 10_000  # entries of a folder that are looked at
 _VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv"})
+_PACKED = frozenset({".zip", ".r3d"})  # Record3D's .r3d is a ZIP archive
 
 
 def refuse_unposed(path: Path) -> None:
@@ -21,13 +22,12 @@ def refuse_unposed(path: Path) -> None:
         path: a file or a folder in no layout that is read.
 
     Raises:
-        DataError: photographs without poses, a video, or an export of Polycam or Record3D.
+        DataError: photographs without poses, a video, or an archive.
     """
-    tool = _capture_app(path)
-    if tool is not None:
-        name, kind = tool
-        remedy = f"convert it with nerfstudio: ns-process-data {kind} --data {path} --output-dir posed"
-        raise DataError(path, "posed images, such as a transforms.json", f"an export of {name}", remedy)
+    packed = _packed(path)
+    if packed is not None:
+        remedy = f"unpack it (unzip {packed} -d capture), then give that folder"
+        raise DataError(path, "the folder of an export", f"{packed.name}, which is packed", remedy)
     if path.is_file() and path.suffix.lower() in _VIDEOS:
         remedy = f"find the poses of its frames: hyperplanes capture {path} --out scene, then give scene"
         raise DataError(path, "posed images", "a video", remedy)
@@ -41,18 +41,12 @@ def refuse_unposed(path: Path) -> None:
         )
 
 
-def _capture_app(path: Path) -> tuple[str, str] | None:
-    """The app that wrote what lies there, and nerfstudio's word for it."""
-    if path.suffix.lower() == ".r3d" and path.is_file():
-        return "Record3D", "record3d"
-    if not path.is_dir():
-        return None
-    names = {child.name for _, child in zip(range(_COUNTED), path.iterdir(), strict=False)}
-    if "metadata" in names and "rgbd" in names or any(name.lower().endswith(".r3d") for name in names):
-        return "Record3D", "record3d"
-    if (path / "keyframes").is_dir() or {"cameras", "images", "depth"} <= names or "corrected_cameras" in names:
-        return "Polycam", "polycam"
-    return None
+def _packed(path: Path) -> Path | None:
+    """The archive that lies there, alone in its folder where a folder is given."""
+    if path.is_file():
+        return path if path.suffix.lower() in _PACKED else None
+    children = [child for _, child in zip(range(2), path.iterdir(), strict=False)] if path.is_dir() else []
+    return _packed(children[0]) if len(children) == 1 and children[0].is_file() else None
 
 
 def photographs_folder(path: Path, suffixes: frozenset[str] = PICTURE_SUFFIXES) -> Path | None:

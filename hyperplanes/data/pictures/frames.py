@@ -26,7 +26,7 @@ from hyperplanes.data.pictures.undistort import check_lens, undistort
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["MEGAPIXEL", "Frame", "assemble", "listed"]
+__all__ = ["MEGAPIXEL", "Frame", "assemble", "listed", "scaled_matrix"]
 
 MEGAPIXEL = 2**20
 """Pixels above which photographs are scaled down unless the caller says by how much."""
@@ -120,7 +120,7 @@ def assemble(
         notes.append(f"scaled down by {factor}, to {size[1] // factor} x {size[0] // factor} pixels{why}")
     pictures, alphas, matrices = [], [], []
     for one in found:
-        matrix = _reduced_matrix(one.frame.calibrate(one.size), one.size, size, factor)
+        matrix = scaled_matrix(one.frame.calibrate(one.size), one.size, (size[0] / factor, size[1] / factor))
         picture, alpha = _pixels(one, size, factor)
         if any(one.frame.lens):
             check_lens(matrix, one.frame.lens, picture.shape[:2], f"{source}, frame {one.frame.name}")
@@ -228,11 +228,17 @@ def _factor(size: tuple[int, int], downscale: int | None, complete: bool, source
     return downscale
 
 
-def _reduced_matrix(
-    matrix: npt.NDArray[np.float64], own: tuple[int, int], size: tuple[int, int], factor: int
+def scaled_matrix(
+    matrix: npt.NDArray[np.float64], own: tuple[float, float], size: tuple[float, float]
 ) -> npt.NDArray[np.float64]:
-    """The calibration of a picture scaled from its own size to the common one and reduced: borders stay in place."""
-    scale = np.array([size[1] / own[1] / factor, size[0] / own[0] / factor])
+    """The calibration of a picture scaled from one (height, width) to another: its borders stay in place.
+
+    Args:
+        matrix: (3, 3), integer pixel centres.
+        own: the size that it was made for.
+        size: the one that is wanted, which need not be whole.
+    """
+    scale = np.array([size[1] / own[1], size[0] / own[0]])
     result = matrix.copy()
     result[:2, :2] *= scale[:, None]
     result[:2, 2] = scale * (matrix[:2, 2] + 0.5) - 0.5

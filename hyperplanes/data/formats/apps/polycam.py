@@ -1,0 +1,80 @@
+"""Polycam's raw data: a JSON file of camera beside each photograph, in the world of ARKit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hyperplanes.data.formats.apps.calibration import calibrated
+from hyperplanes.data.formats.transforms_document import opencv_from_opengl
+from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.masks import find_masks
+from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.utilities.files import DataError, check_link, list_files, malformed, read_json
+
+__all__ = ["is_polycam", "read_polycam"]
+
+_STATED = "a camera of Polycam: t_00 to t_23, fx, fy, cx, cy, width, height"
+
+
+def is_polycam(folder: Path) -> bool:
+    """Whether a folder holds a capture as Polycam exports its raw data, or is the keyframes of one."""
+    return _places(folder) is not None
+
+
+def _places(folder: Path) -> tuple[Path, Path] | None:
+    """The folders of cameras and of photographs: those that Polycam corrected, where it did."""
+    for base in (folder / "keyframes", folder):
+        for kind in ("corrected_", ""):
+            cameras, pictures = base / f"{kind}cameras", base / f"{kind}images"
+            if cameras.is_dir() and pictures.is_dir() and any(cameras.glob("*.json")):
+                return cameras, pictures
+    return None
+
+
+def read_polycam(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+    """The posed pictures of a capture of Polycam.
+
+    keyframes/corrected_cameras/N.json and corrected_images/N.jpg, which are there once the app has processed the
+    capture, else cameras and images. t_ij is row i, column j of the pose, camera to world in OpenGL's axes; the world
+    is ARKit's, y up. Principal points count from the corner of the picture, as in ARKit. Masks may lie in masks/ beside
+    the photographs' folder, or beside keyframes/. (Layout: nerfstudio, process_data/polycam_utils.py.)
+
+    Args:
+        folder: of the capture, unzipped.
+        downscale: as in `assemble`.
+        root: no file may lie outside of it, symbolic links followed; the folder when None.
+
+    Returns:
+        The pictures in the order of their names.
+
+    Raises:
+        DataError: anything wrong with a file.
+    """
+    folder, root = Path(folder), root or Path(folder)
+    found = _places(folder)
+    if found is None:
+        raise DataError(folder, "keyframes/cameras and keyframes/images", "neither", "export the raw data again")
+    cameras, pictures = found
+    frames = []
+    for path in list_files(cameras, {".json"}, root):
+        stated = read_json(path, root)
+        with malformed(path, _STATED):
+            pose = np.array([[float(stated[f"t_{row}{column}"]) for column in range(4)] for row in range(3)])
+            focal, centre = (stated["fx"], stated["fy"]), (stated["cx"], stated["cy"])
+            size = int(stated["height"]), int(stated["width"])
+            calibrate = calibrated(focal, centre, size, path)
+        camera_from_world = opencv_from_opengl(check_pose(pose, path, path.stem)[None])[0]
+        picture = next((each for each in _named(pictures, path.stem) if each.is_file()), pictures / f"{path.stem}.jpg")
+        check_link(picture, root)
+        frames.append(Frame(picture, picture.name, camera_from_world, calibrate, size))
+    homes = [cameras.parent / "masks", folder / "masks"]
+    masks = find_masks(homes, [frame.path for frame in frames], root)
+    frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
+    return replace(assemble(frames, cameras, downscale=downscale)[0], up="y")
+
+
+def _named(pictures: Path, stem: str) -> list[Path]:
+    return [pictures / f"{stem}{ending}" for ending in (".jpg", ".jpeg", ".png")]
