@@ -9,6 +9,8 @@ import tempfile
 from pathlib import Path
 
 from hyperplanes.cli import main
+from hyperplanes.experiments.configurations import configuration
+from hyperplanes.experiments.demonstration.settings import DemoSettings
 
 
 @functools.cache
@@ -23,6 +25,13 @@ def demo_folder():
     folder = Path(tempfile.mkdtemp(prefix="hyperplanes-demo-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return Path(shutil.copytree(shared / "demo", folder / "demo"))
+
+
+def demo_preset():
+    """The model and the training of that demonstration."""
+    settings = DemoSettings.quick_check()
+    trained = next(each for each in settings.table.trainings if each.method == "hyperplanes")
+    return configuration(settings.table, trained, settings.scale, settings.objects, settings.seed)
 
 
 def first_object(folder):

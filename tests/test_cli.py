@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from small_demo import demo_folder, first_object
+from small_demo import demo_folder, demo_preset, first_object
 
 from data_gen.rendering.renderers import RendererError
 from hyperplanes.adaptation import HyperPlanes
@@ -30,7 +30,6 @@ from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.data import DataError, read_task
 from hyperplanes.data.dataset import locate_scene
-from hyperplanes.experiments.demonstration.pipeline import DemoSettings, configurations
 from hyperplanes.export.baking import BakedScene
 from hyperplanes.export.images import to_pixels
 from hyperplanes.fields.baked import BakedField
@@ -515,7 +514,7 @@ def test_the_paper_protocol_is_rendered_and_evaluated_when_asked_for(tmp_path, c
 
 
 def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(PRESETS, "tiny", configurations(DemoSettings.quick_check())["hyperplanes"])
+    monkeypatch.setitem(PRESETS, "tiny", demo_preset())
     data, run = str(demo_folder() / "data"), tmp_path / "run"
     command = ["train", "--data", data, "--preset", "tiny", "--steps", "2", "--out", str(run)]
     assert main([*command, "--method", "nerf", "--protocol", "paper"]) == 0
@@ -650,7 +649,7 @@ def test_the_demonstration_shows_the_packaged_model_before_anything_is_trained(t
 
 
 def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(PRESETS, "tiny", configurations(DemoSettings.quick_check())["hyperplanes"])
+    monkeypatch.setitem(PRESETS, "tiny", demo_preset())
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     command = ["train", "--data", str(demo_folder() / "data"), "--preset", "tiny", "--steps", "24", "--out"]
     step = Trainer.take_step

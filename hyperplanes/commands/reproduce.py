@@ -25,12 +25,12 @@ import tyro
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalInt
+from hyperplanes.commands.runs import make_runner
 from hyperplanes.commands.writing import writes_to
 
 if TYPE_CHECKING:
-    from hyperplanes.configuration.presets import Preset
-    from hyperplanes.experiments.scales import Scale
-    from hyperplanes.views import Tasks
+    from hyperplanes.evaluation import ObjectScore
+    from hyperplanes.experiments.experiment import Cell
 
 __all__ = ["Arguments", "data_sets", "run"]
 
@@ -89,47 +89,40 @@ def data_sets(given: Sequence[str]) -> dict[str, Path]:
 @writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Run what is not done yet and print the table."""
-    from hyperplanes.commands.train import follow
-    from hyperplanes.data.devices import choose_device
     from hyperplanes.experiments import SCALES, find_experiment, report
     from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
-    from hyperplanes.experiments.engine import Runner
     from hyperplanes.experiments.estimate import estimate
     from hyperplanes.experiments.figures import curves_of, figure_of, pictures_of
-    from hyperplanes.training import start_training
     from hyperplanes.utilities.files import write_json, write_whole
     from hyperplanes.utilities.formatting import format_duration
     from hyperplanes.utilities.plots import save_figure
 
-    console, device = Console(), choose_device(arguments.device)
+    console = Console()
     scale = SCALES[arguments.scale]
     experiment = scale.applied(find_experiment(arguments.name)).of(arguments.only)
     seeds = scale.seeds(experiment) if arguments.seeds is None else arguments.seeds
     if seeds < 1:
         raise ValueError(f"--seeds: expected at least 1, got {seeds}")
 
-    def train(method: str, chosen: Preset, data: Tasks, folder: Path, reference: Path | None) -> None:
-        trainer = start_training(chosen.model, chosen.training, data, folder, device, reference)
-        with console.bar(method) as bar:
-            follow(trainer, bar)
+    def found(cell: Cell, seed: int, score: ObjectScore, *_: int) -> None:
+        console.say(f"{cell.row}, {cell.column}, seed {seed}: {score.name} {score.psnr:.2f} dB")
 
-    runner = Runner(
+    runner = make_runner(
         arguments.out,
         scale,
+        console=console,
+        device=arguments.device,
+        announce=console.say,
         given=data_sets(arguments.data),
-        generate=lambda name, folder: _generate(name, folder, scale),
-        train=train,
-        say=console.say,
-        device=device,
         legacy=arguments.legacy,
     )
     if arguments.estimate or scale.resolution is None:
-        found = estimate(runner, experiment, seeds)
-        console.table(found.headings, found.rows)
-        console.say(f"all of it: {format_duration(found.seconds)} on this machine")
+        expected = estimate(runner, experiment, seeds)
+        console.table(expected.headings, expected.rows)
+        console.say(f"all of it: {format_duration(expected.seconds)} on this machine")
         if arguments.estimate:
             return 0
-    outcome = runner.run(experiment, seeds)
+    outcome = runner.run(experiment, seeds, found)
     folder = arguments.out / experiment.name
     command = _command(arguments, seeds)
     write_json(folder / "results.json", report.as_json(outcome, command))
@@ -157,19 +150,3 @@ def _command(arguments: Arguments, seeds: int) -> str:
     only = "".join(f" {each!r}" if " " in each else f" {each}" for each in arguments.only)
     only = f" --only{only}" if only else ""
     return f"hyperplanes reproduce {arguments.name} --scale {arguments.scale} --seeds {seeds}{only}{legacy}{data}"
-
-
-def _generate(class_name: str, folder: Path, scale: Scale) -> None:
-    from hyperplanes.commands import find_verb
-
-    generate = find_verb("generate").load()
-    generate.run(
-        generate.Arguments(
-            folder,
-            class_name=class_name,
-            count=scale.objects,
-            held_out=scale.held_out,
-            views=scale.views,
-            resolution=scale.resolution,
-        )
-    )

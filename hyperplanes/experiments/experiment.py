@@ -10,7 +10,7 @@ from hyperplanes.experiments.published import PublishedTable
 
 __all__ = ["ALL_PLANES", "Cell", "Experiment", "Split", "Trained"]
 
-Split = Literal["test", "train"]
+Split = Literal["test", "train", "all"]
 """Which objects of a class are evaluated."""
 
 ALL_PLANES = 25  # support views of an object in all of the paper's experiments but one
@@ -51,6 +51,8 @@ class Cell:
         quantity: a number of `evaluation.ObjectScore`.
         free: what fine-tuning optimises; "hypernetwork" with theta frozen is the paper's way.
         views: support views that are shown; as many as the model has planes where None.
+        query: query views that are kept back, where the views that are shown are chosen as far apart as all of them
+            stand; all query views where None, and the first support views are shown.
     """
 
     row: str
@@ -62,6 +64,7 @@ class Cell:
     quantity: str = "psnr"
     free: Literal["hypernetwork", "weights"] = "hypernetwork"
     views: int | None = None
+    query: int | None = None
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,7 @@ class Experiment:
         objects: evaluated a class; None for all.
         published_rows: headings of the paper's rows by ours, where ours say more.
         pictures: rows of which a view is shown by every method, beside the truth; none where empty.
+        keep_pictures: whether the query views of all cells are kept as files, where a folder is an experiment's own.
     """
 
     name: str
@@ -98,6 +102,7 @@ class Experiment:
     objects: int | None = None
     published_rows: Mapping[str, str] = field(default_factory=dict)
     pictures: tuple[str, ...] = ()
+    keep_pictures: bool = False
 
     def of(self, headings: Sequence[str]) -> Experiment:
         """The same with some rows and columns alone; all of them where no heading is given.

@@ -22,7 +22,11 @@ AXES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "image_seconds": "seconds a view"}
 
 def figure_of(outcome: Outcome) -> Figure:
     """The figure that the experiment asks for: bars, curves, boxes or PSNR over steps."""
-    figure = {"bars": _bars, "curves": _curves, "boxes": _boxes, "steps": _steps}[outcome.experiment.figure](outcome)
+    draw = {"bars": _bars, "curves": _curves, "boxes": _boxes, "steps": _steps}[outcome.experiment.figure]
+    return _titled(draw(outcome), outcome)
+
+
+def _titled(figure: Figure, outcome: Outcome) -> Figure:
     figure.suptitle(f"{outcome.experiment.title} ({outcome.scale.name}, seeds: {outcome.seeds})", fontsize=10)
     return figure
 
@@ -60,11 +64,7 @@ def _bars(outcome: Outcome) -> Figure:
 
 def curves_of(outcome: Outcome) -> Figure | None:
     """PSNR, SSIM and loss while training, beside a figure of boxes, as the paper has them; None beside others."""
-    if outcome.experiment.figure != "boxes":
-        return None
-    figure = _curves(outcome)
-    figure.suptitle(f"{outcome.experiment.title} ({outcome.scale.name}, seeds: {outcome.seeds})", fontsize=10)
-    return figure
+    return _titled(_curves(outcome), outcome) if outcome.experiment.figure == "boxes" else None
 
 
 def pictures_of(runner: Runner, outcome: Outcome) -> Figure | None:

@@ -107,10 +107,10 @@ def what_differs(outcome: Outcome) -> list[str]:
         learned = scale.learned.get("training.steps") if experiment.name == "shapenet" else None
         others = f", {learned:,} of learned initialisations" if learned else ""
         lines.append(f"Training: {scale.steps:,} steps of each model{others}. Paper: epochs, {paper}.")
-    if scale.tuning is not None and any(scale.method(cell.method) != cell.method for cell in experiment.cells):
-        lines.append(f"At most {scale.tuning} gradient steps on the support views of an object.")
-    if experiment.figure == "steps" and scale.longest is not None:
-        lines.append(f"At most {scale.longest:,} gradient steps on the support views of an object.")
+    if scale.max_steps is not None and any(scale.method(cell.method) != cell.method for cell in experiment.cells):
+        lines.append(f"At most {scale.max_steps} gradient steps on the support views of an object.")
+    if experiment.figure == "steps" and scale.max_curve_steps is not None:
+        lines.append(f"At most {scale.max_curve_steps:,} gradient steps on the support views of an object.")
     if scale.evaluated is not None:
         count = min(scale.evaluated, experiment.objects or scale.evaluated)
         lines.append(f"Judged by {count} object{'s' if count > 1 else ''} a class. Paper: all test objects.")

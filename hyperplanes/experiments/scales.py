@@ -30,8 +30,8 @@ class Scale:
         held_out: of them.
         views: an object, half support and half query. Numbers of planes and of HyperPlanes are in proportion to it.
         steps: of every training; None for the paper's epochs, a step an object.
-        tuning: the most gradient steps on the support views of an object.
-        longest: the same where PSNR is drawn over their number.
+        max_steps: the most gradient steps on the support views of an object.
+        max_curve_steps: the same where PSNR is drawn over their number.
         evaluated: objects a class and split; None for all.
         most_seeds: of a table; None for as many as the paper has.
         changes: of the preset, by dotted names, before a method is chosen.
@@ -42,21 +42,22 @@ class Scale:
         bounds: the sphere of every scene; what the files say or the masks show where None.
         shown: numbers of support views, where a table has rows of several; None for all of them.
         packaged: with the rows of models that come with the package.
+        data: what is generated otherwise, by class: entries that `generate` takes.
     """
 
     name: str
     about: str
     presets: Mapping[int, str]
-    protocol: str
-    resolution: int | None
-    objects: int
-    held_out: int
-    views: int
-    steps: int | None
-    tuning: int | None
-    longest: int | None
-    evaluated: int | None
-    most_seeds: int | None
+    protocol: str = "default"
+    resolution: int | None = None
+    objects: int = 0
+    held_out: int = 0
+    views: int = PAPER_VIEWS
+    steps: int | None = None
+    max_steps: int | None = None
+    max_curve_steps: int | None = None
+    evaluated: int | None = None
+    most_seeds: int | None = None
     changes: Mapping[str, object] = field(default_factory=dict)
     learned: Mapping[str, object] = field(default_factory=dict)
     learned_target: str | None = None
@@ -65,6 +66,7 @@ class Scale:
     bounds: Sphere | None = None
     shown: tuple[int, ...] | None = None
     packaged: bool = True
+    data: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
     def seeds(self, experiment: Experiment) -> int:
         """How many seeds of an experiment are run: as many as in the paper, or as the scale has."""
@@ -79,11 +81,11 @@ class Scale:
             and (self.packaged or not cell.trained.packaged)
         )
         experiment = replace(experiment, cells=kept)
-        if experiment.figure != "steps" or self.longest is None:
+        if experiment.figure != "steps" or self.max_curve_steps is None:
             return experiment
         cells: dict[tuple[str, str], Cell] = {}
         for cell in experiment.cells:
-            count = min(int(cell.column), self.longest)
+            count = min(int(cell.column), self.max_curve_steps)
             method = cell.method.removesuffix(cell.column) + (str(count) if count else "")
             cells.setdefault((cell.row, str(count)), replace(cell, column=str(count), method=method))
         return replace(experiment, cells=tuple(cells.values()))
@@ -99,9 +101,9 @@ class Scale:
         'hyperplanes_2'
         """
         match = re.fullmatch(r"(.+)_(\d+)", name)
-        if match is None or self.tuning is None or "_scratch_" in name:
+        if match is None or self.max_steps is None or "_scratch_" in name:
             return name
-        return f"{match[1]}_{min(int(match[2]), self.tuning)}"
+        return f"{match[1]}_{min(int(match[2]), self.max_steps)}"
 
 
 PUBLISHED_BOUNDS = Sphere((0.0, 0.0, 0.0), 2.0)
@@ -130,20 +132,19 @@ SCALES: dict[str, Scale] = {
     each.name: each
     for each in (
         Scale(
-            "smoke",
-            "seconds: that everything runs; nothing is learnt",
-            {128: "quick", 200: "quick"},
-            "default",
-            16,
-            4,
-            2,
-            8,
-            2,
-            2,
-            3,
-            1,
-            1,
-            {
+            name="smoke",
+            about="seconds: that everything runs; nothing is learnt",
+            presets={128: "quick", 200: "quick"},
+            resolution=16,
+            objects=4,
+            held_out=2,
+            views=8,
+            steps=2,
+            max_steps=2,
+            max_curve_steps=3,
+            evaluated=1,
+            most_seeds=1,
+            changes={
                 "model.network.depth": 2,
                 "model.network.width": 8,
                 "model.hypernetwork.code": 4,
@@ -164,20 +165,18 @@ SCALES: dict[str, Scale] = {
             packaged=False,
         ),
         Scale(
-            "small",
-            "about half an hour a seed of all ten on one core: 32x32, procedural objects",
-            {128: "quick", 200: "quick"},
-            "default",
-            32,
-            50,
-            10,
-            50,
-            200,
-            150,
-            1000,
-            3,
-            3,
-            {
+            name="small",
+            about="about half an hour a seed of all ten on one core: 32x32, procedural objects",
+            presets={128: "quick", 200: "quick"},
+            resolution=32,
+            objects=50,
+            held_out=10,
+            steps=200,
+            max_steps=150,
+            max_curve_steps=1000,
+            evaluated=3,
+            most_seeds=3,
+            changes={
                 "model.network.depth": 3,
                 "model.network.width": 64,
                 "model.sampling.steps": 32,
@@ -196,20 +195,15 @@ SCALES: dict[str, Scale] = {
             shown=(1, 25),
         ),
         Scale(
-            "gpu",
-            "all ten in about a day on one card: data sets as they were published, samples in the visual hull alone",
-            {128: "paper-128", 200: "paper-200"},
-            "ray_marching",
-            None,
-            0,
-            0,
-            50,
-            5000,
-            None,
-            10_000,
-            5,
-            1,
-            {"training.evaluate_every": 500, "training.checkpoint_every": 1000},
+            name="gpu",
+            about="all ten in about a day on one card: data sets as published, samples in the visual hull alone",
+            presets={128: "paper-128", 200: "paper-200"},
+            protocol="ray_marching",
+            steps=5000,
+            max_curve_steps=10_000,
+            evaluated=5,
+            most_seeds=1,
+            changes={"training.evaluate_every": 500, "training.checkpoint_every": 1000},
             learned={
                 "model.network.depth": 5,
                 "model.network.point_frequencies": 20,
@@ -221,19 +215,10 @@ SCALES: dict[str, Scale] = {
             scratch=NERF_TRAINING,
         ),
         Scale(
-            "paper",
-            "the paper's setting on data sets as they were published, on a GPU",
-            {128: "paper-128", 200: "paper-200"},
-            "paper",
-            None,
-            0,
-            0,
-            50,
-            None,
-            None,
-            None,
-            None,
-            None,
+            name="paper",
+            about="the paper's setting on data sets as they were published, on a GPU",
+            presets={128: "paper-128", 200: "paper-200"},
+            protocol="paper",
             learned=LEARNIT,
             learned_target="simplified_nerf",
             fine_tuning=AUTHORS_FINE_TUNING,

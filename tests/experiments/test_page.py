@@ -4,16 +4,20 @@ import base64
 import io
 import re
 from dataclasses import replace
+from functools import partial
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from small_demo import demo_folder
 
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.experiments.demonstration.first_page import write_first_page
+from hyperplanes.experiments.demonstration.settings import DemoSettings
+from hyperplanes.experiments.demonstration.steps import Demonstration
+from hyperplanes.experiments.engine import Runner
 from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
 from hyperplanes.experiments.page.charts import line_chart
 from hyperplanes.experiments.page.pictures import ERROR_SCALE, colour_scale, error_map
@@ -43,6 +47,17 @@ class Balance(HTMLParser):
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
+
+
+class NamedBalls(Balls):
+    """Balls whose views are files, in one split."""
+
+    def names(self, split):
+        return super().names("test")
+
+    def task(self, name):
+        task = super().task(name)
+        return replace(task, query=replace(task.query, names=tuple(f"{index}.png" for index in range(self.views))))
 
 
 def report(title="A <title> & more"):
@@ -171,7 +186,12 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     (tmp_path / "small").mkdir()
     with pytest.raises(CheckpointError, match="small"):
         HyperPlanes.from_pretrained("small")  # a folder of that name goes first, where a name is given
-    data, shown = Balls(train=0, test=1, views=6, size=(24, 24)), {}
-    page = write_first_page(tmp_path / "first.html", data, data.names("test"), 2, shown.__setitem__, counts=(2, 3))
-    assert page.exists()
-    assert len(shown) == 3
+    shown, balls = [], NamedBalls(train=0, test=1, views=6, size=(24, 24))
+    monkeypatch.setattr(Runner, "tasks", lambda runner, class_name: balls)
+    monkeypatch.setattr(Runner, "folder", lambda runner, class_name: tmp_path)
+    settings = replace(DemoSettings.quick_check(), first=("car",), first_counts=(2, 3), frames=4)
+    make_runner = partial(Runner, generate=None, train=None, device=torch.device("cpu"))
+    Demonstration(settings, tmp_path, make_runner, shown.append, None).show_packaged()
+    assert (tmp_path / "first.html").exists()
+    rows = [line.partition(":")[0] for line in shown]
+    assert rows == ["nearest of 3 views, copied", "2 views", "3 views", "the first page"]

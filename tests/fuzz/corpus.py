@@ -18,8 +18,7 @@ from hyperplanes.capture.stages import Stages
 from hyperplanes.configuration.presets import configure
 from hyperplanes.configuration.settings_file import read_experiment
 from hyperplanes.data import open_dataset, read_channel, read_task, read_views
-from hyperplanes.experiments.stages import Stage
-from hyperplanes.experiments.stages import Stages as ExperimentStages
+from hyperplanes.experiments.record import Record
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import Sphere, cameras
 from hyperplanes.training.state import load_state, save_state
@@ -155,20 +154,19 @@ def go_on_generating(folder):
 
 
 def stages(folder):
-    work = ExperimentStages(folder)
-    with work.work(STAGE):
+    with Record(folder / "stages.json").working("data", SETTINGS):
         pass
 
 
 def go_on_in_stages(folder):
-    work = ExperimentStages(folder)
-    if not work.done(STAGE):
-        with work.work(STAGE):
+    record = Record(folder / "stages.json")
+    if not record.done("data", SETTINGS):
+        with record.working("data", SETTINGS):
             pass
-    work.seconds(STAGE)
+    record.seconds("data")
 
 
-STAGE = Stage("data", {"count": 2}, ())
+SETTINGS = {"count": 2}
 
 
 def settings(folder):

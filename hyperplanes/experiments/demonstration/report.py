@@ -1,80 +1,152 @@
-"""From the folder of a demonstration to its page and its picture."""
+"""The pages of the demonstration: what the packaged model makes of objects, and what was trained."""
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from hyperplanes.adaptation.checkpoints import find_checkpoint
+from hyperplanes.adaptation.checkpoints import find_checkpoint, packaged_folder
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.experiments.demonstration.pipeline import MODELS, DemoSettings, describe_row
+from hyperplanes.data.support import Shown
+from hyperplanes.evaluation import Score
+from hyperplanes.experiments.demonstration.settings import (
+    MODELS,
+    PACKAGED,
+    QUERY_VIEWS,
+    DemoSettings,
+    describe_row,
+)
+from hyperplanes.experiments.engine import Runner, curve_of
+from hyperplanes.experiments.experiment import Cell
 from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
 from hyperplanes.experiments.page.content import Pixels
-from hyperplanes.experiments.stages import Stages
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.environment import environment
-from hyperplanes.utilities.files import write_whole
+from hyperplanes.utilities.files import write_json, write_whole
 from hyperplanes.utilities.formatting import format_duration
-from hyperplanes.views import Tasks
+from hyperplanes.views import Task
 
-__all__ = ["describe", "how_it_was_made", "overview", "write_report"]
+__all__ = ["describe_count", "overview", "write_first_page", "write_report"]
 
 HERO_SCALE, SCALE = 2.5, 1.5
 """Sides of turntables as multiples of the images': of the first object, which is shown large, and of the others."""
 
 GAP = 6
 
+TITLE = "New views of objects it has never seen"
 
-def write_report(
-    folder: Path, data: Tasks, settings: DemoSettings, metrics: Mapping[str, Any], facts: Sequence[tuple[str, str]]
-) -> Path:
-    """Write report.html and overview.png.
+
+def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores: Mapping[str, Score]) -> None:
+    """Write what the packaged model makes of objects that no training saw.
 
     Args:
-        folder: of the demonstration, everything before the report done.
-        data: its data set.
+        path: of the page.
+        runner: of `settings.packaged`, all of whose cells are evaluated.
         settings: of the demonstration.
-        metrics: what `write_metrics` returned.
-        facts: how it was made, label and value.
-
-    Returns:
-        The page.
+        scores: by row, over all classes.
     """
-    model = HyperPlanes.from_pretrained(find_checkpoint(folder / "hyperplanes"))
+    model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(runner.device)
+    fewest, most = settings.first_counts[0], settings.first_counts[-1]
+    best = f"views_{most}"
+    exhibits, names = [], []
+    for on in dict.fromkeys(cell.on for cell in settings.packaged.cells):
+        cells = [cell for cell in settings.packaged.cells if cell.on == on]
+        for name in runner.names(on, "all", settings.packaged.objects):
+            task = Shown(runner.tasks(on), most, QUERY_VIEWS).task(name)
+            around = model.adapt(task.support).render(orbit_cameras(task.support, settings.frames // 2)).images
+            read, query = range(len(task.support)), range(len(task.query))
+            exhibits.append(_exhibit(runner, cells, scores, task, read, query, to_pixels(around)))
+            names.append(f"{on}/{name}")
+    height, width = task.query.size
+    page = Report(
+        title=TITLE,
+        lead=f"The packaged model {PACKAGED!r} looks at posed images of an object, any number of them from anywhere, "
+        "and writes the weights of a field that can be looked at from anywhere. Nothing was trained for this page.",
+        figures=[
+            (f"{scores[best].mean('psnr'):.2f} dB", f"PSNR from {most} views, in a single step"),
+            (f"{scores[f'views_{fewest}'].mean('psnr'):.2f} dB", f"from {fewest} views"),
+            (format_duration(scores[best].mean("adapt_seconds")), f"from {most} images to a field"),
+            (format_duration(scores[best].mean("render_seconds")), f"a view of {height} x {width} pixels"),
+        ],
+        method=best,
+        exhibits=exhibits,
+        table=[_row(row, describe_count(row, most), score) for row, score in scores.items()],
+        curves={},
+        tuning={},
+        diagnostics="",
+        facts=[("weights", f"{PACKAGED}, which comes with the package"), ("objects", ", ".join(names))],
+        commands=[
+            (
+                "a turntable of your own posed images (transforms.json beside them)",
+                f"hyperplanes render --checkpoint {PACKAGED} --views photos/ --out new-views --orbit 48 --all-views",
+            ),
+            (
+                "the same after 100 steps on those images, which makes it sharper",
+                f"hyperplanes render --checkpoint {PACKAGED} --views photos/ --out sharper --steps 100 --all-views",
+            ),
+        ],
+    )
+    write_whole(path, render_page(page).encode())
+
+
+def describe_count(row: str, most: int) -> str:
+    """A row of the first page in words."""
+    return f"nearest of {most} views, copied" if row == "nearest_view" else f"{row.removeprefix('views_')} views"
+
+
+def write_report(folder: Path, runner: Runner, settings: DemoSettings) -> None:
+    """Write metrics.json, report.html and overview.png.
+
+    Args:
+        folder: of the demonstration.
+        runner: of `settings.table`, after fine-tuning.
+        settings: of the demonstration.
+    """
+    scores = {cell.row: runner.score(settings.table, cell, settings.seed) for cell in settings.table.cells}
+    write_json(folder / "metrics.json", {row: score.as_json() for row, score in scores.items()})
+    model = HyperPlanes.from_pretrained(find_checkpoint(folder / "hyperplanes")).to(runner.device)
+    data = runner.tasks(settings.class_name)
+    cells = [cell for cell in settings.table.cells if cell.row in settings.methods]
     exhibits, rounds = [], []
     for name in sorted(data.names("test"))[: settings.exhibits]:
         task = data.task(name)
-        support = model.arrange(task.support)
-        size = round((SCALE if exhibits else HERO_SCALE) * settings.resolution)
-        frames = to_pixels(model.adapt(support).render(orbit_cameras(support, settings.frames, size=size)).images)
-        rounds.append(frames)
-        truth = to_pixels(task.query.images)
-        chosen = sorted({len(truth) // 4, 3 * len(truth) // 4})
-        views = [QueryView(truth[i], _predictions(folder, settings, name, task.query.names[i])) for i in chosen]
-        quality = {method: metrics[method]["objects"][name]["psnr"] for method in settings.methods}
-        read = model.prepare(task.support, carved=False).hyperplanes.tolist()
-        exhibits.append(
-            Exhibit(name, to_pixels(support.images), read, views, quality, encode_animation(frames, "webp"))
-        )
-    curves = {method: read_json(folder / method / "training.json")["curve"] for method in MODELS}
+        read, count = model.prepare(task.support, carved=False).hyperplanes.tolist(), len(task.query)
+        task = replace(task, support=model.arrange(task.support))
+        size = SCALE if exhibits else HERO_SCALE
+        around = orbit_cameras(task.support, settings.frames, size=round(size * settings.resolution))
+        rounds.append(to_pixels(model.adapt(task.support).render(around).images))
+        query = sorted({count // 4, 3 * count // 4})
+        exhibits.append(_exhibit(runner, cells, scores, task, read, query, rounds[-1]))
     picture = overview(exhibits[:3], rounds[:3], round(SCALE * settings.resolution))
     write_whole(folder / "overview.png", encode_png(picture, small=True))
-    page = render_page(describe(folder, settings, metrics, exhibits, curves, facts))
-    write_whole(folder / "report.html", page.encode())
-    return folder / "report.html"
+    write_whole(folder / "report.html", render_page(_describe(folder, runner, settings, scores, exhibits)).encode())
 
 
-def _predictions(folder: Path, settings: DemoSettings, name: str, view: str) -> dict[str, Pixels]:
-    file = f"{Path(view).stem}.png"
-    return {method: _read(folder / "pictures" / method / name / file) for method in settings.methods}
+def _exhibit(
+    runner: Runner,
+    cells: Sequence[Cell],
+    scores: Mapping[str, Score],
+    task: Task,
+    read: Sequence[int],
+    query: Sequence[int],
+    around: Pixels,
+) -> Exhibit:
+    """An object: its support views and those that are read, some query views as each cell showed them, and a round."""
+    truth, names = to_pixels(task.query.images), [f"{Path(name).stem}.png" for name in task.query.names]
+    files = {cell.row: runner.pictures(cell, task.name) for cell in cells}
+    views = [
+        QueryView(truth[view], {row: _read(folder / names[view]) for row, folder in files.items()}) for view in query
+    ]
+    quality = {row: next(each.psnr for each in scores[row].objects if each.name == task.name) for row in files}
+    support = to_pixels(task.support.images)
+    return Exhibit(task.name, support, read, views, quality, encode_animation(around, "webp"))
 
 
 def _read(path: Path) -> Pixels:
@@ -82,57 +154,45 @@ def _read(path: Path) -> Pixels:
         return np.asarray(image.convert("RGB"))
 
 
-def describe(
+def _row(row: str, about: str, score: Score) -> Row:
+    seconds = [format_duration(score.mean(each)) for each in ("adapt_seconds", "render_seconds")]
+    foreground = score.mean("psnr_foreground") if "psnr_foreground" in score.quantities else None
+    return Row(row, about, score.mean("psnr"), score.spread("psnr"), foreground, score.mean("ssim"), *seconds)
+
+
+def _describe(
     folder: Path,
+    runner: Runner,
     settings: DemoSettings,
-    metrics: Mapping[str, Any],
+    scores: Mapping[str, Score],
     exhibits: Sequence[Exhibit],
-    curves: Mapping[str, Sequence[Mapping[str, float]]],
-    facts: Sequence[tuple[str, str]],
 ) -> Report:
     """The page's content in words and numbers."""
-    one_step = metrics["hyperplanes"]
-    table = [
-        Row(
-            row,
-            describe_row(row),
-            found["psnr"],
-            statistics.pstdev(each["psnr"] for each in found["objects"].values()),
-            found.get("psnr_foreground"),
-            found["ssim"],
-            format_duration(found["adapt_seconds"]),
-            format_duration(found["render_seconds"]),
-        )
-        for row, found in metrics.items()
-    ]
-    tuning = {
-        method: sorted((float(steps), quality) for steps, quality in found.items())
-        for method, found in read_json(folder / "tuning.json").items()
-    }
+    one_step = scores["hyperplanes"]
     diagnostics = Diagnostics.of_json(read_json(folder / "hyperplanes" / "diagnostics.json"))
-    gap = one_step["psnr"] - metrics["hyperplanes_swapped"]["psnr"]
-    shown = len(exhibits[0].support)
+    gap = one_step.mean("psnr") - scores["hyperplanes_swapped"].mean("psnr")
+    shown, side = len(exhibits[0].support), settings.resolution
     return Report(
-        title="New views of objects it has never seen",
+        title=TITLE,
         lead=f"A hypernetwork looks at a few of {shown} posed images of a {settings.class_name} and writes the weights "
         "of a field that can be looked at from anywhere.",
         figures=[
-            (f"{one_step['psnr']:.2f} dB", "PSNR on held-out objects after a single step"),
-            (f"{one_step['ssim']:.3f}", "SSIM of the same views"),
-            (format_duration(one_step["adapt_seconds"]), f"from {shown} images to a field"),
-            (
-                format_duration(one_step["render_seconds"]),
-                f"a view of {settings.resolution} x {settings.resolution} pixels",
-            ),
+            (f"{one_step.mean('psnr'):.2f} dB", "PSNR on held-out objects after a single step"),
+            (f"{one_step.mean('ssim'):.3f}", "SSIM of the same views"),
+            (format_duration(one_step.mean("adapt_seconds")), f"from {shown} images to a field"),
+            (format_duration(one_step.mean("render_seconds")), f"a view of {side} x {side} pixels"),
         ],
         method="hyperplanes",
         exhibits=exhibits,
-        table=table,
-        curves=curves,
-        tuning=tuning,
+        table=[_row(row, describe_row(row), score) for row, score in scores.items()],
+        curves={method: curve_of(folder / method) for method in MODELS},
+        tuning={
+            method: sorted((float(steps), quality) for steps, quality in found.items())
+            for method, found in read_json(folder / "tuning.json").items()
+        },
         diagnostics=f"Over held-out objects, {diagnostics}. In the table, an object's own update is worth {gap:.2f} dB "
         "more than that of another object.",
-        facts=facts,
+        facts=_how_it_was_made(settings, folder, runner),
         commands=[
             ("this page again, or what is left of it after an interruption", f"hyperplanes demo --out {folder}"),
             (
@@ -147,23 +207,19 @@ def describe(
     )
 
 
-def how_it_was_made(settings: DemoSettings, folder: Path, manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _how_it_was_made(settings: DemoSettings, folder: Path, runner: Runner) -> list[tuple[str, str]]:
     """Data, training, machine and time, label and value."""
-    done, where = Stages(folder), environment()
+    where, trained = environment(), settings.objects - settings.held_out
     steps = read_json(folder / "hyperplanes" / "training.json")["step"]
-    trained = settings.objects - settings.held_out
-    times = ", ".join(
-        f"{name} {format_duration(done.seconds(name))}" for name in ("data", *MODELS) if done.seconds(name)
-    )
+    manifest = read_json(runner.folder(settings.class_name) / "manifest.json")
+    times = {name: runner.record.seconds(name) for name in ("data", *MODELS)}
+    times["data"] += runner.record.seconds("unseen")
     return [
         ("objects", f"{trained} procedural {settings.class_name}s to train on, {settings.held_out} held out"),
-        (
-            "images",
-            f"{settings.views} an object, {settings.resolution} px, half support, half query",
-        ),
+        ("images", f"{settings.views} an object, {settings.resolution} px, half support, half query"),
         ("renderer of the data", str(manifest.get("renderer", "unknown"))),
         ("training", f"{steps:,} steps of each model, preset {settings.preset}, seed {settings.seed}"),
-        ("time", times),
+        ("time", ", ".join(f"{name} {format_duration(seconds)}" for name, seconds in times.items())),
         ("machine", f"{where['gpu'] or where['processor']}, {where['cores']} cores, torch {where['torch']}"),
         ("commit", str(where["commit"])),
         ("paper", "Batorski et al., HyperPlanes: Hypernetwork Approach to Rapid NeRF Adaptation, arXiv 2402.01524"),

@@ -1,0 +1,199 @@
+"""The demonstration as experiments: what is trained and evaluated, and how large."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hyperplanes.experiments.experiment import Cell, Experiment, Trained
+from hyperplanes.experiments.scales import Scale
+from hyperplanes.methods import at_steps, describe_method
+from hyperplanes.rendering.renderer import RayMarching
+
+__all__ = ["MODELS", "PACKAGED", "TUNED", "DemoSettings", "describe_row"]
+
+TUNED = ("hyperplanes", "scratch")
+"""Methods whose PSNR over fine-tuning steps is drawn."""
+
+MODELS = ("hyperplanes", "point_multiplane")
+"""What is trained, each into a folder of its name."""
+
+PACKAGED = "small"
+QUERY_VIEWS = 2  # of each object on its page
+MOST = 12  # objects on its page
+
+TINY = {
+    "model.network.depth": 2,
+    "model.network.width": 16,
+    "model.hypernetwork.views": 12,  # of the paper's 50: three of six
+    "model.hypernetwork.code": 8,
+    "model.hypernetwork.depth": 1,
+    "model.hypernetwork.width": 16,
+    "model.sampling": RayMarching(steps=16),
+    "model.hull_resolution": 16,
+    "training.rays": 32,
+    "training.warmup": 0,
+    "training.checkpoint_every": 10,
+}
+"""Networks so small that nothing is learnt."""
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """How large the demonstration is.
+
+    Attributes:
+        class_name: of the procedural objects.
+        objects: how many, the held-out ones included.
+        held_out: of them.
+        resolution: pixels a side.
+        views: an object, half support and half query.
+        preset: what is trained.
+        steps: of every training.
+        seed: of everything.
+        exhibits: objects shown in the report.
+        frames: of each turntable.
+        unseen_objects: of another class, which no model is trained on.
+        fine_tuned: numbers of fine-tuning steps of the rows of the table, a few and many.
+        tuning: numbers of fine-tuning steps in the chart of fine-tuning.
+        tuned_objects: held-out objects that it is drawn of.
+        first: classes of which the packaged model shows one object each, before anything is trained.
+        first_resolution: of their images.
+        first_counts: numbers of views that it is shown of each.
+        meshes: a folder of mesh files that it shows too.
+        tiny: networks so small that nothing is learnt: to see that everything runs.
+    """
+
+    class_name: str = "car"
+    objects: int = 155
+    held_out: int = 5
+    resolution: int = 64
+    views: int = 50
+    preset: str = "quick"
+    steps: int = 800
+    seed: int = 0
+    exhibits: int = 5
+    frames: int = 36
+    unseen_objects: int = 2
+    fine_tuned: tuple[int, int] = (10, 100)
+    tuning: tuple[int, ...] = (0, 1, 3, 10, 30, 100, 300)
+    tuned_objects: int = 1
+    first: tuple[str, ...] = ("car", "chair", "plane", "lamp")
+    first_resolution: int = 128
+    first_counts: tuple[int, ...] = (3, 10, 25)
+    meshes: Path | None = None
+    tiny: bool = False
+
+    @property
+    def unseen_class(self) -> str:
+        """The class of the objects that no model is trained on."""
+        return "car" if self.class_name == "chair" else "chair"
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The rows of the table on the class that was trained on."""
+        few, many = self.fine_tuned
+        tuned = (f"hyperplanes_{few}", f"hyperplanes_{many}", f"scratch_{many}")
+        return ("nearest_view", "point_multiplane", "hyperplanes_swapped", "hyperplanes", *tuned)
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """All rows of the table: `methods`, and METHOD:CLASS for those on the class that was never trained on."""
+        many = self.fine_tuned[1]
+        unseen = ("nearest_view", "hyperplanes", f"hyperplanes_{many}", f"scratch_{many}")
+        return (*self.methods, *(f"{method}:{self.unseen_class}" for method in unseen))
+
+    @property
+    def table(self) -> Experiment:
+        """Every method on held-out objects of the class that was trained on, and some on objects of the other."""
+        cells = [self._cell(row, *row.split(":")) for row in self.rows]
+        return self._experiment(cells, keep_pictures=True)
+
+    @property
+    def fine_tuning(self) -> Experiment:
+        """PSNR after several numbers of fine-tuning steps."""
+        rows = [row for method in TUNED for row in at_steps(method, self.tuning)]
+        return self._experiment([self._cell(row, row) for row in rows], objects=self.tuned_objects)
+
+    @property
+    def packaged(self) -> Experiment:
+        """The packaged model on objects that no training saw: a row a number of views, a column a class."""
+        rows = {"nearest_view": self.first_counts[-1]} | {f"views_{count}": count for count in self.first_counts}
+        cells = []
+        for row, count in rows.items():
+            method = row if row == "nearest_view" else "hyperplanes"
+            for on in (*self.first, *(["meshes"] if self.meshes else [])):
+                trained = Trained(on, packaged=PACKAGED)
+                cells.append(Cell(row, on, trained, method, on, "all", views=count, query=QUERY_VIEWS))
+        return self._experiment(cells, objects=MOST - len(self.first), keep_pictures=True)
+
+    def _cell(self, row: str, method: str, on: str = "") -> Cell:
+        trained = Trained(self.class_name, method if method in MODELS else "hyperplanes")
+        return Cell(row, "", trained, method, on or self.class_name, free="weights")
+
+    def _experiment(
+        self, cells: Sequence[Cell], *, objects: int | None = None, keep_pictures: bool = False
+    ) -> Experiment:
+        size, cells = self.resolution, tuple(cells)
+        named = Experiment("demonstration", "The demonstration", "", size, epochs=1, runs=1, cells=cells, figure="bars")
+        return replace(named, objects=objects, keep_pictures=keep_pictures)
+
+    @property
+    def scale(self) -> Scale:
+        """How large the trainings are, and the data sets of both classes."""
+        unseen = {"objects": self.unseen_objects, "held_out": self.unseen_objects}
+        return Scale(
+            name="demonstration",
+            about="the class that is trained on, and another one",
+            presets={self.resolution: self.preset},
+            resolution=self.resolution,
+            objects=self.objects,
+            held_out=self.held_out,
+            views=self.views,
+            steps=self.steps,
+            changes=TINY if self.tiny else {},
+            data={self.class_name: {"seed": self.seed}, self.unseen_class: {"seed": self.seed, **unseen}},
+        )
+
+    @property
+    def packaged_scale(self) -> Scale:
+        """One object a class from cameras anywhere, and the mesh files."""
+        drawn = {"rig": "random", "seed": self.seed}
+        return Scale(
+            name="demonstration",
+            about="what the packaged model is shown",
+            presets={self.resolution: self.preset},
+            resolution=self.first_resolution,
+            objects=1,
+            held_out=1,
+            data={**dict.fromkeys(self.first, drawn), "meshes": {**drawn, "meshes": str(self.meshes)}},
+        )
+
+    @classmethod
+    def quick_check(cls, seed: int = 0) -> DemoSettings:
+        """A demonstration of seconds that shows nothing but that it runs."""
+        return cls(
+            objects=4,
+            held_out=2,
+            resolution=24,
+            views=12,
+            steps=20,
+            seed=seed,
+            exhibits=1,
+            frames=6,
+            unseen_objects=1,
+            fine_tuned=(1, 2),
+            tuning=(0, 2, 5),
+            tuned_objects=1,
+            first=("car", "lamp"),
+            first_resolution=24,
+            first_counts=(3, 8),
+            tiny=True,
+        )
+
+
+def describe_row(row: str) -> str:
+    """A row of the table in words."""
+    method, _, class_name = row.partition(":")
+    return describe_method(method) + (f", on {class_name}s: a class never trained on" if class_name else "")

@@ -1,0 +1,113 @@
+"""The steps of the demonstration, in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+
+from hyperplanes.evaluation import Score
+from hyperplanes.experiments.demonstration.report import describe_count, write_first_page, write_report
+from hyperplanes.experiments.demonstration.settings import MODELS, TUNED, DemoSettings
+from hyperplanes.experiments.engine import OnScore, Runner
+from hyperplanes.experiments.experiment import Cell
+from hyperplanes.methods import at_steps
+from hyperplanes.utilities.files import write_json
+
+__all__ = ["Demonstration"]
+
+
+class Demonstration:
+    """Everything once, small: the packaged model, data, trainings, evaluations and two pages.
+
+    Args:
+        settings: how large.
+        out: the folder for everything.
+        make_runner: a `Runner` of a folder, a scale and the names of its folders.
+        say: called with a line.
+        evaluating: a context with the title of a row, for as long as it is evaluated: what hears its scores.
+    """
+
+    def __init__(
+        self,
+        settings: DemoSettings,
+        out: Path,
+        make_runner: Callable[..., Runner],
+        say: Callable[[str], None],
+        evaluating: Callable[[str], AbstractContextManager[OnScore]],
+    ) -> None:
+        self.settings, self.out, self.say, self.evaluating = settings, out, say, evaluating
+        classes = [*settings.first, "meshes"]
+        self.packaged = make_runner(out / "first", settings.packaged_scale, places={name: name for name in classes})
+        places = {settings.class_name: "data", settings.unseen_class: "unseen"} | {name: name for name in MODELS}
+        self.runner = make_runner(out, settings.scale, places=places)
+
+    def steps(self) -> dict[str, Callable[[], object]]:
+        """What does each step, unless it was done before, by its name."""
+        table, seed = self.settings.table, self.settings.seed
+        trained = {each.method: each for each in table.trainings}
+        return {
+            "packaged model": self.show_packaged,
+            "data": lambda: [self.runner.folder(name) for name in table.classes],
+            **{name: partial(self.runner.checkpoint, table, trained[name], seed) for name in MODELS},
+            **{f"evaluate {c.row}": partial(self.evaluate, c) for c in table.cells},
+            "fine-tuning": self.tune,
+            "report": self.report,
+        }
+
+    def show_packaged(self) -> None:
+        """What needs no training, in first.html."""
+        settings, page = self.settings, self.out / "first.html"
+        names = ("first", "first_resolution", "first_counts", "seed", "frames")
+        deciding = {name: getattr(settings, name) for name in names} | {"meshes": str(settings.meshes)}
+        self.packaged.make(page.name, deciding, [page], lambda: self._show_packaged(page))
+
+    def _show_packaged(self, page: Path) -> None:
+        experiment, scores = self.settings.packaged, {}
+        for name in sorted(experiment.classes, key=lambda name: name != "meshes"):  # they may be wrong input
+            self.packaged.folder(name)
+        for row in experiment.rows:
+            cells = [cell for cell in experiment.cells if cell.row == row]
+            found = [self.packaged.score(experiment, cell, self.settings.seed) for cell in cells]
+            scores[row] = Score(row, tuple(each for score in found for each in score.objects))
+            self.say(f"{describe_count(row, self.settings.first_counts[-1])}: {scores[row].mean('psnr'):.2f} dB")
+        write_first_page(page, self.packaged, self.settings, scores)
+        self.say(f"the first page: {page.resolve().as_uri()}")
+
+    def evaluate(self, cell: Cell) -> None:
+        """A row of the table."""
+        with self.evaluating(cell.row) as hear:
+            self.runner.score(self.settings.table, cell, self.settings.seed, hear)
+
+    def tune(self) -> None:
+        """PSNR over fine-tuning steps, in tuning.json by method and number of steps."""
+        path = self.out / "tuning.json"
+        self.runner.make("fine-tuning", self._deciding, [path], lambda: self._tune(path))
+
+    def _tune(self, path: Path) -> None:
+        found: dict[str, float] = {}
+        for cell in self.settings.fine_tuning.cells:
+            found[cell.row] = self.runner.score(self.settings.fine_tuning, cell, self.settings.seed).mean("psnr")
+            self.say(f"{cell.row}: {found[cell.row]:.2f} dB")
+        steps = self.settings.tuning
+        write_json(path, {m: {str(n): found[row] for n in steps for row in at_steps(m, [n])} for m in TUNED})
+
+    def report(self) -> None:
+        """The page, its picture and metrics.json."""
+        outputs = [self.out / name for name in ("metrics.json", "report.html", "overview.png")]
+        shown = {"exhibits": self.settings.exhibits, "frames": self.settings.frames}
+        work = partial(write_report, self.out, self.runner, self.settings)
+        self.runner.make("report", {**self._deciding, **shown}, outputs, work)
+
+    @property
+    def _deciding(self) -> Mapping[str, object]:
+        """What decides the evaluations: data, trainings, and the numbers of fine-tuning steps."""
+        settings, runner, table = self.settings, self.runner, self.settings.table
+        return {
+            "data": [runner.data_name(name) for name in table.classes],
+            "trainings": [runner.training_name(table, each, settings.seed) for each in table.trainings],
+            "rows": settings.rows,
+            "tuning": settings.tuning,
+            "tuned_objects": settings.tuned_objects,
+        }

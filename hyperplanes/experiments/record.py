@@ -1,0 +1,84 @@
+"""What was made in a folder: work that survives an interruption, and is done again when what decides it has changed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hyperplanes.utilities.checkpoints import CheckpointError, read_json
+from hyperplanes.utilities.files import write_json
+
+__all__ = ["Record", "plain"]
+
+
+class Record:
+    """Settings, end and duration of every piece of work, kept in a JSON file.
+
+    Args:
+        path: of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._known: dict[str, Any] = read_json(path) if path.exists() else {}
+        if wrong := sorted(name for name, entry in self._known.items() if not _is_entry(entry)):
+            raise CheckpointError(
+                f"{path}: expected settings, done and seconds of every stage, found others of {wrong[0]!r}; "
+                "remove the file, and all stages are done again"
+            )
+
+    def done(self, name: str, settings: Mapping[str, Any], *outputs: Path) -> bool:
+        """Whether the work was finished with these settings and its outputs are still there."""
+        known = self._known.get(name, {})
+        return bool(known.get("done")) and known["settings"] == plain(settings) and all(p.exists() for p in outputs)
+
+    def seconds(self, name: str) -> float:
+        """How long the work has taken, over all interruptions."""
+        return float(self._known.get(name, {}).get("seconds", 0.0))
+
+    @contextmanager
+    def working(self, name: str, settings: Mapping[str, Any], *outputs: Path) -> Generator[None]:
+        """The time in which something is worked on; an exception leaves it unfinished, to be gone on with.
+
+        Args:
+            name: of the work.
+            settings: all that decides its result, JSON-able.
+            outputs: files and folders; removed first where they were made with other settings.
+        """
+        known = self._known.get(name)
+        if known is None or known["settings"] != plain(settings):
+            for path in outputs if known else ():
+                _remove(path)
+            self._known[name] = {"settings": plain(settings), "done": False, "seconds": 0.0}
+        entry = self._known[name]
+        entry["done"] = False
+        write_json(self.path, self._known)
+        started = time.perf_counter()
+        try:
+            yield
+            entry["done"] = True
+        finally:
+            entry["seconds"] += time.perf_counter() - started
+            write_json(self.path, self._known)
+
+
+def plain(settings: Mapping[str, Any]) -> Any:
+    """Settings as they come back from a JSON file."""
+    return json.loads(json.dumps(settings))
+
+
+def _is_entry(entry: object) -> bool:
+    kinds = {"settings": dict, "done": bool, "seconds": int | float}
+    return isinstance(entry, dict) and all(isinstance(entry.get(name), kind) for name, kind in kinds.items())
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

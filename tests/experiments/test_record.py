@@ -1,0 +1,65 @@
+"""Source of truth: what was begun, interrupted and finished; files that are there and that are gone."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.experiments.demonstration.settings import DemoSettings
+from hyperplanes.experiments.engine import Runner
+from hyperplanes.experiments.record import Record
+from hyperplanes.utilities.checkpoints import CheckpointError
+from tests.reference_rendering import Balls
+
+
+def test_what_was_interrupted_goes_on_and_what_has_other_settings_begins_anew(tmp_path):
+    made = tmp_path / "made"
+
+    def interrupted():
+        with Record(tmp_path / "stages.json").working("a", {"sizes": (1, 2)}, made):
+            made.mkdir()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    record = Record(tmp_path / "stages.json")
+    assert not record.done("a", {"sizes": (1, 2)}, made)
+    with record.working("a", {"sizes": (1, 2)}, made):
+        assert made.exists()
+    spent = record.seconds("a")
+    assert Record(tmp_path / "stages.json").done("a", {"sizes": (1, 2)}, made)
+    assert not record.done("a", {"sizes": (1, 2)}, made, tmp_path / "gone")
+    with record.working("a", {"sizes": (1, 3)}, made):
+        assert not made.exists()
+    assert spent > 0
+    assert record.seconds("b") == 0
+
+
+def test_a_damaged_record_is_one_line(tmp_path):
+    (tmp_path / "stages.json").write_text('{"data": 3}')
+    with pytest.raises(CheckpointError, match="expected settings, done and seconds of every stage, found others of"):
+        Record(tmp_path / "stages.json")
+
+
+def test_a_training_in_a_folder_of_its_own_is_made_anew_when_its_data_changes(tmp_path, monkeypatch):
+    """The folder has the same name, the model and the objects too: the data alone has other pixels."""
+    monkeypatch.setattr(Runner, "tasks", lambda runner, class_name: Balls())
+    settings, trained = DemoSettings.quick_check(), []
+
+    def train(what, chosen, data, reference, folder):
+        assert not folder.exists()
+        folder.mkdir(parents=True)
+        trained.append(what.method)
+
+    def run(resolution):
+        scale = replace(settings.scale, resolution=resolution)
+        places = {each: each for each in ("hyperplanes", "point_multiplane")}
+        runner = Runner(tmp_path, scale, generate=None, train=train, device=torch.device("cpu"), places=places)
+        for each in settings.table.trainings:
+            assert runner.checkpoint(settings.table, each, 0) == tmp_path / each.method
+
+    run(24)
+    run(24)
+    assert len(trained) == 2
+    run(32)
+    assert len(trained) == 4
