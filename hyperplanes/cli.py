@@ -15,6 +15,7 @@ from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import entry_points
 from types import ModuleType
+from typing import Any, get_type_hints
 
 from hyperplanes.commands import EXAMPLES, find_verb, find_verbs, split_settings
 from hyperplanes.utilities.interrupts import Terminated, interruptible
@@ -107,7 +108,17 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
         args=rest,
         config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
     )
+    _check_ranges(parsed)
     return module.run(replace(parsed, settings=tuple(settings)) if settings else parsed)
+
+
+def _check_ranges(parsed: Any) -> None:
+    """Refuse whole numbers outside of the range that a verb declares for them, which its parser does not look at."""
+    for name, hint in get_type_hints(type(parsed), include_extras=True).items():
+        allowed = next((note for note in getattr(hint, "__metadata__", ()) if isinstance(note, range)), None)
+        if allowed is not None and getattr(parsed, name) not in allowed:
+            expected = f"a whole number from {allowed[0]} to {allowed[-1]}"
+            raise ValueError(f"--{name.replace('_', '-')}: expected {expected}, got {getattr(parsed, name)}")
 
 
 def _brought(module: ModuleType) -> list[str]:

@@ -13,7 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.inputs import check_channels_first
+from hyperplanes.geometry.inputs import check_channels_first, check_indices
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.utilities.arguments import checked, kind_of
@@ -188,10 +188,7 @@ class Views:
         flat = flat if among is None else among[flat]
         view, pixel = flat // (height * width), flat % (height * width)
         if among is not None and flat.device.type == "cpu":  # elsewhere it would be waited for
-            least, most = (int(value) for value in flat.aminmax())
-            if least < 0 or int(view.max()) >= len(self):
-                pixels = f"{len(self) * height * width} pixels of {len(self)} views"
-                raise ValueError(f"among: expected indices of {pixels}, got {least} to {most}")
+            check_indices(flat, len(self) * height * width, "among", f"pixels of {len(self)} views")
         row, column = pixel // width, pixel % width
         rays = cast(self.cameras, view, torch.stack([column, row], -1).to(self.images), self.bounds, near_far=near_far)
         colours = self.images[view, :, row, column]

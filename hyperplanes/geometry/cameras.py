@@ -103,8 +103,8 @@ def _check_numbers(calibration: Tensor, pose: Tensor) -> None:
     if (focal <= 0).any():
         view = int((focal <= 0).any(-1).nonzero()[0])
         raise ValueError(f"intrinsics: expected positive focal lengths, got {focal[view].tolist()} in view {view}")
-    rotation = pose[:, :3, :3]
-    identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
+    rotation = pose[:, :3, :3] if pose.element_size() > 2 else pose[:, :3, :3].float()  # no determinant of halves
+    identity = torch.eye(3, dtype=rotation.dtype, device=pose.device)
     error = (rotation @ rotation.mT - identity).abs().flatten(1).amax(1)
     wrong = (error > ROTATION_TOLERANCE) | (torch.linalg.det(rotation) < 0)
     if wrong.any():

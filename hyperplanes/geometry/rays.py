@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera, undistorted_pixels
-from hyperplanes.geometry.inputs import ArrayLike, as_tensor
+from hyperplanes.geometry.inputs import ArrayLike, as_tensor, check_indices
 from hyperplanes.utilities.arguments import checked, checked_fields, kind_of
 
 __all__ = ["Rays", "Sphere", "cast", "pixel_grid"]
@@ -120,7 +120,9 @@ def cast(
             f"{view.dtype} {tuple(view.shape)} and {tuple(pixels.shape)}"
         )
     view = view.to(cameras.extrinsics.device, torch.int64)
-    pixels = pixels if pixels.is_floating_point() else pixels.to(cameras.extrinsics.dtype)
+    if view.device.type == "cpu":
+        check_indices(view, cameras.batch_size, "view", "cameras")
+    pixels = pixels.to(cameras.extrinsics)
     pose = camera.camera_from_world(cameras)[view]
     matrix = camera.intrinsics(cameras)[view]
     shown = None

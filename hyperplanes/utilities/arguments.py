@@ -23,8 +23,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
     Looked at are annotations that are classes, generic ones such as `Sequence[str]`, of which the class counts, tuples
     of a fixed length, `Callable`, `Literal`, `Annotated[int, range(...)]`, unions of all these, and jaxtyping's arrays,
-    of which the kind of numbers and the number of dimensions count; all others are taken as they come. A class is no
-    `Callable` that returns something else than its instances.
+    of which the kind of numbers, the number of dimensions and those of a fixed size count; all others are taken as
+    they come. A class is no `Callable` that returns something else than its instances.
 
     Args:
         function: with annotations that its module can resolve.
@@ -131,12 +131,12 @@ def _fits_one(value: object, hint: Any) -> bool:
         kinds, dimensions = hint.dtypes, hint.dims
         name = str(getattr(value, "dtype", "")).removeprefix("torch.")
         named = not isinstance(kinds, list | tuple) or name in kinds
-        variadic = any("Variadic" in type(each).__name__ for each in dimensions)
-        return named and (variadic or len(dimensions) == getattr(value, "ndim", -1))
+        return named and _has_shape(tuple(getattr(value, "shape", ())), dimensions)
     if (allowed := _range(hint)) is not None:
         return _fits_one(value, int) and value in allowed
     if hint is float:
         number = isinstance(value, Real) and not isinstance(value, bool)
+        number = number and (not isinstance(value, Integral) or abs(int(value)) < 2**63)
         return number or (isinstance(value, Tensor) and value.numel() == 1)
     if hint is int:
         return (
@@ -156,6 +156,20 @@ def _fits_one(value: object, hint: Any) -> bool:
         return isinstance(value, origin or hint)
     except TypeError:  # a protocol that cannot be asked
         return True
+
+
+def _has_shape(shape: tuple[int, ...], dimensions: tuple[Any, ...]) -> bool:
+    """Whether there are as many dimensions as jaxtyping names, and those that it gives a number are of that size.
+
+    A variadic dimension, of which there is one at most, stands for any number of them.
+    """
+    free = next((at for at, each in enumerate(dimensions) if "Variadic" in type(each).__name__), None)
+    if free is not None:
+        others = (None,) * (len(shape) - len(dimensions) + 1)
+        dimensions = (*dimensions[:free], *others, *dimensions[free + 1 :])
+    return len(shape) == len(dimensions) and all(
+        getattr(each, "size", size) == size for size, each in zip(shape, dimensions, strict=True)
+    )
 
 
 def _shown(hint: Any) -> str:

@@ -64,6 +64,7 @@ WRONG = [
     (lambda p, m, i: carve(i[:, :1], rig(), Sphere(), 0), "side: expected 1 to 1024 voxels, got 0"),
     (lambda p, m, i: carve(i[:, :1], rig(), Sphere(), 10**6), "side: expected 1 to 1024 voxels"),
     (lambda p, m, i: cast(rig(), torch.zeros(2, dtype=torch.long), torch.zeros(3, 2)), "view, pixels: expected"),
+    (lambda p, m, i: cast(rig(), torch.tensor([3]), p[:1, :2]), "view: expected indices of 3 cameras, got 3 to 3"),
     (lambda p, m, i: Sphere(radius=-1.0), "sphere: expected finite numbers and no negative radius"),
     (lambda p, m, i: Sphere((0.0, math.nan, 0.0)), "sphere: expected finite numbers"),
     (lambda p, m, i: cameras.look_at(p, up=(0.0, 0.0, 0.0)), "up: expected a direction"),
@@ -250,3 +251,15 @@ def test_images_of_several_channels_may_be_as_narrow_as_a_colour(width):
     torch.testing.assert_close(found.colours[found.valid], wide.colours[found.valid])
     torch.testing.assert_close(lookup(points, matrices, images).colours, found.colours)
     assert sample(images, torch.zeros(5, 3, 2)).shape == (5, 3, 8)
+
+
+def test_pixels_of_another_precision_are_those_of_the_cameras():
+    view, pixels = torch.zeros(4, dtype=torch.long), pixel_grid(2, 2)
+    assert torch.equal(cast(rig(), view, pixels.double()).directions, cast(rig(), view, pixels).directions)
+
+
+def test_poses_of_half_precision_are_checked_as_others_are():
+    poses = cameras.fibonacci_sphere(3, 2.5)
+    assert torch.equal(cameras.with_poses(rig(), poses.half()).extrinsics, poses.half())
+    with pytest.raises(ValueError, match="camera_from_world: expected a rotation"):
+        cameras.with_poses(rig(), (2 * poses).half())

@@ -4,6 +4,8 @@ import jaxtyping
 import numpy as np
 import pytest
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning
@@ -59,6 +61,8 @@ def field(points, directions):
         (lambda: render(int, VIEWS.cameras), "field: expected Callable, got the class int"),
         (lambda: render(field, ring(1, (4, 4)), proposal=HyperPlanes), "proposal: .*, got the class HyperPlanes"),
         (lambda: orbit_cameras(Views, 3), "views: expected Views, got the class Views"),
+        (lambda: cameras.look_at(torch.zeros(5, 5)), r"eyes: expected a tensor \(view 3\), got .*, shape \(5, 5\)"),
+        (lambda: cameras.orbit(3, 10**30), "distance: expected float, got 1000"),
         (lambda: VIEWS.to("../a"), "device: expected a device such as 'cpu' or 'cuda:0', got '../a'"),
         (lambda: render(field, None), "target: expected PinholeCamera or Rays, got None"),
         (lambda: render(field, ring(1, (4, 4)), background="white"), "background: expected float, got 'white'"),
@@ -67,6 +71,18 @@ def field(points, directions):
 def test_arguments_of_another_type_are_named(call, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         call()
+
+
+def test_sizes_that_an_annotation_names_are_looked_at_wherever_others_are_left_open():
+    @checked
+    def taken(rows: Float[Tensor, "*batch 4 3"]):
+        return rows.shape
+
+    for shape in ((4, 3), (2, 4, 3), (5, 2, 4, 3)):
+        assert taken(torch.zeros(shape)) == shape
+    for shape in ((3,), (), (3, 4), (4, 3, 2)):
+        with pytest.raises(ValueError, match="rows: expected a tensor"):
+            taken(torch.zeros(shape))
 
 
 def test_right_arguments_pass():

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import hashlib
 import importlib
 import os
+import shutil
 import stat
 import tempfile
 import warnings
@@ -116,6 +118,12 @@ def _is_private(folder: Path) -> bool:
     return True
 
 
+def _remove(folder: str, process: int) -> None:
+    """Delete the folder of a process when it ends, not when one that was forked from it does."""
+    if os.getpid() == process:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 @functools.cache
 def _cache_folder() -> str:
     """The folder of cached machine code.
@@ -144,5 +152,6 @@ def _cache_folder() -> str:
     except OSError as error:
         problem = error.strerror or str(error)
     instead = tempfile.mkdtemp(prefix="hyperplanes-kernels-")
+    atexit.register(_remove, instead, os.getpid())
     warnings.warn(f"{folder}: {problem}; kernels are compiled into {instead} for this process alone", stacklevel=2)
     return instead
