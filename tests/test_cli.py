@@ -2,6 +2,7 @@
 
 import errno
 import json
+import math
 import os
 import re
 import shutil
@@ -189,6 +190,13 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
             ["render", "--checkpoint", "RUN", "--views", "pyproject.toml", "--out", "OUT/x"],
             ["pyproject.toml", "found a file of another kind"],
         ),
+        (["export", *RENDER[1:], "--texture", "-1"], ["--texture: expected a whole number from 16 to 8192, got -1"]),
+        (["export", *RENDER[1:], "--what", "points", "--points", "0"], ["--points: expected a whole number from 1 to"]),
+        (
+            [*RENDER, "--orbit", "2", "--camera-path", "OUT/a"],
+            ["--camera-path, --orbit: expected one of them, got both"],
+        ),
+        ([*RENDER, "--dataparser-transforms", "OUT/a"], ["--dataparser-transforms: expected --camera-path"]),
         ([*BAKE, "OUT/bk.safetensors", "--orbit", "0"], ["--orbit: expected at least 1 frame, got 0"]),
         (["inspect", "OUT/none"], ["OUT/none: expected a data set, posed images, a checkpoint", "found nothing"]),
     ],
@@ -459,6 +467,42 @@ def test_an_orbit_is_pictures_and_a_turntable(tmp_path):
     with Image.open(tmp_path / "turntable.gif") as animation:
         assert animation.n_frames == 3
     assert len(list(tmp_path.glob("*.png"))) == 3
+
+
+def test_a_camera_path_of_nerfstudio_is_pictures_of_all_that_is_asked_for(tmp_path, capsys):
+    """The poses of the query views as a path: the same pictures, of another size where asked; none from elsewhere."""
+    demo = demo_folder()
+    scene = first_object(demo)
+    document = json.loads((scene / "transforms.json").read_text())
+    angle = math.degrees(2 * math.atan(document["h"] / 2 / document["fl_y"]))
+    query = set(document["test_filenames"])
+    frames = [each["transform_matrix"] for each in document["frames"] if each["file_path"] in query]
+    path = {"render_width": document["w"], "render_height": document["h"], "seconds": 1.0, "camera_path": [
+        {"camera_to_world": [number for row in pose for number in row], "fov": angle} for pose in frames
+    ]}  # fmt: skip
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    line = ["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path / "out")]
+    line += ["--turntable", "gif", "--camera-path", str(tmp_path / "path.json")]
+    names = ["rgb", "depth", "normals", "accumulation"]
+    assert main([*line, "--rendered-output-names", *names]) == 0
+    assert "none of its" not in capsys.readouterr().err
+    reference = demo / "pictures" / "hyperplanes" / scene.name
+    for index, name in enumerate(name for name in document["test_filenames"] if name in query):
+        found = pixels(tmp_path / f"out/{index:04d}.png")
+        assert abs(found - pixels(reference / Path(name).name)).max() <= 1
+        for other in names[1:]:
+            assert pixels(tmp_path / "out" / other / f"{index:04d}.png").shape[:2] == found.shape[:2]
+    for place in (tmp_path / "out", *(tmp_path / "out" / name for name in names[1:])):
+        with Image.open(place / "camera_path.gif") as animation:
+            assert animation.n_frames == len(frames)
+    for frame in path["camera_path"]:
+        for row in (0, 4, 8):  # to its right
+            frame["camera_to_world"][row + 3] += 1000.0 * frame["camera_to_world"][row]
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    assert main([*line, "--size", "8"]) == 0
+    assert "none of its" in (warned := capsys.readouterr().err)
+    assert "--dataparser-transforms" in warned
+    assert max(pixels(tmp_path / "out/0000.png").shape[:2]) == 8
 
 
 def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):

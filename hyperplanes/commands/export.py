@@ -1,4 +1,4 @@
-"""One object as images, a turntable, a mesh and a page to turn it on, from a few posed images of it.
+"""One object as images, a turntable, a mesh, points, splats and a page to turn it on, from a few posed images of it.
 
 The mesh is the surface on which the density crosses a level (marching cubes), as GLB with a texture: Blender, Windows,
 slide shows and three.js open it. The page is one HTML file that a browser opens without anything else: it draws baked
@@ -47,10 +47,15 @@ class Arguments(ObjectArguments):
         page_voxels: Along each side of the grid that the page shows and splats are made of; 1.3 a pixel of the images,
             and at most 256, when not given.
         fit: Gradient steps that fit these voxels, and splats, to the shown views; 0 keeps what the field shows.
+        points: Of the cloud, at most.
         splat_format: ply, which viewers of Gaussian splats read, or the smaller splat without colour by direction.
     """
 
-    what: tuple[Literal["images", "turntable", "mesh", "page", "splats"], ...] = ("images", "turntable", "mesh")
+    what: tuple[Literal["images", "turntable", "mesh", "page", "splats", "points"], ...] = (
+        "images",
+        "turntable",
+        "mesh",
+    )
     frames: int = 48
     size: OptionalInt = None
     turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
@@ -61,6 +66,7 @@ class Arguments(ObjectArguments):
     level: Annotated[float | None, optional("DENSITY")] = None
     page_voxels: OptionalInt = None
     fit: Annotated[int, range(10_000)] = 80
+    points: Annotated[int, range(1, 100_000_001)] = 100_000
     splat_format: Literal["ply", "splat"] = "ply"
 
 
@@ -107,6 +113,14 @@ def run(arguments: Arguments) -> int:
     if "mesh" in arguments.what:
         solid = field if isinstance(field, AdaptedField) else field.adapted
         _write_mesh(solid, shown, query, arguments, console)
+    if "points" in arguments.what:
+        from hyperplanes.export.points import point_cloud, save_points
+
+        bounds = (field if isinstance(field, AdaptedField) else field.adapted).occupancy.bounds
+        pictures = render_views(field, shown.cameras, console)
+        cloud = point_cloud(pictures, shown.cameras, bounds, arguments.points)
+        path = save_points(cloud, out / "points.ply")
+        console.say(f"{path}: {len(cloud):,} points with normals and colours, of {len(shown)} views")
     if {"page", "splats"} & set(arguments.what):
         if isinstance(field, AdaptedField):
             side = arguments.page_voxels or default_side(shown.size)

@@ -11,6 +11,7 @@ import tyro
 __all__ = [
     "Free",
     "ObjectArguments",
+    "OptionalFile",
     "OptionalFolder",
     "OptionalInt",
     "OptionalName",
@@ -29,6 +30,7 @@ def optional(metavar: str, **options: Any) -> Any:
 
 
 OptionalFolder = Annotated[Path | None, optional("FOLDER")]
+OptionalFile = Annotated[Path | None, optional("FILE")]
 OptionalInt = Annotated[int | None, optional("INT")]
 OptionalName = Annotated[str | None, optional("NAME")]
 OptionalNumber = Annotated[int | float | None, optional("NUMBER")]

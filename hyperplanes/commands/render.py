@@ -3,30 +3,48 @@
 The images come as a folder with transforms.json (Blender's, nerfstudio's), a COLMAP model, what Polycam, Record3D,
 KIRI Engine, RealityCapture or Metashape export, a scene of LLFF, IDR or NSVF, or an object of any data set. The model
 is shown the support half of the views and asked for the other half, so that the result can be compared with the truth;
---orbit asks for a round about the object instead.
+--orbit asks for a round about the object instead, --camera-path for the frames of a path that nerfstudio's viewer wrote.
 
 Example:
     hyperplanes render --checkpoint small --views example-car --out new-views
     hyperplanes render --checkpoint runs/demo --views photos/ --out new-views
     hyperplanes render --checkpoint runs/demo --views photos/ --out new-views --orbit 48 --all-views
+    hyperplanes render --checkpoint small --views photos/ --out video --camera-path camera_path.json --turntable mp4
+    hyperplanes render --checkpoint small --views photos/ --out geometry --rendered-output-names rgb depth normals
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_source, render_views
-from hyperplanes.commands.options import Free, ObjectArguments, OptionalInt, Protocol, check_orbit, optional
-from hyperplanes.commands.scene import read_object, refuse_sources
+from hyperplanes.commands.options import (
+    Free,
+    ObjectArguments,
+    OptionalFile,
+    OptionalInt,
+    Protocol,
+    check_orbit,
+    optional,
+)
+from hyperplanes.commands.scene import read_object, read_path, refuse_sources
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
+
+    from hyperplanes.rendering.images import Pictures
+    from hyperplanes.views import Views
 
 __all__ = ["Arguments", "run"]
 
 LARGEST_ORBIT = 400  # pixels of an orbit's pictures where none were asked for: time grows with their square
+ROUND = 4.0  # seconds of a turntable
 
 
 @dataclass(frozen=True)
@@ -36,66 +54,80 @@ class Arguments(ObjectArguments):
     Attributes:
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         orbit: So many pictures evenly around the object, and a turntable, instead of the query poses.
-        size: Pixels along the longer side of an orbit's pictures; as the images, but 400 at most,
-            when not given.
-        turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
+        camera_path: A JSON of nerfstudio's viewer or Blender add-on: the pictures of its frames, and an animation.
+        dataparser_transforms: nerfstudio's dataparser_transforms.json, where the path was made in its viewer: from the
+            world of the views to that of the path.
+        rendered_output_names: What is drawn: rgb, depth (16 bits, along the optical axis), normals, accumulation
+            (opacity); all but rgb into folders of their names.
+        size: Pixels along the longer side of the pictures of an orbit or a path; of an orbit as the images, but 400 at
+            most, when not given.
+        turntable: The format of the animation; mp4 and webm need `pip install hyperplanes[video]`.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
             marching through what is not empty.
     """
 
     fine_tune: Free = "weights"
     orbit: Annotated[int | None, optional("FRAMES")] = None
+    camera_path: OptionalFile = None
+    dataparser_transforms: OptionalFile = None
+    rendered_output_names: tuple[Literal["rgb", "depth", "normals", "accumulation"], ...] = ("rgb",)
     size: OptionalInt = None
     turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
     protocol: Protocol = "default"
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What is rendered.
+
+    Attributes:
+        cameras: one a picture.
+        names: of the pictures.
+        animation: the name of a file for all of them, and the seconds that it lasts; None for poses whose pictures are
+            known.
+    """
+
+    cameras: PinholeCamera
+    names: Sequence[str] = ()
+    animation: tuple[str, float] | None = None
+
+
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
-    from hyperplanes.adaptation.nearest_view import NearestView
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
     from hyperplanes.evaluation.suitability import held_out_psnr, worse_than_copying
     from hyperplanes.export.baking import BakedScene
-    from hyperplanes.export.images import encode_animation, orbit_cameras, save_images, to_pixels
+    from hyperplanes.export.images import encode_animation
+    from hyperplanes.export.outputs import output_frames, save_outputs
     from hyperplanes.utilities.files import write_whole
-    from hyperplanes.utilities.metrics import psnr, ssim
 
-    check_orbit(arguments.orbit, arguments.size)
+    _check(arguments)
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
-    task, _ = read_object(arguments, console)
+    task, up = read_object(arguments, console)
     refuse_sources(arguments.out, arguments.views, task.query.names)
-    shown, asked = task.support.to(device), task.query.to(device)
+    shown, known = task.support.to(device), task.query.to(device)
+    asked = _asked(arguments, shown, known, up, console)
     settings = FineTuning(trainable=arguments.fine_tune)
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
-    cameras = asked.cameras
-    if arguments.orbit is not None:
-        size = arguments.size or min(max(shown.size), LARGEST_ORBIT)
-        cameras = orbit_cameras(shown, arguments.orbit, size=size)
     started = time.perf_counter()
-    pictures = render_views(field, cameras, console, PROTOCOLS[arguments.protocol])
-    seconds = (time.perf_counter() - started) / cameras.batch_size
+    pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
+    seconds = (time.perf_counter() - started) / asked.cameras.batch_size
+    outputs = tuple(dict.fromkeys(arguments.rendered_output_names))
+    paths = save_outputs(outputs, pictures, asked.cameras, arguments.out, asked.names)
     scores = None
-    if arguments.orbit is None:
-        paths = save_images(pictures.images, arguments.out, asked.names)
-        images = pictures.images.clamp(0, 1).to(asked.images.device)
-        value = float(psnr(images, asked.images).mean())
-        quality = f"{value:.2f} dB PSNR"
-        if min(asked.size) >= 11:
-            quality += f", {float(ssim(images, asked.images).mean()):.3f} SSIM"
-        known = "shown to the model as well" if arguments.all_views else "never shown to the model"
-        console.say(f"against the {len(asked)} true views, {known}: {quality}")
-        if not arguments.all_views:
-            copied = NearestView().adapt(shown).render(cameras).images
-            scores = value, float(psnr(copied, asked.images).mean())
+    if asked.animation is None:
+        scores = _compared(pictures, shown, known, arguments.all_views, console)
     else:
-        paths = save_images(pictures.images, arguments.out)
-        animation = arguments.out / f"turntable.{arguments.turntable}"
-        write_whole(animation, encode_animation(to_pixels(pictures.images), arguments.turntable))
-        console.say(f"{animation}: the turntable")
+        name, lasting = asked.animation
+        for output in outputs:
+            path = (arguments.out if output == "rgb" else arguments.out / output) / f"{name}.{arguments.turntable}"
+            frames = output_frames(output, pictures, asked.cameras)
+            write_whole(path, encode_animation(frames, arguments.turntable, lasting))
+            console.say(f"{path}: {lasting:.3g} seconds of them")
     if scores is None and not isinstance(source, BakedScene) and (arguments.steps == 0 or warned):
         scores = held_out_psnr(source, shown)
         if scores is not None:
@@ -106,5 +138,54 @@ def run(arguments: Arguments) -> int:
             scores = scores if arguments.steps == 0 else None
     for line in worse_than_copying(shown, *scores, arguments.steps) if scores else []:
         console.warn(f"{task.name}: {line}")
-    console.say(f"{arguments.out}: {len(paths)} pictures, {format_duration(seconds)} each")
+    console.say(f"{arguments.out}: {len(paths)} pictures, {format_duration(seconds)} a view")
     return 0
+
+
+def _check(arguments: Arguments) -> None:
+    """Refuse options of a camera path or an orbit that say nothing together."""
+    if arguments.camera_path is None:
+        check_orbit(arguments.orbit, arguments.size)
+        if arguments.dataparser_transforms is not None:
+            raise ValueError(
+                "--dataparser-transforms: expected --camera-path, whose world it is of, got none; name one"
+            )
+        return
+    if arguments.orbit is not None:
+        raise ValueError("--camera-path, --orbit: expected one of them, got both; leave one out")
+    if arguments.size is not None and arguments.size < 1:
+        raise ValueError(f"--size: expected at least 1 pixel, got {arguments.size}")
+
+
+def _asked(arguments: Arguments, shown: Views, known: Views, up: str, console: Console) -> Asked:
+    """The cameras of a path, of an orbit, or of the query views."""
+    from hyperplanes.export.images import orbit_cameras
+
+    if arguments.camera_path is not None:
+        path, transforms = arguments.camera_path, arguments.dataparser_transforms
+        cameras, seconds = read_path(path, transforms, arguments.size, shown, up, arguments.views, console)
+        return Asked(cameras, animation=("camera_path", seconds))
+    if arguments.orbit is not None:
+        size = arguments.size or min(max(shown.size), LARGEST_ORBIT)
+        return Asked(orbit_cameras(shown, arguments.orbit, size=size), animation=("turntable", ROUND))
+    return Asked(known.cameras, known.names)
+
+
+def _compared(
+    pictures: Pictures, shown: Views, known: Views, all_views: bool, console: Console
+) -> tuple[float, float] | None:
+    """The mean PSNR of pictures and of the nearest views, where the model was not shown what they are compared to."""
+    from hyperplanes.adaptation.nearest_view import NearestView
+    from hyperplanes.utilities.metrics import psnr, ssim
+
+    images = pictures.images.clamp(0, 1).to(known.images.device)
+    value = float(psnr(images, known.images).mean())
+    quality = f"{value:.2f} dB PSNR"
+    if min(known.size) >= 11:
+        quality += f", {float(ssim(images, known.images).mean()):.3f} SSIM"
+    how = "shown to the model as well" if all_views else "never shown to the model"
+    console.say(f"against the {len(known)} true views, {how}: {quality}")
+    if all_views:
+        return None
+    copied = NearestView().adapt(shown).render(known.cameras).images
+    return value, float(psnr(copied, known.images).mean())

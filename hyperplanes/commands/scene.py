@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
+
     from hyperplanes.commands.console import Console
     from hyperplanes.commands.options import ObjectArguments
     from hyperplanes.data.pictures.posed import Posed
+    from hyperplanes.geometry.rays import Sphere
     from hyperplanes.views import Task, Views
 
-__all__ = ["read_object", "read_scene", "refuse_sources", "say_up"]
+__all__ = ["read_object", "read_path", "read_scene", "refuse_sources", "say_up"]
 
 
 def read_object(arguments: ObjectArguments, console: Console) -> tuple[Task, str]:
@@ -62,6 +65,72 @@ def read_scene(
     if up == "auto":
         up = say_up([task.support] if all_views else [task.support, task.query], console)
     return upright_task(task, up), up
+
+
+def read_path(
+    path: Path, transforms: Path | None, size: int | None, shown: Views, up: str, scene: Path, console: Console
+) -> tuple[PinholeCamera, float]:
+    """The cameras of a camera path in the world of the views that the model is shown, and the seconds of its video.
+
+    A path that looks past the object, as one of another world does, is warned of.
+
+    Args:
+        path: of the file.
+        transforms: nerfstudio's dataparser_transforms.json, or None.
+        size: pixels along the longer side; as the file says where None.
+        shown: the views, turned upright.
+        up: the direction that was up in their world before.
+        scene: the folder that they were read from.
+        console: where it is said.
+    """
+    from hyperplanes.data.camera_path import read_camera_path
+    from hyperplanes.data.dataset import locate_scene
+    from hyperplanes.data.upright import upright_cameras
+    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.utilities.files import read_json
+
+    listed = locate_scene(scene) / "transforms.json"
+    found = read_camera_path(path, transforms, read_json(listed) if listed.is_file() else None)
+    for note in found.notes:
+        console.warn(f"{path}: {note}")
+    cameras = upright_cameras(found.cameras, up)
+    height, width = camera.image_size(cameras)
+    if size is not None:
+        scale = size / max(height, width)
+        cameras = camera.resized(cameras, max(1, round(height * scale)), max(1, round(width * scale)))
+    elif max(height, width) > LARGEST_UNASKED:
+        console.say(
+            f"{path}: pictures of {width}x{height}, as it says; --size makes smaller ones, which take less time"
+        )
+    if not _is_seen(shown.bounds, cameras):
+        console.warn(
+            f"{path}: none of its {cameras.batch_size} cameras looks at the object; a path of nerfstudio's viewer is "
+            "in the world of its model: --dataparser-transforms outputs/.../dataparser_transforms.json"
+        )
+    return cameras, found.seconds
+
+
+LARGEST_UNASKED = 400
+"""Pixels along the longer side above which the pictures of a camera path take long."""
+
+
+def _is_seen(bounds: Sphere, cameras: PinholeCamera) -> bool:
+    """Whether a camera has some of a sphere in its cone of vision, the smallest around its picture."""
+    import torch
+
+    from hyperplanes.geometry import cameras as camera
+
+    away = cameras.extrinsics.new_tensor(bounds.centre) - camera.centres(cameras)
+    distance = away.norm(dim=-1).clamp_min(1e-12)
+    angle = torch.acos(((away * camera.viewing_directions(cameras)).sum(-1) / distance).clamp(-1, 1))
+    radius = torch.asin((bounds.radius / distance).clamp_max(1.0))
+    height, width = camera.image_size(cameras)
+    cone = torch.atan(
+        torch.tensor(float(height), dtype=angle.dtype).hypot(angle.new_tensor(float(width)))
+        / 2
+        / camera.intrinsics(cameras)[:, 0, 0]
+    )
+    return bool(((angle < cone + radius) | (distance < bounds.radius)).any())
 
 
 def say_up(parts: Sequence[Views | Posed], console: Console) -> str:

@@ -17,7 +17,7 @@ from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError
 from hyperplanes.views import Task, Views
 
-__all__ = ["UPS", "guess_up", "stated_up", "upright", "upright_task", "y_up_from"]
+__all__ = ["UPS", "guess_up", "stated_up", "upright", "upright_cameras", "upright_task", "y_up_from"]
 
 UPS = ("y", "z", "x", "-y", "-z", "-x")
 """Axes that may be up in a world; three numbers with commas between them are another direction."""
@@ -135,11 +135,15 @@ def upright(views: Views, up: str) -> Views:
     turn = y_up_from(up)
     if up == "y":
         return views
-    pose = camera.camera_from_world(views.cameras)
-    turned = pose @ turn.T.to(pose)  # camera from old world, after old world from new
-    cameras = camera.with_poses(views.cameras, turned)
+    cameras = upright_cameras(views.cameras, up)
     x, y, z = (turn[:3, :3] @ torch.tensor(views.bounds.centre, dtype=torch.float64)).tolist()
     return replace(views, cameras=cameras, bounds=Sphere((x, y, z), views.bounds.radius), up=views.up and "y")
+
+
+def upright_cameras(cameras: PinholeCamera, up: str) -> PinholeCamera:
+    """The same cameras in a world with y up, as `upright` turns those of views."""
+    pose = camera.camera_from_world(cameras)
+    return camera.with_poses(cameras, pose @ y_up_from(up).T.to(pose))  # camera from old world, old world from new
 
 
 def upright_task(task: Task, up: str) -> Task:

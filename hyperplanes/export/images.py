@@ -26,6 +26,7 @@ __all__ = [
     "TURNTABLE_FORMATS",
     "encode_animation",
     "orbit_cameras",
+    "picture_paths",
     "save_images",
     "save_turntable",
     "to_pixels",
@@ -113,20 +114,34 @@ def save_images(
         names: of the files, without ending; folders in them are dropped. ArrayLike where absent.
 
     Returns:
-        The files.
-
-    Raises:
-        ValueError: names that are not one an image.
+        The files. Names that are not one an image are a ValueError.
     """
-    if names and len(names) != len(images):
-        raise ValueError(f"names: expected {len(images)}, one an image, got {len(names)}")
-    stems = [Path(name).stem for name in names]
-    if len(set(stems)) != len(images):
-        stems = [f"{index:04d}" for index in range(len(images))]
-    paths = [Path(folder) / f"{stem}.png" for stem in stems]
+    paths = picture_paths(len(images), Path(folder), names)
     for path, pixels in zip(paths, to_pixels(images), strict=True):
         write_whole(path, encode_png(pixels, small=True))
     return paths
+
+
+def picture_paths(count: int, folder: Path, names: Sequence[str] = ()) -> list[Path]:
+    """Where so many pictures go: named as what they are pictures of, or numbered where these are not one each.
+
+    Args:
+        count: of pictures.
+        folder: that holds them.
+        names: of files, whose ending and folders are dropped.
+
+    Returns:
+        Paths of PNGs.
+
+    Raises:
+        ValueError: names that are not one a picture.
+    """
+    if names and len(names) != count:
+        raise ValueError(f"names: expected {count}, one an image, got {len(names)}")
+    stems = [Path(name).stem for name in names]
+    if len(set(stems)) != count:
+        stems = [f"{index:04d}" for index in range(count)]
+    return [folder / f"{stem}.png" for stem in stems]
 
 
 def upward(cameras: PinholeCamera) -> tuple[float, float, float]:
@@ -158,8 +173,10 @@ def orbit_cameras(
         with the squarest pixels: a portrait among landscapes was scaled to their size.
 
     Raises:
-        ValueError: no camera asked for.
+        ValueError: no camera asked for, or no view to take after.
     """
+    if not len(views):
+        raise ValueError("views: expected at least one to take the lens and the distance of, got none")
     if count < 1:
         raise ValueError(f"count: expected at least one camera, got {count}")
     cameras, centre = views.cameras, torch.tensor(views.bounds.centre)

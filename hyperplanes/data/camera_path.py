@@ -1,0 +1,129 @@
+"""Camera paths as nerfstudio's viewer and its Blender add-on write them: the cameras of the frames of a video.
+
+A path has `render_width`, `render_height`, `seconds`, and a list `camera_path` of frames: `camera_to_world`, 16 numbers
+row by row in OpenGL's axes, and `fov`, the vertical opening angle in degrees. nerfstudio's viewer writes it in the
+world of the model that it shows, which is turned, moved and scaled; dataparser_transforms.json beside the model's
+config.yml says how.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+from hyperplanes.data.formats.transforms_document import opencv_from_opengl
+from hyperplanes.data.pictures.posed import check_pose
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.files import DataError, read_json
+
+__all__ = ["CameraPath", "read_camera_path"]
+
+MOST_FRAMES, MOST_PIXELS = 100_000, 1 << 26
+EXPORT = "export the path again"
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """The cameras of a video.
+
+    Attributes:
+        cameras: one a frame, in the world of the posed images.
+        seconds: of the video.
+        notes: what the file asks for and is left out.
+    """
+
+    cameras: PinholeCamera
+    seconds: float
+    notes: tuple[str, ...] = ()
+
+
+def read_camera_path(
+    path: str | Path, transforms: str | Path | None = None, scene: Mapping[str, Any] | None = None
+) -> CameraPath:
+    """The cameras of a path that nerfstudio wrote.
+
+    Args:
+        path: the JSON file.
+        transforms: nerfstudio's dataparser_transforms.json, which takes the data's world to that of the path; the path
+            is in the world of the data where absent.
+        scene: the content of the transforms.json of the data, whose `applied_transform` and `applied_scale` tell its
+            world from the one that `transforms` begins with.
+
+    Returns:
+        Perspective cameras, principal points in the middle.
+
+    Raises:
+        DataError: what no such file holds, another kind of camera, or too large a picture.
+    """
+    path = Path(path)
+    document = read_json(path)
+    frames = document.get("camera_path")
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise DataError(path, "camera_path, a list of one or more frames", repr(frames)[:40], EXPORT)
+    if len(frames) > MOST_FRAMES:
+        raise DataError(path, f"at most {MOST_FRAMES} frames", str(len(frames)), "take a shorter path")
+    kind = document.get("camera_type", "perspective")
+    if not isinstance(kind, str) or kind.lower() != "perspective":
+        raise DataError(path, "camera_type perspective", repr(kind)[:40], "choose it in the viewer")
+    size = _number(document, "render_height", path, "a size"), _number(document, "render_width", path, "a size")
+    height, width = (max(1, round(value)) for value in size)
+    if height * width > MOST_PIXELS:
+        raise DataError(path, f"at most {MOST_PIXELS} pixels a frame", f"{width}x{height}", "choose a lower resolution")
+    poses, focal = np.zeros((len(frames), 4, 4)), np.zeros(len(frames))
+    for index, frame in enumerate(frames):
+        poses[index] = _pose(frame.get("camera_to_world"), path, index)
+        angle = _number(frame, "fov", path, f"frame {index}: degrees")
+        if angle >= 180:
+            raise DataError(path, f"frame {index}: a fov below 180 degrees", f"{angle:g}", EXPORT)
+        focal[index] = height / 2 / math.tan(math.radians(angle) / 2)
+    if transforms is not None:
+        poses = _to_data(poses, Path(transforms), scene or {})
+    matrices = np.tile(np.eye(3), (len(frames), 1, 1))
+    matrices[:, 0, 0] = matrices[:, 1, 1] = focal
+    matrices[:, :2, 2] = (width - 1) / 2, (height - 1) / 2
+    world = torch.from_numpy(opencv_from_opengl(poses)).float()
+    cameras = camera.pinhole(torch.from_numpy(matrices).float(), world, height, width)
+    left_out = {"crop": "its crop", "render_time": "its times"}
+    notes = tuple(f"{what} is left out" for name, what in left_out.items() if name in document or name in frames[0])
+    seconds = len(frames) / 24.0 if "seconds" not in document else _number(document, "seconds", path, "a time")
+    return CameraPath(cameras, seconds, notes)
+
+
+def _number(fields: Mapping[str, Any], name: str, path: Path, what: str) -> float:
+    value = fields.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+        raise DataError(path, f"{what} above 0 as {name}", repr(value)[:40], EXPORT)
+    return float(value)
+
+
+def _pose(values: object, path: Path, index: int) -> npt.NDArray[np.float64]:
+    """A camera-to-world pose of 16 numbers row by row, or of rows."""
+    flat = isinstance(values, list) and len(values) == 16 and not any(isinstance(value, list) for value in values)
+    rows = [values[row : row + 4] for row in range(0, 16, 4)] if flat else values
+    return check_pose(rows, path, f"{index} of camera_path")
+
+
+def _to_data(poses: npt.NDArray[np.float64], path: Path, scene: Mapping[str, Any]) -> npt.NDArray[np.float64]:
+    """Poses of nerfstudio's world in that of the data.
+
+    nerfstudio takes a position p of the data to scale * (R p + t); its R and t are of the world before
+    `applied_transform` was.
+    """
+    document = read_json(path)
+    original = check_pose(document.get("transform"), path, "transform")
+    scale = _number(document, "scale", path, "a factor")
+    applied = scene.get("applied_transform")
+    if applied is not None:
+        original = original @ np.linalg.inv(check_pose(applied, "transforms.json", "applied_transform"))
+        scale /= _number({"applied_scale": 1.0, **scene}, "applied_scale", path, "a factor")
+    moved = poses.copy()
+    moved[:, :3, 3] /= scale
+    return np.linalg.inv(original) @ moved

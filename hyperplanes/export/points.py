@@ -1,0 +1,145 @@
+"""A cloud of points on the surface of a field: where its pictures put it, with colours and normals, as PLY."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering.depth import seen_surface
+from hyperplanes.rendering.images import Pictures
+from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.files import format_of, write_whole
+
+__all__ = ["POINTS", "PointCloud", "point_cloud", "save_points"]
+
+POINTS = 100_000
+OPAQUE = 0.9  # opacity from which on a pixel is a point
+TOLERANCE = 0.02  # radii of the scene by which depths of one place may differ between views
+HALVINGS = 24  # of the side of the cells in which points are averaged
+FINEST = 1e-4  # of the scene's radius: the smallest cell
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points on a surface.
+
+    Attributes:
+        points: in the world.
+        normals: unit vectors, outwards.
+        colours: RGB in [0, 1].
+    """
+
+    points: Float[Tensor, "point 3"]
+    normals: Float[Tensor, "point 3"]
+    colours: Float[Tensor, "point 3"]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@checked
+@torch.no_grad()
+def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, count: int = POINTS) -> PointCloud:
+    """The points of all opaque pixels, those of one place averaged, and those that other views contradict left out.
+
+    A view contradicts a point that lies in front of what it shows there: it looks through it. A point stays where more
+    views show a surface there than look through it.
+
+    Args:
+        pictures: of a field, from all around.
+        cameras: which took them.
+        bounds: of the scene.
+        count: of points, at most; of all where there are fewer.
+
+    Returns:
+        At most so many, on the CPU.
+
+    Raises:
+        ValueError: pictures of nothing, or a count below 1.
+    """
+    if count < 1:
+        raise ValueError(f"count: expected at least 1 point, got {count}")
+    surface = seen_surface(pictures, cameras)
+    opaque = (surface.covered > 0) & (pictures.opacity[:, 0] >= OPAQUE)
+    if not opaque.any():
+        raise ValueError("pictures: expected something opaque, got pictures in which nothing is; train longer")
+    points, normals = surface.points[opaque], surface.normals[opaque]
+    colours = pictures.images.permute(0, 2, 3, 1)[opaque].clamp(0, 1)
+    values = torch.cat([points, normals, colours], 1).cpu()
+    values = _averaged(values, values[:, :3], bounds, count)
+    found = PointCloud(values[:, :3], torch.nn.functional.normalize(values[:, 3:6], dim=-1), values[:, 6:])
+    kept = _is_confirmed(found.points, surface.z.cpu(), camera.to(cameras, "cpu", torch.float32), bounds)
+    return PointCloud(found.points[kept], found.normals[kept], found.colours[kept])
+
+
+def _averaged(values: Tensor, points: Tensor, bounds: Sphere, count: int) -> Tensor:
+    """The means of the rows in the cells of the finest grid of which at most so many are filled."""
+    low, high = FINEST, 4.0
+    for _ in range(HALVINGS):
+        side = (low * high) ** 0.5
+        filled = len(_cells(points, bounds, side).unique())
+        low, high = (side, high) if filled > count else (low, side)
+    cells, row, size = _cells(points, bounds, high).unique(return_inverse=True, return_counts=True)
+    sums = values.new_zeros(len(cells), values.shape[1]).index_add(0, row, values)
+    return sums / size[:, None]
+
+
+def _cells(points: Tensor, bounds: Sphere, side: float) -> Int[Tensor, " point"]:
+    """The number of the cell that each point is in, of a grid of cells so many radii wide."""
+    place = (bounds.normalise(points.double()) / side).floor().long()
+    place = place - place.amin(0)
+    span = place.amax(0) + 1
+    return (place[:, 0] * span[1] + place[:, 1]) * span[2] + place[:, 2]
+
+
+def _is_confirmed(points: Tensor, z: Tensor, cameras: PinholeCamera, bounds: Sphere) -> Tensor:
+    """Whether more views show a surface at a point than look through it."""
+    height, width = z.shape[1:]
+    votes = torch.zeros(len(points), dtype=torch.long)
+    for view in range(len(z)):
+        one = camera.select(cameras, [view])
+        pose = camera.camera_from_world(one)[0]
+        depth = points @ pose[2, :3] + pose[2, 3]
+        pixel = one.project(points[None])[0].round()
+        inside = ((pixel >= 0) & (pixel < pixel.new_tensor([width, height]))).all(-1) & (depth > 0)
+        column, row = torch.where(inside[:, None], pixel, 0.0).long().unbind(-1)
+        shown = torch.where(z[view] > 0, z[view], torch.inf)[row, column]
+        votes += inside & ((shown - depth).abs() <= TOLERANCE * bounds.radius)
+        votes -= (inside & (shown - depth > TOLERANCE * bounds.radius)).long()
+    return votes > 0
+
+
+@checked
+def save_points(cloud: PointCloud, path: str | Path) -> Path:
+    """Write a cloud as binary PLY: x y z, nx ny nz, red green blue.
+
+    Args:
+        cloud: what to write.
+        path: ends in .ply.
+
+    Returns:
+        The file. Another ending is a ValueError.
+    """
+    path = Path(path)
+    format_of(path, ("ply",))
+    floats = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    colours = [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.zeros(len(cloud), np.dtype([*floats, *colours]))
+    numbers = torch.cat([cloud.points, cloud.normals], 1).cpu().numpy()
+    pixels = (cloud.colours.clamp(0, 1) * 255).round().byte().cpu().numpy()
+    for values, names in ((numbers, floats), (pixels, colours)):
+        for column, (name, _) in enumerate(names):
+            rows[name] = values[:, column]
+    kinds = {"<f4": "float", "u1": "uchar"}
+    lines = "".join(f"property {kinds[kind]} {name}\n" for name, kind in (*floats, *colours))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n{lines}end_header\n"
+    write_whole(path, header.encode() + rows.tobytes())
+    return path

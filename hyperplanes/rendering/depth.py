@@ -1,0 +1,95 @@
+"""What the depth of pictures says about the surface that they show: z coordinates, places and normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.rendering.images import Pictures
+
+__all__ = ["SeenSurface", "seen_surface"]
+
+COVERED = 0.5  # opacity from which on a pixel shows a surface
+REACH = 2  # pixels to every side that the plane through a pixel is fitted to
+STEEPEST = 6.0  # change of z in widths of a pixel, per pixel; more is another surface
+RIDGE = 1e-3  # of the normal equations, for pixels that have no neighbours
+
+
+@dataclass(frozen=True)
+class SeenSurface:
+    """The surface that pictures show; zero where they show none.
+
+    Attributes:
+        z: coordinate along the optical axis of each camera, in world units, as data sets call depth.
+        points: in the world.
+        normals: unit vectors in the world, towards the camera.
+        covered: where there is a surface.
+    """
+
+    z: Float[Tensor, "view height width"]
+    points: Float[Tensor, "view height width 3"]
+    normals: Float[Tensor, "view height width 3"]
+    covered: Float[Tensor, "view height width"]
+
+
+@torch.no_grad()
+def seen_surface(pictures: Pictures, cameras: PinholeCamera) -> SeenSurface:
+    """The surface that pictures show, from their depth along the rays.
+
+    Over a plane, 1 / z is linear in the coordinates (x / z, y / z) of the rays, whatever the lens. So the normal of a
+    pixel is that of the plane fitted by least squares to 1 / z of the 5 x 5 pixels around it, without those that lie on
+    another surface.
+
+    Args:
+        pictures: of a field.
+        cameras: which took them.
+    """
+    parts = [_one_view(pictures, cameras, view) for view in range(cameras.batch_size)]
+    return SeenSurface(*(torch.stack(values) for values in zip(*parts, strict=True)))
+
+
+def _one_view(pictures: Pictures, cameras: PinholeCamera, view: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    distance, opacity = pictures.depth[view, 0], pictures.opacity[view, 0]
+    height, width = distance.shape
+    one = camera.to(camera.select(cameras, [view]), distance.device, distance.dtype)
+    pixels = pixel_grid(height, width, distance.device)
+    rays = cast(one, torch.zeros(len(pixels), dtype=torch.long, device=distance.device), pixels)
+    rotation = camera.camera_from_world(one)[0, :3, :3]
+    local = (rays.directions @ rotation.T).reshape(height, width, 3)
+    covered = (opacity >= COVERED) & (distance > 0) & (local[..., 2] > 0)
+    z = torch.where(covered, distance * local[..., 2], 0.0)
+    points = rays.at(distance.reshape(-1)).reshape(height, width, 3)
+    slopes = local[..., :2] / local[..., 2:].clamp_min(1e-6)
+    normals = _plane_normals(z, covered, opacity, slopes, float(camera.intrinsics(one)[0, 0, 0])) @ rotation
+    shown = covered[..., None]
+    return z, torch.where(shown, points, 0.0), torch.where(shown, normals, 0.0), covered.to(z)
+
+
+def _plane_normals(z: Tensor, covered: Tensor, opacity: Tensor, slopes: Tensor, focal: float) -> Tensor:
+    """Normals in the camera's frame, by weighted least squares over the pixels around each."""
+    height, width = z.shape
+    weight = covered * opacity
+    frame = [REACH] * 4
+    around = [pad(part, frame) for part in (z, weight, slopes[..., 0], slopes[..., 1])]
+    normal, right = z.new_zeros(height, width, 3, 3), z.new_zeros(height, width, 3)
+    for down in range(2 * REACH + 1):
+        for across in range(2 * REACH + 1):
+            there, share, x, y = (part[down : down + height, across : across + width] for part in around)
+            near = (there - z).abs() <= STEEPEST * REACH * z / focal
+            # pixels from the centre, and 1 / z relative to that of the centre
+            offset = torch.stack([(x - slopes[..., 0]) * focal, (y - slopes[..., 1]) * focal, torch.ones_like(x)], -1)
+            offset = offset * (share * near)[..., None].sqrt()
+            change = (share * near).sqrt() * (z / there.clamp_min(1e-12) - 1)
+            normal += offset[..., :, None] * offset[..., None, :]
+            right += offset * change[..., None]
+    ridge = RIDGE * torch.eye(3, dtype=z.dtype, device=z.device)
+    gradient = torch.linalg.solve(normal + ridge, right)
+    last = (1 + gradient[..., 2]) / focal - (gradient[..., :2] * slopes).sum(-1)
+    return -normalize(torch.cat([gradient[..., :2], last[..., None]], -1), dim=-1)
