@@ -3,7 +3,7 @@
 The images come as a folder with transforms.json (Blender's, nerfstudio's), a COLMAP model, what Polycam, Record3D,
 KIRI Engine, RealityCapture or Metashape export, a scene of LLFF, IDR or NSVF, or an object of any data set. The model
 is shown the support half of the views and asked for the other half, so that the result can be compared with the truth;
---orbit asks for a round about the object instead, --camera-path for the frames of a path that nerfstudio's viewer wrote.
+--orbit asks for a round about the object instead, --camera-path for the frames of a path of nerfstudio's viewer.
 
 Example:
     hyperplanes render --checkpoint small --views example-car --out new-views
