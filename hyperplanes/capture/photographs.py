@@ -59,12 +59,6 @@ class Photograph:
     mask: Path | None = None
 
     @property
-    def stored_size(self) -> tuple[int, int]:
-        """(height, width) after the turn."""
-        height, width = self.size
-        return (width, height) if self.turned else (height, width)
-
-    @property
     def up_in_camera(self) -> tuple[float, float, float]:
         """Which way is up in the stored picture: x right, y down, z forward."""
         return (-1.0, 0.0, 0.0) if self.turned else (0.0, -1.0, 0.0)
@@ -73,7 +67,7 @@ class Photograph:
 def find_photographs(folder: Path) -> list[Path]:
     """The photographs of a folder, or of its folder images/, input/, rgb/ or photos/, in the order of their names.
 
-    ArrayLike in names count as numbers, so that IMG_9 comes before IMG_10.
+    Numbers in names count as numbers, so that IMG_9 comes before IMG_10.
 
     Args:
         folder: what holds them.

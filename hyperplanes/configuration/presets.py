@@ -163,6 +163,16 @@ PAPER_TRAINING = TrainingConfig(steps=100_000, tasks=1, reference_objects=3, ray
 """One object and 512 rays a step, Adam at 1e-4 for theta and the hypernetwork (Appendix B); the HyperPlanes of three
 more objects are read for the standardisation."""
 
+MUON_TRAINING = TrainingConfig(
+    tasks=4,
+    rays=256,
+    optimiser="muon",
+    learning_rate=2e-3,
+    hypernetwork_learning_rate=1e-3,
+    final_rate_factor=0.02,
+)
+"""What trains fields of 128x128 in hours on a few cores."""
+
 PRESETS: dict[str, Preset] = {
     "quick": Preset(
         ModelConfig(
@@ -171,11 +181,10 @@ PRESETS: dict[str, Preset] = {
             sampling=RayMarching(steps=64),
             hull_resolution=64,
         ),
-        TrainingConfig(
+        replace(
+            MUON_TRAINING,
             steps=1200,
-            tasks=4,
             rays=192,
-            optimiser="muon",
             learning_rate=3e-3,
             hypernetwork_learning_rate=1.5e-3,
             warmup=100,
@@ -196,19 +205,14 @@ PRESETS: dict[str, Preset] = {
             sampling=RayMarching(steps=64),
             hull_resolution=96,
         ),
-        TrainingConfig(
+        replace(
+            MUON_TRAINING,
             steps=30_000,
-            tasks=4,
-            rays=256,
             views=(1, 2, 3, 4, 5, 7, 10, 15, 25, 40),
             rotations=0.5,
             random_background=True,
             volume_loss=0.1,
-            optimiser="muon",
-            learning_rate=2e-3,
-            hypernetwork_learning_rate=1e-3,
             warmup=300,
-            final_rate_factor=0.02,
         ),
         128,
         "any number of views of any rig, 128x128, hours on a few cores",
@@ -220,16 +224,7 @@ PRESETS: dict[str, Preset] = {
             sampling=RayMarching(steps=96),
             hull_resolution=96,
         ),
-        TrainingConfig(
-            steps=30_000,
-            tasks=4,
-            rays=256,
-            optimiser="muon",
-            learning_rate=2e-3,
-            hypernetwork_learning_rate=1e-3,
-            warmup=500,
-            final_rate_factor=0.02,
-        ),
+        replace(MUON_TRAINING, steps=30_000, warmup=500),
         128,
         "the paper's field of 25 planes with a low-rank update of all layers, 128x128, hours on a few cores",
     ),
@@ -241,15 +236,13 @@ PRESETS: dict[str, Preset] = {
     ),
     "paper-128-brief": Preset(
         ModelConfig(coarse_network=True),
-        TrainingConfig(
+        replace(
+            MUON_TRAINING,
             steps=800,
-            tasks=4,
             rays=128,
-            optimiser="muon",
             learning_rate=5e-4,
             hypernetwork_learning_rate=3e-4,
             warmup=100,
-            final_rate_factor=0.02,
             empty_points=64,
             evaluate_every=200,
         ),

@@ -111,7 +111,7 @@ def save_images(
     Args:
         images: RGB in [0, 1].
         folder: made where absent.
-        names: of the files, without ending; folders in them are dropped. ArrayLike where absent.
+        names: of the files, without ending; folders in them are dropped. Numbers where absent.
 
     Returns:
         The files. Names that are not one an image are a ValueError.

@@ -25,7 +25,7 @@ from hyperplanes.views import Views
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["TexturedSurface", "render_surface", "save_textured", "texture_surface"]
+__all__ = ["TexturedSurface", "save_textured", "texture_surface"]
 
 FACES = 10_000
 SIZE = 1024
@@ -145,17 +145,17 @@ def _texels(mesh: TexturedSurface) -> tuple[npt.NDArray[np.int64], ...]:
     return height - 1 - up[inside], column[inside], face[inside], shares  # pyright: ignore[reportReturnType]
 
 
-def _hits(
+def _distances(
     solid: trimesh.Trimesh, cameras: PinholeCamera, view: int, pixels: Float[Tensor, "pixel 2"]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.float32]]:
-    """Which pixels meet the surface: their numbers, faces and points; and distances of all, infinite beside it."""
+) -> Float[Tensor, " pixel"]:
+    """The distance of the surface at every pixel, infinite beside it."""
     rays = cast(cameras, torch.full((len(pixels),), view), pixels)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
     found = solid.ray.intersects_id(origins, directions, multiple_hits=False, return_locations=True)
-    face, ray, place = found  # pyright: ignore[reportAssignmentType]
+    _, ray, place = found  # pyright: ignore[reportAssignmentType]
     distances = np.full(len(pixels), np.inf, np.float32)
     distances[ray] = np.linalg.norm(place - origins[ray], axis=1)
-    return ray, face, place, distances
+    return torch.from_numpy(distances)
 
 
 def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views) -> Any:  # noqa: ANN401
@@ -164,7 +164,7 @@ def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views)
     pixels = pixel_grid(height, width)
     for view in range(len(views)):
         one = camera.select(views.cameras, [view])
-        depth = torch.from_numpy(_hits(solid, views.cameras, view, pixels)[3]).reshape(1, 1, height, width)
+        depth = _distances(solid, views.cameras, view, pixels).reshape(1, 1, height, width)
         edge = max_pool2d(depth, 3, 1, 1) + max_pool2d(-depth, 3, 1, 1)  # range of a pixel and its neighbours
         maps = torch.cat([depth, edge], 1).nan_to_num(nan=1e9, posinf=1e9)
         pixel = 1 / float(camera.intrinsics(one)[0, 0, 0])  # its side, one unit away
@@ -191,38 +191,6 @@ def _spread(
     empty[row, column] = False
     nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
     return np.round(texture[tuple(np.asarray(nearest))] * 255).astype(np.uint8)
-
-
-@torch.no_grad()
-def render_surface(mesh: TexturedSurface, cameras: PinholeCamera, *, samples: int = 2) -> Float[Tensor, "view 4 h w"]:
-    """Pictures of a textured surface over white, and what they cover, by casting rays at its triangles.
-
-    Args:
-        mesh: what is seen, without light.
-        cameras: any number, on the CPU.
-        samples: along each side of a pixel.
-
-    Returns:
-        RGB and opacity in [0, 1].
-    """
-    import trimesh
-
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    height, width = camera.image_size(cameras)
-    offsets = (torch.arange(samples) + 0.5) / samples - 0.5
-    pixels = pixel_grid(height, width)[:, None] + torch.cartesian_prod(offsets, offsets).reshape(-1, 2)
-    texture = torch.from_numpy(mesh.texture).permute(2, 0, 1)[None].float() / 255
-    pictures = []
-    for view in range(cameras.batch_size):
-        ray, face, place, _ = _hits(solid, cameras, view, pixels.reshape(-1, 2))
-        triangles = solid.triangles[face]
-        shares = trimesh.triangles.points_to_barycentric(triangles, place) if len(face) else np.zeros((0, 3))
-        at = torch.from_numpy((mesh.places[mesh.faces[face]] * shares[..., None]).sum(1)).float() * 2 - 1
-        values = torch.tensor([1.0, 1.0, 1.0, 0.0]).repeat(pixels.shape[0] * pixels.shape[1], 1)
-        found = grid_sample(texture, at[None, None] * torch.tensor([1.0, -1.0]), align_corners=False)[0, :, 0].T
-        values[torch.from_numpy(ray)] = torch.cat([found, torch.ones(len(found), 1)], 1)
-        pictures.append(values.reshape(height, width, -1, 4).mean(2).permute(2, 0, 1))
-    return torch.stack(pictures)
 
 
 def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:

@@ -1,10 +1,10 @@
 """Processes that share the objects of every step, by torch.distributed: gradients averaged, stops and errors agreed on.
 
-Lightning Fabric starts the processes and joins them (`launching.py`). Its collectives do not serve (2.6.6): `all_reduce`
-sends a barrier and a message for every tensor, 284 ms for the 79 gradients of `small` in two processes of one machine
-where one message takes 13 ms; `broadcast` pickles what it sends; `setup` averages gradients in the backward pass of a
-wrapped module, and those of Reptile and MAML are made by no backward pass, while the losses of one step go through
-several fields of the same weights. What is used here are the functions of torch.distributed that they call.
+Lightning Fabric starts the processes and joins them (`launching.py`). Its collectives (2.6.6) do not serve:
+`all_reduce` sends a barrier and a message for every tensor, 284 ms for the 79 gradients of `small` in two processes of
+one machine where one message takes 13 ms; `broadcast` pickles what it sends; `setup` averages gradients in the backward
+pass of a wrapped module, and those of Reptile and MAML are made by no backward pass, while the losses of one step go
+through several fields of the same weights. What is used here are the functions of torch.distributed that they call.
 
 Each process renders its share of a step's objects. Weights, optimisers and draws are the same in all of them, so each
 could go on alone from any checkpoint. The first one writes files and validates on held-out objects.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch.profiler import record_function
@@ -21,44 +21,19 @@ from hyperplanes.views import Tasks
 __all__ = ["Objective", "RenderingObjective"]
 
 
-class Objective(Protocol):
+class Objective(ABC):
     """What a training does with the objects of a step, and how it is judged.
 
     Attributes:
         updates: the updates of theta of the last step, an object each; none where it has none.
-    """
-
-    updates: Sequence[Parameters]
-
-    @property
-    def rays_per_step(self) -> int:
-        """Rays of all objects of a step."""
-        ...
-
-    def tasks(self, data: Tasks) -> Tasks:
-        """The tasks as this training shows them to the model."""
-        ...
-
-    def gradients(self, batch: Batch) -> float:
-        """Set the gradients of the model's weights for this process's objects; returns the mean loss of these."""
-        ...
-
-    def adapt(self, prepared: SupportContext) -> AdaptedField:
-        """The field of a held-out object."""
-        ...
-
-
-class RenderingObjective:
-    """The losses of query rays rendered with theta + delta, by backpropagation (HyperPlanes, Algorithm 1).
 
     Args:
-        model: with a hypernetwork, or a target alone.
+        model: trained in place.
         config: of the training.
     """
 
     def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
         self.model, self.config = model, config
-        self.losses = losses_of(config)
         self.updates: Sequence[Parameters] = ()
 
     @property
@@ -67,8 +42,29 @@ class RenderingObjective:
         return self.config.rays * self.config.tasks
 
     def tasks(self, data: Tasks) -> Tasks:
-        """The tasks as they are."""
+        """The tasks as this training shows them to the model: as they are."""
         return data
+
+    @abstractmethod
+    def gradients(self, batch: Batch) -> float:
+        """Set the gradients of the model's weights for this process's objects; returns the mean loss of these."""
+
+    @abstractmethod
+    def adapt(self, prepared: SupportContext) -> AdaptedField:
+        """The field of a held-out object."""
+
+
+class RenderingObjective(Objective):
+    """The losses of query rays rendered with theta + delta, by backpropagation (HyperPlanes, Algorithm 1).
+
+    Args:
+        model: with a hypernetwork, or a target alone.
+        config: of the training.
+    """
+
+    def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
+        super().__init__(model, config)
+        self.losses = losses_of(config)
 
     def gradients(self, batch: Batch) -> float:
         """Backpropagate the mean over the rendered objects of the sum of the losses."""

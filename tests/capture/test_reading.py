@@ -47,7 +47,7 @@ def test_the_rarer_shape_lies_on_its_side_and_knows_where_up_is(upright, tmp_pat
     photographs, _ = list_photographs(find_photographs(tmp_path))
     picture, _ = read_upright(photographs[3], 1000)
     assert photographs[3].turned
-    assert photographs[3].stored_size == (24, 40)
+    assert picture.shape[:2] == (24, 40)
     x, y, _ = photographs[3].up_in_camera
     towards = picture[12, 20] - picture[12 - round(11 * y) - 1, 20 + round(18 * x)].astype(int)
     assert towards[1] < 0  # green is the upper half of the tall picture

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from torch.nn.functional import grid_sample
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.mesh import extract_mesh
-from hyperplanes.export.texture import render_surface, save_textured, texture_surface
+from hyperplanes.export.texture import save_textured, texture_surface
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
-from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
@@ -39,6 +40,28 @@ def views(field):
     cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), camera.fibonacci_sphere(10, 3.0), SIZE, SIZE)
     seen = field.render(cameras)
     return Views(seen.images, cameras, seen.opacity)
+
+
+def render_surface(mesh, cameras):
+    """Pictures of a textured surface over white, and what they cover, by four rays a pixel at its triangles."""
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    height, width = camera.image_size(cameras)
+    offsets = torch.tensor([-0.25, 0.25])
+    pixels = (pixel_grid(height, width)[:, None] + torch.cartesian_prod(offsets, offsets)).reshape(-1, 2)
+    texture = torch.from_numpy(mesh.texture).permute(2, 0, 1)[None].float() / 255
+    pictures = []
+    for view in range(cameras.batch_size):
+        rays = cast(cameras, torch.full((len(pixels),), view), pixels)
+        face, ray, place = solid.ray.intersects_id(
+            rays.origins.numpy(), rays.directions.numpy(), multiple_hits=False, return_locations=True
+        )
+        shares = trimesh.triangles.points_to_barycentric(solid.triangles[face], place)
+        at = torch.from_numpy((mesh.places[mesh.faces[face]] * shares[..., None]).sum(1)).float() * 2 - 1
+        found = grid_sample(texture, at[None, None] * torch.tensor([1.0, -1.0]), align_corners=False)[0, :, 0].T
+        values = torch.tensor([1.0, 1.0, 1.0, 0.0]).repeat(len(pixels), 1)
+        values[torch.from_numpy(ray)] = torch.cat([found, torch.ones(len(found), 1)], 1)
+        pictures.append(values.reshape(height, width, -1, 4).mean(2).permute(2, 0, 1))
+    return torch.stack(pictures)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,6 @@ __all__ = ["camera_file", "read_idr"]
 
 _FILES = ("cameras.npz", "cameras_sphere.npz")  # IDR's name, and NeuS's
 _HOMES = ("image", "images", "rgb")
-LARGEST_COUNT = 100_000
 
 
 def camera_file(folder: Path) -> Path | None:

@@ -39,55 +39,34 @@ class Layout:
         return PosedTask.alternating(self.read(folder, downscale, root), name)
 
 
+def _layout(
+    found: Callable[[Path], object], read: Callable[..., Posed], read_task: Callable[..., PosedTask] | None = None
+) -> Layout:
+    """A layout whose readers take the factor to scale down by and the root as `downscale` and `root`."""
+    return Layout(
+        lambda folder: bool(found(folder)),
+        lambda folder, downscale, root: read(folder, downscale=downscale, root=root),
+        read_task and (lambda folder, name, downscale, root: read_task(folder, name, downscale=downscale, root=root)),
+    )
+
+
 LAYOUTS = (
-    Layout(
-        lambda folder: bool(find_transforms(folder)),
-        lambda folder, downscale, root: read_transforms(find_transforms(folder), downscale=downscale, root=root),
-        lambda folder, name, downscale, root: read_transforms_task(folder, name, downscale=downscale, root=root),
+    _layout(
+        find_transforms, lambda folder, **more: read_transforms(find_transforms(folder), **more), read_transforms_task
     ),
-    Layout(
-        nsvf.is_nsvf,
-        lambda folder, downscale, root: nsvf.read_nsvf(folder, downscale=downscale, root=root),
-        lambda folder, name, downscale, root: nsvf.read_nsvf_task(folder, name, downscale=downscale, root=root),
-    ),
+    _layout(nsvf.is_nsvf, nsvf.read_nsvf, nsvf.read_nsvf_task),
     Layout(srn.is_srn, lambda folder, downscale, root: srn.read_srn(folder, root=root).downscaled(downscale)),
-    Layout(
-        lambda folder: colmap.find_model(folder) is not None,
-        lambda folder, downscale, root: colmap.read_colmap(folder, downscale=downscale, root=root),
-    ),
-    Layout(llff.is_llff, lambda folder, downscale, root: llff.read_llff(folder, downscale=downscale, root=root)),
-    Layout(nmr.is_nmr, lambda folder, downscale, root: nmr.read_nmr(folder, downscale=downscale, root=root)),
-    Layout(
-        lambda folder: idr.camera_file(folder) is not None,
-        lambda folder, downscale, root: idr.read_idr(folder, downscale=downscale, root=root),
-    ),
-    Layout(
-        objaverse.is_omniobject,
-        lambda folder, downscale, root: objaverse.read_omniobject(folder, downscale=downscale, root=root),
-    ),
-    Layout(
-        objaverse.is_rendered,
-        lambda folder, downscale, root: objaverse.read_rendered(folder, downscale=downscale, root=root),
-    ),
-    Layout(
-        co3d.is_sequence, lambda folder, downscale, root: co3d.read_sequence(folder, downscale=downscale, root=root)
-    ),
-    Layout(
-        polycam.is_polycam,
-        lambda folder, downscale, root: polycam.read_polycam(folder, downscale=downscale, root=root),
-    ),
-    Layout(
-        record3d.is_record3d,
-        lambda folder, downscale, root: record3d.read_record3d(folder, downscale=downscale, root=root),
-    ),
-    Layout(
-        lambda folder: bool(metashape.find_cameras_files(folder)),
-        lambda folder, downscale, root: metashape.read_metashape(folder, downscale=downscale, root=root),
-    ),
-    Layout(
-        lambda folder: bool(realitycapture.find_tables(folder)),
-        lambda folder, downscale, root: realitycapture.read_realitycapture(folder, downscale=downscale, root=root),
-    ),
+    _layout(colmap.find_model, colmap.read_colmap),
+    _layout(llff.is_llff, llff.read_llff),
+    _layout(nmr.is_nmr, nmr.read_nmr),
+    _layout(idr.camera_file, idr.read_idr),
+    _layout(objaverse.is_omniobject, objaverse.read_omniobject),
+    _layout(objaverse.is_rendered, objaverse.read_rendered),
+    _layout(co3d.is_sequence, co3d.read_sequence),
+    _layout(polycam.is_polycam, polycam.read_polycam),
+    _layout(record3d.is_record3d, record3d.read_record3d),
+    _layout(metashape.find_cameras_files, metashape.read_metashape),
+    _layout(realitycapture.find_tables, realitycapture.read_realitycapture),
 )
 
 

@@ -1,4 +1,4 @@
-"""ArrayLike in text files: poses, calibrations and boxes as SRN, NSVF and their like write them."""
+"""Numbers in text files: poses, calibrations and boxes as SRN, NSVF and their like write them."""
 
 from __future__ import annotations
 

@@ -78,11 +78,17 @@ def project(s, points, at, pitch, matrices, view, min_z):
 
 @inlined
 @no_type_check
-def place(s, out, column, row, height, width):
-    """RAW_U, RAW_V, RECIPROCAL -> clamped U, V; INSIDE; coordinates, into `out` at `column` and `row`.
+def _clamped(value, last):
+    """A coordinate between 0 and `last`; the comparisons are written so that NaN becomes 0."""
+    zero = type(value)(0)
+    value = value if value > zero else zero
+    return value if value < last else last
 
-    Comparisons are written so that NaN becomes 0.
-    """
+
+@inlined
+@no_type_check
+def place(s, out, column, row, height, width):
+    """RAW_U, RAW_V, RECIPROCAL -> clamped U, V; INSIDE; coordinates, into `out` at `column` and `row`."""
     one, zero, border = s.dtype.type(1), s.dtype.type(0), s.dtype.type(BORDER)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
     per_column = s.dtype.type(2) / s.dtype.type(max(width - 1, 1))
@@ -91,10 +97,7 @@ def place(s, out, column, row, height, width):
         u, v = load(s, RAW_U + i), load(s, RAW_V + i)
         front = load(s, RECIPROCAL + i) > zero
         inside = front & (u >= -border) & (u <= right + border) & (v >= -border) & (v <= bottom + border)
-        u = u if u > zero else zero
-        u = u if u < right else right
-        v = v if v > zero else zero
-        v = v if v < bottom else bottom
+        u, v = _clamped(u, right), _clamped(v, bottom)
         store(s, U + i, u)
         store(s, V + i, v)
         store(s, INSIDE + i, one if inside else zero)
@@ -126,10 +129,7 @@ def _unnormalize(s, count, values, at, step, apart, height, width):
         u = (read(values, at, i * step) + one) * per_column
         v = (read(values, at, i * step + apart) + one) * per_row
         inside = (u >= zero) & (u <= right) & (v >= zero) & (v <= bottom)
-        u = u if u > zero else zero
-        u = u if u < right else right
-        v = v if v > zero else zero
-        v = v if v < bottom else bottom
+        u, v = _clamped(u, right), _clamped(v, bottom)
         store(s, U + i, u)
         store(s, V + i, v)
         store(s, INSIDE + i, one if inside else zero)

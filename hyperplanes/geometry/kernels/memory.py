@@ -30,7 +30,7 @@ def pitch(points: Tensor) -> int:
 
 
 def pixel_pitch(channels: int) -> int:
-    """ArrayLike a pixel's gradient takes in memory: three channels are padded to a vector of four."""
+    """Numbers that a pixel's gradient takes in memory: three channels are padded to a vector of four."""
     return 4 if channels == 3 else channels
 
 

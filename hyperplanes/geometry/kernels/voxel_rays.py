@@ -89,6 +89,18 @@ def _colour(basis, ray, mixed, density):
     return r / density, g / density, b / density
 
 
+@inlined
+@no_type_check
+def _composite(optical_depth, added, r, g, b, red, green, blue, opacity):  # noqa: PLR0913
+    """The weight of a sample in its pixel, and the sums up to it (NeRF, Eq. 3)."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    weight = math.exp(-optical_depth) * (one - math.exp(-added))
+    red += weight * min(max(r, zero), one)
+    green += weight * min(max(g, zero), one)
+    blue += weight * min(max(b, zero), one)
+    return weight, optical_depth + added, red, green, blue, opacity + weight
+
+
 @no_type_check
 def render(index, values, empty, origins, directions, near, far, basis, step, limit, background, out, start, stop):  # noqa: PLR0913
     """The pixels of rays start..stop: (colour, opacity, depth) into `out`.
@@ -115,14 +127,9 @@ def render(index, values, empty, origins, directions, near, far, basis, step, li
                 break
             total += 1
             r, g, b = _colour(basis, ray, mixed, density)
-            # Compositing (NeRF, Eq. 3).
-            added = density * step
-            weight = math.exp(-optical_depth) * (one - math.exp(-added))
-            optical_depth += added
-            red += weight * min(max(r, zero), one)
-            green += weight * min(max(g, zero), one)
-            blue += weight * min(max(b, zero), one)
-            opacity += weight
+            weight, optical_depth, red, green, blue, opacity = _composite(
+                optical_depth, density * step, r, g, b, red, green, blue, opacity
+            )
             depth += weight * t
         out[ray, 0] = red + (one - opacity) * background
         out[ray, 1] = green + (one - opacity) * background
@@ -163,13 +170,9 @@ def add_gradients(  # noqa: PLR0913
             places[count, 0], places[count, 1], places[count, 2] = x, y, z
             colours[count, 0], colours[count, 1], colours[count, 2] = r, g, b
             densities[count] = density
-            added = density * step
-            weight = math.exp(-optical_depth) * (one - math.exp(-added))
-            optical_depth += added
-            red += weight * min(max(r, zero), one)
-            green += weight * min(max(g, zero), one)
-            blue += weight * min(max(b, zero), one)
-            opacity += weight
+            _, optical_depth, red, green, blue, opacity = _composite(
+                optical_depth, density * step, r, g, b, red, green, blue, opacity
+            )
             count += 1
         # Twice the difference from the truth.
         wrong_r = np.float32(2.0) * (red + (one - opacity) * background - truth[ray, 0])

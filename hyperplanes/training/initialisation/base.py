@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -10,18 +9,16 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.initialisation import InitialisationConfig
-from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.episodes import Episode
-from hyperplanes.views import Tasks
+from hyperplanes.training.objective import Objective
 
 __all__ = ["InitialisationObjective", "draw_rays", "draw_seed"]
 
 
-class InitialisationObjective:
+class InitialisationObjective(Objective):
     """Weights that are validated after gradient steps on an object, as many as in training.
 
     Args:
@@ -29,24 +26,11 @@ class InitialisationObjective:
         config: of the training.
     """
 
-    def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
-        self.model, self.config = model, config
-        self.updates: Sequence[Parameters] = ()
-
     @property
     def initialisation(self) -> InitialisationConfig:
         """How the initialisation is learned."""
         assert self.model.config.initialisation is not None
         return self.model.config.initialisation
-
-    @property
-    def rays_per_step(self) -> int:
-        """Rays of all objects of a step."""
-        return self.config.rays * self.config.tasks
-
-    def tasks(self, data: Tasks) -> Tasks:
-        """The tasks as they are."""
-        return data
 
     def adapt(self, prepared: SupportContext) -> AdaptedField:
         """The field of a held-out object, after the steps of training."""
