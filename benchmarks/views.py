@@ -230,23 +230,23 @@ class _Partly:
 
     Attributes:
         model: the model.
-        written: which parameters are updated, by name.
-        hidden: channels of the volume that are set to zero.
+        updated: which parameters are updated, by name.
+        masked: channels of the volume that are set to zero.
     """
 
     model: HyperPlanes
-    written: Callable[[str], bool] = lambda name: True
-    hidden: tuple[int, ...] = ()
+    updated: Callable[[str], bool] = lambda name: True
+    masked: tuple[int, ...] = ()
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The field of theta and what is left of the update."""
         model, prepared = self.model.eval(), self.model.prepare(support)
         if prepared.volume is not None:
-            kept = [float(channel not in self.hidden) for channel in range(CHANNELS)]
+            kept = [float(channel not in self.masked) for channel in range(CHANNELS)]
             volume = prepared.volume * prepared.volume.new_tensor(kept)[:, None, None, None]
             prepared = replace(prepared, volume=volume)
-        update = Parameters((name, value) for name, value in model.update(prepared).items() if self.written(name))
+        update = Parameters((name, value) for name, value in model.update(prepared).items() if self.updated(name))
         return model.rendering_field(prepared, model.theta + update)
 
 
@@ -264,8 +264,8 @@ METHODS = {
 }
 
 PARTS = {
-    "without_share": lambda model, *_: _Partly(model, hidden=(0,)),
-    "without_colours": lambda model, *_: _Partly(model, hidden=(1, 2, 3)),
-    "without_number": lambda model, *_: _Partly(model, hidden=(4,)),
+    "without_share": lambda model, *_: _Partly(model, masked=(0,)),
+    "without_colours": lambda model, *_: _Partly(model, masked=(1, 2, 3)),
+    "without_number": lambda model, *_: _Partly(model, masked=(4,)),
 }
 """Parts of what a hypernetwork that reads a volume reads, left out at use."""

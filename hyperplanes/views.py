@@ -26,7 +26,7 @@ MOST = 1.5
 
 
 def check_values(name: str, values: object) -> None:
-    """Nothing, where pictures or masks are floating-point numbers in [0, 1].
+    """Refuse pictures or masks that are not floating-point numbers in [0, 1].
 
     Args:
         name: of the argument.

@@ -28,7 +28,7 @@ _MOST_FACES_TO_CLOSE = 500_000
 
 
 def check_faces(mesh: trimesh.Trimesh, label: str) -> None:
-    """Nothing, where all faces are on vertices that are there.
+    """Refuse faces on vertices that are not there.
 
     Args:
         mesh: as it was read.

@@ -157,19 +157,19 @@ class Descent:
             pixels: flat indices of their pixels that count.
             on_step: called with the number of steps done, before the first and after each.
         """
-        longest = self.settings.max_steps
+        most = self.settings.max_steps
         generator = torch.Generator().manual_seed(self.settings.seed + 1)
         with torch.no_grad():
             near_far = self.field(None).sampling.near_far
             rays, truth = holdout.sample_rays(HOLDOUT_RAYS, generator=generator, among=pixels, near_far=near_far)
         errors: dict[int, float] = {}
-        every = max(1, longest // CHECKS)
+        every = max(1, most // CHECKS)
 
         best = 0
-        for step in self.run(longest):
+        for step in self.run(most):
             if on_step is not None:
                 on_step(step)
-            if step not in (0, every // 3, longest) and step % every:
+            if step not in (0, every // 3, most) and step % every:
                 continue
             with torch.no_grad():
                 error = float((self.field(None).trace(rays).colour - truth).square().mean())

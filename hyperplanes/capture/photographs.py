@@ -126,12 +126,12 @@ def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[
     return _with_one_shape(found), notes
 
 
-def read_upright(photograph: Photograph, longest: int) -> tuple[Pixels, bool]:
+def read_upright(photograph: Photograph, max_size: int) -> tuple[Pixels, bool]:
     """The pixels of a photograph as it is stored in a capture: upright or on its side, scaled, its mask as alpha.
 
     Args:
         photograph: which one.
-        longest: pixels along the longer side at most.
+        max_size: pixels along the longer side at most.
 
     Returns:
         (height, width, 4), straight alpha, and whether alpha means anything.
@@ -159,20 +159,20 @@ def read_upright(photograph: Photograph, longest: int) -> tuple[Pixels, bool]:
         scaled = Image.fromarray(opacity).resize(picture.shape[1::-1], Image.Resampling.BILINEAR)
         picture[..., 3] = np.array(scaled)
         alpha = True
-    size = scaled_size(picture.shape[:2], longest)
+    size = scaled_size(picture.shape[:2], max_size)
     picture = resized(picture, size)
     if photograph.turned:
         picture = np.ascontiguousarray(np.rot90(picture))
     return picture, alpha and bool((picture[..., 3] < 255).any())
 
 
-def scaled_size(size: tuple[int, int], longest: int) -> tuple[int, int]:
+def scaled_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
     """(height, width) scaled down so that the longer side has so many pixels at most.
 
     >>> scaled_size((3000, 4000), 1000)
     (750, 1000)
     """
-    factor = min(1.0, longest / max(size))
+    factor = min(1.0, max_size / max(size))
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 

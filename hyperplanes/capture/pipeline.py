@@ -54,13 +54,13 @@ class Settings:
     """How a capture is made.
 
     Attributes:
-        longest: pixels along the longer side, in which poses are found and pictures written.
+        max_size: pixels along the longer side, in which poses are found and pictures written.
         mask: auto, given, colour, network, grabcut, none, or a command with {image} and {mask} in it.
         frames: taken out of a video.
         order: "auto", "sequence" (neighbours are matched) or "any" (all pairs are).
     """
 
-    longest: int = 1000
+    max_size: int = 1000
     mask: str = "auto"
     frames: int = 60
     order: str = "auto"
@@ -134,10 +134,10 @@ def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
 
 def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photograph], list[Picture], dict[int, Path]]:
     """The photographs upright and scaled, as files, and the masks that came with them by their number."""
-    longest = work.settings.longest
+    max_size = work.settings.max_size
     stamps = [(str(one.path.resolve()), one.path.stat().st_mtime, one.path.stat().st_size) for one in photographs]
     masks = [None if one.mask is None else (str(one.mask), one.mask.stat().st_mtime) for one in photographs]
-    key = fingerprint(stamps, masks, longest, work.settings.mask in ("auto", "given"))
+    key = fingerprint(stamps, masks, max_size, work.settings.mask in ("auto", "given"))
     folder = work.stages.folder / "pictures"
     done = work.stages.begin("pictures", key)
     if done is None:
@@ -145,7 +145,7 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
         for index, one in enumerate(photographs):
             work.progress("photographs", index, len(photographs), one.path.name)
             try:
-                picture, alpha = read_upright(one, longest)
+                picture, alpha = read_upright(one, max_size)
             except DataError as error:
                 if one.mask is not None and str(one.mask) in str(error):
                     raise

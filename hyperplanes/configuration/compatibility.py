@@ -68,7 +68,7 @@ def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
 
 
 def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: ModelConfig, target: Target) -> None:
-    """Nothing, where a model can be fine-tuned so.
+    """Refuse a fine-tuning that the model cannot take.
 
     Args:
         settings: of fine-tuning.

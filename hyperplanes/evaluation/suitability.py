@@ -87,9 +87,9 @@ def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | Non
     """
     if len(shown) < 4:
         return None
-    left_out = torch.linspace(0, len(shown) - 1, min(HELD_OUT, len(shown) // 2) + 2)[1:-1].round().long()
-    rest = [index for index in range(len(shown)) if index not in left_out.tolist()]
-    truth_views, remaining = shown[left_out], shown[rest]
+    holdout = torch.linspace(0, len(shown) - 1, min(HELD_OUT, len(shown) // 2) + 2)[1:-1].round().long()
+    rest = [index for index in range(len(shown)) if index not in holdout.tolist()]
+    truth_views, remaining = shown[holdout], shown[rest]
     scale = min(1.0, HELD_OUT_SIZE / max(truth_views.size))
     size = max(1, round(truth_views.size[0] * scale)), max(1, round(truth_views.size[1] * scale))
     truth = torch.nn.functional.interpolate(truth_views.images, size, mode="area")

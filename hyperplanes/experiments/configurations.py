@@ -138,12 +138,12 @@ def _settings(experiment: Experiment, scale: Scale) -> dict[str, dict[str, objec
                 found[kind]["views.steps"] = int(steps[1])
             if cell.views is not None and experiment.published_row(cell.row):
                 found[kind]["views.shown"] = scale.planes(cell.views)
-        if tuning and cell.free == "hypernetwork":
+        if tuning and cell.trainable == "hypernetwork":
             tuned = _flat(scale.fine_tuning, "fine_tuning.")
             optimiser, rate, _ = RATES["hypernetwork"]
             stated = {"fine_tuning.optimiser": optimiser, "fine_tuning.learning_rate": rate}
             tuned |= {name: value for name, value in stated.items() if tuned[name] is None}
-            found["fine-tuning"] = tuned | {"fine_tuning.trainable": cell.free}
+            found["fine-tuning"] = tuned | {"fine_tuning.trainable": cell.trainable}
     return found
 
 

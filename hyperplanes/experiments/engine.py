@@ -247,7 +247,7 @@ class Runner:
                 "method": method,
                 "on": self.data_name(cell.on),
                 "object": name,
-                "free": cell.free if method != cell.trained.method else "",
+                "free": cell.trainable if method != cell.trained.method else "",
                 "seed": seed,
                 "views": self._views(cell, checkpoint),
                 "fine_tuning": stated(self.fine_tuning(cell)),
@@ -288,7 +288,7 @@ class Runner:
     ) -> tuple[WithSampler, Tasks]:
         """The adapter of a cell, and the objects with as many support views as it shows."""
         checkpoints = find_checkpoints([checkpoint])
-        trainable = cell.free if "hyperplanes" in checkpoints else "weights"
+        trainable = cell.trainable if "hyperplanes" in checkpoints else "weights"
         settings = replace(self.fine_tuning(cell), trainable=trainable, seed=seed)
         tasks, views = self.tasks(cell.on), self._views(cell, checkpoint)
         tasks = WithSupport(tasks, views) if cell.query is None else Shown(tasks, views, cell.query)

@@ -49,7 +49,7 @@ class Cell:
         on: the class of the objects that it is evaluated on.
         split: which of them.
         quantity: a number of `evaluation.ObjectScore`.
-        free: what fine-tuning optimises; "hypernetwork" with theta frozen is the paper's way.
+        trainable: what fine-tuning optimises; "hypernetwork" with theta frozen is the paper's way.
         views: support views that are shown; as many as the model has planes where None.
         query: query views that are kept back, where the views that are shown are chosen as far apart as all of them
             stand; all query views where None, and the first support views are shown.
@@ -62,7 +62,7 @@ class Cell:
     on: str
     split: Split = "test"
     quantity: str = "psnr"
-    free: Literal["hypernetwork", "weights"] = "hypernetwork"
+    trainable: Literal["hypernetwork", "weights"] = "hypernetwork"
     views: int | None = None
     query: int | None = None
 

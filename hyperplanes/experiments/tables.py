@@ -43,7 +43,7 @@ def _hyperplanes(on: str, changes: Mapping[str, object] | None = None, planes: i
 
 def _tuned(row: str, trained: Trained, on: str, split: Split = "test") -> list[Cell]:
     cells = [Cell(row, column, trained, method, on, split) for column, method in TUNED.items()]
-    return [*cells, Cell(row, WHOLE, trained, "hyperplanes_100", on, split, free="weights")]
+    return [*cells, Cell(row, WHOLE, trained, "hyperplanes_100", on, split, trainable="weights")]
 
 
 def _shapenet() -> Experiment:

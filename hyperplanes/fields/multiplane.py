@@ -23,8 +23,8 @@ def plane_features(points: Float[Tensor, "point 3"], planes: ImagePlanes) -> Flo
     # colours from [0, 1] to [-1, 1], as coordinates are
     colours, coordinates = 2 * found.colours - 1, found.coordinates
     # what a masked plane shows is left out
-    if planes.hidden is not None:
-        shown = ~planes.hidden[:, None]
+    if planes.masked is not None:
+        shown = ~planes.masked[:, None]
         colours, coordinates = colours * shown, coordinates * shown
     # all planes' colours, then all planes' coordinates
     return torch.cat([colours.flatten(1), coordinates.flatten(1)], -1)

@@ -66,7 +66,7 @@ class ImagePlanes:
         self.backend = backend
         self.exact = exact
         self.nearest = MIN_Z * camera.scale(cameras)
-        self.hidden: Bool[Tensor, " view"] | None = None
+        self.masked: Bool[Tensor, " view"] | None = None
         self._packed: tuple[int, PackedImages | None] | None = None
 
     def __len__(self) -> int:
@@ -80,15 +80,15 @@ class ImagePlanes:
         """The images and where their cameras stand, for notebooks."""
         return show_views(repr(self), self.images, self.cameras)
 
-    def mask_views(self, views: Int[Tensor, " hidden"]) -> ImagePlanes:
+    def mask_views(self, views: Int[Tensor, " masked"]) -> ImagePlanes:
         """The same planes, some more of which show no point: their colours are the background, and nothing is valid.
 
         Args:
             views: their indices.
         """
-        hidden = torch.zeros(len(self), dtype=torch.bool).index_fill_(0, views.cpu(), True).to(self.images.device)
+        masked = torch.zeros(len(self), dtype=torch.bool).index_fill_(0, views.cpu(), True).to(self.images.device)
         result = copy.copy(self)
-        result.hidden = hidden if self.hidden is None else hidden | self.hidden
+        result.masked = masked if self.masked is None else masked | self.masked
         return result
 
     def lookup(
@@ -127,8 +127,8 @@ class ImagePlanes:
                 packed=self.packed_images(points),
                 backend=self.backend,
             )
-        if self.hidden is not None:
-            shown = found.valid & ~(self.hidden if views is None else self.hidden[views])
+        if self.masked is not None:
+            shown = found.valid & ~(self.masked if views is None else self.masked[views])
             found = replace(found, colours=torch.where(shown[..., None], found.colours, self.background), valid=shown)
         if not return_directions:
             return found

@@ -101,28 +101,28 @@ class Reading:
     Attributes:
         best: views of the least penalty; 0 reads none of them.
         nearest: views nearest to a direction.
-        octaves: of the encoded point.
-        along_octaves: of the encoded direction.
+        point_frequencies: of the encoded point.
+        direction_frequencies: of the encoded direction.
         falloff: of depths behind the hull, in 1 / radii, where tanh makes them inputs.
         smallest_angle: between a view and a direction, in radians: nearer ones count as that far.
     """
 
     best: int
     nearest: int
-    octaves: int
-    along_octaves: int
+    point_frequencies: int
+    direction_frequencies: int
     falloff: float
     smallest_angle: float
 
     @property
     def row_size(self) -> int:
         """The encoded point, nine numbers of each of the best views, eleven of all of them."""
-        return 3 + 6 * self.octaves + 9 * self.best + 11
+        return 3 + 6 * self.point_frequencies + 9 * self.best + 11
 
     @property
     def near_size(self) -> int:
         """The encoded direction, and seven numbers of each of the nearest views."""
-        return 3 + 6 * self.along_octaves + 7 * self.nearest
+        return 3 + 6 * self.direction_frequencies + 7 * self.nearest
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class VisibilityPlanes:
         """The side of a voxel in radii of the scene: what depths are exact to."""
         return 2 / self.occupancy.occupied.shape[0]
 
-    def mask_views(self, views: Int[Tensor, " hidden"]) -> VisibilityPlanes:
+    def mask_views(self, views: Int[Tensor, " masked"]) -> VisibilityPlanes:
         """The same planes, some more of which see nothing: no point is valid there, and its colour is the background.
 
         Args:
@@ -322,7 +322,7 @@ class VisibilityPlanes:
         fixed = (
             points.contiguous().numpy(), along.contiguous().numpy(), *maps,
             packed.words.flatten().numpy().view(np.uint32), features.numpy(),
-            (*views, reading.best, reading.nearest, len(self), packed.bits, reading.octaves, reading.along_octaves),
+            (*views, reading.best, reading.nearest, len(self), packed.bits, reading.point_frequencies, reading.direction_frequencies),
             np.array(numbers, np.float32), np.array([*bounds.centre, 1 / bounds.radius], np.float32),
             *(each.numpy() for each in (rows, coverage, near, weights, colours)),
         )  # fmt: skip

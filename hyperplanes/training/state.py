@@ -102,7 +102,7 @@ def load_state(
     model: HyperPlanes,
     optimisers: Sequence[torch.optim.Optimizer],
     config: Mapping[str, Any],
-    free: Sequence[str],
+    may_differ: Sequence[str],
     defaults: Mapping[str, Any],
     data: Mapping[str, Any] | None = None,
 ) -> tuple[int, Curve]:
@@ -113,7 +113,7 @@ def load_state(
         model: of the same configuration.
         optimisers: over the same parameters.
         config: of the training that is to go on.
-        free: entries of it that may differ.
+        may_differ: entries of it that a resumed training may change.
         defaults: what entries are that a training of an earlier version has not.
         data: as in `save_state`; trainings of earlier versions have noted none.
 
@@ -128,7 +128,7 @@ def load_state(
     _compare_data(path, saved.get("data"), data)
     try:
         with malformed(path, "the state of a training"):
-            return _load(path, saved, model, optimisers, config, free, defaults)
+            return _load(path, saved, model, optimisers, config, may_differ, defaults)
     except DataError as error:
         raise CheckpointError(str(error)) from error
 
@@ -155,7 +155,7 @@ def _load(
     model: HyperPlanes,
     optimisers: Sequence[torch.optim.Optimizer],
     config: Mapping[str, Any],
-    free: Sequence[str],
+    may_differ: Sequence[str],
     defaults: Mapping[str, Any],
 ) -> tuple[int, Curve]:
     folder = path.parent
@@ -168,7 +168,7 @@ def _load(
     wanted, before = (
         json.loads(encode_json(dict(each))) for each in (config, {**defaults, **_upgraded(path, saved["config"])})
     )
-    differing = [name for name in wanted if name not in free and before[name] != wanted[name]]
+    differing = [name for name in wanted if name not in may_differ and before[name] != wanted[name]]
     if differing:
         raise CheckpointError(
             f"{path}: expected the same training to resume, found other {', '.join(differing)}; {REMEDY}"

@@ -48,15 +48,15 @@ def test_where_there_are_fewer_views_than_planes_each_stands_at_one_plane_and_th
     filled, dropped = (
         small_model(hypernetwork=None, plane_dropout=chance, order=order).prepare(support[seen]) for chance in (0, 0.3)
     )
-    assert filled.planes.hidden is None
+    assert filled.planes.masked is None
     assert (
-        dropped.planes.hidden.tolist()
+        dropped.planes.masked.tolist()
         == {"matched": [False, True, False, True], "file": [False, False, True, True]}[order]
     )
     assert torch.equal(filled.views.images, dropped.views.images)
     both = dropped.mask_views(torch.tensor([0]))  # what is hidden stays so
-    assert both.planes.hidden.sum() == 3
-    assert small_model(hypernetwork=None, plane_dropout=0.3, order=order).prepare(support).planes.hidden is None
+    assert both.planes.masked.sum() == 3
+    assert small_model(hypernetwork=None, plane_dropout=0.3, order=order).prepare(support).planes.masked is None
 
 
 @pytest.mark.parametrize("target", ["nerf", "image_based"])

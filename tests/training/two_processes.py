@@ -68,7 +68,7 @@ def initialised(folder=None):
 KINDS = {"conditioned": conditioned, "normalised": normalised, "initialised": initialised}
 
 OPTIONS = """
-    --model.network.depth 2 --model.network.width 24 --model.network.planes 4 --model.network.point-octaves 3
+    --model.network.depth 2 --model.network.width 24 --model.network.planes 4 --model.network.point-frequencies 3
     --model.hypernetwork.views 2 --model.hypernetwork.code 8 --model.hypernetwork.width 16 --model.hypernetwork.depth 2
     --model.sampling.steps 24 --model.hull-side 16 --training.tasks 2 --training.rays 16 --training.warmup 0
     --training.evaluate-every 2 --training.checkpoint-every 2 --training.held-out 1

@@ -130,7 +130,7 @@ class DemoSettings:
 
     def _cell(self, row: str, method: str, on: str = "") -> Cell:
         trained = Trained(self.class_name, method if method in MODELS else "hyperplanes")
-        return Cell(row, "", trained, method, on or self.class_name, free="weights")
+        return Cell(row, "", trained, method, on or self.class_name, trainable="weights")
 
     def _experiment(
         self, cells: Sequence[Cell], *, objects: int | None = None, keep_pictures: bool = False
