@@ -97,6 +97,7 @@ class ImageBasedNeRF(Target):
         self.density = nn.Linear(width + 1, 1)
         self.view = nn.Linear(width + encoded_size(config.direction_frequencies) + BLENDED * blended, width // 2)
         self.colour = nn.Linear(width // 2, blended + 3)
+        # heads that begin with the visual hull: density follows the masks, colours are the plain blend
         with torch.no_grad():
             for layer in (self.density, self.view, self.colour):
                 nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
@@ -225,12 +226,14 @@ class ImageBasedField(Field):
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
         """Colour in [0, 1] and density per world unit at points seen along unit directions."""
         if self._is_described(points):
+            # one kernel: the best views of each point (point, input), the nearest ones (point, blended, ...)
             inputs, coverage, near = self._read(points, directions)
             hidden = self.trunk(inputs)
             return self._coloured(hidden, near), self._density(hidden, coverage)
+        # the same in PyTorch: which views see a point best, which stand nearest to the direction
         config = self.target.config
         visibility = self.planes.choose(points, directions, best=config.planes, nearest=config.blended)
-        colours = self.planes.colours.lookup(points).colours
+        colours = self.planes.colours.lookup(points).colours  # (point, view, 3)
         hidden = self._hidden(points, visibility, colours)
         return self._colour(hidden, visibility, colours, directions), self._density(hidden, visibility.coverage)
 
@@ -297,16 +300,18 @@ class ImageBasedField(Field):
     def _hidden(self, points: Tensor, visibility: Visibility, shown: Tensor) -> Float[Tensor, "point width"]:
         """The trunk at points, which reads the `config.planes` views that see them best; `shown` are all colours."""
         config, seen = self.target.config, visibility.best
-        valid = seen.valid[..., None]
-        colours = (2 * _of(shown, seen.views) - 1) * valid
+        # what each of the best views shows, from [0, 1] to [-1, 1]: (point, chosen, 3), then (point, chosen, READ)
+        colours = (2 * _of(shown, seen.views) - 1) * seen.valid[..., None]
         slots = self.slots(points, seen, colours)
 
+        # what they have in common: mean, variance, difference to the best, least coverage, number of views
         weights = seen.weights[..., None]
         mean = (weights * colours).sum(1)
         variance = (weights * (colours - mean[:, None]).square()).sum(1)
         number = visibility.number.clamp_min(1).log()
         overall = [mean, variance, colours[:, 0] - mean, torch.stack([visibility.coverage, number], 1)]
 
+        # the encoded point, the views one after the other, what they have in common, the grid
         inputs = [encode(self.bounds.normalise(points), config.point_frequencies)]
         inputs += [self.joined(slots), *overall, *self._features(points)]
         return self.trunk(torch.cat(inputs, 1))
@@ -341,14 +346,17 @@ class ImageBasedField(Field):
         """
         config, near = self.target.config, visibility.nearest
         assert near is not None
+        # the angle between the direction and each view's ray, more where the view does not see the point: (point, view)
         angle = torch.acos((near.directions * directions[:, None]).sum(-1).clamp(-1 + 1e-6, 1 - 1e-6))
         score = (angle + ANGLE * near.penalty.clamp_min(0)).clamp_min(SMALLEST_ANGLE)
+        # weights that fall to zero at the next view, so that the blend is continuous where it changes
         count = min(config.blended, len(self.planes))
         farthest = score[:, count:] if len(self.planes) > count else 2 * score[:, count - 1 :]
         weights = (1 / score[:, :count] - 1 / (1.01 * farthest)).clamp_min(1e-6)
         seen = ChosenViews(*(getattr(near, each.name)[:, :count] for each in dataclasses.fields(near)))
-        colours, valid = _of(shown, seen.views), seen.valid[..., None]
+        colours, valid = _of(shown, seen.views), seen.valid[..., None]  # (point, blended, 3), (point, blended, 1)
 
+        # what the head reads: the trunk's features, the encoded direction, what each of these views shows
         slots = torch.cat([(2 * colours - 1) * valid, angle[:, :count, None] * valid, _described(seen)], -1)
         along = encode(directions, config.direction_frequencies)
         value = torch.cat([self.layer("feature", hidden), along, _padded(slots, config.blended).flatten(1)], 1)
@@ -356,6 +364,7 @@ class ImageBasedField(Field):
 
     def _blend(self, value: Tensor, weights: Tensor, colours: Tensor) -> Float[Tensor, "point 3"]:
         """The mean of colours by weights, given as logarithms, which the network multiplies; and its shift."""
+        # the network's factor of each weight, as a logarithm, and its shift of the logit of the colour
         factors, shift = self.layer("colour", relu(self.layer("view", value))).split([self.target.config.blended, 3], 1)
         weights = torch.softmax(weights + factors[:, : weights.shape[1]], 1)
         return torch.sigmoid(torch.logit(self.blended(weights, colours), 0.005) + shift)

@@ -318,11 +318,12 @@ class VisibilityPlanes:
         weights, colours = torch.empty(len(along), kept), torch.empty(len(along), kept, 3)
         surface = points.new_zeros(0) if self._surface is None else self._surface
         numbers = [*self._limits(), FADING, reading.falloff, reading.smallest_angle]
+        frequencies = reading.point_frequencies, reading.direction_frequencies
         maps = [each.contiguous().flatten().numpy() for each in (self._shown_cameras(), self.depth_opacity, surface)]
         fixed = (
             points.contiguous().numpy(), along.contiguous().numpy(), *maps,
             packed.words.flatten().numpy().view(np.uint32), features.numpy(),
-            (*views, reading.best, reading.nearest, len(self), packed.bits, reading.point_frequencies, reading.direction_frequencies),
+            (*views, reading.best, reading.nearest, len(self), packed.bits, *frequencies),
             np.array(numbers, np.float32), np.array([*bounds.centre, 1 / bounds.radius], np.float32),
             *(each.numpy() for each in (rows, coverage, near, weights, colours)),
         )  # fmt: skip
