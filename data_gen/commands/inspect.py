@@ -1,12 +1,15 @@
 """Say what is in a data set or a checkpoint, and whether it is as it should be.
 
 Of a data set: counts, splits, bounds, what was skipped, whether the poses agree with the masks (OpenCV poses declared
-as OpenGL are recognised), and two pictures: a contact sheet, and the cameras around the object. Ends with exit code 1
-when something is wrong with it.
+as OpenGL are recognised), and two pictures: a contact sheet, and the cameras around the object. Of a single scene also
+which sides its views cover, how much they have in common, reprojection errors where a sparse reconstruction lies beside
+it, the worst views, and what to expect, tried with `small` on views left out. Ends with exit code 1 when something is
+wrong with it.
 
 Example:
     hyperplanes inspect data/cars
     hyperplanes inspect data/cars --checksums
+    hyperplanes inspect scene          # what `capture` wrote, or photographs that another program has posed
     hyperplanes inspect runs/demo/hyperplanes
 """
 
@@ -168,7 +171,7 @@ def _inspect(arguments: Arguments, console: Console) -> int:
         )
     out = arguments.out or Path("runs/inspect") / arguments.path.resolve().name
     refuse_sources(out, arguments.path)
-    found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums)
+    found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums, trial=True)
     for line in found.lines():
         console.say(line)
     return int(found.has_problems)

@@ -1,8 +1,11 @@
-"""Inspect a data set: contact sheet, cameras around the visual hull, counts, bounds, and the conventions check."""
+"""Inspect a data set: contact sheet, cameras around the visual hull, counts, bounds, and the conventions check.
+
+Of a single scene also what its views cover and have in common, the worst of them, and what to expect.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +14,13 @@ import numpy as np
 from data_gen.datasets.contact_sheet import contact_sheet
 from data_gen.datasets.manifest import Verification, verify
 from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import write_whole
+from hyperplanes.utilities.files import read_json, write_whole
 
 __all__ = ["Inspection", "inspect"]
 
 _OBJECTS, _VIEWS, _FRUSTUM = 8, 10, 0.35
+_LONGEST, _TRIED = 320, 96  # pixels of pictures whose coverage is looked at, and of those that a model is tried on
+_POINTS = 5000  # of a sparse reconstruction are drawn
 
 
 @dataclass(frozen=True)
@@ -27,12 +32,14 @@ class Inspection:
         files: the pictures that were written.
         notes: what could not be done and why, one line each.
         verification: of the checksums, where it was requested.
+        scene: what the views of a single scene cover, a line a fact.
     """
 
     description: Any
     files: tuple[Path, ...]
     notes: tuple[str, ...]
     verification: Verification | None = None
+    scene: tuple[str, ...] = ()
 
     @property
     def has_problems(self) -> bool:
@@ -44,41 +51,117 @@ class Inspection:
     def lines(self) -> list[str]:
         """All of it as text, a line a fact."""
         checked = [] if self.verification is None else self.verification.lines()
-        return [*self.description.lines(), *checked, *(f"wrote {path}" for path in self.files), *self.notes]
+        return [
+            *self.description.lines(),
+            *self.scene,
+            *checked,
+            *(f"wrote {path}" for path in self.files),
+            *self.notes,
+        ]
 
 
-def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS, *, checksums: bool = False) -> Inspection:
+def inspect(
+    path: str | Path, out: str | Path, objects: int = _OBJECTS, *, checksums: bool = False, trial: bool = False
+) -> Inspection:
     """Describe a data set, and draw it.
 
     Args:
         path: a data set in any layout, or a posed scene.
-        out: the folder for contact_sheet.png and cameras.png.
+        out: the folder for contact_sheet.png and cameras.png, and coverage.png of a single scene.
         objects: how many objects to look at.
         checksums: compare every file with its checksum in the manifest, too.
+        trial: of a single scene with masks, try how well the packaged model `small` shows views that it was not shown.
 
     Returns:
         The description and the files. A data set that cannot be opened is a DataError; without matplotlib there is
         no cameras.png, and a note.
     """
     from hyperplanes.data import open_dataset
+    from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.inspection.describe import describe
+    from hyperplanes.data.inspection.picture import draw_coverage
+    from hyperplanes.data.inspection.scene import describe_scene
 
     data, out = open_dataset(path), Path(out)
     description = describe(data, objects)
-    files, notes = [], []
+    files, notes, scene = [], [], []
     verification = verify(path) if checksums else None
     names = [one.name for one in description.objects]
     if names:
         pictures, labels = _pictures(data, names)
         files.append(out / "contact_sheet.png")
         write_whole(files[0], encode_png(contact_sheet(pictures, min(_VIEWS, len(pictures)), labels)))
+        views = _all_views(data, names[0])
+        sparse = _sparse(locate_scene(path), data.posed(names[0])) if len(data) == 1 else None
+        report = describe_scene(views, sparse) if len(data) == 1 and len(views) > 1 else None
+        if report is not None:
+            scene = [*report.lines(), *(_trial(views) if trial else [])]
         try:
-            drawing = _cameras(data.task(names[0]))
-            files.append(out / "cameras.png")
-            write_whole(files[1], drawing)
+            drawings = {"cameras.png": _cameras(views, len(data.posed(names[0]).support), names[0], sparse)}
+            if report is not None:
+                drawings["coverage.png"] = draw_coverage(report, views)
+            for name, drawing in drawings.items():
+                files.append(out / name)
+                write_whole(files[-1], drawing)
         except ImportError:
             notes.append("cameras.png: not drawn, matplotlib is not installed; pip install matplotlib")
-    return Inspection(description, tuple(files), tuple(notes), verification)
+    return Inspection(description, tuple(files), tuple(notes), verification, tuple(scene))
+
+
+def _all_views(data: Any, name: str) -> Any:
+    """All views of an object, small, in a world with y up, the support first."""
+    from hyperplanes.data.inspection.scene import stand_upright
+    from hyperplanes.views import join_views
+
+    posed = data.posed(name)
+    small = posed.downscaled(max(1, -(-max(posed.support.rgba.shape[2:]) // _LONGEST))).task()
+    return stand_upright(join_views(small.support, small.query))
+
+
+def _sparse(folder: Path, posed: Any) -> Any:
+    """The points of a reconstruction beside a scene, in the world with y up; with `capture`'s reprojection errors."""
+    from hyperplanes.capture.sparse_model import SparseModel
+    from hyperplanes.data.formats.sparse_points import read_sparse_points
+    from hyperplanes.data.upright import guess_up, y_up_from
+
+    if not folder.is_dir() and folder.suffix != ".json":
+        return None
+    folder = folder if folder.is_dir() else folder.parent
+    found, path = read_sparse_points(folder), folder / "capture" / "poses" / "model.npz"
+    if found is None:
+        return None
+    if not found.errors and path.is_file() and (folder / "transforms.json").is_file():
+        frames = read_json(folder / "transforms.json", folder).get("frames", [])
+        model = SparseModel.load(path)
+        if len(model) == len(frames):
+            errors = dict(zip((frame["file_path"] for frame in frames), model.errors_of_cameras(), strict=True))
+            found = replace(found, error=model.reprojection_error, errors=errors)
+    turn = y_up_from(posed.support.up or guess_up(posed.support.cameras) or "y")[:3, :3].numpy()
+    return replace(found, places=found.places @ turn.T)
+
+
+def _trial(views: Any) -> list[str]:
+    """How well the packaged model shows views that were left out, in a line; nothing where it cannot be tried."""
+    from torch.nn.functional import interpolate
+
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
+    from hyperplanes.evaluation.suitability import held_out_psnr
+    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.views import Views
+
+    if views.masks is None or len(views) < 8:
+        return []
+    scale = min(1.0, _TRIED / max(views.size))
+    size = round(views.size[0] * scale), round(views.size[1] * scale)
+    images, masks = (interpolate(each, size, mode="area") for each in (views.images, views.masks))
+    small = Views(images, camera.resized(views.cameras, *size), masks, views.bounds, views.names, views.up)
+    found = held_out_psnr(HyperPlanes.from_pretrained("small"), small)
+    if found is None:
+        return []
+    return [
+        f"tried: in one step `small` shows four views that it was not given at {found[0]:.1f} dB (64 pixels), the "
+        f"nearest view copied has {found[1]:.1f}; 20 is a blurred likeness, 30 is hard to tell from a photograph"
+    ]
 
 
 def _pictures(data: Any, names: list[str]) -> tuple[list[np.ndarray], list[str]]:
@@ -95,8 +178,15 @@ def _pictures(data: Any, names: list[str]) -> tuple[list[np.ndarray], list[str]]
     return pictures, labels
 
 
-def _cameras(task: Any) -> bytes:
-    """PNG of the frusta of support (blue) and query (orange) cameras around the hull, or around the bounds."""
+def _cameras(views: Any, support: int, title: str, sparse: Any = None) -> bytes:
+    """PNG of the frusta of support (blue) and query (orange) cameras around the hull, or around the bounds.
+
+    Args:
+        views: in a world with y up, the support first.
+        support: how many they are.
+        title: of the picture.
+        sparse: points of a reconstruction, in the same world; those far away are left out.
+    """
     import io
 
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -104,15 +194,24 @@ def _cameras(task: Any) -> bytes:
 
     figure = Figure(figsize=(8, 8), dpi=100)
     axes: Any = figure.add_subplot(projection="3d")
-    for views, colour, label in ((task.support, "tab:blue", "support"), (task.query, "tab:orange", "query")):
-        for index, corners in enumerate(_frusta(views)):
+    halves = ((slice(support), "tab:blue", "support"), (slice(support, None), "tab:orange", "query"))
+    frusta = _frusta(views)
+    for half, colour, label in halves:
+        for index, corners in enumerate(frusta[half]):
             for line in (corners[[0, 1, 2, 3, 4, 1]], corners[[0, 2]], corners[[0, 3]], corners[[0, 4]]):
                 axes.plot(line[:, 0], -line[:, 2], line[:, 1], color=colour, linewidth=0.6)
             if index == 0:
-                axes.plot([], [], [], color=colour, label=f"{len(views)} {label} cameras")
-    points, shown = _solid(task.support)
+                axes.plot([], [], [], color=colour, label=f"{len(frusta[half])} {label} cameras")
+    points, shown = _solid(views)
     axes.scatter(points[:, 0], -points[:, 2], points[:, 1], s=2, c="0.35", label=shown)
-    axes.set(xlabel="x", ylabel="-z", zlabel="y", title=task.name)
+    if sparse is not None:
+        reach = np.abs(frusta[:, 0] - views.bounds.centre).max()
+        points = sparse.places[(np.abs(sparse.places - views.bounds.centre) < reach).all(1)]
+        points = points[:: max(1, len(points) // _POINTS)]
+        axes.scatter(
+            points[:, 0], -points[:, 2], points[:, 1], s=1, c="tab:green", label="points of the reconstruction"
+        )
+    axes.set(xlabel="x", ylabel="-z", zlabel="y", title=title)
     axes.set_aspect("equal")
     axes.legend(loc="upper left")
     buffer = io.BytesIO()

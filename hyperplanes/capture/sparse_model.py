@@ -56,6 +56,13 @@ class SparseModel:
             return float("nan")
         return float(self.errors[self.observed[:, 1]].mean())
 
+    def errors_of_cameras(self) -> list[float]:
+        """The mean reprojection error of the points that each camera sees, in pixels; NaN of one that sees none."""
+        with np.errstate(invalid="ignore"):
+            count = np.bincount(self.observed[:, 0], minlength=len(self))
+            total = np.bincount(self.observed[:, 0], self.errors[self.observed[:, 1]], len(self))
+            return (total / count).tolist()
+
     def project(
         self, camera: int, points: Float[np.ndarray, "point 3"]
     ) -> tuple[Float[np.ndarray, "2 point"], Float[np.ndarray, " point"]]:

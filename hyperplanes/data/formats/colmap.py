@@ -17,7 +17,7 @@ from hyperplanes.data.pictures.posed import Posed, check_pose
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError, check_link, inside, read_bytes, read_text
 
-__all__ = ["find_model", "read_colmap"]
+__all__ = ["find_model", "image_names", "read_colmap"]
 
 # COLMAP's number, name and parameters of the camera models that are read
 _MODELS = {
@@ -43,6 +43,7 @@ class _Camera:
 
 @dataclass(frozen=True)
 class _Image:
+    number: int
     name: str
     camera: int
     camera_from_world: npt.NDArray[np.float64]
@@ -96,20 +97,7 @@ def read_colmap(
     model = find_model(folder)
     if model is None:
         raise DataError(folder, "cameras and images, .bin or .txt", "neither", "check the path")
-    binary = (model / "images.bin").is_file() and (model / "cameras.bin").is_file()
-    suffix = ".bin" if binary else ".txt"
-    paths = model / f"cameras{suffix}", model / f"images{suffix}"
-    for path in paths:
-        check_link(path, root or folder)
-    try:
-        if binary:
-            cameras, images = _cameras_binary(paths[0]), _images_binary(paths[1])
-        else:
-            cameras, images = _cameras_text(paths[0]), _images_text(paths[1])
-    except DataError:
-        raise
-    except (struct.error, IndexError, UnicodeDecodeError, ValueError) as error:
-        raise DataError(model, "a whole COLMAP model", f"a broken one ({error})", _REMEDY) from error
+    paths, cameras, images = _read(model, root or folder)
     if not images:
         raise DataError(paths[1], "registered images", "none", "reconstruct again")
     images = sorted(images, key=lambda image: image.name)
@@ -133,6 +121,33 @@ def read_colmap(
     masks = find_masks([home.parent / "masks"], [frame.path for frame in frames], root or home.parent)
     frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
     return assemble(frames, paths[1], bounds=bounds, downscale=downscale)[0]
+
+
+def image_names(model: Path, root: Path) -> dict[int, str]:
+    """The names of a model's registered images by their numbers; what is broken is a DataError.
+
+    Args:
+        model: the folder that `find_model` found.
+        root: no file may lie outside of it, symbolic links followed.
+    """
+    return {image.number: image.name for image in _read(model, root)[2]}
+
+
+def _read(model: Path, root: Path) -> tuple[tuple[Path, Path], dict[int, _Camera], list[_Image]]:
+    """The files of a model, and what they hold."""
+    binary = (model / "images.bin").is_file() and (model / "cameras.bin").is_file()
+    suffix = ".bin" if binary else ".txt"
+    paths = model / f"cameras{suffix}", model / f"images{suffix}"
+    for path in paths:
+        check_link(path, root)
+    try:
+        if binary:
+            return paths, _cameras_binary(paths[0]), _images_binary(paths[1])
+        return paths, _cameras_text(paths[0]), _images_text(paths[1])
+    except DataError:
+        raise
+    except (struct.error, IndexError, UnicodeDecodeError, ValueError) as error:
+        raise DataError(model, "a whole COLMAP model", f"a broken one ({error})", _REMEDY) from error
 
 
 def _picture(home: Path, name: str, source: Path, root: Path) -> Path:
@@ -209,7 +224,7 @@ def _images_text(path: Path) -> list[_Image]:
         if not words:
             continue
         numbers = np.array(words[1:8], dtype=np.float64)
-        images.append(_Image(" ".join(words[9:]), int(words[8]), _pose(numbers[:4], numbers[4:])))
+        images.append(_Image(int(words[0]), " ".join(words[9:]), int(words[8]), _pose(numbers[:4], numbers[4:])))
         next(lines, None)  # the points of this image, possibly none
     return images
 
@@ -233,7 +248,7 @@ def _images_binary(path: Path) -> list[_Image]:
         values = struct.unpack_from("<i7di", data, at)
         end = data.index(b"\0", at + 64)
         pose = _pose(np.array(values[1:5]), np.array(values[5:8]))
-        images.append(_Image(data[at + 64 : end].decode(), values[8], pose))
+        images.append(_Image(values[0], data[at + 64 : end].decode(), values[8], pose))
         at = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
     if at > len(data):
         raise ValueError(f"{path.name} ends early")

@@ -46,10 +46,11 @@ def test_a_right_data_set_is_described_and_drawn(tmp_path):
     assert not found.has_problems
     sheet = np.array(Image.open(found.files[0]))
     assert sheet.shape[1] > 6 * SIZE
-    assert [path.name for path in found.files] == ["contact_sheet.png", "cameras.png"]
+    assert [path.name for path in found.files] == ["contact_sheet.png", "cameras.png", "coverage.png"]
     text = "\n".join(found.lines())
     assert "objects: 1 (1 test)" in text
     assert "conventions: masks agree with the poses" in text
+    assert "coverage: " in text
 
 
 @pytest.mark.parametrize(

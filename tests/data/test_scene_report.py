@@ -1,0 +1,115 @@
+"""What `inspect` says of a scene's views.
+
+Source of truth: areas of spherical caps, angles by hand, and damage that is done here to one view on purpose.
+"""
+
+import math
+import struct
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from hyperplanes.data.formats.sparse_points import read_sparse_points
+from hyperplanes.data.inspection.picture import draw_coverage
+from hyperplanes.data.inspection.scene import describe_scene
+from hyperplanes.geometry import Sphere
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.poses import look_at
+from hyperplanes.views import Views
+
+SIZE = 48
+
+
+def standing(*angles):
+    """Grey views without masks from azimuths and elevations in degrees."""
+    azimuth, elevation = torch.deg2rad(torch.tensor(angles, dtype=torch.float64)).T
+    flat = elevation.cos()
+    eyes = 3 * torch.stack([flat * azimuth.sin(), elevation.sin(), flat * azimuth.cos()], -1)
+    cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), look_at(eyes).float(), SIZE, SIZE)
+    names = tuple(f"images/{index}.png" for index in range(len(angles)))
+    return Views(torch.full((len(angles), 3, SIZE, SIZE), 0.5), cameras, None, Sphere(), names, "y")
+
+
+def ball():
+    """Twelve views of a ball with noise on it."""
+    views = standing(*((30 * index, 20 * (-1) ** index) for index in range(12)))
+    rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    middle = (SIZE - 1) / 2
+    mask = ((rows - middle) ** 2 + (columns - middle) ** 2 < (SIZE / 4) ** 2).float().expand(12, 1, SIZE, SIZE)
+    noise = torch.rand(12, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+    return replace(views, images=noise * mask + 1 - mask, masks=mask.clone())
+
+
+def test_coverage_is_the_area_of_caps():
+    report = describe_scene(standing((0, 0), (180, 0)))
+    assert report.covered == pytest.approx(1 - math.cos(math.radians(30)), abs=0.01), "two caps of (1 - cos 30) / 2"
+    assert (report.above, report.below, report.gap) == (0.0, 0.0, None)
+    assert [view.neighbour for view in report.views] == pytest.approx([180, 180], abs=1e-3)
+    assert "only from near where the views stand" in report.expectation()
+
+
+def test_the_widest_gap_lies_between_views_that_are_named():
+    """A view that looks steeply down closes no gap."""
+    report = describe_scene(standing(*((20 * index, 10) for index in range(11)), (280, 85)))
+    assert report.views[11].faults == ("no other within 79 degrees",)
+    width, left, right = report.gap
+    assert (round(width), left, right) == (160, "10.png", "0.png")
+    assert [round(value, 3) for value in report.views[4].direction] == [80, 10]
+    assert "gap: nothing was seen from 160 degrees around between 10.png and 0.png" in report.lines()
+
+
+def test_a_right_scene_has_no_faults():
+    report = describe_scene(ball())
+    assert report.is_sound
+    fits = [view.agreement for view in report.views]
+    assert max(fits) - min(fits) < 0.1, "the hull's voxels make all silhouettes larger alike"
+    assert report.shown > 3
+    assert not any(view.cut for view in report.views)
+
+
+def test_a_wrong_mask_and_a_blurred_picture_are_named():
+    views = ball()
+    views.masks[3, :, :, : SIZE // 2] = 0
+    kernel = torch.ones(3, 1, 5, 5) / 25
+    views.images[7] = torch.nn.functional.conv2d(views.images[7:8], kernel, padding=2, groups=3)[0]
+    report = describe_scene(views)
+    faults = {view.name: view.faults for view in report.views if view.faults}
+    assert set(faults) == {"3.png", "7.png"}
+    assert faults["3.png"][0].startswith("mask and the hull of all masks agree by ")
+    assert faults["7.png"][0].startswith("blurred, ")
+    assert {view.name for view in report.worst[:2]} == {"3.png", "7.png"}
+    picture = Image.open(BytesIO(draw_coverage(report, views)))
+    assert picture.size[0] > 800
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_reprojection_errors_of_colmap(tmp_path, binary):
+    """Three points of errors 1, 2 and 6 pixels; a.png shows the first two, b.png all of them."""
+    tracks = [((0, 1, 2), 1.0, (4, 9)), ((3, 4, 5), 2.0, (4, 9)), ((6, 7, 8), 6.0, (9,))]
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 4 4 4 4 2 2\n")
+    (tmp_path / "images.txt").write_text("4 1 0 0 0 0 0 0 1 a.png\n\n9 1 0 0 0 0 0 0 1 b.png\n\n")
+    assert read_sparse_points(tmp_path) is None
+    if binary:
+        data = struct.pack("<Q", 3)
+        for number, (place, error, images) in enumerate(tracks):
+            data += struct.pack("<Q3d3BdQ", number, *place, 9, 9, 9, error, len(images))
+            data += b"".join(struct.pack("<ii", image, 0) for image in images)
+        (tmp_path / "points3D.bin").write_bytes(data)
+    else:
+        lines = [
+            f"{number} {' '.join(map(str, place))} 9 9 9 {error} {' '.join(f'{image} 0' for image in images)}"
+            for number, (place, error, images) in enumerate(tracks)
+        ]
+        (tmp_path / "points3D.txt").write_text("# points\n" + "\n".join(lines) + "\n")
+    found = read_sparse_points(tmp_path)
+    assert found.errors == {"a.png": 1.5, "b.png": 3.0}
+    assert (found.count, found.error) == (3, pytest.approx(2.4))
+    np.testing.assert_array_equal(found.places[1], [3, 4, 5])
+    views = replace(standing((0, 0), (20, 0)), names=("a.png", "b.png"))
+    said = "\n".join(describe_scene(views, replace(found, errors={"a.png": 1.0, "b.png": 4.0})).lines())
+    assert "reprojection error: 2.40 pixels (mean, 3 points), 4.00 in the worst view (b.png)" in said
+    assert "reprojection error 4.0 pixels, in the median 2.5" not in said, "less than twice the median"
