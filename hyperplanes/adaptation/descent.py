@@ -159,6 +159,7 @@ class Descent:
         """
         most = self.settings.max_steps
         generator = torch.Generator().manual_seed(self.settings.seed + 1)
+        # the rays that judge, the same at every check
         with torch.no_grad():
             near_far = self.field(None).sampling.near_far
             rays, truth = holdout.sample_rays(HOLDOUT_RAYS, generator=generator, among=pixels, near_far=near_far)
@@ -169,6 +170,7 @@ class Descent:
         for step in self.run(most):
             if on_step is not None:
                 on_step(step)
+            # between two checks
             if step not in (0, every // 3, most) and step % every:
                 continue
             with torch.no_grad():

@@ -92,6 +92,7 @@ def diagnose(model: HyperPlanes, prepared: Sequence[SupportContext]) -> Diagnost
         raise ValueError(f"diagnose: expected a hypernetwork and at least 2 objects, got {what}")
     training = model.training
     model.eval()
+    # which units of the head any object activates, seen while the updates are made
     active: list[Tensor] = []
     hooks = [
         layer.register_forward_hook(lambda module, inputs, output: active.append((output > 0).any(0).flatten()))
@@ -103,6 +104,7 @@ def diagnose(model: HyperPlanes, prepared: Sequence[SupportContext]) -> Diagnost
         for hook in hooks:
             hook.remove()
         model.train(training)
+    # (object, parameter): norm of the updates, and of their differences from the mean
     flat = torch.stack([torch.cat([value.flatten() for value in update.values()]) for update in updates])
     norm = float(flat.square().sum(1).mean().sqrt())
     spread = float((flat - flat.mean(0)).square().sum(1).mean().sqrt())

@@ -113,14 +113,17 @@ def bake(
         raise ValueError(f"directions: expected at least {HARMONICS}, one a harmonic, got {directions}")
     coarser = coarsening(side)
     view = camera.fibonacci_sphere(directions, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
+    # transmittance from outside to coarse voxels, along every direction
     coarse = _resampled(adapted.refined_occupancy, side // coarser)
     optical_depth = torch.zeros_like(coarse.occupied, dtype=view.dtype)
     optical_depth[coarse.occupied] = _density_at(adapted, coarse.centres()) * coarse.voxel
     arriving = transmittance(optical_depth, coarse.occupied.nonzero(), view)
+    # voxels that some light reaches
     visible = torch.zeros_like(coarse.occupied)
     visible[coarse.occupied] = arriving.amax(1) > MIN_TRANSMITTANCE
     row = torch.zeros(coarse.occupied.numel(), dtype=torch.long, device=view.device)
     row[coarse.occupied.flatten()] = torch.arange(len(arriving), device=view.device)
+    # density and coefficients of the fine voxels in these
     fine = _resampled(Occupancy(visible, coarse.bounds), side)
     cells, rows = [], []
     centres, done = fine.centres(), 0
@@ -135,6 +138,7 @@ def bake(
     if not sum(len(part) for part in cells):
         raise ValueError("bake: expected a field with something in it, got one that is empty everywhere")
     filled, values = torch.cat(cells), torch.cat(rows)
+    # where each voxel's row is
     index = torch.full((side**3,), -1, dtype=torch.int32, device=view.device)
     index[filled] = torch.arange(len(filled), dtype=torch.int32, device=view.device)
     return BakedField(index.reshape(side, side, side).cpu(), values.cpu(), fine.bounds)

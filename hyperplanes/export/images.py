@@ -180,6 +180,7 @@ def orbit_cameras(
     if count < 1:
         raise ValueError(f"count: expected at least one camera, got {count}")
     cameras, centre = views.cameras, torch.tensor(views.bounds.centre)
+    # the level circle: its first direction below the first view, and the one across
     positions = camera.centres(cameras).cpu().float() - centre
     up = torch.tensor(upward(cameras))
     front = positions[0] - (positions[0] @ up) * up
@@ -189,11 +190,13 @@ def orbit_cameras(
     side = torch.linalg.cross(up, front)
     angle = torch.arange(count) * (2 * math.pi / count)
     around = angle.cos()[:, None] * front + angle.sin()[:, None] * side
+    # cameras on it, as far away as most views
     distance = float(positions.norm(dim=1).median())
     eyes = centre + distance * (math.cos(elevation) * around + math.sin(elevation) * up)
     x, y, z = up.tolist()
     pose = camera.look_at(eyes, views.bounds.centre, (x, y, z)).to(cameras.extrinsics)
     height, width = views.size
+    # the lens of the view with the squarest pixels
     focal = camera.intrinsics(cameras)[:, [0, 1], [0, 1]].log()
     squarest = int((focal[:, 0] - focal[:, 1]).abs().round(decimals=3).argmin())
     batch = camera.with_poses(camera.select(cameras, [squarest] * count), pose)

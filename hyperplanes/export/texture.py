@@ -74,15 +74,18 @@ def texture_surface(
     Returns:
         The mesh.
     """
+    # fewer triangles, and their places in the texture
     solid = _simplified(surface, faces)
     vertices, normals = (np.array(part, np.float32) for part in (solid.vertices, solid.vertex_normals))
     origin, indices, places, height, width = _unwrapped(vertices, np.array(solid.faces, np.uint32), size)
     blank = np.zeros((height, width, 3), np.uint8)
     mesh = TexturedSurface(vertices[origin], indices.astype(np.int64), normals[origin], places, blank)
+    # the point and the normal of each texel
     row, column, face, shares = _texels(mesh)
     corners = mesh.faces[face]
     points = torch.from_numpy((mesh.vertices[corners] * shares[..., None]).sum(1))
     outward = normalize(torch.from_numpy((mesh.normals[corners] * shares[..., None]).sum(1)), dim=-1)
+    # a mean of what the field and the views show there
     device = field.occupancy.occupied.device
     parts = zip(points.to(device).split(CHUNK), (-outward).to(device).split(CHUNK), strict=True)
     total = OF_FIELD * torch.cat([field(here, along)[0].cpu() for here, along in parts])

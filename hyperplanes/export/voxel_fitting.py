@@ -55,12 +55,14 @@ def fit_voxels(
     if not len(live):
         return baked
     rays = min(rays, len(live))
+    # optical depth of a voxel and coefficients, each with its own rate
     depth, colour = (baked.values[:, :1] * voxel).clamp_min(SMALLEST_DEPTH), baked.values[:, 1:].clone()
     groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
     descent = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, DECAY ** (1 / max(1, steps)))
     generator, step_length = torch.Generator().manual_seed(seed), 2 * baked.bounds.radius / STEPS_A_DIAMETER
     for step in range(steps):
+        # squared error of some rays, and its gradient by the kernel
         drawn, truth = views.sample_rays(rays, generator=generator, among=live)
         values, basis = torch.cat([depth / voxel, colour], 1), spherical_harmonics(drawn.directions)
         _, gradient = voxel_gradients(

@@ -164,16 +164,19 @@ def _carve_torch(
     missing = torch.full_like(kept, votes)
     last = points.new_tensor([tables.shape[2] - 1.5, tables.shape[1] - 1.5])
     for matrix, calibration, table in zip(matrices, calibrations, tables, strict=True):
+        # where the voxels that are left fall into the view, and the boxes around what their balls cover
         homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
         z = homogeneous[:, 2]
         front = z > _min_z(grid)
         pixels = homogeneous[:, :2] / torch.where(front, z, 1.0)[:, None]
         extent = ball_extent(pixels, z, calibration, grid.voxel * math.sqrt(3) / 2) + 0.5
+        # pixels of the mask in each box, from four entries of its summed table
         inside = front & ((pixels - extent >= -0.5) & (pixels + extent <= last)).all(1)
         low, high = pixels[inside] - extent[inside], pixels[inside] + extent[inside]
         (left, top), (right, bottom) = (low + 0.5).long().unbind(1), ((high + 0.5).long() + 1).unbind(1)
         right, bottom = right.clamp_max(table.shape[1] - 1), bottom.clamp_max(table.shape[0] - 1)
         count = table[bottom, right] - table[bottom, left] - table[top, right] + table[top, left]
+        # a box without any is a vote against the voxel
         missing[inside.nonzero()[count == 0, 0]] -= 1
         stays = missing > 0
         kept, points, missing = kept[stays], points[stays], missing[stays]

@@ -60,10 +60,12 @@ def look_at(
     if (distance <= 1e-7 * (eyes.norm(dim=-1, keepdim=True) + aim.norm())).any():
         raise ValueError(f"eyes: expected every eye away from the target {target}, got one at it")
     forward, upward = forward / distance, upward / length
+    # where a camera looks along `up`, another axis stands for it
     axis = int(upward.abs().argmax())
     other = torch.zeros_like(upward)
     other[(axis + 1) % 3] = upward[axis].sign()
     vertical = torch.linalg.cross(forward, upward.expand_as(eyes)).norm(dim=-1, keepdim=True) < 1e-6
+    # the rows of the rotation: right, down, forward
     right = torch.linalg.cross(forward, torch.where(vertical, other, upward))
     right = right / right.norm(dim=-1, keepdim=True)
     down = torch.linalg.cross(forward, right)

@@ -175,7 +175,7 @@ class VisibilityPlanes:
         matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
-        self._hidden = torch.zeros(len(images), dtype=torch.bool, device=images.device)
+        self._masked = torch.zeros(len(images), dtype=torch.bool, device=images.device)
 
     def __len__(self) -> int:
         return len(self.colours)
@@ -193,7 +193,7 @@ class VisibilityPlanes:
         """
         result = copy.copy(self)
         result.colours = self.colours.mask_views(views)
-        result._hidden = self._hidden.index_fill(0, views.to(self._hidden.device), True)
+        result._masked = self._masked.index_fill(0, views.to(self._masked.device), True)
         return result
 
     @property
@@ -257,7 +257,7 @@ class VisibilityPlanes:
 
     def _shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, and 0 where it is hidden."""
-        return torch.cat([self._cameras, (~self._hidden).to(self._cameras)[None]])
+        return torch.cat([self._cameras, (~self._masked).to(self._cameras)[None]])
 
     def _choose_compiled(
         self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
@@ -335,13 +335,15 @@ class VisibilityPlanes:
         self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
     ) -> Visibility:
         """As `choose`, in plain PyTorch."""
+        # depth and opacity of every view where the point falls: (point, view)
         planes = ImagePlanes(depth_opacity.permute(0, 3, 1, 2), self.colours.cameras, exact=True)
         found = planes.lookup(points, return_directions=True)
         assert found.directions is not None
         assert found.distances is not None
-        valid = found.valid & ~self._hidden
+        valid = found.valid & ~self._masked
         depth, coverage = found.colours.unbind(-1)
         coverage = torch.where(valid, coverage, 1.0)
+        # how far behind the surface, in radii, and what that and a broken mask cost
         behind = torch.where(valid, (found.distances - depth) / self.occupancy.bounds.radius, 0.0)
         penalty = (behind - self.tolerance).clamp(-DEEPEST, DEEPEST) + PARTLY * (coverage < WHOLE)
         penalty = torch.where(valid, penalty, UNSEEN)

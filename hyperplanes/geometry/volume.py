@@ -31,10 +31,12 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
         of these colours and the penalty of the best view brought nothing (docs/small.md).
     """
     occupancy = planes.occupancy
+    # which share of each cell is within the hull (x, y, z), and the centres of cells that have some
     share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.depth_opacity), SIDE)[0, 0]
     cells = (share > 0).nonzero()
     unit = (cells.to(share) + 0.5) * (2 / SIDE) - 1
     points = unit * occupancy.bounds.radius + unit.new_tensor(occupancy.bounds.centre)
+    # mean colour of the views that see a cell best (cell, 3), and how many show it, as a logarithm
     if planes.can_describe(points):
         rows = planes.describe(points, None, _READING, occupancy.bounds).rows
         mean, number = rows[:, _READING.row_size - 11 : _READING.row_size - 8], rows[:, -1]
@@ -45,6 +47,7 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
         colours = 2 * shown.gather(1, seen.views[..., None].expand(-1, -1, 3)) - 1
         mean = (seen.weights[..., None] * colours).sum(1)
         number = visibility.number.clamp_min(1).log()
+    # back into the grid
     x, y, z = cells.unbind(1)
     values = torch.cat([share[x, y, z][:, None], mean, number[:, None]], 1)
     volume = share.new_zeros(CHANNELS, SIDE, SIDE, SIDE)

@@ -69,6 +69,7 @@ class BatchNorm2d(nn.BatchNorm2d):
         if not self.training or not is_shared():
             return super().forward(input)
         axes = (0, 2, 3)
+        # mean and variance over the batches of all processes
         count = sum_over_processes(input.new_tensor(float(input.numel() // input.shape[1])))
         mean = sum_over_processes(input.sum(axes)) / count
         centred = input - mean[:, None, None]

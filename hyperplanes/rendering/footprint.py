@@ -34,11 +34,13 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
     if not len(points):
         return result
     for view, matrix in enumerate(matrices):
+        # centres of the voxels at the surface, in pixels of the view; everything where one is too near
         homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
         if float(homogeneous[:, 2].min()) < 2 * occupancy.voxel:
             result[view] = True
             continue
         pixels = homogeneous[:, :2] / homogeneous[:, 2:]
+        # half sizes of the boxes around what the voxels' balls cover; those that meet the image
         extent = ball_extent(pixels, homogeneous[:, 2], calibration[view], occupancy.voxel * math.sqrt(3) / 2)
         touching = ((pixels + extent >= 0) & (pixels - extent <= pixels.new_tensor([width - 1, height - 1]))).all(-1)
         if not touching.any():
@@ -47,6 +49,7 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
         if across > width or down > height:
             result[view] = True
             continue
+        # each centre's pixel, spread by the largest of these boxes
         padded = torch.zeros(height + 2 * down, width + 2 * across, device=points.device)
         column, row = pixels[touching].round().long().unbind(-1)
         padded[row + down, column + across] = 1.0

@@ -69,6 +69,7 @@ def render_images(
     needed = height * width * (BYTES_OF_VIEW + BYTES_KEPT * cameras.batch_size)
     require_memory("cameras", f"{cameras.batch_size} of {width}x{height}", needed, "render fewer or smaller pictures")
     pixels = pixel_grid(height, width, cameras.intrinsics.device)
+    # pixels whose rays may meet something; the others are background
     live = None if occupancy is None else footprint(occupancy, cameras).flatten(1)
     values = pixels.new_zeros(cameras.batch_size, height * width, 5)
     values[..., :3] = background

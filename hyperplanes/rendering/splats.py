@@ -150,6 +150,7 @@ def _backward(centres, shapes, opacities, colours, wrong, left, behind, by_opaci
                 alpha = min(LARGEST_ALPHA, opacities[splat] * shape)
                 if alpha < SMALLEST_ALPHA:
                     continue
+                # transmittance before the splat; what it adds to the loss, and what it hides
                 before = left[row, column] / (1.0 - alpha)
                 shown = 0.0
                 for channel in range(3):

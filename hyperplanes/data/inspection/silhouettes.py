@@ -67,6 +67,7 @@ def coarse_hull(masks: Float[Tensor, "view 1 height width"], cameras: PinholeCam
     """
     sphere = estimate_bounds(cameras)
     nothing = CoarseHull(masks.new_zeros(0, 3), None)
+    # cameras that look away from the sphere have no hull in it
     pose = camera.camera_from_world(cameras)
     ahead = pose[:, 2] @ pose.new_tensor([*sphere.centre, 1.0])
     if (ahead > 0).float().mean() < 0.5:
@@ -75,6 +76,7 @@ def coarse_hull(masks: Float[Tensor, "view 1 height width"], cameras: PinholeCam
     ends = cut_off(masks)
     cut = float(ends.float().mean()) > OFTEN_CUT
     sphere = Sphere(sphere.centre, ROOM * sphere.radius) if cut else sphere
+    # each time in the sphere around what the last hull was
     for _ in range(3 if cut else 2):
         grid = carve(masks, cameras, sphere, SIDE)
         points = grid.centres()

@@ -51,10 +51,12 @@ def place(s, pitch, total, x, y, z, cameras, shape, min_z):
     last_column, last_row = number(width - 1), number(height - 1)
     most_column, most_row = number(max(width - 2, 0)), number(max(height - 2, 0))
     for k in range(total):
+        # the ray from the camera's centre: its length, later its direction
         dx, dy, dz = x - read(cameras, 0, k), y - read(cameras, pitch, k), z - read(cameras, 2 * pitch, k)
         square = dx * dx + dy * dy + dz * dz
         distance = np.sqrt(square)
         reciprocal = one / max(distance, number(1e-30))
+        # projection by the view's 3 x 4 matrix
         m = 3 * pitch
         u = read(cameras, m, k) * x + read(cameras, m + pitch, k) * y
         u += read(cameras, m + 2 * pitch, k) * z + read(cameras, m + 3 * pitch, k)
@@ -67,6 +69,7 @@ def place(s, pitch, total, x, y, z, cameras, shape, min_z):
         front = camera_z > min_z
         per_z = one / (camera_z if front else one)
         u, v = u * per_z, v * per_z
+        # whether the pixel lies in the image; its upper left neighbour and the fractions beyond it
         shown = front & (u >= low) & (u <= right) & (v >= low) & (v <= bottom) & (read(cameras, 15 * pitch, k) > zero)
         u, v = (min(max(u, zero), last_column) if shown else zero), (min(max(v, zero), last_row) if shown else zero)
         column, row = np.int32(min(u, most_column)), np.int32(min(v, most_row))
@@ -93,12 +96,15 @@ def judge(s, pitch, total, maps, shape, limits):
         at, across, down = load_int(s, AT * pitch, k), load(s, ACROSS * pitch + k), load(s, DOWN * pitch + k)
         right, below = np.int32(at + across_next), np.int32(at + down_next)
         beyond = np.int32(below + across_next)
+        # depth of the surface there, bilinear
         a, b = read(maps, 0, at), read(maps, 0, below)
         a, b = a + across * (read(maps, 0, right) - a), b + across * (read(maps, 0, beyond) - b)
         depth = a + down * (b - a)
+        # opacity of the mask there, bilinear
         a, b = read(maps, 1, at), read(maps, 1, below)
         a, b = a + across * (read(maps, 1, right) - a), b + across * (read(maps, 1, beyond) - b)
         opacity = a + down * (b - a)
+        # how far behind the surface the point lies, in radii, and what that costs
         shown = load(s, SHOWN * pitch + k) > zero
         behind = (load(s, DISTANCE * pitch + k) - depth) * per_unit
         penalty = min(max(behind - tolerance, -deepest), deepest) + (partly if opacity < whole else zero)
@@ -165,15 +171,19 @@ def choose(
     s, scores = np.empty(ROWS * pitch, limits.dtype), np.empty(max(best_count, near_count), limits.dtype)
     for point in range(start, stop):
         at = 3 * point
+        # what each view shows of the point
         place(s, pitch, total, points[at], points[at + 1], points[at + 2], cameras, shape, limits[0])
         judge(s, pitch, total, maps, shape, limits)
+        # over all views: least opacity, and how many show it
         covered, seen = number(1), number(0)
         for k in range(total):
             covered = min(covered, load(s, OPACITY * pitch + k))
             seen += load(s, SHOWN * pitch + k)
         overall[2 * point], overall[2 * point + 1] = covered, seen
+        # the views that see it best
         least(s, pitch, total, PENALTY, best_count, best, scores, point * best_count)
         _keep(s, pitch, best_count, best, best_values, point * best_count)
+        # those whose rays are closest to its direction
         if near_count:
             rank(s, pitch, total, directions[at], directions[at + 1], directions[at + 2], limits[7])
             least(s, pitch, total, SCORE, near_count, near, scores, point * near_count)
