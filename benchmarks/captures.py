@@ -31,8 +31,8 @@ from hyperplanes.data import read_task
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.pictures.images import read_image
 from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import write_json, write_whole
 from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.writing import write_json, write_whole
 
 __all__ = ["PoseErrors", "compare_poses", "main"]
 

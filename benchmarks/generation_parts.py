@@ -83,7 +83,7 @@ def stages(objects: int, out: Path) -> dict[str, float]:
     from data_gen.rigs import fixed
     from data_gen.shapes import make
     from hyperplanes.utilities.encoding import sha256
-    from hyperplanes.utilities.files import write_folder
+    from hyperplanes.utilities.writing import write_folder
 
     rig = fixed(VIEWS, RESOLUTION)
     spent = dict.fromkeys(("mesh", "one sample a pixel drawn", "nine samples a pixel drawn", "png", "written"), 0.0)

@@ -44,8 +44,8 @@ from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.episodes.augmentation import Rotation
 from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import write_whole
 from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Task, Tasks, Views
 
 __all__ = ["METHODS", "PARTS", "adapters", "main"]

@@ -14,7 +14,8 @@ import numpy as np
 from data_gen.datasets.contact_sheet import contact_sheet
 from data_gen.datasets.manifest import Verification, verify
 from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import read_json, write_whole
+from hyperplanes.utilities.files import read_json
+from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["Inspection", "inspect"]
 

@@ -16,7 +16,8 @@ from typing import Any
 
 from data_gen.datasets.sources import Item
 from hyperplanes.utilities.encoding import encode_json, sha256
-from hyperplanes.utilities.files import DataError, inside, malformed, one_writer, read_bytes, read_json, write_whole
+from hyperplanes.utilities.files import DataError, inside, malformed, read_bytes, read_json
+from hyperplanes.utilities.writing import one_writer, write_whole
 
 __all__ = ["FORMAT", "MANIFEST", "GenerationState", "Verification", "build_manifest", "verify"]
 

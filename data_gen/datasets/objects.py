@@ -13,7 +13,7 @@ from data_gen.datasets.config import RenderConfig
 from data_gen.datasets.layouts import LAYOUTS, RenderedObject
 from data_gen.datasets.sources import Item
 from hyperplanes.utilities.encoding import encode_json, sha256
-from hyperplanes.utilities.files import write_folder, write_whole
+from hyperplanes.utilities.writing import write_folder, write_whole
 
 __all__ = ["open_renderer"]
 

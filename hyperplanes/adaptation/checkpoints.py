@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from hyperplanes.adaptation.hub import download_checkpoint, is_repository
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
-from hyperplanes.utilities.files import write_json
+from hyperplanes.utilities.writing import write_json
 
 __all__ = [
     "checkpoint_folder",

@@ -28,7 +28,8 @@ from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import Pixels, read_image
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import DataError, write_whole
+from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["Captured", "Progress", "Settings", "capture"]
 

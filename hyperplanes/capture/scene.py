@@ -13,7 +13,7 @@ from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.pictures.images import Pixels
 from hyperplanes.data.pictures.undistort import undistort
-from hyperplanes.utilities.files import write_json, write_whole
+from hyperplanes.utilities.writing import write_json, write_whole
 
 __all__ = ["Captured", "encode_points", "straightened", "write_scene"]
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hyperplanes.utilities.encoding import sha256
-from hyperplanes.utilities.files import DataError, read_json, write_json
+from hyperplanes.utilities.files import DataError, read_json
+from hyperplanes.utilities.writing import write_json
 
 __all__ = ["Stages", "fingerprint"]
 

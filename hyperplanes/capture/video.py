@@ -11,7 +11,8 @@ from PIL import Image
 from scipy import ndimage
 
 from hyperplanes.capture.packages import require
-from hyperplanes.utilities.files import DataError, write_whole
+from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["VIDEO_SUFFIXES", "sharpness", "take_frames"]
 

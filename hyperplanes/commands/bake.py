@@ -63,8 +63,8 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.utilities.errors import prefix_errors
-    from hyperplanes.utilities.files import write_whole
     from hyperplanes.utilities.metrics import psnr
+    from hyperplanes.utilities.writing import write_whole
 
     if arguments.out.is_dir():
         raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")

@@ -249,7 +249,7 @@ def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Compar
     """Every file but the grid of pictures."""
     from hyperplanes.evaluation import figures, tables
     from hyperplanes.methods import at_steps
-    from hyperplanes.utilities.files import write_json, write_whole
+    from hyperplanes.utilities.writing import write_json, write_whole
 
     if arguments.json is not None:
         write_json(arguments.json, tables.as_json(scores, pairs))

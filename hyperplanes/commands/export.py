@@ -161,7 +161,9 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
 
 def _write_mesh(solid: AdaptedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:
     """The mesh, with a line on how it agrees with the field's pictures, and a warning where it does not."""
-    from hyperplanes.export.mesh import agreement, choose_level, density_grid, extract_mesh, fill_hidden, save_mesh
+    from hyperplanes.export.mesh import density_grid, extract_mesh, save_mesh
+    from hyperplanes.export.mesh_filling import fill_hidden
+    from hyperplanes.export.mesh_level import agreement, choose_level
     from hyperplanes.export.texture import save_textured, texture_surface
 
     density, level = density_grid(solid, arguments.voxels), arguments.level

@@ -102,7 +102,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.images import encode_animation
     from hyperplanes.export.outputs import output_frames, save_outputs
-    from hyperplanes.utilities.files import write_whole
+    from hyperplanes.utilities.writing import write_whole
 
     _check(arguments)
     console, device = Console(), choose_device(arguments.device)

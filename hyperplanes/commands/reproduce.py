@@ -93,9 +93,9 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
     from hyperplanes.experiments.estimate import estimate
     from hyperplanes.experiments.figures import curves_of, figure_of, pictures_of
-    from hyperplanes.utilities.files import write_json, write_whole
     from hyperplanes.utilities.formatting import format_duration
     from hyperplanes.utilities.plots import save_figure
+    from hyperplanes.utilities.writing import write_json, write_whole
 
     console = Console()
     scale = SCALES[arguments.scale]

@@ -74,7 +74,7 @@ def writes_to(
     A folder that was not there before and that a failure leaves empty is removed again.
 
     Args:
-        folder: from a verb's arguments the folder that it writes into, as in `files.one_writer`.
+        folder: from a verb's arguments the folder that it writes into, as in `utilities.writing.one_writer`.
         when: whether this process writes there at all; of the processes of one training, the first one alone does.
         check: what raises where the folder may not be written into, before it is made.
 
@@ -85,7 +85,7 @@ def writes_to(
     def decorate(run: Callable[[Any], int]) -> Callable[[Any], int]:
         @wraps(run)
         def locked(arguments: Any) -> int:
-            from hyperplanes.utilities.files import one_writer
+            from hyperplanes.utilities.writing import one_writer
 
             check(arguments)
             if not when(arguments):

@@ -29,7 +29,7 @@ from hyperplanes.export.images import save_images
 from hyperplanes.methods import WithSampler, make_method
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import encode_json
-from hyperplanes.utilities.files import write_json
+from hyperplanes.utilities.writing import write_json
 from hyperplanes.views import Task, Tasks
 
 __all__ = ["Curve", "OnScore", "Outcome", "Runner", "curve_of", "file_name"]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
-from hyperplanes.utilities.files import write_json
+from hyperplanes.utilities.writing import write_json
 
 __all__ = ["Record", "plain"]
 

@@ -19,7 +19,8 @@ from hyperplanes.adaptation.base import Renderable
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import format_of, write_whole
+from hyperplanes.utilities.files import format_of
+from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
 __all__ = [

@@ -13,7 +13,7 @@ from hyperplanes.export.images import picture_paths, to_pixels
 from hyperplanes.rendering.depth import seen_surface
 from hyperplanes.rendering.images import Pictures
 from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import write_json, write_whole
+from hyperplanes.utilities.writing import write_json, write_whole
 
 __all__ = ["OUTPUTS", "depth_pixels", "output_frames", "save_outputs"]
 

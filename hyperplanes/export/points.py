@@ -16,7 +16,8 @@ from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering.depth import seen_surface
 from hyperplanes.rendering.images import Pictures
 from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.files import format_of, write_whole
+from hyperplanes.utilities.files import format_of
+from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["POINTS", "PointCloud", "point_cloud", "save_points"]
 

@@ -20,7 +20,8 @@ from hyperplanes.fields.baked import HARMONICS, BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.splats import render_splats, splat_gradients
 from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.files import format_of, write_whole
+from hyperplanes.utilities.files import format_of
+from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
 __all__ = ["SPLAT_FORMATS", "Splats", "fit_splats", "save_splats", "splats_of"]

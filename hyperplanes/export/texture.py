@@ -19,7 +19,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.mesh import Surface
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
-from hyperplanes.utilities.files import write_whole
+from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes import EpisodeLoader
 from hyperplanes.training.optimisation import Optimisation
 from hyperplanes.training.state import Curve, check_model, check_whole, load_state, save_state
-from hyperplanes.utilities.files import write_json
+from hyperplanes.utilities.writing import write_json
 
 __all__ = ["Checkpointing"]
 

@@ -17,8 +17,8 @@ from torch import Tensor
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.export.images import to_pixels
-from hyperplanes.utilities.files import write_whole
 from hyperplanes.utilities.metrics import ssim
+from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["Progress", "Samples", "Speed", "TensorBoard", "gradient_norms", "write_curve"]
 

@@ -16,7 +16,7 @@ from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.training.trainer import Trainer
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import sha256
-from hyperplanes.utilities.files import write_json
+from hyperplanes.utilities.writing import write_json
 from hyperplanes.views import Tasks
 
 __all__ = ["start_training"]

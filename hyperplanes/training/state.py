@@ -24,8 +24,9 @@ from hyperplanes.adaptation.optimisers import Muon
 from hyperplanes.configuration.upgrade import upgrade_training
 from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
 from hyperplanes.utilities.encoding import encode_json
-from hyperplanes.utilities.files import DataError, malformed, write_json
+from hyperplanes.utilities.files import DataError, malformed
 from hyperplanes.utilities.settings import SettingsError
+from hyperplanes.utilities.writing import write_json
 
 __all__ = ["Curve", "check_model", "check_whole", "load_state", "save_state"]
 

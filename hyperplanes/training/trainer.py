@@ -25,7 +25,7 @@ from hyperplanes.training.validation import Validation, Validator
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.errors import prefix_errors
-from hyperplanes.utilities.files import write_whole
+from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Tasks
 
 __all__ = ["Trainer", "train"]

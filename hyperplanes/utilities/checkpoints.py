@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hyperplanes.utilities import files
+from hyperplanes.utilities import files, writing
 
 __all__ = [
     "CheckpointError",
@@ -63,7 +63,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
             f"{path}: expected finite numbers to save, found NaN or infinity in {name}; nothing was written and what "
             "was saved before stays; train with lower rates"
         )
-    files.write_whole(path, save(content, {CHECKSUM: _checksum(content)}))
+    writing.write_whole(path, save(content, {CHECKSUM: _checksum(content)}))
 
 
 def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:

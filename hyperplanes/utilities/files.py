@@ -1,48 +1,31 @@
-"""Reading and writing whole files: only regular ones, checked JSON, safe paths, atomic writes, one writer a folder."""
+"""Reading whole files: only regular ones, checked JSON, safe paths, and what is said of those that are malformed."""
 
 from __future__ import annotations
 
-import errno
-import itertools
 import json
-import math
 import os
-import re
-import shutil
 import stat
 import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Collection, Generator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Generator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hyperplanes.utilities.encoding import encode_json
-
 __all__ = [
     "DataError",
-    "WriteError",
     "check_link",
     "check_regular",
     "format_of",
     "inside",
     "list_files",
     "malformed",
-    "one_writer",
     "read_bytes",
     "read_json",
     "read_text",
-    "write_folder",
-    "write_json",
-    "write_whole",
 ]
-
-_unfinished = itertools.count()
-
-UNFINISHED = re.compile(r"\..+\.(\d+)-\d+\.part")
-"""Names of files that are being written, with the number of the process."""
 
 LARGEST_JSON = 256 * 2**20
 """Bytes above which a JSON file is refused unread."""
@@ -73,22 +56,6 @@ class DataError(ValueError):
     def __init__(self, where: str | Path, expected: str = "", found: str = "", remedy: str = "") -> None:
         text = f"{where}: expected {expected}, found {found}; {remedy}" if expected else str(where)
         super().__init__(" ".join(text.split()))
-
-
-class WriteError(DataError, OSError):
-    """A file that cannot be written: no space, no permission, or another failure of the operating system.
-
-    Args:
-        path: the file.
-        size: of its content in bytes.
-        error: what the operating system said.
-    """
-
-    def __init__(self, path: Path, size: int, error: OSError) -> None:
-        found, remedy = error.strerror or str(error), "check the folder and its permissions"
-        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
-            found, remedy = f"a full disk ({found})", "free some and run the same command again"
-        super().__init__(path, f"room to write {size} bytes", found, remedy)
 
 
 @contextmanager
@@ -265,165 +232,3 @@ def format_of(path: str | Path, formats: Sequence[str]) -> str:
     if kind not in formats:
         raise ValueError(f"{path}: expected a name that ends in {', '.join(formats)}, got {kind!r}")
     return kind
-
-
-def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None, *, durable: bool = True) -> None:
-    """Write a file so that nobody ever sees half of it: beside its name first, then renamed.
-
-    Args:
-        path: the file; its folder is made when absent.
-        data: all of it.
-        scratch: where the unfinished file lies instead, a folder of the same file system.
-        durable: wait until it is on the disk, so that it is whole even after a power failure.
-
-    Raises:
-        WriteError: no space, no permission, or another failure of the operating system.
-    """
-    path = Path(path)
-    temporary = None
-    try:
-        if scratch is None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        name = _unfinished_beside(path, scratch)
-        with open(name, "wb") as file:
-            temporary = name
-            file.write(data)
-            if durable:
-                file.flush()
-                os.fsync(file.fileno())
-        try:
-            os.replace(temporary, path)
-        except FileNotFoundError:  # looking for the folder every time would cost as much as the file
-            path.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(temporary, path)
-        if durable:
-            _sync_folder(path.parent)
-    except OSError as error:
-        raise WriteError(path, len(data), error) from error
-    finally:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Have a rename on the disk too; file systems that cannot open folders do it by themselves."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-@contextmanager
-def one_writer(folder: str | Path) -> Generator[None]:
-    """The time in which nobody else may write into a folder, which is made when absent.
-
-    The lock belongs to the process: it ends with it, however it ends. A file `.lock` stands in the folder meanwhile.
-
-    Args:
-        folder: to write into.
-
-    Raises:
-        DataError: another process at work there, a file in its place, or a folder that cannot be written to.
-    """
-    import fcntl
-
-    folder = Path(folder)
-    path = folder / ".lock"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        while True:
-            lock = open(path, "w")
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if path.exists() and os.path.samestat(os.fstat(lock.fileno()), os.stat(path)):
-                    break
-            except BaseException:
-                lock.close()
-                raise
-            lock.close()  # of a writer that has just finished and taken its file away
-    except BlockingIOError as error:
-        remedy = "wait for it, or name another folder"
-        raise DataError(folder, "a folder of its own", "another hyperplanes at work there", remedy) from error
-    except (FileExistsError, NotADirectoryError) as error:
-        raise DataError(folder, "a folder to write into", "a file", "name another one") from error
-    except OSError as error:
-        found = error.strerror or str(error)
-        raise DataError(folder, "a folder to write into", found, "name another one") from error
-    try:
-        _delete_unfinished(folder)
-        yield
-    finally:
-        with suppress(OSError):
-            path.unlink()
-        lock.close()
-
-
-def _delete_unfinished(folder: Path) -> None:
-    """Delete what killed processes have left half written in a folder, and in those in it that nobody has locked."""
-    for place in (folder, *(child for child in folder.iterdir() if child.is_dir() and not child.is_symlink())):
-        if place != folder and (place / ".lock").exists():
-            continue
-        for path in place.glob(".*.part"):
-            owner = UNFINISHED.fullmatch(path.name)
-            if owner is not None and not _is_running(int(owner[1])):
-                with suppress(OSError):
-                    shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        return True
-    return True
-
-
-def write_json(path: str | Path, value: object) -> None:
-    """Write a JSON file, whole or not at all; infinity and what is not a number, which JSON has not, become null."""
-    write_whole(path, encode_json(_finite(value)))
-
-
-def _finite(value: object) -> object:
-    if isinstance(value, Mapping):
-        return {name: _finite(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def write_folder(folder: str | Path, files: dict[str, bytes], scratch: str | Path) -> None:
-    """Write a folder of files so that nobody ever sees half of it; a rename a file takes twice as long as writing it.
-
-    Args:
-        folder: the folder; where it exists already, its files are replaced one by one.
-        files: content by name inside the folder.
-        scratch: a folder of the same file system, where it lies until it is whole.
-
-    Raises:
-        WriteError: no space, no permission, or another failure of the operating system.
-    """
-    folder = Path(folder)
-    temporary = _unfinished_beside(folder, scratch)
-    try:
-        for parent in {os.path.dirname(name) for name in files}:
-            os.makedirs(os.path.join(temporary, parent), exist_ok=True)
-        for name, data in files.items():
-            with open(os.path.join(temporary, name), "wb") as file:
-                file.write(data)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        os.rename(temporary, folder)
-    except OSError as error:
-        if error.errno not in {errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR}:
-            raise WriteError(folder, sum(map(len, files.values())), error) from error
-        for name, data in files.items():
-            write_whole(folder / name, data, scratch, durable=False)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _unfinished_beside(path: Path, scratch: str | Path | None) -> str:
-    return os.path.join(scratch or path.parent, f".{path.name}.{os.getpid()}-{next(_unfinished)}.part")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.utilities.files import write_whole
+from hyperplanes.utilities.writing import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

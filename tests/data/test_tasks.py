@@ -15,7 +15,8 @@ from hyperplanes.data import DataError, Dataset, open_dataset
 from hyperplanes.data.dataset import open_datasets
 from hyperplanes.data.formats.catalogue import FORMAT
 from hyperplanes.utilities.encoding import encode_npz, encode_png
-from hyperplanes.utilities.files import read_json, write_folder, write_whole
+from hyperplanes.utilities.files import read_json
+from hyperplanes.utilities.writing import write_folder, write_whole
 
 
 @pytest.fixture
@@ -121,6 +122,6 @@ def test_a_huge_json_is_refused_unread(tmp_path):
 
 def test_writing_needs_no_torch():
     """Property: workers of the generator start without torch, in a third of the time and of the memory."""
-    modules = "hyperplanes.utilities.files, hyperplanes.data.formats.transforms_document"
+    modules = "hyperplanes.utilities.writing, hyperplanes.data.formats.transforms_document"
     code = f"import {modules}, sys; print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

@@ -11,16 +11,9 @@ from PIL import Image
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.images import encode_animation, orbit_cameras, save_images, save_turntable, to_pixels, upward
-from hyperplanes.export.mesh import (
-    Agreement,
-    Surface,
-    agreement,
-    choose_level,
-    density_grid,
-    extract_mesh,
-    fill_hidden,
-    save_mesh,
-)
+from hyperplanes.export.mesh import Surface, density_grid, extract_mesh, save_mesh
+from hyperplanes.export.mesh_filling import fill_hidden
+from hyperplanes.export.mesh_level import Agreement, agreement, choose_level
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere

@@ -23,7 +23,7 @@ from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import Sphere, cameras
 from hyperplanes.training.state import load_state, save_state
 from hyperplanes.utilities.encoding import encode_json, sha256
-from hyperplanes.utilities.files import write_json
+from hyperplanes.utilities.writing import write_json
 from tests.fuzz.published import Published
 
 VIEWS, HEIGHT, WIDTH = 4, 10, 12

@@ -21,7 +21,7 @@ from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.training import Trainer, TrainingConfig, train
 from hyperplanes.training.monitoring import TensorBoard
-from hyperplanes.utilities import checkpoints, files
+from hyperplanes.utilities import checkpoints, writing
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.interrupts import HungUp, Terminated
 from hyperplanes.utilities.metrics import psnr
@@ -353,7 +353,7 @@ def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, 
         states[step] = state_of(trainer.model)
         if step == 1:
             trainer.save()
-    write, found = files.write_whole, []
+    write, found = writing.write_whole, []
     for survived in range(5):
         left = iter(range(survived))
 
@@ -363,7 +363,7 @@ def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, 
             write(path, content)
 
         with monkeypatch.context() as patch:
-            patch.setattr(files, "write_whole", write_some)
+            patch.setattr(writing, "write_whole", write_some)
             if survived < 4:
                 with pytest.raises(Killed):
                     trainer.save()

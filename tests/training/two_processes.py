@@ -22,7 +22,7 @@ from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.utilities.checkpoints import save_tensors
-from hyperplanes.utilities.files import write_json
+from hyperplanes.utilities.writing import write_json
 from tests.reference_rendering import Balls, awaken, small_model
 
 CONFIG = TrainingConfig(

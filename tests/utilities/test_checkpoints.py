@@ -15,7 +15,7 @@ from hyperplanes.utilities.checkpoints import (
     read_json,
     save_tensors,
 )
-from hyperplanes.utilities.files import write_json, write_whole
+from hyperplanes.utilities.writing import write_json, write_whole
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "count": torch.tensor(7), "b": torch.ones(3, 2).T}
 

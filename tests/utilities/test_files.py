@@ -16,7 +16,8 @@ from hyperplanes.data import open_dataset
 from hyperplanes.data.formats.npz import read_npz
 from hyperplanes.data.pictures.images import read_image
 from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors
-from hyperplanes.utilities.files import DataError, inside, malformed, one_writer, read_bytes, read_json
+from hyperplanes.utilities.files import DataError, inside, malformed, read_bytes, read_json
+from hyperplanes.utilities.writing import one_writer
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -29,8 +29,8 @@ from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.environment import environment
-from hyperplanes.utilities.files import write_json, write_whole
 from hyperplanes.utilities.formatting import format_duration
+from hyperplanes.utilities.writing import write_json, write_whole
 from hyperplanes.views import Task
 
 __all__ = ["describe_count", "overview", "write_first_page", "write_report"]

@@ -13,7 +13,7 @@ from hyperplanes.experiments.demonstration.settings import MODELS, TUNED, DemoSe
 from hyperplanes.experiments.engine import OnScore, Runner
 from hyperplanes.experiments.experiment import Cell
 from hyperplanes.methods import at_steps
-from hyperplanes.utilities.files import write_json
+from hyperplanes.utilities.writing import write_json
 
 __all__ = ["Demonstration"]
 

@@ -1,4 +1,4 @@
-"""The CPU kernel of `visibility.first_hits`: every ray steps through the grid until a voxel is occupied."""
+"""The CPU kernel of `geometry.first_hits`: every ray steps through the grid until a voxel is occupied."""
 
 from __future__ import annotations
 

@@ -1,0 +1,139 @@
+"""Where the cameras of a rig stand: fixed places, random ones, a circle, a spiral."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from data_gen.rigs.rig import DEFAULT_DISTANCE, Array, Rig, aimed
+
+__all__ = ["fixed", "orbit", "random", "spiral"]
+
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+_SPIRAL_ANGLE = 20.0  # radians about the vertical axis from the horizon to the pole, as SRN's renderer has it
+
+
+def fixed(
+    views: int = 50,
+    resolution: int | tuple[int, int] = 128,
+    *,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+    lowest: float = -20.0,
+    highest: float = 80.0,
+) -> Rig:
+    """The same well spread poses for every object.
+
+    Views with an even index (support) and with an odd index (query) are each a spherical Fibonacci spread over the band
+    of elevations, and their union is well spread too: the second spread stands half a step higher and is turned into
+    the gaps of the first. Within each half, views come in farthest-first order, so the first few are well spread as
+    well. Of 50 views, no two are nearer than 15.6 degrees, and no two of a half nearer than 29 degrees.
+
+    Elevations are from `lowest` to `highest` degrees; the other arguments are those of `make_rig`.
+    """
+    _check_views(views)
+    bottom, top = _height_band(lowest, highest)
+    directions = np.empty((views, 3))
+    for first in (0, 1):
+        count = len(range(first, views, 2))
+        if count:  # a golden spiral, uniform in area between the two heights
+            heights = bottom + (top - bottom) * (np.arange(count) + 0.25 + 0.5 * first) / count
+            azimuths = first * _GOLDEN_ANGLE / 2.0 + _GOLDEN_ANGLE * np.arange(count, dtype=np.float64)
+            spread = _directions(heights, azimuths)
+            directions[first::2] = spread[_farthest_first(spread)]
+    return aimed(directions, resolution, distance, field_of_view)
+
+
+def random(
+    views: int = 50,
+    resolution: int | tuple[int, int] = 128,
+    *,
+    seed: int,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+    lowest: float = -90.0,
+    highest: float = 90.0,
+) -> Rig:
+    """Cameras at random, uniformly in area over a band of elevations: the whole sphere, or the upper half of it.
+
+    Elevations are from `lowest` (0 for the upper hemisphere) to `highest` degrees; the other arguments are those of
+    `make_rig`.
+    """
+    _check_views(views)
+    generator = np.random.default_rng(seed)
+    heights = generator.uniform(*_height_band(lowest, highest), views)
+    azimuths = generator.uniform(0.0, 2.0 * math.pi, views)
+    return aimed(_directions(heights, azimuths), resolution, distance, field_of_view)
+
+
+def orbit(
+    views: int = 60,
+    resolution: int | tuple[int, int] = 128,
+    *,
+    elevation: float = 20.0,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+) -> Rig:
+    """Cameras evenly around the object at one height: a turntable.
+
+    The first is in the direction of +z, all are `elevation` degrees over the horizon; the other arguments are those of
+    `make_rig`.
+
+    Raises:
+        ValueError: if the number of views, elevation, distance or resolution make no sense.
+    """
+    _check_views(views)
+    if not -90.0 <= elevation <= 90.0:
+        raise ValueError(f"elevation: expected -90 to 90 degrees, received {elevation}")
+    azimuths = 2.0 * math.pi * np.arange(views) / views
+    heights = np.full(views, math.sin(math.radians(elevation)))
+    return aimed(_directions(heights, azimuths), resolution, distance, field_of_view)
+
+
+def spiral(
+    views: int = 251,
+    resolution: int | tuple[int, int] = 128,
+    *,
+    distance: float = DEFAULT_DISTANCE,
+    field_of_view: float | None = None,
+) -> Rig:
+    """Cameras on an Archimedean spiral over the upper hemisphere, from the horizon to the pole.
+
+    Elevations grow by equal steps, 90 degrees in all, while the azimuth turns by 20 radians, as in the renderings of
+    SRN's test objects (Sitzmann et al. 2019); the arguments are those of `make_rig`.
+    """
+    _check_views(views)
+    steps = np.arange(views) / max(views - 1, 1)
+    return aimed(
+        _directions(np.sin(0.5 * math.pi * steps), -_SPIRAL_ANGLE * steps), resolution, distance, field_of_view
+    )
+
+
+def _check_views(views: int) -> None:
+    if views < 1:
+        raise ValueError(f"views: expected at least 1, received {views}")
+
+
+def _directions(heights: Array, azimuths: Array) -> Array:
+    """Unit vectors (view, 3) from y coordinates and angles about y that start at +z and turn towards +x."""
+    across = np.sqrt(np.clip(1.0 - heights**2, 0.0, None))
+    return np.stack((across * np.sin(azimuths), heights, across * np.cos(azimuths)), axis=-1)
+
+
+def _height_band(lowest: float, highest: float) -> tuple[float, float]:
+    """The y coordinates on the unit sphere of two elevations in degrees."""
+    if not -90.0 <= lowest < highest <= 90.0:
+        raise ValueError(f"lowest, highest: expected -90 <= lowest < highest <= 90, received {lowest} and {highest}")
+    return math.sin(math.radians(lowest)), math.sin(math.radians(highest))
+
+
+def _farthest_first(directions: Array) -> list[int]:
+    """An order in which each direction is the one farthest from all before it; the first stays first."""
+    order = [0]
+    nearness = directions @ directions[0]
+    while len(order) < len(directions):
+        following = int(np.argmin(np.where(np.isin(np.arange(len(directions)), order), np.inf, nearness.round(9))))
+        order.append(following)
+        nearness = np.maximum(nearness, directions @ directions[following])
+    return order
