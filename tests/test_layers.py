@@ -27,7 +27,7 @@ LAYERS = {
     "hyperplanes.experiments": 4.5,
     "hyperplanes.adaptation": 3,
     "hyperplanes.data": 3,
-    "hyperplanes.export": 3,
+    "hyperplanes.export": 3.2,
     "hyperplanes.fields": 2,
     "hyperplanes.rendering": 2,
     "hyperplanes.views": 2,
