@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.inputs import ArrayLike
