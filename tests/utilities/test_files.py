@@ -112,10 +112,11 @@ def test_every_verb_that_writes_locks_its_folder_and_names_a_file_in_its_place(t
 
 
 def test_a_lock_ends_with_its_process(tmp_path):
-    code = f"import os; from hyperplanes.utilities.writing import one_writer\nwith one_writer({str(tmp_path)!r}): os.abort()"
-    assert (
-        subprocess.run([sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL).returncode == -signal.SIGABRT
+    code = (
+        f"import os; from hyperplanes.utilities import writing\nwith writing.one_writer({str(tmp_path)!r}): os.abort()"
     )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL)
+    assert done.returncode == -signal.SIGABRT
     assert (tmp_path / ".lock").exists()
     with one_writer(tmp_path):
         pass
