@@ -38,7 +38,6 @@ UNSTANDARDISED = {"code_normalisation": "none", "centre": False}
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "none": ("no hypernetwork", NONE),
     "low_rank": ("the preset: low-rank update of every layer, codes and outputs standardised over objects", {}),
-    "scaling": ("rows scaled and biases shifted, without the low-rank product", {"update": "scaling"}),
     "uncentred": ("outputs not standardised: the update may have a part that all objects share", {"centre": False}),
     "mean": ("codes of the views averaged, not concatenated", {"join": "mean"}),
     "relu": ("ReLU, not SiLU, in the head", {"activation": "relu"}),

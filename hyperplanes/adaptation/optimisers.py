@@ -13,10 +13,11 @@ __all__ = ["OPTIMISERS", "Muon", "make_optimisers", "orthogonalise"]
 OPTIMISERS = ("adam", "muon", "sgd")
 
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of the quintic Newton-Schulz iteration of Jordan et al. 2024
+ITERATIONS = 5
 NARROWEST = 16  # matrices with fewer rows or columns, such as the heads of colour and density, are left to Adam
 
 
-def orthogonalise(matrix: Float[Tensor, "row column"], steps: int = 5) -> Float[Tensor, "row column"]:
+def orthogonalise(matrix: Float[Tensor, "row column"]) -> Float[Tensor, "row column"]:
     """An approximation of U V^T, where U S V^T is the singular value decomposition of the matrix.
 
     Quintic Newton-Schulz iterations (Jordan et al. 2024, "Muon"); the singular values of the result lie between about
@@ -24,13 +25,12 @@ def orthogonalise(matrix: Float[Tensor, "row column"], steps: int = 5) -> Float[
 
     Args:
         matrix: of any scale.
-        steps: iterations.
     """
     a, b, c = COEFFICIENTS
     tall = matrix.shape[0] > matrix.shape[1]
     value = matrix.mT if tall else matrix
     value = value / value.norm().clamp_min(1e-7)
-    for _ in range(steps):
+    for _ in range(ITERATIONS):
         gram = value @ value.mT
         value = torch.addmm(value, torch.addmm(gram, gram, gram, beta=b, alpha=c), value, beta=a)
     return value.mT if tall else value

@@ -73,11 +73,11 @@ def compare(first: Score, second: Score, quantity: str = "psnr") -> Comparison:
     return Comparison(first.method, second.method, quantity, differences, fmean(differences.values()), low, high, p)
 
 
-def compare_all(scores: Sequence[Score], quantity: str = "psnr") -> list[Comparison]:
-    """Every pair of methods that have the quantity for every object, the better one first, largest difference first."""
-    whole = [s for s in scores if quantity in s.quantities and math.isfinite(s.mean(quantity))]
-    ordered = sorted(whole, key=lambda score: -score.mean(quantity))
-    pairs = [compare(first, second, quantity) for first, second in combinations(ordered, 2)]
+def compare_all(scores: Sequence[Score]) -> list[Comparison]:
+    """Every pair of methods whose PSNR is finite on every object, the better one first, largest difference first."""
+    whole = [score for score in scores if math.isfinite(score.mean("psnr"))]
+    ordered = sorted(whole, key=lambda score: -score.mean("psnr"))
+    pairs = [compare(first, second) for first, second in combinations(ordered, 2)]
     return sorted(pairs, key=lambda pair: -pair.mean)
 
 

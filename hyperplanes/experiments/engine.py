@@ -275,10 +275,10 @@ class Runner:
         """The folder of the query views of an object, as a cell shows them, where they are kept."""
         return self.out / "pictures" / cell.column / file_name(cell.row) / name
 
-    def picture(self, experiment: Experiment, cell: Cell, seed: int = 0) -> tuple[Tensor, Tensor]:
+    def picture(self, experiment: Experiment, cell: Cell) -> tuple[Tensor, Tensor]:
         """The first query view of the first object of a cell: the truth, and what the method shows; (3, h, w)."""
-        checkpoint = self.checkpoint(experiment, cell.trained, seed)
-        adapter, tasks = self._method(experiment, cell, self.scale.method(cell.method), checkpoint, seed)
+        checkpoint = self.checkpoint(experiment, cell.trained, 0)
+        adapter, tasks = self._method(experiment, cell, self.scale.method(cell.method), checkpoint, 0)
         task = tasks.task(self.names(cell.on, cell.split, experiment.objects)[0])
         query = task.query[:1]
         return query.images[0], adapter.adapt(task.support).render(query.cameras).images[0].clamp(0, 1)

@@ -29,6 +29,7 @@ LARGEST = 8_000_000
 BITS = ((8, 8, 8), (8, 7, 6), (8, 6, 5), (8, 6, 4), (7, 5, 3), (7, 5, 0))
 """Of the mean colour, the first and the second order; 0 leaves an order out. Tried in turn until the page is small."""
 
+STEPS = 192  # of rays, along a diameter of the scene's sphere, as of `BakedScene`
 OWN = 8.0  # how much a voxel's own colour counts, and each neighbour's 1, when colours are prepared for the page
 CLAMP = 1e-3  # of the values of a coefficient that may lie beyond its range, at either end
 STYLE = """<style>
@@ -57,13 +58,12 @@ body > p {{ position: fixed; left: 1em; bottom: 0; pointer-events: none; }}
 """
 
 
-def page_of(baked: BakedField, views: Views, *, steps: int = 192, picture: bytes = b"", largest: int = LARGEST) -> str:
+def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: int = LARGEST) -> str:
     """A part of an HTML page that draws baked voxels by WebGL2; any number of them may stand in one page.
 
     Args:
         baked: what is shown.
         views: whose up, distance and lens the viewer begins with.
-        steps: samples along a diameter of the scene's sphere, as of `BakedScene`.
         picture: a WebP file, animated or not, that stands there until the voxels are shown, and where they cannot be.
         largest: bytes of the voxels in the page.
 
@@ -89,7 +89,7 @@ def page_of(baked: BakedField, views: Views, *, steps: int = 192, picture: bytes
         "rows": len(baked.values),
         "centre": baked.bounds.centre,
         "radius": baked.bounds.radius,
-        "steps": steps,
+        "steps": STEPS,
         "low": low,
         "range": span,
         "up": upward(views.cameras),

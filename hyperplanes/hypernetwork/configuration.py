@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": relu, "silu": silu}
-CODE_NORMALISATIONS = ("none", "layer", "running")
+CODE_NORMALISATIONS = ("none", "running")
 JOINS = ("concatenate", "mean")
 WEIGHTS_SEEN = ("updated", "all")
 
@@ -35,13 +35,13 @@ class HeadConfig:
 
     Attributes:
         code: length of the code of one image.
-        code_normalisation: of the codes: "running" standardises them by running statistics over objects, "layer" each
-            over its own entries, "none" leaves them.
+        code_normalisation: of the codes: "running" standardises them by running statistics over objects, "none" leaves
+            them as they are.
         depth: fully connected layers of the head before its outputs.
         width: of each of them.
         activation: of the head: "relu" as in the paper, or "silu".
         layers: which layers of the target are updated: ("colour", "density") as in the paper, or ("all",).
-        update: how outputs become an update: "full" as in the paper, "scaling" or "low_rank"; see `updates`.
+        update: how outputs become an update: "full" as in the paper, or "low_rank"; see `updates`.
         rank: of "low_rank" updates.
         see_weights: theta is an input.
         weights_seen: how much of it: "updated", the weights of the layers that are updated, or "all". The paper says

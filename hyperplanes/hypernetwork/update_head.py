@@ -42,11 +42,7 @@ class UpdateHead(HyperNetwork):
 
     def make_normalisation(self, shape: tuple[int, ...]) -> nn.Module:
         """The normalisation of codes of that shape."""
-        if self.config.code_normalisation == "running":
-            return RunningStandardisation(shape)
-        if self.config.code_normalisation == "layer":
-            return nn.LayerNorm(self.config.code, elementwise_affine=False)
-        return nn.Identity()
+        return RunningStandardisation(shape) if self.config.code_normalisation == "running" else nn.Identity()
 
     def make_head(self, read: int, shapes: Mapping[str, torch.Size]) -> None:
         """The layers from `read` numbers an object, and from theta of all `shapes`, to the outputs."""

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-__all__ = ["UPDATES", "FullUpdate", "LowRankUpdate", "ScalingUpdate"]
+__all__ = ["UPDATES", "FullUpdate", "LowRankUpdate"]
 
 
 class FullUpdate(nn.Module):
@@ -26,30 +26,11 @@ class FullUpdate(nn.Module):
         return outputs.reshape(parameter.shape)
 
 
-class ScalingUpdate(nn.Module):
-    """One output a row: it scales the row of a weight matrix, and is added to the entry of a bias.
-
-    With FiLM (Perez et al. 2018) this is a feature-wise affine modulation of what each layer computes, written as an
-    update of its weights: delta W = diag(s) W, delta b = t.
-
-    Args:
-        shape: of the parameter.
-        rank: unused.
-    """
-
-    def __init__(self, shape: torch.Size, rank: int = 0) -> None:
-        super().__init__()
-        self.size = shape[0]
-
-    def forward(self, outputs: Float[Tensor, " row"], parameter: Tensor) -> Tensor:
-        """diag(outputs) W of a matrix, the outputs of a bias."""
-        return outputs if parameter.ndim == 1 else outputs[:, None] * parameter
-
-
 class LowRankUpdate(nn.Module):
-    """The scaling update and a product of thin matrices: delta W = diag(s) W + U V (as LoRA, Hu et al. 2022).
+    """Rows are scaled, and a product of thin matrices is added: delta W = diag(s) W + U V, delta b = t.
 
-    U (row, rank) is an output; V (rank, column) is learned and the same for all objects.
+    s and t modulate what a layer computes as FiLM does (Perez et al. 2018), U V is one as LoRA's (Hu et al. 2022): U
+    (row, rank) is an output; V (rank, column) is learned and the same for all objects.
 
     Args:
         shape: of the parameter.
@@ -71,8 +52,4 @@ class LowRankUpdate(nn.Module):
         return scale * parameter + left @ self.right
 
 
-UPDATES: dict[str, type[FullUpdate] | type[ScalingUpdate] | type[LowRankUpdate]] = {
-    "full": FullUpdate,
-    "scaling": ScalingUpdate,
-    "low_rank": LowRankUpdate,
-}
+UPDATES: dict[str, type[FullUpdate] | type[LowRankUpdate]] = {"full": FullUpdate, "low_rank": LowRankUpdate}

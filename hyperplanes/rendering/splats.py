@@ -30,9 +30,8 @@ def render_splats(
     opacities: Float[Tensor, " splat"],
     colours: Float[Tensor, "splat 3"],
     cameras: PinholeCamera,
-    background: float = 1.0,
 ) -> Float[Tensor, "3 height width"]:
-    """The picture of Gaussians for one camera.
+    """The picture of Gaussians over white for one camera.
 
     Args:
         means: in the world.
@@ -40,12 +39,11 @@ def render_splats(
         opacities: at the centres, in [0, 1].
         colours: as seen from the camera, in [0, 1].
         cameras: a batch of one, without lens distortion.
-        background: grey value behind everything.
 
     Returns:
         RGB.
     """
-    return _drawn(means, sizes, opacities, colours, cameras, background, None)[0]
+    return _drawn(means, sizes, opacities, colours, cameras, None)[0]
 
 
 def splat_gradients(
@@ -55,7 +53,6 @@ def splat_gradients(
     colours: Float[Tensor, "splat 3"],
     cameras: PinholeCamera,
     truth: Float[Tensor, "3 height width"],
-    background: float = 1.0,
 ) -> tuple[float, Float[Tensor, " splat"], Float[Tensor, "splat 3"]]:
     """The mean squared error of `render_splats`, and its gradients with respect to opacities and colours.
 
@@ -66,12 +63,11 @@ def splat_gradients(
         colours: as there.
         cameras: as there.
         truth: the picture as it should be.
-        background: as there.
 
     Returns:
         The error and both gradients.
     """
-    image, by_opacity, by_colour = _drawn(means, sizes, opacities, colours, cameras, background, truth)
+    image, by_opacity, by_colour = _drawn(means, sizes, opacities, colours, cameras, truth)
     number = truth.numel()
     return float((image - truth).square().mean()), by_opacity / number, by_colour / number
 
@@ -83,7 +79,6 @@ def _drawn(
     opacities: Tensor,
     colours: Tensor,
     cameras: PinholeCamera,
-    background: float,
     truth: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The picture, and where the truth is given the gradients of the sum of squared errors."""
@@ -105,12 +100,12 @@ def _drawn(
     picture = torch.zeros(height, width, 3)
     left = torch.ones(height, width)
     compile_function(_forward)(*arrays, picture.numpy(), left.numpy())
-    image = picture + left[..., None] * background
+    image = picture + left[..., None]
     by_opacity, by_colour = torch.zeros_like(opacities), torch.zeros_like(colours)
     if truth is not None:
         wrong = 2 * (image - truth.permute(1, 2, 0)).contiguous()
         found = torch.zeros(len(order)), torch.zeros(len(order), 3)
-        behind = (left * wrong.sum(-1) * background).contiguous()  # what lies behind, times the errors
+        behind = (left * wrong.sum(-1)).contiguous()  # what lies behind, times the errors
         gradient = compile_function(_backward)
         gradient(*arrays, wrong.numpy(), left.numpy(), behind.numpy(), found[0].numpy(), found[1].numpy())
         by_opacity[order], by_colour[order] = found

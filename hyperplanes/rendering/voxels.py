@@ -20,6 +20,7 @@ from hyperplanes.rendering.compositing import Rendered
 __all__ = ["distance_to_filled", "render_voxels", "voxel_gradients"]
 
 MAX_DISTANCE = 255  # of the distance transform, which is stored in a byte
+STOP = 1e-3  # transmittance below which a ray is finished
 RAYS = 1 << 10  # in one call of the kernel
 
 
@@ -56,8 +57,7 @@ def render_voxels(
     *,
     step: float,
     empty: UInt8[Tensor, "cell_x cell_y cell_z"] | None = None,
-    stop: float = 1e-3,
-    background: float = 1.0,
+    stop: float = STOP,
 ) -> Rendered:
     """The pixels of rays through a baked field: the same sums as `RayMarching` computes, in one compiled loop a ray.
 
@@ -70,7 +70,6 @@ def render_voxels(
         step: distance between samples in world units.
         empty: the result of `distance_to_filled`, by which empty space is skipped; computed here where absent.
         stop: transmittance below which a ray is finished.
-        background: grey value behind everything.
 
     Returns:
         Pixels; `samples` counts the samples of positive density.
@@ -78,7 +77,7 @@ def render_voxels(
     kernel = compile_function(voxel_rays.render)
     out = np.empty((len(rays), 5), np.float32)
     arrays = _arrays(index, values, bounds, rays, basis, distance_to_filled(index) if empty is None else empty)
-    numbers = _numbers(step, stop, background)
+    numbers = _numbers(step, stop)
     samples = sum(parallel_for(lambda first, last: kernel(*arrays, *numbers, out, first, last), len(rays), RAYS))
     found = torch.from_numpy(out)
     return Rendered(found[:, :3], found[:, 3], found[:, 4], samples)
@@ -94,8 +93,6 @@ def voxel_gradients(
     *,
     step: float,
     empty: UInt8[Tensor, "cell_x cell_y cell_z"],
-    stop: float = 1e-3,
-    background: float = 1.0,
 ) -> tuple[float, Float[Tensor, "row 28"]]:
     """The mean squared error of the pixels of `render_voxels`, and its gradient with respect to `values`.
 
@@ -108,8 +105,6 @@ def voxel_gradients(
         truth: what the pixels should be.
         step: as there.
         empty: the result of `distance_to_filled`.
-        stop: as there.
-        background: as there.
 
     Returns:
         The error, and its gradient.
@@ -118,7 +113,7 @@ def voxel_gradients(
     chunk = max(1, -(-len(rays) // torch.get_num_threads()))  # one a thread, each with a gradient of its own
     found = torch.zeros(-(-len(rays) // chunk), *values.shape)
     arrays = _arrays(index, values, bounds, rays, basis, empty)
-    numbers, colours = _numbers(step, stop, background), truth.float().contiguous().numpy()
+    numbers, colours = _numbers(step, STOP), truth.float().contiguous().numpy()
 
     def work(first: int, last: int) -> float:
         return kernel(*arrays, *numbers, colours, found[first // chunk].numpy(), first, last)
@@ -145,6 +140,6 @@ def _arrays(
     )
 
 
-def _numbers(step: float, stop: float, background: float) -> tuple[np.float32, ...]:
-    """The step, the optical depth at which a ray is finished, and the background."""
-    return np.float32(step), np.float32(-math.log(stop) if stop > 0 else math.inf), np.float32(background)
+def _numbers(step: float, stop: float) -> tuple[np.float32, ...]:
+    """The step, the optical depth at which a ray is finished, and a white background."""
+    return np.float32(step), np.float32(-math.log(stop) if stop > 0 else math.inf), np.float32(1.0)

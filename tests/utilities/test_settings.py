@@ -48,7 +48,7 @@ def other(value):
     }
     known |= {
         "none": "relu",
-        "running": "layer",
+        "running": "none",
         "concatenate": "mean",
         "low_rank": "full",
         "ray_marching": "hierarchical",

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from hyperplanes.data.pictures.frames import Frame, assemble, scaled_matrix
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, check_pose
-from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError, check_link, inside, read_bytes, read_text
 
 __all__ = ["find_model", "image_names", "read_colmap"]
@@ -70,9 +69,7 @@ def find_model(folder: str | Path) -> Path | None:
     return None
 
 
-def read_colmap(
-    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
-) -> Posed:
+def read_colmap(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
     """The posed pictures of a COLMAP reconstruction.
 
     COLMAP's world and its OpenCV axes are kept; its principal point counts from the pictures' borders. Pictures lie in
@@ -82,7 +79,6 @@ def read_colmap(
 
     Args:
         folder: the project, or the model itself.
-        bounds: of the scene; estimated when None.
         downscale: as in `assemble`.
         root: the model may not lie outside of it, symbolic links followed, nor a picture outside of it and of the
             folder of pictures; the folder when None.
@@ -120,7 +116,7 @@ def read_colmap(
         )
     masks = find_masks([home.parent / "masks"], [frame.path for frame in frames], root or home.parent)
     frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
-    return assemble(frames, paths[1], bounds=bounds, downscale=downscale)[0]
+    return assemble(frames, paths[1], downscale=downscale)[0]
 
 
 def image_names(model: Path, root: Path) -> dict[int, str]:

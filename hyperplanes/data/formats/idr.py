@@ -27,9 +27,7 @@ def camera_file(folder: Path) -> Path | None:
     return next((folder / name for name in _FILES if (folder / name).is_file()), None)
 
 
-def read_idr(
-    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
-) -> Posed:
+def read_idr(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
     """The posed pictures of a scene in IDR's layout.
 
     `world_mat_i` projects homogeneous points of the world to pixels (integer pixel centres), `scale_mat_i` takes the
@@ -38,7 +36,6 @@ def read_idr(
 
     Args:
         folder: with cameras.npz or cameras_sphere.npz.
-        bounds: of the scene; the unit sphere when None.
         downscale: as in `assemble`.
         root: no file may lie outside of it, symbolic links followed; the folder when None.
 
@@ -70,7 +67,7 @@ def read_idr(
         frames.append(
             Frame(path, path.relative_to(folder).as_posix(), pose, _fixed(matrix), image_size(path), mask=mask)
         )
-    return assemble(frames, source, bounds=bounds or Sphere(), downscale=downscale)[0]
+    return assemble(frames, source, bounds=Sphere(), downscale=downscale)[0]
 
 
 def _fixed(matrix: npt.NDArray[np.float64]) -> Callable[[tuple[int, int]], npt.NDArray[np.float64]]:

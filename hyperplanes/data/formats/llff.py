@@ -13,7 +13,6 @@ from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, check_pose
-from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import MALFORMED, DataError, list_files, read_bytes
 
 __all__ = ["FILE", "is_llff", "read_llff"]
@@ -27,9 +26,7 @@ def is_llff(folder: Path) -> bool:
     return (folder / FILE).is_file()
 
 
-def read_llff(
-    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
-) -> Posed:
+def read_llff(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
     """The posed pictures of a scene in LLFF's layout.
 
     A row of poses_bounds.npy is a 3 x 5 matrix, row by row, and two depths: the axes of the camera in the world (down,
@@ -39,7 +36,6 @@ def read_llff(
 
     Args:
         folder: with poses_bounds.npy.
-        bounds: of the scene; estimated when None.
         downscale: as in `assemble`.
         root: no file may lie outside of it, symbolic links followed; the folder when None.
 
@@ -79,7 +75,7 @@ def read_llff(
                 depths=(float(near), float(far)) if 0 < near < far < np.inf else None,
             )
         )
-    return assemble(frames, source, bounds=bounds, downscale=downscale)[0]
+    return assemble(frames, source, downscale=downscale)[0]
 
 
 class _Calibration:

@@ -19,7 +19,6 @@ from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
-from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError, list_files, read_text
 
 __all__ = ["catalogue", "is_nmr", "read_nmr"]
@@ -43,14 +42,11 @@ def is_nmr(folder: Path) -> bool:
     return bool(np.abs(world[:3, :3] @ world[:3, :3].T - np.eye(3)).max() < RIGID)
 
 
-def read_nmr(
-    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
-) -> Posed:
+def read_nmr(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
     """The posed pictures of one object; the world is ShapeNet's, y up.
 
     Args:
         folder: with cameras.npz and image/.
-        bounds: of the scene; estimated when None.
         downscale: as in `assemble`.
         root: no file may lie outside of it, symbolic links followed; the folder when None.
 
@@ -73,7 +69,7 @@ def read_nmr(
         pose = check_pose(_matrix(arrays, f"world_mat_{index}", source), source, path.name)
         focal = np.abs(np.diagonal(_matrix(arrays, f"camera_mat_{index}", source))[:2]).astype(np.float64)
         frames.append(Frame(path, f"image/{path.name}", pose, _Calibration(focal), mask=mask))
-    return assemble(frames, source, bounds=bounds, downscale=downscale)[0]
+    return assemble(frames, source, downscale=downscale)[0]
 
 
 def catalogue(folder: Path) -> Catalogue | None:

@@ -28,9 +28,7 @@ def is_nsvf(folder: Path) -> bool:
     return bool(names) and all(re.match(r"[012]_", name) for name in names)
 
 
-def read_nsvf(
-    folder: str | Path, *, bounds: Sphere | None = None, downscale: int | None = None, root: Path | None = None
-) -> Posed:
+def read_nsvf(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
     """The posed pictures of a scene in NSVF's layout.
 
     pose/*.txt are OpenCV camera-to-world; intrinsics.txt is a 3 x 3 or 4 x 4 calibration, or begins with
@@ -39,7 +37,6 @@ def read_nsvf(
 
     Args:
         folder: of the scene.
-        bounds: of the scene; the sphere around the box when None.
         downscale: as in `assemble`.
         root: no file may lie outside of it, symbolic links followed; the folder when None.
 
@@ -63,7 +60,7 @@ def read_nsvf(
         pose[:3, :3] = world_from_camera[:3, :3].T
         pose[:3, 3] = -pose[:3, :3] @ world_from_camera[:3, 3]
         frames.append(Frame(path, f"rgb/{path.name}", pose, _Calibration(matrix, size), size))
-    return assemble(frames, folder, bounds=bounds or _box(folder / "bbox.txt", root), downscale=downscale)[0]
+    return assemble(frames, folder, bounds=_box(folder / "bbox.txt", root), downscale=downscale)[0]
 
 
 def read_nsvf_task(

@@ -71,7 +71,7 @@ def _unit(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)], -1)
 
 
-def _wrapped(faults: tuple[str, ...], width: int = 34) -> list[str]:
+def _wrapped(faults: tuple[str, ...]) -> list[str]:
     import textwrap
 
-    return [line for fault in faults for line in textwrap.wrap(fault, width)]
+    return [line for fault in faults for line in textwrap.wrap(fault, 34)]

@@ -226,19 +226,18 @@ def _how_it_was_made(settings: DemoSettings, folder: Path, runner: Runner) -> li
     ]
 
 
-def overview(exhibits: Sequence[Exhibit], rounds: Sequence[Pixels], side: int, columns: int = 7) -> Pixels:
+def overview(exhibits: Sequence[Exhibit], rounds: Sequence[Pixels], side: int) -> Pixels:
     """One picture of it all: a row an object, on the left what was read, on the right new views around it.
 
     Args:
         exhibits: the objects.
         rounds: the frames of their turntables.
         side: of every picture in it, in pixels.
-        columns: new views a row.
 
     Returns:
         Pixels (height, width, 3).
     """
-    rows = []
+    rows, columns = [], 7  # new views a row
     for exhibit, frames in zip(exhibits, rounds, strict=True):
         read = [_resized(exhibit.support[index], side) for index in exhibit.read[:5]]
         new = [_resized(frames[round(column * len(frames) / columns) % len(frames)], side) for column in range(columns)]
