@@ -1,4 +1,4 @@
-"""`scripts/setup` against a pip that installs nothing and notes what it was asked for."""
+"""Source of truth: what `scripts/setup` asks a pip for that installs nothing and notes it."""
 
 import os
 import shutil

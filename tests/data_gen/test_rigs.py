@@ -1,4 +1,4 @@
-"""Camera rigs: against Kornia's projection, by their spread, and in what they refuse."""
+"""Source of truth: Kornia's projection, the stated spread of cameras, hand-made numbers, and what is refused."""
 
 import numpy as np
 import pytest

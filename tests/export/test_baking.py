@@ -1,4 +1,4 @@
-"""Baked fields against the fields they were made from."""
+"""Source of truth: the fields that were baked, Beer and Lambert's law of a slab, packed PyTorch, what was written."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Where machine code is cached: numba unpickles it, so nobody else may have written there."""
+"""Source of truth: a property: numba unpickles cached machine code, so nobody else may write where it lies."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Whatever geometry is given is computed, converted, or refused in one sentence; nothing leaves its memory."""
+"""Source of truth: plain PyTorch on the same input, or one sentence that refuses it; nothing leaves its memory."""
 
 import math
 import subprocess

@@ -1,4 +1,4 @@
-"""Lookups against tests/reference.py (one lookup at a time), stated edge cases, and one backend against another."""
+"""Source of truth: tests/reference.py (one lookup at a time), stated edge cases, and another backend."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The visual hull against a loop (tests/reference.py) and against shapes whose pictures are known exactly."""
+"""Source of truth: a loop (tests/reference.py), and shapes whose pictures are known exactly."""
 
 import itertools
 import math

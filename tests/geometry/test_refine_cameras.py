@@ -1,4 +1,4 @@
-"""The example at a small size: cameras known to be wrong by a known amount are found again."""
+"""Source of truth: cameras that are wrong by a known amount, which the example, made small, finds again."""
 
 import importlib.util
 import sys

@@ -1,4 +1,4 @@
-"""Sampling against SciPy, PyTorch's grid_sample and stated edge cases; one backend against another."""
+"""Source of truth: SciPy, PyTorch's grid_sample, stated edge cases, and another backend."""
 
 import inspect
 import math

@@ -1,4 +1,4 @@
-"""Threads: the same result for any number of them, from several at once, and after a fork."""
+"""Source of truth: one thread: any number of them, several at once and a forked process give the same."""
 
 import importlib
 import os

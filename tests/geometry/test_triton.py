@@ -1,4 +1,4 @@
-"""The CUDA kernels against the plain backend: on a GPU, or anywhere with TRITON_INTERPRET=1 and Triton installed."""
+"""Source of truth: the plain backend, on a GPU, or anywhere with TRITON_INTERPRET=1 and Triton installed."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""What TF32 matrix products do to pictures, without a GPU."""
+"""Source of truth: operands rounded by hand as TF32 rounds them, and PyTorch's own setting, without a GPU."""
 
 import torch
 from torch.nn.functional import linear

@@ -1,4 +1,4 @@
-"""Refined occupancy: what a field fills is kept, what it does not fill goes."""
+"""Source of truth: the shape that a field fills, known in closed form: all of it is kept, and little else."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM against what every verb promises: one line, an exit code, and nothing half-written left behind."""
+"""Source of truth: what every verb promises of Ctrl-C and SIGTERM: one line, an exit code, no half-written file."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Lights: bounds of what they do to white and grey surfaces, by the shading formula; and what they refuse."""
+"""Source of truth: the shading formula on white and grey surfaces, the stated bounds, and what is refused."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Finding a renderer: what is tried, remembered and said. Fakes stand for the subprocess where needed."""
+"""Source of truth: the stated order of renderers, and fakes of the subprocess that tries each of them."""
 
 import subprocess
 import sys
