@@ -106,9 +106,9 @@ def _number(fields: Mapping[str, Any], name: str, path: Path, what: str) -> floa
 
 def _pose(values: object, path: Path, index: int) -> npt.NDArray[np.float64]:
     """A camera-to-world pose of 16 numbers row by row, or of rows."""
-    flat = isinstance(values, list) and len(values) == 16 and not any(isinstance(value, list) for value in values)
-    rows = [values[row : row + 4] for row in range(0, 16, 4)] if flat else values
-    return check_pose(rows, path, f"{index} of camera_path")
+    if isinstance(values, list) and len(values) == 16 and not any(isinstance(value, list) for value in values):
+        values = [values[row : row + 4] for row in range(0, 16, 4)]
+    return check_pose(values, path, f"{index} of camera_path")
 
 
 def _to_data(poses: npt.NDArray[np.float64], path: Path, scene: Mapping[str, Any]) -> npt.NDArray[np.float64]:

@@ -237,39 +237,44 @@ class Runner:
             on_score: called after every object that was not evaluated before.
         """
         checkpoint = self.checkpoint(experiment, cell.trained, seed)
-        trained = self.training_name(experiment, cell.trained, seed)
         method, made = self.scale.method(cell.method), None
+        shared = {
+            "checkpoint": self.training_name(experiment, cell.trained, seed),
+            "method": method,
+            "on": self.data_name(cell.on),
+            "free": cell.trainable if method != cell.trained.method else "",  # as earlier versions named it
+            "seed": seed,
+            "views": self._views(cell, checkpoint),
+            "fine_tuning": stated(self.fine_tuning(cell)),
+            **({} if cell.query is None else {"query": cell.query}),
+            **self._reading,
+        }
         objects: list[ObjectScore] = []
         names = self.names(cell.on, cell.split, experiment.objects)
         for count, name in enumerate(names, 1):
-            settings = {
-                "checkpoint": trained,
-                "method": method,
-                "on": self.data_name(cell.on),
-                "object": name,
-                "free": cell.trainable if method != cell.trained.method else "",
-                "seed": seed,
-                "views": self._views(cell, checkpoint),
-                "fine_tuning": stated(self.fine_tuning(cell)),
-                **({} if cell.query is None else {"query": cell.query}),
-                **self._reading,
-            }
-            start = f"{Path(self.data_name(cell.on)).name}-{method}-{seed}"
-            path = self.out / "evaluations" / f"{_name(start, settings)}.json"
-            pictures = None
-            if self.places is not None:
-                path = self.out / "scores" / cell.column / file_name(cell.row) / f"{name}.json"
-                pictures = self.pictures(cell, name) if experiment.keep_pictures else None
+            # what is known of the object, if it was found with the same settings
+            settings = {**shared, "object": name}
+            path, pictures = self._evaluation(cell, settings), self.pictures(cell, name)
             known = read_json(path) if path.exists() else {}
-            if known.get("settings") != plain(settings) or not (pictures is None or pictures.exists()):
+            whole = pictures.exists() or not experiment.keep_pictures
+            # else the evaluation, its pictures first
+            if known.get("settings") != plain(settings) or not whole:
                 self.begin()
                 made = made or self._method(experiment, cell, method, checkpoint, seed)
-                score = evaluate(method, *made, [name], pictures and partial(_save_pictures, pictures))
+                keep = partial(_save_pictures, pictures) if experiment.keep_pictures else None
+                score = evaluate(method, *made, [name], keep)
                 known = {"settings": settings, "score": score.as_json()}
                 on_score(cell, seed, score.objects[0], count, len(names))
                 write_json(path, known)
             objects += Score.of_json(method, known["score"]).objects
         return Score(method, tuple(objects))
+
+    def _evaluation(self, cell: Cell, settings: Mapping[str, Any]) -> Path:
+        """The file of what a cell found of an object."""
+        if self.places is not None:
+            return self.out / "scores" / cell.column / file_name(cell.row) / f"{settings['object']}.json"
+        start = f"{Path(settings['on']).name}-{settings['method']}-{settings['seed']}"
+        return self.out / "evaluations" / f"{_name(start, settings)}.json"
 
     def pictures(self, cell: Cell, name: str) -> Path:
         """The folder of the query views of an object, as a cell shows them, where they are kept."""

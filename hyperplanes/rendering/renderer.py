@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
-from typing import overload
+from typing import TypedDict, Unpack, overload
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -23,35 +23,25 @@ from hyperplanes.utilities.arguments import checked
 __all__ = ["FieldFunction", "Hierarchical", "RayMarching", "Sampler", "allow_tf32", "render"]
 
 
+class _Options(TypedDict, total=False):
+    bounds: Sphere | None
+    occupancy: Occupancy | None
+    proposal: FieldFunction | None
+    generator: torch.Generator | None
+    background: float
+    differentiable: bool | None
+    chunk: int | None
+
+
 @overload
 def render(
-    field: FieldFunction,
-    target: PinholeCamera,
-    sampling: Sampler | None = None,
-    *,
-    bounds: Sphere | None = None,
-    occupancy: Occupancy | None = None,
-    proposal: FieldFunction | None = None,
-    generator: torch.Generator | None = None,
-    background: float = 1.0,
-    differentiable: bool | None = None,
-    chunk: int | None = None,
+    field: FieldFunction, target: PinholeCamera, sampling: Sampler | None = None, **options: Unpack[_Options]
 ) -> Pictures: ...
 
 
 @overload
 def render(
-    field: FieldFunction,
-    target: Rays,
-    sampling: Sampler | None = None,
-    *,
-    bounds: Sphere | None = None,
-    occupancy: Occupancy | None = None,
-    proposal: FieldFunction | None = None,
-    generator: torch.Generator | None = None,
-    background: float = 1.0,
-    differentiable: bool | None = None,
-    chunk: int | None = None,
+    field: FieldFunction, target: Rays, sampling: Sampler | None = None, **options: Unpack[_Options]
 ) -> Rendered: ...
 
 
