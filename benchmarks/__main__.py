@@ -13,6 +13,7 @@ from hyperplanes.utilities.files import DataError
 
 NAMES = (
     "all",
+    "baked",
     "image_based",
     "busy",
     "captures",

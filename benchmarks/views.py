@@ -48,7 +48,7 @@ from hyperplanes.utilities.metrics import psnr
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Task, Tasks, Views
 
-__all__ = ["METHODS", "PARTS", "adapters", "main"]
+__all__ = ["METHODS", "PARTS", "adapters", "main", "suite_folders"]
 
 QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_seconds")
 
@@ -88,22 +88,14 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--quick", action="store_true", help="one count and object: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)
-    if (chosen.data is None) == (chosen.suite is None):
-        parser.error("--data, --suite: expected one of the two")
-    if chosen.suite is not None:
-        chosen.data = [chosen.root / name for name in SUITES[chosen.suite]]
-        for path in chosen.data:
-            if not path.exists():
-                parser.error(
-                    f"--root: expected {path}, found nothing there; make it by\n  {made_by(chosen.suite, path)}"
-                )
+    folders = suite_folders(parser, chosen)
     if chosen.quick:
         chosen.counts, chosen.objects, chosen.query = [3], 2, 1
     if chosen.inputs:
         chosen.counts = [len(chosen.inputs)]
     model, rows, sheet = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint))), [], []
     model.config = replace(model.config, second_pass=chosen.second_pass or model.config.second_pass)
-    for path in chosen.data:
+    for path in folders:
         data = open_dataset(path)
         names = sorted(data.names("test"))[: chosen.objects]
         seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count: truth and prediction of every view
@@ -138,6 +130,23 @@ def main(arguments: list[str]) -> int:
         sheet = [pad(row, (0, widest - row.shape[2]), value=1.0) for row in sheet]
         write_whole(chosen.pictures, encode_png(to_pixels(torch.cat(sheet, 1)[None])[0], small=True))
     return 0
+
+
+def suite_folders(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -> list[Path]:
+    """The data sets that --data, or --suite and --root, name; the parser says what is wrong with them."""
+    if (chosen.data is None) == (chosen.suite is None):
+        parser.error("--data, --suite: expected one of the two")
+    if chosen.suite is None:
+        return chosen.data
+    if chosen.suite not in SUITES:
+        parser.error(f"--suite: expected one of {', '.join(SUITES)}, got {chosen.suite}")
+    folders = [chosen.root / name for name in SUITES[chosen.suite]]
+    for path in folders:
+        if not path.exists():
+            parser.error(
+                f"--root: expected {path}, found nothing there; make it by\n  {made_by(chosen.suite, path)}"
+            )
+    return folders
 
 
 SUITES: dict[str, dict[str, str]] = {

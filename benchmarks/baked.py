@@ -1,0 +1,94 @@
+"""Baked voxels against the field that they were baked from: PSNR on views that neither was shown, and time.
+
+    python -m benchmarks baked --data data/cars data/chairs --json FILE
+    python -m benchmarks baked --suite cc0 --counts 5 25 --json FILE
+
+Of every held-out object so many views are shown to the model, and some others are rendered by its field, by the voxels
+as they were baked, and by the voxels after they were fitted to the shown views. The reference of every time is the
+field, in the same run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from pathlib import Path
+
+from benchmarks._timing import timed
+from benchmarks.reporting import Row, finish
+from benchmarks.views import suite_folders
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.base import Adapter, Pictures
+from hyperplanes.adaptation.checkpoints import find_checkpoint
+from hyperplanes.data import open_dataset
+from hyperplanes.data.support import Shown
+from hyperplanes.export.baking import BakedScene, bake, default_side
+from hyperplanes.export.voxel_fitting import STEPS, fit_voxels
+from hyperplanes.utilities.metrics import psnr
+from hyperplanes.views import Task
+
+__all__ = ["main"]
+
+
+def main(arguments: list[str]) -> int:
+    """Measure, print, and write the rows where asked.
+
+    Args:
+        arguments: see --help.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks baked", description=__doc__)
+    parser.add_argument("--checkpoint", default="small", help="a folder, or the name of a packaged model")
+    parser.add_argument("--data", type=Path, nargs="+", help="data sets, or single scenes")
+    parser.add_argument("--suite", help="instead of --data, as in `python -m benchmarks views`")
+    parser.add_argument("--root", type=Path, default=Path("data"), help="of the suites")
+    parser.add_argument("--counts", type=int, nargs="+", default=[25], help="numbers of support views")
+    parser.add_argument("--objects", type=int, default=3, help="of each data set")
+    parser.add_argument("--query", type=int, default=3, help="views of each object to be judged by")
+    parser.add_argument("--side", type=int, help="voxels an axis; what `hyperplanes bake` takes when not given")
+    parser.add_argument("--fit", type=int, default=STEPS, help="steps of fitting (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="one object, few steps: to see that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    chosen = parser.parse_args(arguments)
+    if chosen.quick:
+        chosen.counts, chosen.objects, chosen.query, chosen.side, chosen.fit = [3], 1, 1, 32, 2
+    model = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint)))
+    rows = []
+    for path in suite_folders(parser, chosen):
+        data = open_dataset(path)
+        names = sorted(data.names("test"))[: chosen.objects]
+        for count in chosen.counts:
+            shown = Shown(data, count, chosen.query)
+            found = [measure(model, shown.task(name), chosen.side, chosen.fit) for name in names]
+            row: Row = {"name": path.resolve().name, "views": count, "objects": len(names)}
+            row |= {key: statistics.fmean(each[key] for each in found) for key in found[0]}
+            row["worst"] = min(each["fitted"] - each["field"] for each in found)
+            print(row, flush=True)
+            rows.append(row)
+    return finish("baked", rows, chosen.json)
+
+
+def measure(model: Adapter, task: Task, side: int | None, fit: int) -> dict[str, float]:
+    """One object: PSNR by the field, the voxels and the fitted voxels, and seconds; times of a view are medians."""
+    adapted, cameras = model.adapt(task.support), task.query.cameras
+    adapted.render(task.query[:1].cameras)  # compiles, and refines the occupancy
+    field_seconds, by_field = timed(lambda: adapted.render(cameras))
+    bake_seconds, baked = timed(lambda: bake(adapted, side=side or default_side(task.support.size)))
+    fit_seconds, fitted = timed(lambda: fit_voxels(baked, task.support, steps=fit))
+    scene = BakedScene(fitted)
+    scene.render(task.query[:1].cameras)
+    voxel_seconds, by_voxels = timed(lambda: scene.render(cameras))
+    plain = BakedScene(baked).render(cameras)
+
+    def quality(pictures: Pictures) -> float:
+        return float(psnr(pictures.images.clamp(0, 1), task.query.images).mean())
+
+    views = len(task.query)
+    return {
+        "field": quality(by_field),
+        "baked": quality(plain),
+        "fitted": quality(by_voxels),
+        "field_ms": 1e3 * field_seconds / views,
+        "voxels_ms": 1e3 * voxel_seconds / views,
+        "bake_seconds": bake_seconds,
+        "fit_seconds": fit_seconds,
+    }
