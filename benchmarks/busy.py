@@ -32,6 +32,7 @@ __all__ = ["main"]
 
 WORKS = ("lookup", "carving", "rendering", "fine_tuning", "training")
 SPIN = "while True: pass"
+WARM, SHORTEST = 0.5, 1.0  # seconds of work before the first repetition, and of all repetitions at least
 
 
 def main(arguments: list[str]) -> int:
@@ -59,9 +60,9 @@ def main(arguments: list[str]) -> int:
                 with _busy(spinning):
                     times = {count: _in_process(work, count, policy, chosen) for count in counts}
                 for count, seconds in times.items():
-                    pairs = sorted(one / ours for one, ours in zip(times[1], seconds, strict=True))
                     row: Row = {"name": work, "load": load, "policy": policy, "threads": count}
-                    rows.append({**row, "seconds": statistics.median(seconds), "speedup": statistics.median(pairs)})
+                    took, alone = statistics.median(seconds), statistics.median(times[1])
+                    rows.append({**row, "seconds": took, "speedup": alone / took})
     return finish("busy", rows, chosen.json)
 
 
@@ -88,11 +89,14 @@ def _in_process(work: str, threads: int, policy: str, chosen: argparse.Namespace
 
 
 def _seconds(name: str, repeats: int, quick: bool) -> list[float]:
-    """The wall time of every repetition, after one that is not measured."""
-    work = _work(name, quick)
+    """The wall time of every repetition, after some that are not measured: caches, compilation, sleeping cores."""
+    work, times = _work(name, quick), []
     work()
-    times = []
-    for _ in range(repeats):
+    warm, begun = time.perf_counter() + (0 if quick else WARM), time.perf_counter()
+    while begun < warm:
+        work()
+        begun = time.perf_counter()
+    while len(times) < repeats or sum(times) < (0 if quick else SHORTEST):
         begun = time.perf_counter()
         work()
         times.append(time.perf_counter() - begun)

@@ -143,9 +143,7 @@ def suite_folders(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -
     folders = [chosen.root / name for name in SUITES[chosen.suite]]
     for path in folders:
         if not path.exists():
-            parser.error(
-                f"--root: expected {path}, found nothing there; make it by\n  {made_by(chosen.suite, path)}"
-            )
+            parser.error(f"--root: expected {path}, found nothing there; make it by\n  {made_by(chosen.suite, path)}")
     return folders
 
 

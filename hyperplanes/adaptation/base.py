@@ -13,6 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.occupancy import Occupancy, carve, full
 from hyperplanes.geometry.rays import Rays
@@ -25,6 +26,8 @@ from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
+
+POINTS = 1 << 12  # whose density one thread evaluates
 
 
 @runtime_checkable
@@ -82,6 +85,11 @@ class AdaptedField:
         """The precision in which the field expects points; single for functions that do not say."""
         return getattr(self.field, "dtype", torch.float32)
 
+    @property
+    def thread_safe(self) -> bool:
+        """Whether several threads may evaluate the field at once; as it says itself."""
+        return getattr(self.field, "thread_safe", False)
+
     @cached_property
     def refined_occupancy(self) -> Occupancy:
         """The voxels of `occupancy` in which the field has density; computed when the first view is rendered."""
@@ -90,6 +98,11 @@ class AdaptedField:
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without colour where the field can do that."""
         points = points.to(self.dtype)
+        if self.thread_safe and points.device.type == "cpu" and not torch.is_grad_enabled():
+            return torch.cat(list(parallel_map(self._density, points.split(POINTS))))
+        return self._density(points)
+
+    def _density(self, points: Tensor) -> Tensor:
         if self.densities:
             return self.densities[0](points)
         return self.field(points, torch.nn.functional.normalize(points, dim=-1))[1]
@@ -141,6 +154,10 @@ class _Cast:
 
     field: Any
     dtype: torch.dtype
+
+    @property
+    def thread_safe(self) -> bool:
+        return getattr(self.field, "thread_safe", False)
 
     def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         colour, density = self.field(points.to(self.dtype), directions.to(self.dtype))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -75,6 +76,8 @@ class _Hull:
 
     masks: ImagePlanes
     bounds: Sphere
+
+    thread_safe: ClassVar[bool] = True
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """High where every view that shows a point shows the object there, else 0."""

@@ -15,6 +15,7 @@ from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.fields.baked import HARMONICS, LARGEST_SIDE, BakedField, spherical_harmonics
 from hyperplanes.fields.base import MLPField
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
@@ -125,16 +126,18 @@ def bake(
     row[coarse.occupied.flatten()] = torch.arange(len(arriving), device=view.device)
     # density and coefficients of the fine voxels in these
     fine = _resampled(Occupancy(visible, coarse.bounds), side)
-    cells, rows = [], []
-    centres, done = fine.centres(), 0
-    for points in centres.split(CHUNK):
-        cell = fine.index(points)
-        found = _voxels(adapted, points, view, arriving[row[coarse.index(points)]], fine.voxel)
-        cells.append(cell[found[0]])
-        rows.append(found[1])
-        done += len(points)
+
+    def voxels(points: Tensor) -> tuple[Tensor, Tensor]:
+        some, found = _voxels(adapted, points, view, arriving[row[coarse.index(points)]], fine.voxel)
+        return fine.index(points)[some], found
+
+    cells, rows, centres = [], [], fine.centres()
+    parallel = adapted.thread_safe and centres.device.type == "cpu"
+    for cell, found in (parallel_map if parallel else map)(voxels, centres.split(CHUNK)):
+        cells.append(cell)
+        rows.append(found)
         if on_part:
-            on_part(done, len(centres))
+            on_part(min(len(cells) * CHUNK, len(centres)), len(centres))
     if not sum(len(part) for part in cells):
         raise ValueError("bake: expected a field with something in it, got one that is empty everywhere")
     filled, values = torch.cat(cells), torch.cat(rows)

@@ -205,6 +205,8 @@ class Field:
     planes: Any
     bounds: Sphere
 
+    thread_safe: ClassVar[bool] = True  # nothing changes while it is evaluated: several threads share a picture
+
     def __repr__(self) -> str:
         weights = sum(value.numel() for value in self.parameters.values())
         planes = "" if self.planes is None else f", {len(self.planes)} planes"

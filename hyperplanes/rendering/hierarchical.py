@@ -73,7 +73,7 @@ class Hierarchical:
 
     def rays_per_chunk(self, device: torch.device) -> int:
         """A quarter of what `RayMarching` takes on a CPU, since every ray has all its samples."""
-        return 1 << 16 if device.type == "cuda" else 1 << 12
+        return 1 << 16 if device.type == "cuda" else 1 << 9
 
     @property
     def stop(self) -> float:

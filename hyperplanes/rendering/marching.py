@@ -52,8 +52,8 @@ class RayMarching:
         return f"{self.steps} in hull"
 
     def rays_per_chunk(self, device: torch.device) -> int:
-        """So many that few chunks make an image and the packed samples fit into memory."""
-        return 1 << 16 if device.type == "cuda" else 1 << 14
+        """So many that few chunks make an image and the packed samples fit into memory; on a CPU one thread's part."""
+        return 1 << 16 if device.type == "cuda" else 1 << 11
 
     def place(self, rays: Rays, occupancy: Occupancy | None, generator: torch.Generator | None = None) -> PackedSamples:
         """One sample a step where the grid is occupied.

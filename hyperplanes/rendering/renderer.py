@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import TypedDict, Unpack, overload
 
 import torch
 from kornia.geometry.camera import PinholeCamera
 
+from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered
@@ -125,8 +127,21 @@ def _in_chunks(
     """The pixels of rays without gradients, so many at once."""
     size = chunk or sampler.rays_per_chunk(rays.origins.device)
     with allow_tf32(rays.origins.device):
-        parts = [rays[first : first + size] for first in range(0, max(1, len(rays)), size)]
-        return _joined([integrate(scene, part, sampler, generator, differentiable=False) for part in parts])
+        parts = [rays[first:last] for first, last in pairwise(_bounds(len(rays), size))]
+        alone = generator is not None or rays.origins.device.type != "cpu" or not scene.is_thread_safe
+        run = map if alone else parallel_map
+        return _joined(list(run(lambda part: integrate(scene, part, sampler, generator, differentiable=False), parts)))
+
+
+def _bounds(total: int, size: int) -> list[int]:
+    """Where parts of at most so many begin and end: equal ones, an even number of them for two threads.
+
+    >>> _bounds(10, 4), _bounds(2, 4), _bounds(0, 4)
+    ([0, 3, 5, 8, 10], [0, 2], [0, 0])
+    """
+    count = max(1, -(-total // size))
+    count += count % 2 if total > size // 2 else 0
+    return [-(-part * total // count) for part in range(count + 1)]
 
 
 def _joined(parts: list[Rendered]) -> Rendered:

@@ -15,7 +15,9 @@ from hyperplanes.utilities.arguments import kind_of
 __all__ = ["FieldFunction", "Scene", "SplitField", "evaluate", "points_per_batch"]
 
 FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Points (n, 3) and unit directions (n, 3) -> colours (n, 3) in [0, 1] and densities (n,) per world unit."""
+"""Points (n, 3) and unit directions (n, 3) -> colours (n, 3) in [0, 1] and densities (n,) per world unit.
+
+One with an attribute `thread_safe` that is true is evaluated by several threads at once where no gradient is kept."""
 
 
 @runtime_checkable
@@ -54,6 +56,12 @@ class Scene:
     occupancy: Occupancy | None = None
     proposal: FieldFunction | None = None
     background: float = 1.0
+
+    @property
+    def is_thread_safe(self) -> bool:
+        """Whether its fields say, by an attribute `thread_safe`, that several threads may call them at once."""
+        fields = (self.field, self.proposal or self.field)
+        return all(getattr(field, "thread_safe", False) for field in fields)
 
 
 def evaluate(

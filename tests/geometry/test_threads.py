@@ -4,6 +4,7 @@ import importlib
 import os
 import pkgutil
 import signal
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -12,7 +13,7 @@ from numba.core.dispatcher import Dispatcher
 
 from hyperplanes.geometry import ImagePlanes, cameras, kernels
 from hyperplanes.geometry.kernels import threads
-from hyperplanes.geometry.kernels.threads import parallel_for
+from hyperplanes.geometry.kernels.threads import parallel_for, parallel_map
 
 PREFIX = "hyperplanes.geometry.kernels."
 
@@ -29,6 +30,45 @@ def test_parallel_for_covers_every_index_once():
     assert sorted(spans)[0][0] == 0
     assert sum(stop - start for start, stop in spans) == 10_001
     assert parallel_for(lambda start, stop: 1, 0, 5) == []
+
+
+@pytest.fixture
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_parts_of_parallel_map_run_alone_without_gradients_and_in_order(three_threads):
+    weight = torch.ones(1, requires_grad=True)
+    ran = []
+
+    def work(part):
+        ran.append((threading.get_ident(), torch.get_num_threads(), (weight * part).requires_grad))
+        return 2 * part
+
+    assert list(parallel_map(work, range(20))) == list(range(0, 40, 2))
+    assert {state[1:] for state in ran} == {(1, False)}
+    assert threading.get_ident() not in {state[0] for state in ran}
+    assert torch.get_num_threads() == 3
+    born = []  # a thread that begins afterwards has as many as were set
+    thread = threading.Thread(target=lambda: born.append(torch.get_num_threads()))
+    thread.start()
+    thread.join()
+    assert born == [3]
+
+
+def test_an_error_in_a_part_is_raised_and_the_parts_after_it_are_left_out(three_threads):
+    ran = []
+
+    def work(part):
+        ran.append(part)
+        raise ValueError(f"part {part}")
+
+    with pytest.raises(ValueError, match="part 0"):
+        list(parallel_map(work, range(10_000)))
+    assert len(ran) < 10_000
 
 
 @pytest.mark.parametrize(("size", "exact"), [(8, False), (8, True), (150, True)])

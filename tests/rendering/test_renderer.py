@@ -3,6 +3,8 @@ company and background change no ray).
 """
 
 import math
+import threading
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -140,6 +142,33 @@ def test_chunks_make_the_same_picture(sampling):
         torch.testing.assert_close(parts.depth, whole.depth, atol=1e-4, rtol=0)
         assert parts.samples == whole.samples
     assert not whole.colour.requires_grad
+
+
+def test_the_picture_is_the_same_by_any_number_of_threads():
+    """Of fields that say that several threads may call them; others are called by one, and by this one."""
+
+    @dataclass(frozen=True)
+    class Ball:
+        thread_safe: bool
+        callers: set[int]
+
+        def __call__(self, points, directions):
+            self.callers.add(threading.get_ident())
+            return soft_ball(points, directions)
+
+    rays = some_rays(37, dtype=torch.float32)
+    before, pictures, callers = torch.get_num_threads(), [], []
+    try:
+        for count, safe in ((1, True), (2, True), (3, True), (3, False)):
+            torch.set_num_threads(count)
+            ball = Ball(safe, set())
+            pictures.append(render(ball, rays, RayMarching(32), differentiable=False, chunk=8, occupancy=GRID).colour)
+            callers.append(ball.callers)
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(picture, pictures[0]) for picture in pictures)
+    assert callers[0] == callers[3] == {threading.get_ident()}
+    assert not callers[1] & callers[0]
 
 
 @pytest.mark.parametrize("sampling", PROTOCOLS)

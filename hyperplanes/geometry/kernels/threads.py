@@ -1,24 +1,28 @@
-"""A parallel for loop over compiled kernels.
+"""Work for several threads: ranges of compiled kernels, and parts of a computation in PyTorch.
 
-The kernels release the interpreter lock, so a pool of Python threads runs them in parallel: it survives a fork (the
-child starts a new pool), may be used from several threads at once, and follows `torch.set_num_threads`, none of which
-holds for numba's own threading layers.
+Both release the interpreter lock, so pools of Python threads run them in parallel: they survive a fork (the child
+starts new ones), may be used from several threads at once, and follow `torch.set_num_threads`, none of which holds for
+numba's own threading layers.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier, Lock
 from typing import TypeVar
 
 import torch
 
-__all__ = ["parallel_for"]
+__all__ = ["parallel_for", "parallel_map"]
 
+Part = TypeVar("Part")
 Result = TypeVar("Result")
 
 _pools: dict[int, ThreadPoolExecutor] = {}
+_single: dict[int, ThreadPoolExecutor] = {}  # whose threads run operations of PyTorch alone
+_making = Lock()
 
 
 def parallel_for(work: Callable[[int, int], Result], total: int, chunk: int) -> list[Result]:
@@ -47,11 +51,70 @@ def parallel_for(work: Callable[[int, int], Result], total: int, chunk: int) -> 
     return [result for _, result in sorted(results, key=lambda pair: pair[0])]
 
 
+def parallel_map(work: Callable[[Part], Result], parts: Sequence[Part]) -> Iterator[Result]:
+    """The results of work(part), in order, without gradients, by `torch.get_num_threads()` threads on the CPU.
+
+    Each thread runs the operations of PyTorch alone: OpenMP's threads would wait for each other after each operation,
+    and parts are waited for once. What a part computes depends on the part, not on the number of threads.
+
+    Args:
+        work: may be called from several threads at once, and does not build on gradients or autocast.
+        parts: of the work, each long enough that starting it takes no time by comparison (a millisecond).
+
+    Yields:
+        The result of each part.
+
+    >>> list(parallel_map(torch.get_num_threads, [])), sum(parallel_map(lambda part: part.sum(), torch.ones(6, 2)))
+    ([], tensor(12.))
+    """
+    threads = min(torch.get_num_threads(), len(parts))
+    if threads < 2 or torch.is_autocast_enabled("cpu"):
+        yield from map(work, parts)
+        return
+
+    @torch.no_grad()  # as all such settings one of the thread
+    def run(part: Part) -> Result:
+        return work(part)
+
+    futures = [_single_pool(threads).submit(run, part) for part in parts]
+    try:
+        for future in futures:
+            yield future.result()
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _single_pool(size: int) -> ThreadPoolExecutor:
+    with _making:
+        if size not in _single:
+            pool = ThreadPoolExecutor(size, "hyperplanes-parts", _run_operations_alone)
+            started = Barrier(size + 1)
+            for _ in range(size):
+                pool.submit(started.wait)
+            started.wait()
+            torch.set_num_threads(torch.get_num_threads())  # threads to come take the number that was set last
+            _single[size] = pool
+        return _single[size]
+
+
+def _run_operations_alone() -> None:
+    torch.get_num_threads()  # a thread that has not asked yet takes the number of all, later
+    torch.set_num_threads(1)
+
+
 def _pool(size: int) -> ThreadPoolExecutor:
     if size not in _pools:
         _pools[size] = ThreadPoolExecutor(size, thread_name_prefix="hyperplanes-kernels")
     return _pools[size]
 
 
+def _forget() -> None:
+    global _making
+    _making = Lock()
+    _pools.clear()
+    _single.clear()
+
+
 if hasattr(os, "register_at_fork"):  # a forked child has the pool's locks but not its threads
-    os.register_at_fork(after_in_child=_pools.clear)
+    os.register_at_fork(after_in_child=_forget)
