@@ -5,6 +5,7 @@ import os
 import pkgutil
 import signal
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -64,6 +65,7 @@ def test_an_error_in_a_part_is_raised_and_the_parts_after_it_are_left_out(three_
 
     def work(part):
         ran.append(part)
+        time.sleep(1e-3)
         raise ValueError(f"part {part}")
 
     with pytest.raises(ValueError, match="part 0"):
