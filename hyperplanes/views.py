@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.inputs import check_channels_first, check_indices
@@ -133,6 +134,18 @@ class Views:
             cameras=camera.to(self.cameras, device, dtype),
             masks=None if self.masks is None else self.masks.to(device=device, dtype=dtype),
         )
+
+    @checked
+    def resized(self, longest: int) -> Views:
+        """The views scaled down so that the longer side of a picture has so many pixels; smaller ones as they are."""
+        scale = longest / max(self.size)
+        if scale >= 1:
+            return self
+        size = max(1, round(self.size[0] * scale)), max(1, round(self.size[1] * scale))
+        images, masks = (
+            None if each is None else interpolate(each, size, mode="area") for each in (self.images, self.masks)
+        )
+        return self._derived(images=images, masks=masks, cameras=camera.resized(self.cameras, *size))
 
     def _derived(self, **changes: Any) -> Views:
         """The same views with some of their parts changed together, which need not be looked at again."""

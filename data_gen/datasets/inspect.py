@@ -143,20 +143,12 @@ def _sparse(folder: Path, posed: Any) -> Any:
 
 def _trial(views: Any) -> list[str]:
     """How well the packaged model shows views that were left out, in a line; nothing where it cannot be tried."""
-    from torch.nn.functional import interpolate
-
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.evaluation.suitability import held_out_psnr
-    from hyperplanes.geometry import cameras as camera
-    from hyperplanes.views import Views
 
     if views.masks is None or len(views) < 8:
         return []
-    scale = min(1.0, _TRIED / max(views.size))
-    size = round(views.size[0] * scale), round(views.size[1] * scale)
-    images, masks = (interpolate(each, size, mode="area") for each in (views.images, views.masks))
-    small = Views(images, camera.resized(views.cameras, *size), masks, views.bounds, views.names, views.up)
-    found = held_out_psnr(HyperPlanes.from_pretrained("small"), small)
+    found = held_out_psnr(HyperPlanes.from_pretrained("small"), views.resized(_TRIED))
     if found is None:
         return []
     return [

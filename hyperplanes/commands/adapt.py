@@ -43,7 +43,7 @@ def run(arguments: Arguments) -> int:
     refuse_baked(arguments.checkpoint, "adapt")
     refuse_checkpoint(arguments.out, arguments.checkpoint)
     model = load_adaptable(arguments.checkpoint, device, second_pass=arguments.second_pass)
-    task, up = read_object(arguments, console)
+    task, up = read_object(arguments, model, console)
     settings = FineTuning(trainable=arguments.fine_tune)
     field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)
     assert isinstance(field, AdaptedField)

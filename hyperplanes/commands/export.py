@@ -98,7 +98,7 @@ def run(arguments: Arguments) -> int:
             coarsening(arguments.page_voxels)
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
-    task, _ = read_object(arguments, console)
+    task, _ = read_object(arguments, source, console)
     refuse_sources(out / "images", arguments.views, task.query.names)
     shown, query = task.support.to(device), task.query.to(device)
     field, _ = adapt_to(source, shown, task.name, console, steps=arguments.steps)

@@ -107,7 +107,7 @@ def run(arguments: Arguments) -> int:
     _check(arguments)
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
-    task, up = read_object(arguments, console)
+    task, up = read_object(arguments, source, console)
     refuse_sources(arguments.out, arguments.views, task.query.names)
     shown, known = task.support.to(device), task.query.to(device)
     asked = _asked(arguments, shown, known, up, console)

@@ -10,24 +10,37 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.console import Console
     from hyperplanes.commands.options import ObjectArguments
     from hyperplanes.data.pictures.posed import Posed
+    from hyperplanes.export.baking import BakedScene
     from hyperplanes.geometry.rays import Sphere
     from hyperplanes.views import Task, Views
 
 __all__ = ["read_object", "read_path", "read_scene", "refuse_sources", "say_up"]
 
 
-def read_object(arguments: ObjectArguments, console: Console) -> tuple[Task, str]:
-    """As `read_scene`, of the options that the verbs of one object share."""
-    return read_scene(
+def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, console: Console) -> tuple[Task, str]:
+    """As `read_scene`, of the options that the verbs of one object share; poses are refined where that is asked for.
+
+    Args:
+        arguments: the options.
+        source: what will adapt to the views.
+        console: where it is said.
+    """
+    from hyperplanes.commands.poses import refine_task
+
+    task, up = read_scene(
         arguments.views,
         console,
         all_views=arguments.all_views,
         up=arguments.up,
         downscale=arguments.downscale,
     )
+    if arguments.refine_poses:
+        task = refine_task(source, task, console, all_views=arguments.all_views)
+    return task, up
 
 
 def read_scene(

@@ -1,0 +1,194 @@
+"""Poses and the focal length refined by the pictures themselves, before a field is adapted to them.
+
+A grid of density and colour is optimised together with a small motion of each camera, by rays of all views, from small
+pictures and few cells to larger ones: at first only coarse shapes pull at the poses (Lin et al. 2021, "BARF"). The grid
+is then thrown away. It is no field of ours: those look colours up in the views, and so hide what is wrong with a pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, max_pool2d, softplus
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.occupancy import Occupancy, carve
+from hyperplanes.geometry.rays import Rays, Sphere
+from hyperplanes.geometry.volume import interpolate_grid
+from hyperplanes.rendering.compositing import composite
+from hyperplanes.views import Views
+
+__all__ = ["FEWEST_VIEWS", "Refined", "refine_poses"]
+
+LEVELS = ((32, 32, 200), (64, 48, 200), (128, 64, 200))
+"""Pixels along the longer side of the pictures, cells of the grid along an axis, and steps."""
+
+FEWEST_VIEWS = 5
+RAYS = 2048
+GRID_RATE, POSE_RATE, FOCAL_RATE = 0.2, 5e-3, 5e-4  # of Adam
+FINAL_RATE = 0.1  # of the rates of poses and focal length, at the last step
+SAMPLES = 1.5  # along a ray, for each cell of the grid along an axis
+OUTSIDE, INSIDE = -6.0, 0.0  # what the grid begins with, before softplus: optical depth of a cell
+UNKNOWN = -3.0  # where there are no masks
+EMPTY = 0.02  # optical depth of cells that are left out, but for two beside others
+VOTES = 0.2  # of the masks must rule a cell out: those of wrong poses carve
+MARGIN = 0.08  # of the longer side of a picture: how far from the masks rays are drawn
+
+Grid = Float[Tensor, "channel x y z"]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Views with other cameras.
+
+    Attributes:
+        views: the same pictures.
+        turned: degrees by which each camera was turned about the middle of the bounds.
+        focal: what the focal lengths were multiplied with.
+    """
+
+    views: Views
+    turned: Float[Tensor, " view"]
+    focal: float
+
+
+class _MovedCameras(nn.Module):
+    """Cameras that move as rigid bodies about the middle of the bounds, and share a factor of their focal lengths.
+
+    There a turn and a shift do different things to a picture; about its own centre a camera's turn is nearly a shift.
+    """
+
+    def __init__(self, cameras: PinholeCamera, bounds: Sphere) -> None:
+        super().__init__()
+        self.cameras, self.bounds = cameras, bounds
+        self.twist = nn.Parameter(torch.zeros(cameras.batch_size, 6))  # radians about x, y, z, shift in radii
+        self.focal = nn.Parameter(torch.zeros(()))  # its logarithm
+
+    def relative(self) -> Float[Tensor, "view 6"]:
+        """The motions, less what all have in common: the world stays where it was."""
+        return self.twist - self.twist.mean(0)
+
+    def forward(self) -> PinholeCamera:
+        twist = self.relative()
+        x, y, z = twist[:, :3].unbind(1)
+        zero = torch.zeros_like(x)
+        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+        upper = torch.cat([cross, twist[:, 3:, None] * self.bounds.radius], 2)
+        motion = torch.linalg.matrix_exp(torch.cat([upper, torch.zeros_like(upper[:, :1])], 1))
+        middle, back = torch.eye(4), torch.eye(4)
+        middle[:3, 3] = torch.tensor(self.bounds.centre)
+        back[:3, 3] = -middle[:3, 3]
+        pose = camera.camera_from_world(self.cameras) @ middle @ motion @ back
+        matrix = camera.intrinsics(self.cameras)
+        matrix = torch.cat([matrix[:, :, :2] * self.focal.exp(), matrix[:, :, 2:]], 2)
+        return camera.pinhole(matrix, pose, *camera.image_size(self.cameras))
+
+
+def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], None] | None = None) -> Refined:
+    """Views whose cameras fit their pictures better, where they did not fit well.
+
+    Poses that are wrong by some degrees come back to a fraction of a pixel (docs/adaptation.md). Those that are right
+    to a tenth of a pixel become worse: compare both on views that a field is not shown.
+
+    Args:
+        views: of one object, with or without masks, without lens distortion.
+        seed: of rays and samples.
+        on_step: called with the number of steps done and that of all.
+
+    Returns:
+        The views on the CPU in single precision; the mean motion of all cameras is none.
+
+    Raises:
+        ValueError: fewer than five views, or cameras with lens distortion.
+    """
+    if len(views) < FEWEST_VIEWS or isinstance(views.cameras, DistortedCamera):
+        found = f"{len(views)}" + (" with lens distortion" if isinstance(views.cameras, DistortedCamera) else "")
+        raise ValueError(
+            f"views: expected at least {FEWEST_VIEWS} without lens distortion to refine poses, got {found}"
+        )
+    views = views.to("cpu", torch.float32)
+    generator = torch.Generator().manual_seed(seed)
+    cameras = _MovedCameras(views.cameras, views.bounds)
+    rates = POSE_RATE, FOCAL_RATE
+    groups = [{"params": [each], "lr": rate} for each, rate in zip((cameras.twist, cameras.focal), rates, strict=True)]
+    motion = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    grid, done, total = _first_grid(views, LEVELS[0][1]), 0, sum(steps for _, _, steps in LEVELS)
+    for pixels, side, steps in LEVELS:
+        # the same object in larger pictures and smaller cells
+        small = views.resized(pixels)
+        among = _near_masks(small)
+        grid = interpolate(grid.detach()[None], (side,) * 3, mode="trilinear", align_corners=False)[0]
+        occupancy = Occupancy(softplus(grid[0]) > EMPTY, views.bounds).dilated(2)
+        grid = grid.clone().requires_grad_(True)
+        content = torch.optim.Adam([grid], lr=GRID_RATE, betas=(0.9, 0.99))
+        for _ in range(steps):
+            # rays of the cameras as they stand now, and how far the grid is from what they show
+            shown = replace(small, cameras=camera.resized(cameras(), *small.size))
+            rays, truth, opacity = shown.sample_masked_rays(RAYS, generator=generator, among=among)
+            loss = _loss(grid, occupancy, rays, truth, None if views.masks is None else opacity[:, 0], generator)
+            for optimiser in (content, motion):
+                optimiser.zero_grad()
+            loss.backward()
+            content.step()
+            for group, rate in zip(motion.param_groups, rates, strict=True):
+                group["lr"] = rate * FINAL_RATE ** (done / total)
+            motion.step()
+            done += 1
+            if on_step is not None:
+                on_step(done, total)
+    with torch.no_grad():
+        turned = torch.rad2deg(cameras.relative()[:, :3].norm(dim=1))
+        return Refined(replace(views, cameras=cameras()), turned, math.exp(float(cameras.focal)))
+
+
+def _loss(
+    grid: Grid,
+    occupancy: Occupancy,
+    rays: Rays,
+    truth: Float[Tensor, "ray 3"],
+    opacity: Float[Tensor, " ray"] | None,
+    generator: torch.Generator,
+) -> Tensor:
+    """Squared error of the colours of rays, and of their opacity where masks say it."""
+    hit: Bool[Tensor, " ray"] = rays.far > rays.near
+    near, length = rays.near[hit][:, None], (rays.far - rays.near)[hit][:, None]
+    # one sample in each interval of a ray, (ray, sample), and which of them lie in cells that are not empty
+    count = int(SAMPLES * grid.shape[1])
+    edges = torch.linspace(0, 1, count + 1)
+    where = near + length * (edges[:-1] + torch.rand(len(near), count, generator=generator) / count)
+    points = rays.origins[hit][:, None] + where[..., None] * rays.directions[hit][:, None]
+    inside = occupancy.contains(points.detach())
+    # their density and colour, composited with nothing between them
+    values = interpolate_grid(grid, points[inside], occupancy.bounds)
+    density = torch.zeros(inside.shape).index_put(inside.nonzero().unbind(1), softplus(values[:, 0]) / occupancy.voxel)
+    colour = torch.zeros(points.shape).index_put(inside.nonzero().unbind(1), torch.sigmoid(values[:, 1:]))
+    seen, _ = composite(colour, density, near + length * edges)
+    loss = (seen.colour - truth[hit]).square().mean()
+    return loss if opacity is None else loss + (seen.opacity - opacity[hit]).square().mean()
+
+
+def _near_masks(views: Views) -> Int[Tensor, " pixel"] | None:
+    """Flat indices (view, row, column) of the pixels on the masks and around them; None without masks."""
+    if views.masks is None:
+        return None
+    reach = max(1, round(MARGIN * max(views.size)))
+    return max_pool2d(views.masks, 2 * reach + 1, 1, reach).flatten().nonzero()[:, 0]
+
+
+def _first_grid(views: Views, side: int) -> Grid:
+    """A grey hull of the masks, which several of them have to rule a cell out of, or thin fog."""
+    grid = torch.zeros(4, side, side, side)
+    grid[0] = UNKNOWN
+    if views.masks is not None:
+        small = views.resized(64)
+        assert small.masks is not None
+        hull = carve(small.masks, small.cameras, views.bounds, side, votes=max(1, round(VOTES * len(views))))
+        grid[0] = torch.where(hull.occupied, INSIDE, OUTSIDE)
+    return grid

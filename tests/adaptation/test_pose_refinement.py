@@ -1,0 +1,100 @@
+"""Poses that are disturbed on purpose come back.
+
+Source of truth: the poses that the pictures of example-car were rendered from, disturbed here by known motions.
+"""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import pose_refinement
+from hyperplanes.adaptation.pose_refinement import refine_poses
+from hyperplanes.commands import poses as command
+from hyperplanes.commands.console import Console
+from hyperplanes.data import read_task
+from hyperplanes.data.inspection.matches import sampson
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import distorted
+from hyperplanes.views import Task, join_views
+
+DEGREES = 2.0
+
+
+@pytest.fixture(scope="module")
+def views():
+    task = read_task("example-car")
+    return join_views(task.support, task.query)[list(range(0, 50, 3))]
+
+
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch):
+    monkeypatch.setattr(pose_refinement, "LEVELS", ((32, 24, 60), (64, 24, 60)))
+    monkeypatch.setattr(pose_refinement, "RAYS", 1024)
+
+
+def disturbed(views):
+    """Each camera turned by two degrees about an axis through it, and moved by as much of its distance."""
+    generator = torch.Generator().manual_seed(0)
+    draw = torch.nn.functional.normalize(torch.randn(2, len(views), 3, generator=generator), dim=-1)
+    turn, shift = draw * math.radians(DEGREES)
+    twist = torch.zeros(len(views), 4, 4)
+    twist[:, [2, 0, 1], [1, 2, 0]], twist[:, [1, 2, 0], [2, 0, 1]] = turn, -turn
+    twist[:, :3, 3] = shift * camera.centres(views.cameras).norm(dim=1, keepdim=True)
+    pose = torch.linalg.matrix_exp(twist) @ camera.camera_from_world(views.cameras)
+    return replace(views, cameras=camera.with_poses(views.cameras, pose))
+
+
+def epipolar_error(cameras, views):
+    """Median Sampson error in pixels of points on the object that the true cameras see: no common motion changes it."""
+    points = torch.randn(60, 3, generator=torch.Generator().manual_seed(1)) * 0.3
+    pixels = views.cameras.project(points.expand(len(views), -1, 3)).double()
+    pose, matrix = camera.camera_from_world(cameras).double(), camera.intrinsics(cameras).double()
+    errors = []
+    for step in (1, 3):
+        other = torch.arange(len(views)).roll(step)
+        pairs = torch.stack([pixels, pixels[other]], 2).flatten(0, 1)
+        motion = (pose[other] @ torch.linalg.inv(pose)).repeat_interleave(60, 0)
+        calibrations = [each.repeat_interleave(60, 0) for each in (matrix, matrix[other])]
+        errors.append(sampson(pairs, *calibrations, motion))
+    return float(torch.cat(errors).median())
+
+
+def test_disturbed_poses_come_back(views):
+    wrong, told = disturbed(views), []
+    before = epipolar_error(wrong.cameras, views)
+    found = refine_poses(wrong, on_step=lambda done, total: told.append((done, total)))
+    assert before > 1
+    assert epipolar_error(found.views.cameras, views) < 0.25 * before
+    assert told[0] == (1, 120)
+    assert told[-1] == (120, 120)
+    assert torch.equal(found.views.images, wrong.images)
+    assert 0.97 < found.focal < 1.03
+    assert found.turned.shape == (len(views),)
+
+
+def test_what_cannot_be_refined_is_refused(views):
+    with pytest.raises(ValueError, match="views: expected at least 5 without lens distortion to refine poses, got 4"):
+        refine_poses(views[:4])
+    bent = replace(views, cameras=distorted(views.cameras, torch.full((5,), 1e-3)))
+    with pytest.raises(ValueError, match="got 17 with lens distortion"):
+        refine_poses(bent)
+
+
+@pytest.mark.parametrize(("better", "said"), [(True, "poses: refined, turned by "), (False, "poses: as given, ")])
+def test_views_left_out_decide(views, capsys, monkeypatch, better, said):
+    """The judge's figures are given here; the poses of the one or the other come out, for support and query alike."""
+    from hyperplanes.evaluation import suitability
+
+    figures = iter([(20.0, 0.0), (21.0 if better else 20.4, 0.0)])
+    monkeypatch.setattr(suitability, "held_out_psnr", lambda *_: next(figures))
+    monkeypatch.setattr(pose_refinement, "LEVELS", ((16, 8, 2),))
+    task = Task(views[:9], views[9:], "car")
+    source = type("Model", (), {"rig": torch.zeros(0)})()
+    found = command.refine_task(source, task, Console())
+    assert said in capsys.readouterr().out
+    for old, new in ((task.support, found.support), (task.query, found.query)):
+        assert (new is not old) == better
+        assert torch.equal(new.images, old.images)
+        assert torch.equal(new.cameras.extrinsics, old.cameras.extrinsics) != better
