@@ -22,6 +22,7 @@ NAMES = (
     "lookup",
     "rendering",
     "small",
+    "splats",
     "training",
     "views",
     "visibility",
@@ -31,6 +32,7 @@ OF_SPEED = (
     "lookup",
     "rendering",
     "small",
+    "splats",
     "training",
     "visibility",
 )  # "busy" measures beside a load of its own

@@ -21,6 +21,7 @@ COMMANDS: dict[str, list[str]] = {
     "busy": [],
     "rendering": ["--sizes", "64", "128", "200", "400"],
     "small": ["--second-pass"],
+    "splats": [],
     "training": [],
     "generation": [],
 }

@@ -46,7 +46,8 @@ class Arguments(ObjectArguments):
             with the rendered ones, and what no shown camera sees into is filled.
         page_voxels: Along each side of the grid that the page shows and splats are made of; 1.3 a pixel of the images,
             and at most 256, when not given.
-        fit: Gradient steps that fit these voxels, and splats, to the shown views; 0 keeps what the field shows.
+        fit: Gradient steps that fit these voxels to the shown views, and 2.5 times as many for splats; 0 keeps what the
+            field shows.
         points: Of the cloud, at most.
         splat_format: ply, which viewers of Gaussian splats read, or the smaller splat without colour by direction.
     """
@@ -139,7 +140,8 @@ def run(arguments: Arguments) -> int:
 def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:
     """The splats of voxels, with a line on how they look beside them."""
     from hyperplanes.export.baking import BakedScene
-    from hyperplanes.export.splats import fit_splats, save_splats, splats_of
+    from hyperplanes.export.splats import STEPS, fit_splats, save_splats, splats_of
+    from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
     from hyperplanes.geometry.distortion import DistortedCamera
     from hyperplanes.utilities.metrics import psnr
 
@@ -147,9 +149,8 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
     straight = not isinstance(shown.cameras, DistortedCamera)
     if straight and arguments.fit:
         with console.bar("fitting splats") as bar:
-            splats = fit_splats(
-                splats, shown, steps=arguments.fit, on_step=lambda done: bar.show(done, arguments.fit, "steps")
-            )
+            steps = arguments.fit * STEPS // VOXEL_STEPS
+            splats = fit_splats(splats, shown, steps=steps, on_step=lambda done: bar.show(done, steps, "steps"))
     if straight:
         asked = query[:8].to("cpu")
         pictures = splats.render(asked.cameras), BakedScene(baked).render(asked.cameras).images

@@ -104,7 +104,7 @@ def _number(fields: Mapping[str, Any], name: str, path: Path, what: str) -> floa
     return float(value)
 
 
-def _pose(values: object, path: Path, index: int) -> npt.NDArray[np.float64]:
+def _pose(values: Any, path: Path, index: int) -> npt.NDArray[np.float64]:
     """A camera-to-world pose of 16 numbers row by row, or of rows."""
     if isinstance(values, list) and len(values) == 16 and not any(isinstance(value, list) for value in values):
         values = [values[row : row + 4] for row in range(0, 16, 4)]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from hyperplanes.fields.baked import HARMONICS, BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.rendering.splats import render_splats, splat_gradients
+from hyperplanes.rendering.splats import render_splats
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.files import format_of
 from hyperplanes.utilities.writing import write_whole
@@ -27,59 +27,72 @@ from hyperplanes.views import Views
 __all__ = ["SPLAT_FORMATS", "Splats", "fit_splats", "save_splats", "splats_of"]
 
 SPLAT_FORMATS = ("ply", "splat")
-SIZE = 0.6  # standard deviation of a splat, in voxels
-STEPS = 100
-RATES = 0.02, 0.1  # of coefficients of colour, and of logits of opacity
+SIZE = 0.35  # standard deviation of a splat before it is fitted, in voxels
+STEPS = 200
+RATES = {"means": 0.2, "scales": 0.06, "quaternions": 0.06, "logits": 0.2, "coefficients": 0.02}
+"""Of each step, at first: means in sizes of splats, scales by their logarithms.
+
+Of a car of 100 x 100 pixels with 25 views shown, splats had 24.2 dB on others with opacities and colours alone, 26.0 with
+scales, 27.7 with places and rotations, 28.6 begun smaller at higher rates, 29.0 at these; its voxels had 29.2.
+"""
+
 MEAN = 0.28209479  # the first harmonic
 HALF_TURN = (1, -1, -1, 1, -1, 1, 1, -1, 1)  # of the harmonics under (x, y, z) -> (x, -y, -z)
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Isotropic Gaussians.
+    """Gaussians.
 
     Attributes:
         means: in the world.
-        sizes: standard deviations in world units.
+        scales: standard deviations along the axes of each, in world units.
+        quaternions: rotations of these axes, real part first, of any length.
         logits: of the opacities at the centres.
         coefficients: of colour, red first, as those of a `BakedField`.
     """
 
     means: Float[Tensor, "splat 3"]
-    sizes: Float[Tensor, " splat"]
+    scales: Float[Tensor, "splat 3"]
+    quaternions: Float[Tensor, "splat 4"]
     logits: Float[Tensor, " splat"]
     coefficients: Float[Tensor, "splat 27"]
 
     def colours(self, cameras: PinholeCamera) -> Float[Tensor, "splat 3"]:
-        """As one camera sees them, in [0, 1]; a batch of one."""
+        """As one camera sees them, 0 or more; a batch of one."""
         directions = torch.nn.functional.normalize(self.means - camera.centres(cameras), dim=-1)
         basis = spherical_harmonics(directions)[:, None]
-        return (self.coefficients.reshape(-1, 3, HARMONICS) * basis).sum(-1).clamp(0, 1)
+        return (self.coefficients.reshape(-1, 3, HARMONICS) * basis).sum(-1).clamp_min(0)
+
+    def picture(self, cameras: PinholeCamera) -> Float[Tensor, "3 height width"]:
+        """What one camera sees over white, with gradients; a batch of one."""
+        shape = self.means, self.scales, self.quaternions, self.logits.sigmoid()
+        return render_splats(*shape, self.colours(cameras), cameras)
 
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Float[Tensor, "view 3 height width"]:
         """Their pictures over white."""
-        opacities, each = self.logits.sigmoid(), range(cameras.batch_size)
-        ones = [camera.select(cameras, [view]) for view in each]
-        return torch.stack([render_splats(self.means, self.sizes, opacities, self.colours(one), one) for one in ones])
+        return torch.stack([self.picture(camera.select(cameras, [view])) for view in range(cameras.batch_size)])
 
 
 @checked
 def splats_of(baked: BakedField) -> Splats:
-    """One splat a voxel, as opaque as the voxel is and with its colours."""
+    """One round splat a voxel, as opaque as the voxel is and with its colours."""
     places = (baked.index >= 0).nonzero()
     rows = baked.values[baked.index[baked.index >= 0].long()]
     voxel = 2 * baked.bounds.radius / baked.side
     means = (places.float() + 0.5) * voxel + (torch.tensor(baked.bounds.centre) - baked.bounds.radius)
     opacity = (1 - torch.exp(-rows[:, 0] * voxel)).clamp(0.004, 0.98)
-    return Splats(means, torch.full((len(means),), SIZE * voxel), torch.logit(opacity), rows[:, 1:].clone())
+    unturned = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1)
+    scales = torch.full((len(means), 3), SIZE * voxel)
+    return Splats(means, scales, unturned, torch.logit(opacity), rows[:, 1:].clone())
 
 
 @checked
 def fit_splats(
     splats: Splats, views: Views, *, steps: int = STEPS, seed: int = 0, on_step: Callable[[int], None] | None = None
 ) -> Splats:
-    """The splats after gradient steps (Adam) on their opacities and colours, one view a step.
+    """The splats after gradient steps (Adam) on all that describes them, one view a step.
 
     Args:
         splats: where it starts.
@@ -89,30 +102,35 @@ def fit_splats(
         on_step: told the number of steps done.
 
     Returns:
-        Splats at the same places.
+        As many splats.
     """
     views = views.to("cpu", torch.float32)
-    coefficients = splats.coefficients.clone().requires_grad_()
-    logits = splats.logits.clone().requires_grad_()
-    groups = [{"params": [coefficients], "lr": RATES[0]}, {"params": [logits], "lr": RATES[1]}]
-    descent = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    size = float(splats.scales.mean()) if len(splats.scales) else 1.0
+    free = {name: torch.zeros_like(getattr(splats, name)).requires_grad_() for name in RATES}
+    descent = torch.optim.Adam([{"params": [free[name]], "lr": RATES[name]} for name in RATES], betas=(0.9, 0.99))
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, 0.1 ** (1 / max(1, steps)))
+
+    def moved() -> Splats:
+        return Splats(
+            splats.means + size * free["means"],
+            splats.scales * free["scales"].exp(),
+            splats.quaternions + free["quaternions"],
+            splats.logits + free["logits"],
+            splats.coefficients + free["coefficients"],
+        )
+
     generator = torch.Generator().manual_seed(seed)
     order = torch.cat([torch.randperm(len(views), generator=generator) for _ in range(-(-steps // len(views)))])
     for step, view in enumerate(order[:steps].tolist()):
-        one = camera.select(views.cameras, [view])
-        now = replace(splats, coefficients=coefficients, logits=logits)
-        colours, opacities = now.colours(one), logits.sigmoid()
-        _, *gradients = splat_gradients(
-            splats.means, splats.sizes, opacities.detach(), colours.detach(), one, views.images[view]
-        )
+        picture = moved().picture(camera.select(views.cameras, [view]))
         descent.zero_grad()
-        torch.autograd.backward([opacities, colours], gradients)
+        (picture - views.images[view]).square().mean().backward()
         descent.step()
         schedule.step()
         if on_step:
             on_step(step + 1)
-    return replace(splats, coefficients=coefficients.detach(), logits=logits.detach())
+    with torch.no_grad():
+        return moved()
 
 
 @checked
@@ -128,9 +146,11 @@ def save_splats(splats: Splats, path: str | Path) -> Path:
     """
     path = Path(path)
     kind = format_of(path, SPLAT_FORMATS)
+    w, x, y, z = splats.quaternions.unbind(-1)
     turned = replace(
         splats,
         means=splats.means * torch.tensor([1.0, -1.0, -1.0]),
+        quaternions=torch.nn.functional.normalize(torch.stack([-x, w, -z, y], -1), dim=-1),  # a half turn about x first
         coefficients=(splats.coefficients.reshape(-1, 3, HARMONICS) * torch.tensor(HALF_TURN)).flatten(1),
     )
     write_whole(path, _ply(turned) if kind == "ply" else _splat(turned))
@@ -148,8 +168,8 @@ def _ply(splats: Splats) -> bytes:
         "f_dc_0 f_dc_1 f_dc_2": coefficients[..., 0] - 0.5 / MEAN,
         " ".join(f"f_rest_{place}" for place in range(45)): rest,
         "opacity": splats.logits[:, None],
-        "scale_0 scale_1 scale_2": splats.sizes.log()[:, None].expand(-1, 3),
-        "rot_0 rot_1 rot_2 rot_3": torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(number, 4),
+        "scale_0 scale_1 scale_2": splats.scales.log(),
+        "rot_0 rot_1 rot_2 rot_3": splats.quaternions,
     }
     names = "".join(f"property float {name}\n" for names in columns for name in names.split())
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {number}\n{names}end_header\n"
@@ -163,8 +183,8 @@ def _splat(splats: Splats) -> bytes:
     colour = splats.coefficients.reshape(-1, 3, HARMONICS)[..., 0] * MEAN
     content = np.zeros(len(splats.means), kind)
     content["mean"] = splats.means.numpy()
-    content["size"] = splats.sizes[:, None].numpy()
+    content["size"] = splats.scales.numpy()
     shown = torch.cat([colour, opacity[:, None]], 1).clamp(0, 1) * 255
     content["colour"] = shown.round().byte().numpy()
-    content["rotation"] = [255, 128, 128, 128]  # 128 + 128 times the quaternion (1, 0, 0, 0)
-    return content[np.argsort(-(splats.sizes**3 * opacity).numpy(), kind="stable")].tobytes()
+    content["rotation"] = (splats.quaternions * 128 + 128).round().clamp(0, 255).byte().numpy()
+    return content[np.argsort(-(splats.scales.prod(1) * opacity).numpy(), kind="stable")].tobytes()

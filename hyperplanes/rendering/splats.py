@@ -1,4 +1,4 @@
-"""A rasteriser of isotropic Gaussians, as viewers of Gaussian splats draw them, compiled for the CPU by numba.
+"""A differentiable rasteriser of Gaussians, as viewers of Gaussian splats draw them, compiled for the CPU by numba.
 
 As in "3D Gaussian Splatting" (Kerbl et al., 2023): Gaussians are projected by the local affine approximation of the
 perspective, widened by 0.3 square pixels, and composited front to back in the order of their depths.
@@ -7,7 +7,7 @@ perspective, widened by 0.3 square pixels, and composited front to back in the o
 from __future__ import annotations
 
 import math
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import torch
 from jaxtyping import Float
@@ -17,114 +17,118 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.kernels.compiling import compile_function
 
-__all__ = ["render_splats", "splat_gradients"]
+__all__ = ["render_splats", "rotations_of"]
 
 DILATION = 0.3  # square pixels
 NEAR = 1e-6  # of the scene's unit: what lies nearer to the camera's plane is not drawn
 LARGEST_ALPHA, SMALLEST_ALPHA = 0.99, 1 / 255
+DEVIATIONS = 3.0  # from the centre of a splat to the border of what is drawn of it
+
+
+def rotations_of(quaternions: Float[Tensor, "splat 4"]) -> Float[Tensor, "splat 3 3"]:
+    """The rotations of quaternions, real part first, of any length.
+
+    >>> rotations_of(torch.tensor([[2.0, 0.0, 0.0, 2.0]]))[0].round().tolist()  # a quarter turn about z
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
 def render_splats(
     means: Float[Tensor, "splat 3"],
-    sizes: Float[Tensor, " splat"],
+    scales: Float[Tensor, "splat 3"],
+    quaternions: Float[Tensor, "splat 4"],
     opacities: Float[Tensor, " splat"],
     colours: Float[Tensor, "splat 3"],
     cameras: PinholeCamera,
 ) -> Float[Tensor, "3 height width"]:
-    """The picture of Gaussians over white for one camera.
+    """The picture of Gaussians over white for one camera, with gradients to all that describes them.
 
     Args:
         means: in the world.
-        sizes: standard deviations in world units.
+        scales: standard deviations along the axes of each, in world units.
+        quaternions: rotations of these axes, real part first.
         opacities: at the centres, in [0, 1].
-        colours: as seen from the camera, in [0, 1].
+        colours: as seen from the camera.
         cameras: a batch of one, without lens distortion.
 
     Returns:
         RGB.
     """
-    return _drawn(means, sizes, opacities, colours, cameras, None)[0]
-
-
-def splat_gradients(
-    means: Float[Tensor, "splat 3"],
-    sizes: Float[Tensor, " splat"],
-    opacities: Float[Tensor, " splat"],
-    colours: Float[Tensor, "splat 3"],
-    cameras: PinholeCamera,
-    truth: Float[Tensor, "3 height width"],
-) -> tuple[float, Float[Tensor, " splat"], Float[Tensor, "splat 3"]]:
-    """The mean squared error of `render_splats`, and its gradients with respect to opacities and colours.
-
-    Args:
-        means: as there.
-        sizes: as there.
-        opacities: as there.
-        colours: as there.
-        cameras: as there.
-        truth: the picture as it should be.
-
-    Returns:
-        The error and both gradients.
-    """
-    image, by_opacity, by_colour = _drawn(means, sizes, opacities, colours, cameras, truth)
-    number = truth.numel()
-    return float((image - truth).square().mean()), by_opacity / number, by_colour / number
-
-
-@torch.no_grad()
-def _drawn(
-    means: Tensor,
-    sizes: Tensor,
-    opacities: Tensor,
-    colours: Tensor,
-    cameras: PinholeCamera,
-    truth: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The picture, and where the truth is given the gradients of the sum of squared errors."""
     pose, matrix = camera.camera_from_world(cameras)[0], camera.intrinsics(cameras)[0]
     height, width = camera.image_size(cameras)
     local = means @ pose[:3, :3].T + pose[:3, 3]
-    order = torch.argsort(local[:, 2])
-    order = order[local[order, 2] > NEAR]
+    with torch.no_grad():
+        order = torch.argsort(local[:, 2])
+        order = order[local[order, 2] > NEAR]
     x, y, z = local[order].unbind(-1)
     across, down = matrix[0, 0], matrix[1, 1]
-    centre = torch.stack([across * x / z + matrix[0, 2], down * y / z + matrix[1, 2]], -1)
-    variance = (sizes[order] / z).square()  # times the Jacobian's products
-    xx = variance * across**2 * (1 + (x / z).square()) + DILATION
-    yy = variance * down**2 * (1 + (y / z).square()) + DILATION
-    xy = variance * across * down * (x / z) * (y / z)
+    centres = torch.stack([across * x / z + matrix[0, 2], down * y / z + matrix[1, 2]], -1)
+    # the axes of each Gaussian in pixels: the Jacobian of the projection times its axes in the camera's frame
+    axes = pose[:3, :3] @ rotations_of(quaternions[order]) * scales[order, None]
+    right = across * (axes[:, 0] - (x / z)[:, None] * axes[:, 2]) / z[:, None]
+    below = down * (axes[:, 1] - (y / z)[:, None] * axes[:, 2]) / z[:, None]
+    xx, yy = right.square().sum(-1) + DILATION, below.square().sum(-1) + DILATION
+    xy = (right * below).sum(-1)
     determinant = xx * yy - xy.square()
-    shapes = torch.stack([yy / determinant, -xy / determinant, xx / determinant, 3 * torch.maximum(xx, yy).sqrt()], -1)
-    arrays = [part.float().contiguous().numpy() for part in (centre, shapes, opacities[order], colours[order])]
-    picture = torch.zeros(height, width, 3)
-    left = torch.ones(height, width)
-    compile_function(_forward)(*arrays, picture.numpy(), left.numpy())
-    image = picture + left[..., None]
-    by_opacity, by_colour = torch.zeros_like(opacities), torch.zeros_like(colours)
-    if truth is not None:
-        wrong = 2 * (image - truth.permute(1, 2, 0)).contiguous()
-        found = torch.zeros(len(order)), torch.zeros(len(order), 3)
-        behind = (left * wrong.sum(-1)).contiguous()  # what lies behind, times the errors
-        gradient = compile_function(_backward)
-        gradient(*arrays, wrong.numpy(), left.numpy(), behind.numpy(), found[0].numpy(), found[1].numpy())
-        by_opacity[order], by_colour[order] = found
-    return image.permute(2, 0, 1), by_opacity, by_colour
+    conics = torch.stack([yy / determinant, -xy / determinant, xx / determinant], -1)
+    reach = DEVIATIONS * torch.maximum(xx, yy).detach().sqrt()
+    picture: Tensor = _Rasterise.apply(  # type: ignore[no-untyped-call]
+        centres, conics, opacities[order], colours[order], reach, (height, width)
+    )
+    return picture.permute(2, 0, 1)
+
+
+class _Rasterise(torch.autograd.Function):
+    """Splats in the order of their depths to a picture (height, width, 3)."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        centres: Tensor,
+        conics: Tensor,
+        opacities: Tensor,
+        colours: Tensor,
+        reach: Tensor,
+        size: tuple[int, int],
+    ) -> Tensor:
+        splats = [part.detach().float().contiguous() for part in (centres, conics, reach, opacities, colours)]
+        picture, left = torch.zeros(*size, 3), torch.ones(*size)
+        compile_function(_forward)(*(part.numpy() for part in splats), picture.numpy(), left.numpy())
+        ctx.save_for_backward(*splats, left)
+        return picture + left[..., None]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        centres, conics, reach, opacities, colours, left = ctx.saved_tensors
+        wrong = gradients[0].float().contiguous()
+        behind = (left * wrong.sum(-1)).contiguous()  # what lies behind, white at last, times the gradient
+        found = [torch.zeros_like(part) for part in (centres, conics, opacities, colours)]
+        arrays = (centres, conics, reach, opacities, colours, wrong, left.clone(), behind, *found)
+        compile_function(_backward)(*(part.numpy() for part in arrays))
+        return (*found, None, None)
 
 
 @no_type_check
-def _forward(centres, shapes, opacities, colours, picture, left):
+def _forward(centres, conics, reaches, opacities, colours, picture, left):
     """Splats from the front to the back; `left` is the transmittance of each pixel."""
     height, width = left.shape
     for splat in range(len(opacities)):
-        x, y, reach = centres[splat, 0], centres[splat, 1], shapes[splat, 3]
+        x, y, reach = centres[splat, 0], centres[splat, 1], reaches[splat]
+        a, b, c = conics[splat, 0], conics[splat, 1], conics[splat, 2]
         for row in range(max(0, int(math.ceil(y - reach))), min(height - 1, int(math.floor(y + reach))) + 1):
             for column in range(max(0, int(math.ceil(x - reach))), min(width - 1, int(math.floor(x + reach))) + 1):
                 u, v = column - x, row - y
-                power = shapes[splat, 0] * u * u + 2.0 * shapes[splat, 1] * u * v + shapes[splat, 2] * v * v
-                alpha = min(LARGEST_ALPHA, opacities[splat] * math.exp(-0.5 * power))
+                alpha = opacities[splat] * math.exp(-0.5 * (a * u * u + 2.0 * b * u * v + c * v * v))
                 if alpha < SMALLEST_ALPHA:
                     continue
+                alpha = min(LARGEST_ALPHA, alpha)
                 weight = left[row, column] * alpha
                 for channel in range(3):
                     picture[row, column, channel] += weight * colours[splat, channel]
@@ -132,26 +136,36 @@ def _forward(centres, shapes, opacities, colours, picture, left):
 
 
 @no_type_check
-def _backward(centres, shapes, opacities, colours, wrong, left, behind, by_opacity, by_colour):  # noqa: PLR0913
+def _backward(  # noqa: PLR0913
+    centres, conics, reaches, opacities, colours, wrong, left, behind, by_centre, by_conic, by_opacity, by_colour
+):
     """Splats from the back to the front, each taken out of `left` again and added to `behind`."""
     height, width = left.shape
     for splat in range(len(opacities) - 1, -1, -1):
-        x, y, reach = centres[splat, 0], centres[splat, 1], shapes[splat, 3]
+        x, y, reach = centres[splat, 0], centres[splat, 1], reaches[splat]
+        a, b, c = conics[splat, 0], conics[splat, 1], conics[splat, 2]
         for row in range(max(0, int(math.ceil(y - reach))), min(height - 1, int(math.floor(y + reach))) + 1):
             for column in range(max(0, int(math.ceil(x - reach))), min(width - 1, int(math.floor(x + reach))) + 1):
                 u, v = column - x, row - y
-                power = shapes[splat, 0] * u * u + 2.0 * shapes[splat, 1] * u * v + shapes[splat, 2] * v * v
-                shape = math.exp(-0.5 * power)
-                alpha = min(LARGEST_ALPHA, opacities[splat] * shape)
+                shape = math.exp(-0.5 * (a * u * u + 2.0 * b * u * v + c * v * v))
+                alpha = opacities[splat] * shape
                 if alpha < SMALLEST_ALPHA:
                     continue
-                # transmittance before the splat; what it adds to the loss, and what it hides
+                clipped = alpha > LARGEST_ALPHA
+                alpha = min(LARGEST_ALPHA, alpha)
                 before = left[row, column] / (1.0 - alpha)
                 shown = 0.0
                 for channel in range(3):
                     by_colour[splat, channel] += before * alpha * wrong[row, column, channel]
                     shown += colours[splat, channel] * wrong[row, column, channel]
-                if opacities[splat] * shape < LARGEST_ALPHA:
-                    by_opacity[splat] += shape * (before * shown - behind[row, column] / (1.0 - alpha))
+                if not clipped:
+                    by_alpha = before * shown - behind[row, column] / (1.0 - alpha)
+                    by_opacity[splat] += shape * by_alpha
+                    by_power = -0.5 * alpha * by_alpha  # of the quadratic form
+                    by_conic[splat, 0] += by_power * u * u
+                    by_conic[splat, 1] += by_power * 2.0 * u * v
+                    by_conic[splat, 2] += by_power * v * v
+                    by_centre[splat, 0] -= by_power * 2.0 * (a * u + b * v)
+                    by_centre[splat, 1] -= by_power * 2.0 * (b * u + c * v)
                 behind[row, column] += before * alpha * shown
                 left[row, column] = before

@@ -4,16 +4,18 @@ Source of truth: the formulas of "3D Gaussian Splatting" (Kerbl et al., 2023), w
 file; the pictures of what was written; autograd.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 
-from hyperplanes.export.splats import Splats, fit_splats, save_splats, splats_of
+from hyperplanes.export.splats import fit_splats, save_splats, splats_of
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere, pixel_grid
-from hyperplanes.rendering.splats import splat_gradients
+from hyperplanes.rendering.splats import render_splats, rotations_of
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 
@@ -34,7 +36,10 @@ def splats():
     values = 0.1 * torch.randn(int(filled.sum()), 28, generator=torch.Generator().manual_seed(0))
     values[:, 0] = 30.0
     values[:, [1, 10, 19]] = 1.7 * (0.5 + 0.4 * torch.sin(3 * points[filled]))
-    return splats_of(BakedField(index, values, Sphere()))
+    round_ones = splats_of(BakedField(index, values, Sphere()))
+    generator = torch.Generator().manual_seed(1)
+    scales = 2 * round_ones.scales * torch.rand(len(values), 3, generator=generator).add(0.3)
+    return replace(round_ones, scales=scales, quaternions=torch.randn(len(values), 4, generator=generator))
 
 
 def read(path):
@@ -50,48 +55,55 @@ def read(path):
         seen = 0.28209479177387814 * first + 0.4886025119029199 * (-y * part[0] + z * part[1] - x * part[2])
         seen = seen + 1.0925484305920792 * (x * y * part[3] - y * z * part[4] - x * z * part[6])
         seen = seen + 0.31539156525252005 * (2 * z * z - x * x - y * y) * part[5]
-        return (seen + 0.5462742152960396 * (x * x - y * y) * part[7] + 0.5).clamp(0, 1)
+        return (seen + 0.5462742152960396 * (x * x - y * y) * part[7] + 0.5).clamp_min(0)
 
     assert not rest[..., 8:].any()
-    assert torch.equal(column("rot_0", "rot_1", "rot_2", "rot_3")[0], torch.tensor([1.0, 0.0, 0.0, 0.0]))
-    return means, column("scale_0").exp()[:, 0], torch.sigmoid(column("opacity"))[:, 0], colours
+    scales, quaternions = column("scale_0", "scale_1", "scale_2").exp(), column("rot_0", "rot_1", "rot_2", "rot_3")
+    return means, scales, quaternions, torch.sigmoid(column("opacity"))[:, 0], colours
 
 
 def test_a_viewer_of_the_file_sees_the_same_pictures_with_y_down(splats, tmp_path):
-    from hyperplanes.rendering.splats import render_splats
-
-    means, sizes, opacities, colours = read(save_splats(splats, tmp_path / "ball.ply"))
+    means, scales, quaternions, opacities, colours = read(save_splats(splats, tmp_path / "ball.ply"))
     assert torch.allclose(means, splats.means @ DOWN[:3, :3], atol=1e-6)
     for view in range(2):
         one = camera.select(CAMERAS, [view])
         there = camera.with_poses(one, one.extrinsics @ DOWN)
-        found = render_splats(means, sizes, opacities, colours(camera.centres(there)), there)
+        found = render_splats(means, scales, quaternions, opacities, colours(camera.centres(there)), there)
         torch.testing.assert_close(found, splats.render(one)[0], atol=1e-4, rtol=0)
 
 
 def test_the_small_format(splats, tmp_path):
     content = save_splats(splats, tmp_path / "ball.splat").read_bytes()
     assert len(content) == 32 * len(splats.means)
-    means = np.frombuffer(content, "<f4").reshape(-1, 8)[:, :3]
+    rows = np.frombuffer(content, "<f4").reshape(-1, 8)
     wanted = (splats.means @ DOWN[:3, :3]).numpy()
-    assert np.allclose(np.sort(means, axis=0), np.sort(wanted, axis=0))
+    order = [int(np.abs(wanted - mean).sum(1).argmin()) for mean in rows[:20, :3]]
+    np.testing.assert_allclose(rows[:20, :3], wanted[order], atol=1e-6)
+    np.testing.assert_allclose(rows[:20, 3:6], splats.scales[order].numpy(), rtol=1e-6)
+    turned = (np.frombuffer(content, "u1").reshape(-1, 32)[:20, 28:].astype(np.float32) - 128) / 128
+    expected = DOWN[:3, :3] @ rotations_of(splats.quaternions[order])
+    torch.testing.assert_close(rotations_of(torch.from_numpy(turned)), expected, atol=0.05, rtol=0)
     with pytest.raises(ValueError, match=r"ball\.obj: expected a name that ends in ply, splat, got 'obj'"):
         save_splats(splats, tmp_path / "ball.obj")
 
 
-def composited(means, sizes, opacities, colours, one):
+def composited(splats, opacities, colours, one):
     """The picture by autograd: each splat over all pixels, in the order of depth, with the kernel's thresholds."""
     matrix, pose = camera.intrinsics(one)[0], camera.camera_from_world(one)[0]
+    means, scales, quaternions = splats
     local = means @ pose[:3, :3].T + pose[:3, 3]
-    pixels = pixel_grid(*camera.image_size(one))
-    picture, left = torch.zeros(len(pixels), 3), torch.ones(len(pixels), 1)
+    pixels = pixel_grid(*camera.image_size(one)).to(means)
+    picture, left = means.new_zeros(len(pixels), 3), means.new_ones(len(pixels), 1)
     for splat in torch.argsort(local[:, 2]):
         x, y, z = local[splat]
         fx, fy = matrix[0, 0], matrix[1, 1]
         jacobian = torch.stack(
             [fx * torch.stack([1 / z, 0 * z, -x / z**2]), fy * torch.stack([0 * z, 1 / z, -y / z**2])]
         )
-        covariance = sizes[splat] ** 2 * jacobian @ jacobian.T + 0.3 * torch.eye(2)
+        axes = pose[:3, :3] @ rotations_of(quaternions[splat][None])[0]
+        covariance = jacobian @ axes @ torch.diag(scales[splat] ** 2) @ axes.T @ jacobian.T + 0.3 * torch.eye(2).to(
+            means
+        )
         away = pixels - torch.stack([fx * x / z + matrix[0, 2], fy * y / z + matrix[1, 2]])
         power = (away @ torch.linalg.inv(covariance) * away).sum(-1, keepdim=True)
         inside = away.abs().amax(-1, keepdim=True) <= 3 * covariance.diagonal().max().sqrt()
@@ -101,23 +113,38 @@ def composited(means, sizes, opacities, colours, one):
     return (picture + left).T.reshape(3, *camera.image_size(one))
 
 
-def test_gradients_are_those_of_autograd():
+def test_the_picture_and_its_gradients_are_those_of_autograd():
     generator = torch.Generator().manual_seed(1)
-    means, sizes = 0.4 * torch.randn(5, 3, generator=generator), torch.full((5,), 0.3)
-    opacities = (0.2 + 0.6 * torch.rand(5, generator=generator)).requires_grad_()
-    colours = torch.rand(5, 3, generator=generator).requires_grad_()
+    parts = [
+        0.4 * torch.randn(5, 3, generator=generator),
+        0.2 + 0.3 * torch.rand(5, 3, generator=generator),
+        torch.randn(5, 4, generator=generator),
+        0.2 + 0.6 * torch.rand(5, generator=generator),
+        torch.rand(5, 3, generator=generator),
+    ]
     one = camera.pinhole(camera.symmetric_intrinsics(12, 12, 0.7), camera.fibonacci_sphere(3, 3.0)[1:2], 12, 12)
     truth = torch.rand(3, 12, 12, generator=generator)
-    wanted = (composited(means, sizes, opacities, colours, one) - truth).square().mean()
-    wanted.backward()
-    error, *found = splat_gradients(means, sizes, opacities.detach(), colours.detach(), one, truth)
-    assert error == pytest.approx(float(wanted.detach()), rel=1e-5)
-    torch.testing.assert_close(found, [opacities.grad, colours.grad], rtol=1e-3, atol=1e-6)
+    gradients, pictures = [], []
+    for draw in (lambda *each: composited(each[:3], *each[3:], one), lambda *each: render_splats(*each, one)):
+        leaves = [part.clone().requires_grad_() for part in parts]
+        pictures.append(draw(*leaves))
+        (pictures[-1] - truth).square().mean().backward()
+        gradients.append([leaf.grad for leaf in leaves])
+    torch.testing.assert_close(pictures[1], pictures[0], atol=1e-5, rtol=0)
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-6)
 
 
-def test_fitting_brings_back_the_colours(splats):
+def test_fitting_brings_back_what_was_taken_away(splats):
+    """Of the same splats faded, moved and swollen, the pictures come back; opacities and colours alone do less."""
     truth = splats.render(CAMERAS)
-    faded = Splats(splats.means, splats.sizes, splats.logits, 0.9 * splats.coefficients)
-    before = float(psnr(faded.render(CAMERAS), truth).mean())
-    fitted = fit_splats(faded, Views(truth, CAMERAS), steps=18)
-    assert float(psnr(fitted.render(CAMERAS), truth).mean()) > before + 3
+    generator = torch.Generator().manual_seed(2)
+    spoilt = replace(
+        splats,
+        means=splats.means + 0.02 * torch.randn(splats.means.shape, generator=generator),
+        scales=1.5 * splats.scales,
+        coefficients=0.9 * splats.coefficients,
+    )
+    before = float(psnr(spoilt.render(CAMERAS), truth).mean())
+    fitted = fit_splats(spoilt, Views(truth.clamp(0, 1), CAMERAS), steps=24)
+    assert float(psnr(fitted.render(CAMERAS), truth).mean()) > before + 5
+    assert fitted.means.shape == splats.means.shape
