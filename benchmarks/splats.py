@@ -55,7 +55,7 @@ def main(arguments: list[str]) -> int:
     return finish("splats", rows, chosen.json)
 
 
-def measure(model: HyperPlanes, task: Task, voxel_steps: int = 80, splat_steps: int = 200) -> Row:
+def measure(model: HyperPlanes, task: Task, voxel_steps: int = 80, splat_steps: int = 160) -> Row:
     """One object as a field, as voxels and as splats."""
     shown, asked = task.support, task.query[:COMPARED]
     field = model.adapt(shown)
