@@ -15,10 +15,10 @@ SIZE = 112
 """Width and height of a texture in pixels."""
 
 
-def _grid(size: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel centres as (v upwards, u), each (size, size) in (0, 1)."""
-    row, column = np.mgrid[0:size, 0:size]
-    return 1 - (row + 0.5) / size, (column + 0.5) / size
+def _grid() -> tuple[np.ndarray, np.ndarray]:
+    """Pixel centres as (v upwards, u), each (SIZE, SIZE) in (0, 1)."""
+    row, column = np.mgrid[0:SIZE, 0:SIZE]
+    return 1 - (row + 0.5) / SIZE, (column + 0.5) / SIZE
 
 
 def _mix(first: Colour, second: Colour, share: np.ndarray) -> np.ndarray:

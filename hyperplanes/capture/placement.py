@@ -145,7 +145,7 @@ def _without_strays(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return result
 
 
-def _ground(points: np.ndarray, up: np.ndarray, sphere: Sphere, seed: int = 0) -> np.ndarray | None:
+def _ground(points: np.ndarray, up: np.ndarray, sphere: Sphere) -> np.ndarray | None:
     """The normal of the level plane under the object that enough of the points around it lie on, or None."""
     offset = points - np.array(sphere.centre)
     height = offset @ up
@@ -153,7 +153,7 @@ def _ground(points: np.ndarray, up: np.ndarray, sphere: Sphere, seed: int = 0) -
     offset, tolerance = offset[near], PLANE_NEAR * sphere.radius
     if len(offset) < 4 * FEWEST_POINTS:
         return None
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     best, most = None, max(FEWEST_POINTS, PLANE_SHARE * len(offset))
     for _ in range(500):
         first, second, third = offset[generator.choice(len(offset), 3, replace=False)]

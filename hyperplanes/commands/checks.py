@@ -75,21 +75,14 @@ def healthy(checks: Sequence[Check]) -> bool:
     return all(check.works or not check.needed for check in checks)
 
 
-def examine(folder: Path = Path()) -> list[Check]:
-    """Look at everything.
-
-    Args:
-        folder: where results would go, for the room that is left.
-
-    Returns:
-        The outcomes, needed things first.
-    """
+def examine() -> list[Check]:
+    """The outcomes of all checks, needed things first."""
     checks = [_python(), _torch(), _packages()]
     if all(check.works for check in checks):
         checks += _lookups()
         for entry in entry_points(group=GROUP):
             checks += entry.load()()
-    return [*checks, _disk(folder), *(_optional(module) for module in OPTIONAL)]
+    return [*checks, _disk(Path()), *(_optional(module) for module in OPTIONAL)]
 
 
 def _python() -> Check:

@@ -173,6 +173,7 @@ def _describe_nearest(s, pitch, packed, shape, chosen, scores, numbers, directio
         if index < near:
             row[at + 7 * index + 3] = angle
     farthest = number(1.01) * scores[slots] if total > slots else two * number(1.01) * scores[near - 1]
+    # what is read of a view, as in `_describe_best`: by one function for both the kernel takes 15 to 25 % longer
     for index in range(near):
         view = chosen[index]
         valid = load(s, PENALTY * pitch + view) < unseen
