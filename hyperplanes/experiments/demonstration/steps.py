@@ -26,7 +26,7 @@ class Demonstration:
         out: the folder for everything.
         make_runner: a `Runner` of a folder, a scale and the names of its folders.
         say: called with a line.
-        evaluating: a context with the title of a row, for as long as it is evaluated: what hears its scores.
+        evaluating: a context with the title of a row, for as long as it is evaluated: what its scores are told to.
     """
 
     def __init__(
@@ -77,8 +77,8 @@ class Demonstration:
 
     def evaluate(self, cell: Cell) -> None:
         """A row of the table."""
-        with self.evaluating(cell.row) as hear:
-            self.runner.score(self.settings.table, cell, self.settings.seed, hear)
+        with self.evaluating(cell.row) as on_score:
+            self.runner.score(self.settings.table, cell, self.settings.seed, on_score)
 
     def tune(self) -> None:
         """PSNR over fine-tuning steps, in tuning.json by method and number of steps."""
