@@ -80,6 +80,7 @@ def read_camera_path(
     poses, focal = np.zeros((len(frames), 4, 4)), np.zeros(len(frames))
     for index, frame in enumerate(frames):
         poses[index] = _pose(frame.get("camera_to_world"), path, index)
+        # the focal length of a vertical angle, in pixels
         angle = _number(frame, "fov", path, f"frame {index}: degrees")
         if angle >= 180:
             raise DataError(path, f"frame {index}: a fov below 180 degrees", f"{angle:g}", EXPORT)

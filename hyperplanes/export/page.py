@@ -74,6 +74,7 @@ def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: i
     Raises:
         ValueError: voxels that do not get small enough.
     """
+    # as many bits a number as the size allows
     for bits in BITS:
         low, span, text = _encoded(baked, bits)
         if len(text) <= largest:
@@ -83,6 +84,7 @@ def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: i
             f"page: expected at most {largest / 1e6:g} MB, got {len(text) / 1e6:.1f} MB of {len(baked.values):,} "
             f"voxels; bake fewer than {baked.side} along an axis"
         )
+    # what the viewer begins with
     start = orbit_cameras(views, 1)
     scene = {
         "side": baked.side,

@@ -114,6 +114,7 @@ def fit_splats(
     views = views.to("cpu", torch.float32)
     splats = splats[_weights(splats, views) > SEEN]
     size = float(splats.scales.mean()) if len(splats.scales) else 1.0
+    # offsets of all numbers from what they begin with, each kind with its rate
     free = {name: torch.zeros_like(getattr(splats, name)).requires_grad_() for name in RATES}
     descent = torch.optim.Adam([{"params": [free[name]], "lr": RATES[name]} for name in RATES], betas=(0.9, 0.99))
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, 0.1 ** (1 / max(1, steps)))
@@ -130,6 +131,7 @@ def fit_splats(
         )
 
     generator = torch.Generator().manual_seed(seed)
+    # every view as often as every other, in random order
     order = torch.cat([torch.randperm(len(views), generator=generator) for _ in range(-(-steps // len(views)))])
     for step, view in enumerate(order[:steps].tolist()):
         picture = moved().picture(camera.select(views.cameras, [view]))

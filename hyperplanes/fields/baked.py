@@ -82,6 +82,7 @@ class BakedField:
         towards empty voxels.
         """
         side = self.side
+        # the eight voxels around each point, and the share of each
         place = (self.bounds.normalise(points) + 1) * (side / 2) - 0.5
         low = place.floor()
         fraction = place - low
@@ -100,6 +101,7 @@ class BakedField:
             weighted = weight * found[:, 0]
             density = density + weighted
             coefficients = coefficients + weighted[:, None] * found[:, 1:]
+        # colour: the mean of the coefficients by density, along the directions
         coefficients = (coefficients / density.clamp_min(1e-8 / self.bounds.radius)[:, None]).reshape(-1, 3, HARMONICS)
         colour = (coefficients * spherical_harmonics(directions)[:, None]).sum(-1)
         return colour.clamp(0, 1), density

@@ -50,6 +50,7 @@ def refine(
     threshold = -math.log1p(-opacity_loss) / (2 * occupancy.bounds.radius)
     side, bounds = occupancy.occupied.shape[0], occupancy.bounds
     asked, large = occupancy.occupied, side >= 64 and int(occupancy.occupied.sum()) > COARSE_FIRST
+    # of large grids only what a grid of half the resolution keeps is asked
     if large:
         halved = _halved(occupancy)
         coarse = _dilated(halved, _filled_from_outside(halved, halved.occupied, density, threshold), margin)
@@ -58,6 +59,7 @@ def refine(
         )
     filled = _filled_from_outside(occupancy, asked, density, threshold)
     kept, divided = _dilated(occupancy, filled, margin), torch.zeros_like(filled)
+    # what lies between the centres: voxels beside those that are kept are asked in eight places
     while True:
         near = Occupancy(kept, bounds).dilated().occupied if large else occupancy.occupied
         asked = near & occupancy.occupied & ~kept & ~divided

@@ -13,6 +13,7 @@ from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.utilities.axes import invert_poses
 from hyperplanes.utilities.files import MALFORMED, DataError, list_files, read_bytes
 
 __all__ = ["FILE", "is_llff", "read_llff"]
@@ -58,17 +59,15 @@ def read_llff(folder: str | Path, *, downscale: int | None = None, root: Path | 
         if not (np.isfinite(matrix).all() and min(height, width, focal) > 0):
             found = f"{height:g}, {width:g}, {focal:g} for {path.name}"
             raise DataError(source, "a positive height, width and focal length in each row", found, "write it again")
+        # columns: down, right, backwards, the centre
         down, right, backwards, centre = matrix[:, :4].T
         world_from_camera = check_pose(np.stack([right, down, -backwards, centre], 1), source, path.name)
-        pose = np.eye(4)
-        pose[:3, :3] = world_from_camera[:3, :3].T
-        pose[:3, 3] = -pose[:3, :3] @ world_from_camera[:3, 3]
         near, far = row[15:]
         frames.append(
             Frame(
                 path,
                 path.relative_to(folder).as_posix(),
-                pose,
+                invert_poses(world_from_camera),
                 _Calibration(width, focal),
                 (round(height), round(width)),
                 mask=mask,

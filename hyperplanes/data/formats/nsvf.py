@@ -13,6 +13,7 @@ from hyperplanes.data.pictures.frames import Frame, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.axes import invert_poses
 from hyperplanes.utilities.files import DataError, list_files
 
 __all__ = ["is_nsvf", "read_nsvf", "read_nsvf_task"]
@@ -56,10 +57,9 @@ def read_nsvf(folder: str | Path, *, downscale: int | None = None, root: Path | 
     for path in pictures:
         pose_file = folder / "pose" / f"{path.stem}.txt"
         world_from_camera = check_pose(read_numbers(pose_file, [16], root).reshape(4, 4), pose_file, path.stem)
-        pose = np.eye(4)
-        pose[:3, :3] = world_from_camera[:3, :3].T
-        pose[:3, 3] = -pose[:3, :3] @ world_from_camera[:3, 3]
-        frames.append(Frame(path, f"rgb/{path.name}", pose, _Calibration(matrix, size), size))
+        frames.append(
+            Frame(path, f"rgb/{path.name}", invert_poses(world_from_camera), _Calibration(matrix, size), size)
+        )
     return assemble(frames, folder, bounds=_box(folder / "bbox.txt", root), downscale=downscale)[0]
 
 

@@ -14,6 +14,7 @@ from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.images import image_size, read_image
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.axes import invert_poses
 from hyperplanes.utilities.files import DataError, list_files
 
 __all__ = ["catalogue", "is_srn", "read_srn"]
@@ -55,6 +56,7 @@ def read_srn(folder: str | Path, *, bounds: Sphere | None = None, root: Path | N
     pixels = [read_image(path, size) for path in pictures]
     rgba = [picture for picture, _ in pixels]
     alpha = any(has_alpha and (picture[..., 3] < 255).any() for picture, has_alpha in pixels)
+    # objects rendered over white, without alpha: what is exactly white is background
     if not alpha and all(_white_border(picture) for picture in rgba):
         alpha = True
         for picture in rgba:
@@ -62,14 +64,10 @@ def read_srn(folder: str | Path, *, bounds: Sphere | None = None, root: Path | N
     world_from_camera = np.stack(
         [check_pose(read_numbers(path, [16], root).reshape(4, 4), path, path.stem) for path in poses]
     )
-    rotation = world_from_camera[:, :3, :3].transpose(0, 2, 1)
-    camera_from_world = np.tile(np.eye(4), (len(poses), 1, 1))
-    camera_from_world[:, :3, :3] = rotation
-    camera_from_world[:, :3, 3:] = -rotation @ world_from_camera[:, :3, 3:]
     matrix = _intrinsics(folder / "intrinsics.txt", size, root)
     return posed(
         rgba,
-        camera_from_world,
+        invert_poses(world_from_camera),
         np.tile(matrix, (len(poses), 1, 1)),
         has_alpha=alpha,
         bounds=bounds,

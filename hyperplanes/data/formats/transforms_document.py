@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.utilities.axes import flip_camera_axes
+from hyperplanes.utilities.axes import flip_camera_axes, invert_poses
 from hyperplanes.utilities.files import DataError
 
 __all__ = ["calibration", "opencv_from_opengl", "stated_size", "transforms_document"]
@@ -78,12 +78,7 @@ def opencv_from_opengl(world_from_camera: npt.NDArray[np.float64]) -> npt.NDArra
     >>> opencv_from_opengl(np.eye(4)[None])[0].diagonal().tolist()
     [1.0, -1.0, -1.0, 1.0]
     """
-    poses = flip_camera_axes(world_from_camera)
-    rotation = poses[:, :3, :3].transpose(0, 2, 1)
-    result = np.tile(np.eye(4), (len(poses), 1, 1))
-    result[:, :3, :3] = rotation
-    result[:, :3, 3:] = -rotation @ poses[:, :3, 3:]
-    return result
+    return invert_poses(flip_camera_axes(world_from_camera))
 
 
 def calibration(

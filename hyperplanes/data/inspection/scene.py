@@ -160,11 +160,13 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
     views = stand_upright(views)
     written = views.names or tuple(map(str, range(len(views))))
     names = tuple(PurePosixPath(name).name for name in written)
+    # where the views stand, and how far the nearest other is
     axes = _directions(views)
     apart = torch.rad2deg(torch.acos((axes @ axes.T).clamp(-1, 1)))
     apart.fill_diagonal_(torch.inf)
     nearests = apart.amin(1)
     azimuth, elevation = _angles(axes)
+    # how each mask fits the hull of all, how sharp each picture is, how well each is posed
     hull = _hull(views)
     agreement = None if hull is None else _agreement(views, hull)
     middle = None if agreement is None else float(agreement.median())
@@ -190,6 +192,7 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
         reports.append(
             ViewReport(name, direction, nearest, fit, float(sharp[index]), error, bool(cut[index]), tuple(faults))
         )
+    # how much of all directions, from above and from below, some view covers
     every = torch.linalg.inv(fibonacci_sphere(DIRECTIONS, 1.0).double())[:, :3, 3]
     near = angles_to(axes, every) < NEAR
     up = torch.rad2deg(torch.asin(every[:, 1].clamp(-1, 1)))

@@ -107,6 +107,7 @@ def assemble(
         The pictures, and which of the frames they are. Pictures that are missing or misfit, or a lens that folds the
         picture, are a DataError.
     """
+    # the frames that have a picture, and one size for all of them
     kept, notes = _present(frames, source, complete)
     found = [_examine(frames[index], source) for index in kept]
     size = _common_size([one.size for one in found])
@@ -118,6 +119,7 @@ def assemble(
     if factor > 1:
         why = "" if downscale else "; --downscale 1 keeps every pixel"
         notes.append(f"scaled down by {factor}, to {size[1] // factor} x {size[0] // factor} pixels{why}")
+    # each picture at that size, without its lens, and its calibration with it
     pictures, alphas, matrices = [], [], []
     for one in found:
         matrix = scaled_matrix(one.frame.calibrate(one.size), one.size, (size[0] / factor, size[1] / factor))

@@ -85,6 +85,7 @@ def read_metashape(folder: str | Path, *, downscale: int | None = None, root: Pa
         if not usable:
             found = f"none of {len(cameras)}"
             raise DataError(path, "cameras that are aligned, enabled and calibrated", found, "align the photographs")
+        # the component with most cameras: others have worlds of their own
         largest = Counter(each.get("component_id") for each in usable).most_common(1)[0][0]
         kept = [each for each in usable if each.get("component_id") == largest]
         world = worlds.get(largest) or _similarity(chunk, path)
