@@ -22,6 +22,7 @@ from kornia.geometry.camera import PinholeCamera
 from hyperplanes.data.formats.transforms_document import opencv_from_opengl
 from hyperplanes.data.pictures.posed import check_pose
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.files import DataError, read_json
 
 __all__ = ["CameraPath", "read_camera_path"]
@@ -45,6 +46,7 @@ class CameraPath:
     notes: tuple[str, ...] = ()
 
 
+@checked
 def read_camera_path(
     path: str | Path, transforms: str | Path | None = None, scene: Mapping[str, Any] | None = None
 ) -> CameraPath:

@@ -12,6 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from hyperplanes.export.images import picture_paths, to_pixels
 from hyperplanes.rendering.depth import seen_surface
 from hyperplanes.rendering.images import Pictures
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.writing import write_json, write_whole
 
@@ -45,6 +46,7 @@ def depth_pixels(z: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint16], fl
     return np.where(seen, NEAREST + np.round(scaled * (FARTHEST - NEAREST)), 0).astype(np.uint16), nearest, farthest
 
 
+@checked
 def output_frames(name: str, pictures: Pictures, cameras: PinholeCamera) -> npt.NDArray[np.uint8]:
     """One output as 8-bit colours (view, height, width, 3), for animations.
 
@@ -59,8 +61,9 @@ def output_frames(name: str, pictures: Pictures, cameras: PinholeCamera) -> npt.
     return pixels if pixels.ndim == 4 else np.repeat(pixels[..., None], 3, -1)
 
 
+@checked
 def save_outputs(
-    outputs: Sequence[str], pictures: Pictures, cameras: PinholeCamera, folder: Path, names: Sequence[str] = ()
+    outputs: Sequence[str], pictures: Pictures, cameras: PinholeCamera, folder: str | Path, names: Sequence[str] = ()
 ) -> list[Path]:
     """Write one PNG a view and output: of rgb into the folder, of the others into one of their name in it.
 
@@ -81,7 +84,7 @@ def save_outputs(
     written = []
     for output in outputs:
         pixels, stated = _pixels(output, pictures, cameras)
-        place = folder if output == "rgb" else folder / output
+        place = Path(folder) if output == "rgb" else Path(folder) / output
         for path, each in zip(picture_paths(len(pixels), place, names), pixels, strict=True):
             write_whole(path, encode_png(each, small=each.dtype == np.uint8))
             written.append(path)
@@ -91,7 +94,13 @@ def save_outputs(
 
 
 def _pixels(name: str, pictures: Pictures, cameras: PinholeCamera) -> tuple[npt.NDArray, dict[str, float]]:
-    """The pixels of an output, and what has to be known to read them."""
+    """The pixels of an output, and what has to be known to read them.
+
+    Raises:
+        ValueError: an output that is none.
+    """
+    if name not in OUTPUTS:
+        raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, got {name!r}")
     if name == "rgb":
         return to_pixels(pictures.images), {}
     if name == "accumulation":

@@ -13,6 +13,7 @@ from torch.nn.functional import normalize, pad
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
 from hyperplanes.rendering.images import Pictures
+from hyperplanes.utilities.arguments import checked
 
 __all__ = ["SeenSurface", "seen_surface"]
 
@@ -39,6 +40,7 @@ class SeenSurface:
     covered: Float[Tensor, "view height width"]
 
 
+@checked
 @torch.no_grad()
 def seen_surface(pictures: Pictures, cameras: PinholeCamera) -> SeenSurface:
     """The surface that pictures show, from their depth along the rays.
@@ -50,7 +52,14 @@ def seen_surface(pictures: Pictures, cameras: PinholeCamera) -> SeenSurface:
     Args:
         pictures: of a field.
         cameras: which took them.
+
+    Raises:
+        ValueError: cameras of other pictures.
     """
+    expected = (cameras.batch_size, *(camera.image_size(cameras) if cameras.batch_size else ()))
+    shape = (len(pictures.depth), *pictures.depth.shape[2:])
+    if expected != shape:
+        raise ValueError(f"cameras: expected {shape[0]} of pictures of {shape[1:]} pixels, got {expected}")
     parts = [_one_view(pictures, cameras, view) for view in range(cameras.batch_size)]
     return SeenSurface(*(torch.stack(values) for values in zip(*parts, strict=True)))
 

@@ -3,6 +3,7 @@
 Case number i of a seed is always the same: `python -m tests.fuzz --calls 1 --only i --seed SEED`.
 """
 
+import json
 import math
 import os
 import random
@@ -18,11 +19,15 @@ import hyperplanes as hp
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.data import read_channel
+from hyperplanes.data.camera_path import read_camera_path
 from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
+from hyperplanes.export.outputs import save_outputs
+from hyperplanes.export.points import point_cloud, save_points
 from hyperplanes.export.splats import fit_splats, save_splats, splats_of
 from hyperplanes.geometry import Sphere, cameras, occupancy, poses, rays
 from hyperplanes.geometry import lookup as lookups
+from hyperplanes.rendering.depth import seen_surface
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.utilities.checkpoints import CheckpointError
 from tests.fuzz.campaign import Failure, Hang, time_limit
@@ -32,6 +37,11 @@ from tests.fuzz.corpus import archive, baked, data_set, posed_scene, small_model
 def fog(points, directions):
     """Thin and grey."""
     return torch.full_like(points, 0.5), torch.ones(len(points))
+
+
+def wall(points, directions):
+    """Opaque and grey."""
+    return torch.full_like(points, 0.5), torch.full((len(points),), 1e3)
 
 
 def make_calls(home):
@@ -54,6 +64,11 @@ def make_calls(home):
     matrix, pose = cameras.intrinsics(batch)[0], cameras.camera_from_world(batch)
     surface = hp.extract_mesh(field, voxels=8, level=1e-6)
     few = hp.FineTuning(rays=16, max_steps=2)
+    shown = hp.render(wall, batch, bounds=Sphere())
+    frame = {"camera_to_world": torch.eye(4).flatten().tolist(), "fov": 50.0}
+    path = {"render_width": 8, "render_height": 4, "seconds": 1.0, "camera_path": [frame]}
+    (home / "path.json").write_text(json.dumps(path))
+    (home / "world.json").write_text(json.dumps({"transform": torch.eye(4).tolist(), "scale": 1.0}))
     calls = {
         "read_views": (hp.read_views, {"path": home / "scene", "downscale": 1, "up": "y"}),
         "read_task": (hp.read_task, {"path": home / "scene", "downscale": 1, "up": "auto"}),
@@ -116,6 +131,13 @@ def make_calls(home):
         "splats_of": (splats_of, {"baked": voxels}),
         "fit_splats": (fit_splats, {"splats": splats, "views": views, "steps": 1, "seed": 0}),
         "save_splats": (save_splats, {"splats": splats, "path": out / "a.ply"}),
+        "read_camera_path": (read_camera_path, {"path": home / "path.json", "transforms": home / "world.json",
+                                                "scene": {"applied_scale": 2.0}}),
+        "seen_surface": (seen_surface, {"pictures": shown, "cameras": batch}),
+        "save_outputs": (save_outputs, {"outputs": ["depth", "normals"], "pictures": shown, "cameras": batch,
+                                        "folder": out, "names": ["a", "b", "c", "d"]}),
+        "point_cloud": (point_cloud, {"pictures": shown, "cameras": batch, "bounds": Sphere(), "count": 20}),
+        "save_points": (save_points, {"cloud": point_cloud(shown, batch, Sphere()), "path": out / "points.ply"}),
         "BakedScene.render": (BakedScene(voxels).render, {"cameras": batch}),
         "save_mesh": (hp.save_mesh, {"surface": surface, "path": out / "b.ply"}),
         "extract_mesh": (hp.extract_mesh, {"field": field, "voxels": 8, "level": 1e-6}),
