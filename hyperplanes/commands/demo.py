@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -89,16 +89,8 @@ def settings_of(arguments: Arguments) -> DemoSettings:
         )
     if arguments.resolution < 16:
         raise ValueError(f"resolution: expected at least 16 pixels, got {arguments.resolution}")
-    return DemoSettings(
-        arguments.class_name,
-        arguments.objects,
-        arguments.held_out,
-        arguments.resolution,
-        preset=arguments.preset,
-        steps=arguments.steps,
-        seed=arguments.seed,
-        meshes=arguments.meshes,
-    )
+    given = {each.name for each in fields(DemoSettings)} & {each.name for each in fields(Arguments)}
+    return DemoSettings(**{name: getattr(arguments, name) for name in given})
 
 
 @writes_to(lambda arguments: arguments.out)
@@ -109,8 +101,7 @@ def run(arguments: Arguments) -> int:
     console, settings = Console(), settings_of(arguments)
     heading, begun = "", False
 
-    def begin() -> None:
-        """Something of the step is not made yet."""
+    def begin() -> None:  # something of the step is not made yet
         nonlocal begun
         if not begun:
             console.say(heading)

@@ -107,8 +107,7 @@ class DemoSettings:
     @property
     def table(self) -> Experiment:
         """Every method on held-out objects of the class that was trained on, and some on objects of the other."""
-        cells = [self._cell(row, *row.split(":")) for row in self.rows]
-        return self._experiment(cells, keep_pictures=True)
+        return self._experiment([self._cell(row, *row.split(":")) for row in self.rows], keep_pictures=True)
 
     @property
     def fine_tuning(self) -> Experiment:
