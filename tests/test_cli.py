@@ -469,6 +469,15 @@ def test_an_orbit_is_pictures_and_a_turntable(tmp_path):
     assert len(list(tmp_path.glob("*.png"))) == 3
 
 
+def test_a_cloud_of_points_is_exported(tmp_path, capsys):
+    demo = demo_folder()
+    line = ["export", "--checkpoint", str(demo), "--views", str(first_object(demo)), "--out", str(tmp_path)]
+    assert main([*line, "--what", "points", "--points", "50"]) == 0
+    number = int(re.search(r"element vertex (\d+)", (tmp_path / "points.ply").read_bytes().decode("latin1"))[1])
+    assert 0 < number <= 50
+    assert f"points.ply: {number} points with normals and colours" in capsys.readouterr().out
+
+
 def test_a_camera_path_of_nerfstudio_is_pictures_of_all_that_is_asked_for(tmp_path, capsys):
     """The poses of the query views as a path: the same pictures, of another size where asked; none from elsewhere."""
     demo = demo_folder()

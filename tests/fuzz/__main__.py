@@ -5,6 +5,7 @@ Beside damaged files, wrong command lines and wrong calls: `python -m tests.fuzz
 
 import argparse
 import faulthandler
+import shutil
 import sys
 import tempfile
 import time
@@ -49,6 +50,8 @@ def main():
         found += len(failures)
     if found:
         print(f"what they left is in {home}")
+    else:
+        shutil.rmtree(home)
     return int(bool(found))
 
 
