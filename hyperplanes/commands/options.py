@@ -62,8 +62,8 @@ class ObjectArguments:
         second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
             visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
-        refine_poses: Refine the poses of all views and their focal length first, and keep them where support views that
-            the model is not given are shown better by half a decibel: for poses that are a little wrong.
+        refine_poses: Refine the poses of all views first, and keep them where support views that the model is not given
+            are shown better by half a decibel: for poses that are a little wrong.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held. Meshes, turntables and baked files have y up.
         downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as

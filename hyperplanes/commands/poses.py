@@ -56,7 +56,7 @@ def refine_task(source: HyperPlanes | BakedScene, task: Task, console: Console, 
         return task
     turned = found.turned
     console.say(
-        f"poses: refined, turned by {float(turned.median()):.2f} degrees (median), {float(turned.max()):.2f} at most, "
-        f"focal length times {found.focal:.4f}: {figures}"
+        f"poses: refined, turned by {float(turned.median()):.2f} degrees (median), {float(turned.max()):.2f} at most: "
+        f"{figures}"
     )
     return Task(support, support if all_views else found.views[count:], task.name)

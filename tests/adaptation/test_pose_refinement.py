@@ -32,6 +32,7 @@ def views():
 def few_steps(monkeypatch):
     monkeypatch.setattr(pose_refinement, "LEVELS", ((32, 24, 60), (64, 24, 60)))
     monkeypatch.setattr(pose_refinement, "RAYS", 1024)
+    monkeypatch.setattr(pose_refinement, "FIXED", 0)
 
 
 def disturbed(views):
@@ -70,7 +71,6 @@ def test_disturbed_poses_come_back(views):
     assert told[0] == (1, 120)
     assert told[-1] == (120, 120)
     assert torch.equal(found.views.images, wrong.images)
-    assert 0.97 < found.focal < 1.03
     assert found.turned.shape == (len(views),)
 
 
