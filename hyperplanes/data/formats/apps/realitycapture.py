@@ -90,7 +90,7 @@ def world_from_angles(heading: float, pitch: float, roll: float) -> npt.NDArray[
     With all three zero the camera looks straight down, the upper border of its picture towards y, in a world with z up;
     heading turns clockwise seen from above.
 
-    >>> world_from_angles(90, 0, 0).round().tolist()
+    >>> (world_from_angles(90, 0, 0).round() + 0.0).tolist()
     [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
     from scipy.spatial.transform import Rotation
