@@ -23,7 +23,7 @@ from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
 from hyperplanes.export.baking import BakedScene, bake, default_side
-from hyperplanes.export.voxel_fitting import STEPS, fit_voxels
+from hyperplanes.export.voxel_fitting import STEPS, fit_voxels, render_guide
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task
 
@@ -73,7 +73,9 @@ def measure(model: Adapter, task: Task, side: int | None, fit: int) -> dict[str,
     adapted.render(task.query[:1].cameras)  # compiles, and refines the occupancy
     field_seconds, by_field = timed(lambda: adapted.render(cameras))
     bake_seconds, baked = timed(lambda: bake(adapted, side=side or default_side(task.support.size)))
-    fit_seconds, fitted = timed(lambda: fit_voxels(baked, task.support, steps=fit))
+    guide_seconds, guide = timed(lambda: render_guide(adapted, task.support))
+    alone = fit_voxels(baked, task.support, steps=fit) if guide else None
+    fit_seconds, fitted = timed(lambda: fit_voxels(baked, task.support, guide=guide, steps=fit))
     scene = BakedScene(fitted)
     scene.render(task.query[:1].cameras)
     voxel_seconds, by_voxels = timed(lambda: scene.render(cameras))
@@ -87,8 +89,9 @@ def measure(model: Adapter, task: Task, side: int | None, fit: int) -> dict[str,
         "field": quality(by_field),
         "baked": quality(plain),
         "fitted": quality(by_voxels),
+        "fitted_without_guide": quality(BakedScene(alone).render(cameras) if alone else by_voxels),
         "field_ms": 1e3 * field_seconds / views,
         "voxels_ms": 1e3 * voxel_seconds / views,
         "bake_seconds": bake_seconds,
-        "fit_seconds": fit_seconds,
+        "fit_seconds": guide_seconds + fit_seconds,
     }

@@ -193,7 +193,7 @@ def bake_field(field: AdaptedField, shown: Views, side: int, fit: int, console: 
         console: where the progress is shown, and at the end what it cost.
     """
     from hyperplanes.export.baking import bake
-    from hyperplanes.export.voxel_fitting import fit_voxels
+    from hyperplanes.export.voxel_fitting import fit_voxels, render_guide
 
     started = time.perf_counter()
     with console.bar("baking") as bar:
@@ -202,7 +202,8 @@ def bake_field(field: AdaptedField, shown: Views, side: int, fit: int, console: 
     how = f"{len(baked.values):,} voxels of {side}^3 baked in {format_duration(between - started)}"
     if fit:
         with console.bar("fitting voxels") as bar:
-            baked = fit_voxels(baked, shown, steps=fit, on_step=lambda done: bar.show(done, fit, "steps"))
+            guide = render_guide(field, shown)
+            baked = fit_voxels(baked, shown, guide=guide, steps=fit, on_step=lambda done: bar.show(done, fit, "steps"))
         how += f", fitted to {len(shown)} views in {format_duration(time.perf_counter() - between)}"
     console.say(how)
     return baked

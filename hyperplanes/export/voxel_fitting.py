@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 
 import torch
+from torch import Tensor
 
+from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.baking import BakedScene
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.voxels import voxel_gradients
 from hyperplanes.views import Views
 
-__all__ = ["STEPS", "fit_voxels"]
+__all__ = ["STEPS", "fit_voxels", "render_guide"]
 
 STEPS = 80
 RAYS = 8192
@@ -21,12 +25,41 @@ COLOUR_RATE = 0.01
 DECAY = 0.1  # of both rates, from the first step to the last
 STEPS_A_DIAMETER = 256
 SMALLEST_DEPTH = 1e-4  # of a voxel: colour has no gradient where density is zero
+ENOUGH = 16  # views by which voxels are fitted without a guide
+
+
+def render_guide(adapted: AdaptedField, views: Views) -> Views | None:
+    """Views of a field from all around the object, as the second source of `fit_voxels` where few views are shown.
+
+    Fitted to a few views alone, voxels show them and little else: 1.9 dB less than before the fit from three views of a
+    car, and with the guide 0.7 dB less; one of random shapes from five gains 1.9 dB with it and 1.3 without
+    (`python -m benchmarks baked --counts 3 5 8`).
+
+    Args:
+        adapted: the field that the voxels were baked from.
+        views: posed images that it was adapted to.
+
+    Returns:
+        Sixteen views of half the size, as far from the object as the given ones; None where these are sixteen or more.
+    """
+    if len(views) >= ENOUGH:
+        return None
+    bounds = adapted.occupancy.bounds
+    centre = torch.tensor(bounds.centre)
+    distance = (camera.centres(views.cameras).cpu().float() - centre).norm(dim=1).mean()
+    eyes = centre + distance * camera.fibonacci_sphere(ENOUGH, 1.0)[:, 2, :3]
+    matrix = camera.intrinsics(views.cameras)[:1].cpu().float().expand(ENOUGH, 3, 3)
+    around = camera.pinhole(matrix, camera.look_at(eyes, bounds.centre), *views.size)
+    height, width = (max(8, side // 2) for side in views.size)
+    around = camera.resized(around, height, width)
+    return Views(adapted.render(around).images.clamp(0, 1).cpu(), around, bounds=bounds)
 
 
 def fit_voxels(
     baked: BakedField,
     views: Views,
     *,
+    guide: Views | None = None,
     steps: int = STEPS,
     rays: int = RAYS,
     seed: int = 0,
@@ -40,6 +73,7 @@ def fit_voxels(
     Args:
         baked: where it starts; on the CPU.
         views: posed images of the object, on any device.
+        guide: renderings of the field from other places, from `render_guide`; the fewer views, the more rays of these.
         steps: gradient steps.
         rays: of each step, drawn from all views; no more than there are pixels that show something.
         seed: of the rays.
@@ -48,13 +82,13 @@ def fit_voxels(
     Returns:
         Voxels at the same places.
     """
-    views = views.to("cpu", torch.float32)
     scene, voxel = BakedScene(baked, STEPS_A_DIAMETER), 2 * baked.bounds.radius / baked.side
-    views = replace(views, bounds=baked.bounds)
-    live = scene.footprint(views.cameras).flatten().nonzero()[:, 0]
-    if not len(live):
+    share = max(0.0, 1 - len(views) / ENOUGH) if guide is not None else 0.0
+    sources = [_Source.of(views, scene, rays, 1 - share)]
+    if guide is not None and share:
+        sources.append(_Source.of(guide, scene, rays, share))
+    if not sum(source.rays for source in sources):
         return baked
-    rays = min(rays, len(live))
     # optical depth of a voxel and coefficients, each with its own rate
     depth, colour = (baked.values[:, :1] * voxel).clamp_min(SMALLEST_DEPTH), baked.values[:, 1:].clone()
     groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
@@ -63,7 +97,7 @@ def fit_voxels(
     generator, step_length = torch.Generator().manual_seed(seed), 2 * baked.bounds.radius / STEPS_A_DIAMETER
     for step in range(steps):
         # squared error of some rays, and its gradient by the kernel
-        drawn, truth = views.sample_rays(rays, generator=generator, among=live)
+        drawn, truth = _draw(sources, generator)
         values, basis = torch.cat([depth / voxel, colour], 1), spherical_harmonics(drawn.directions)
         _, gradient = voxel_gradients(
             baked.index, values, baked.bounds, drawn, basis, truth, step=step_length, empty=scene.distances
@@ -75,3 +109,26 @@ def fit_voxels(
         if on_step:
             on_step(step + 1)
     return replace(baked, values=torch.cat([depth / voxel, colour], 1))
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Views, those of their pixels that may show a voxel, and how many rays of a step are drawn from these."""
+
+    views: Views
+    live: Tensor
+    rays: int
+
+    @classmethod
+    def of(cls, views: Views, scene: BakedScene, rays: int, share: float) -> _Source:
+        """With a share of the rays, and no more than there are such pixels."""
+        views = replace(views.to("cpu", torch.float32), bounds=scene.field.bounds)
+        live = scene.footprint(views.cameras).flatten().nonzero()[:, 0]
+        return cls(views, live, min(round(share * rays), len(live)))
+
+
+def _draw(sources: list[_Source], generator: torch.Generator) -> tuple[Rays, Tensor]:
+    """Rays of all sources, and the colours that their pixels have."""
+    parts = [it.views.sample_rays(it.rays, generator=generator, among=it.live) for it in sources if it.rays]
+    rays = Rays(*(torch.cat([getattr(part, each.name) for part, _ in parts]) for each in fields(Rays)))
+    return rays, torch.cat([colours for _, colours in parts])

@@ -8,7 +8,7 @@ import torch
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.baking import BakedScene, bake
-from hyperplanes.export.voxel_fitting import fit_voxels
+from hyperplanes.export.voxel_fitting import fit_voxels, render_guide
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
@@ -178,3 +178,18 @@ def test_fitting_brings_back_colours_and_densities(adapted):
     assert after > before + 5
     assert steps == list(range(1, 31))
     assert torch.equal(fitted.index, whole.index)
+
+
+def test_a_guide_keeps_what_few_views_do_not_show(adapted):
+    """Two views of another brightness: without the guide all that they do not show is lost, with it little."""
+    whole, guide = bake(adapted, side=32), render_guide(adapted, Views(adapted.render(CAMERAS).images, CAMERAS)[:2])
+    assert guide is not None
+    assert guide.size == (CAMERAS.height[0] // 2, CAMERAS.width[0] // 2)
+    darker = Views(0.8 * adapted.render(CAMERAS).images, CAMERAS)[:2]
+    others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
+    truth = adapted.render(others).images
+    alone, guided = (fit_voxels(whole, darker, guide=each, steps=30, rays=1024) for each in (None, guide))
+    lost = [float(psnr(BakedScene(each).render(others).images, truth).mean()) for each in (alone, guided)]
+    assert lost[1] > lost[0] + 3
+    many = Views(truth.repeat(6, 1, 1, 1), camera.select(others, [0, 1, 2] * 6))
+    assert render_guide(adapted, many) is None
