@@ -18,7 +18,7 @@ from benchmarks._timing import timed
 from benchmarks.reporting import Row, finish
 from benchmarks.views import suite_folders
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.adaptation.base import Adapter, Pictures
+from hyperplanes.adaptation.base import Pictures
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
@@ -67,7 +67,7 @@ def main(arguments: list[str]) -> int:
     return finish("baked", rows, chosen.json)
 
 
-def measure(model: Adapter, task: Task, side: int | None, fit: int) -> dict[str, float]:
+def measure(model: HyperPlanes, task: Task, side: int | None, fit: int) -> dict[str, float]:
     """One object: PSNR by the field, the voxels and the fitted voxels, and seconds; times of a view are medians."""
     adapted, cameras = model.adapt(task.support), task.query.cameras
     adapted.render(task.query[:1].cameras)  # compiles, and refines the occupancy

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, load_source, render_views
+from hyperplanes.commands.fields import adapt_to, bake_field, load_source, render_views
 from hyperplanes.commands.options import (
     Free,
     ObjectArguments,
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Arguments", "run"]
 
+VOXEL_VIEWS, VOXEL_PIXELS = 16, 2_000_000  # from which on voxels draw an orbit: they are as good, and made sooner
 LARGEST_ORBIT = 400  # pixels of an orbit's pictures where none were asked for: time grows with their square
 ROUND = 4.0  # seconds of a turntable
 
@@ -62,6 +63,9 @@ class Arguments(ObjectArguments):
         size: Pixels along the longer side of the pictures of an orbit or a path; of an orbit as the images, but 400 at
             most, when not given.
         turntable: The format of the animation; mp4 and webm need `pip install hyperplanes[video]`.
+        representation: What draws the pictures: the field itself, or voxels that are baked from it and fitted to the
+            shown views, which takes half a minute once and milliseconds a picture. auto takes voxels for an orbit or
+            a path, where 16 views or more are shown and there are two million pixels to draw.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
             marching through what is not empty.
     """
@@ -73,6 +77,7 @@ class Arguments(ObjectArguments):
     rendered_output_names: tuple[Literal["rgb", "depth", "normals", "accumulation"], ...] = ("rgb",)
     size: OptionalInt = None
     turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
+    representation: Literal["auto", "field", "voxels"] = "auto"
     protocol: Protocol = "default"
 
 
@@ -95,13 +100,16 @@ class Asked:
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
+    from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
     from hyperplanes.evaluation.suitability import held_out_psnr, worse_than_copying
-    from hyperplanes.export.baking import BakedScene
+    from hyperplanes.export.baking import BakedScene, default_side
     from hyperplanes.export.images import encode_animation
     from hyperplanes.export.outputs import output_frames, save_outputs
+    from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
+    from hyperplanes.geometry import cameras as camera
     from hyperplanes.utilities.writing import write_whole
 
     _check(arguments)
@@ -113,6 +121,9 @@ def run(arguments: Arguments) -> int:
     asked = _asked(arguments, shown, known, up, console)
     settings = FineTuning(trainable=arguments.fine_tune)
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
+    if isinstance(field, AdaptedField) and _takes_voxels(arguments, asked, len(shown)):
+        side = default_side(max(shown.size, camera.image_size(asked.cameras)))
+        field = BakedScene(bake_field(field, shown, side, VOXEL_STEPS, console))
     started = time.perf_counter()
     pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / asked.cameras.batch_size
@@ -142,8 +153,24 @@ def run(arguments: Arguments) -> int:
     return 0
 
 
+def _takes_voxels(arguments: Arguments, asked: Asked, shown: int) -> bool:
+    """Whether baked voxels draw the pictures: when told so, or where that is faster and loses nothing."""
+    if arguments.representation != "auto":
+        return arguments.representation == "voxels"
+    from hyperplanes.geometry import cameras as camera
+
+    height, width = camera.image_size(asked.cameras)
+    pixels = asked.cameras.batch_size * height * width
+    colours_alone = set(arguments.rendered_output_names) == {"rgb"} and arguments.protocol == "default"
+    return asked.animation is not None and colours_alone and shown >= VOXEL_VIEWS and pixels >= VOXEL_PIXELS
+
+
 def _check(arguments: Arguments) -> None:
     """Refuse options of a camera path or an orbit that say nothing together."""
+    if arguments.representation == "voxels" and arguments.protocol != "default":
+        raise ValueError(
+            "--protocol: expected none with --representation voxels, which are not sampled so; leave one out"
+        )
     if arguments.camera_path is None:
         check_orbit(arguments.orbit, arguments.size)
         if arguments.dataparser_transforms is not None:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import Renderable
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import carve
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.files import format_of
@@ -35,6 +36,7 @@ __all__ = [
 ]
 
 TURNTABLE_FORMATS = ("webp", "gif", "mp4", "webm")
+FRAMED, MARGIN = 48, 0.02  # voxels an axis of the hull that fits into an orbit, and the share of a side left free
 CODECS = {"mp4": "libx264", "webm": "libvpx-vp9"}
 
 
@@ -163,6 +165,9 @@ def orbit_cameras(
 ) -> PinholeCamera:
     """Cameras on a level circle around what the views show, as far away and with the lens of one of them.
 
+    Where the views have masks, the cameras stand further back if the visual hull would not fit into their pictures, as
+    after close-ups that the border cuts.
+
     Args:
         views: posed images of the object.
         count: how many cameras.
@@ -196,15 +201,38 @@ def orbit_cameras(
     eyes = centre + distance * (math.cos(elevation) * around + math.sin(elevation) * up)
     x, y, z = up.tolist()
     pose = camera.look_at(eyes, views.bounds.centre, (x, y, z)).to(cameras.extrinsics)
-    height, width = views.size
     # the lens of the view with the squarest pixels
     focal = camera.intrinsics(cameras)[:, [0, 1], [0, 1]].log()
     squarest = int((focal[:, 0] - focal[:, 1]).abs().round(decimals=3).argmin())
-    batch = camera.with_poses(camera.select(cameras, [squarest] * count), pose)
+    lens = camera.select(cameras, [squarest])
+    batch = camera.with_poses(camera.select(lens, [0] * count), _stepped_back(pose, lens, views))
     if size is None:
         return batch
+    height, width = views.size
     scale = size / max(height, width)
     return camera.resized(batch, max(1, round(height * scale)), max(1, round(width * scale)))
+
+
+def _stepped_back(pose: Tensor, lens: PinholeCamera, views: Views) -> Tensor:
+    """Poses (camera from world) moved back along their axes, all alike, until the pictures show the visual hull."""
+    if views.masks is None:
+        return pose
+    hull = carve(views.masks, views.cameras, views.bounds, FRAMED)
+    points = hull.centres().to(pose)
+    if not len(points):
+        return pose
+    matrix, (height, width) = camera.intrinsics(lens)[0].to(pose), camera.image_size(lens)
+    seen = points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+    needed = seen.new_zeros(())
+    for axis, side in ((0, width), (1, height)):
+        focal, middle, margin = matrix[axis, axis], matrix[axis, 2], MARGIN * side
+        before, after = middle - margin, side - 1 - margin - middle  # pixels to the two borders
+        for place, room in ((-seen[..., axis], before), (seen[..., axis], after)):
+            if room > 0:
+                needed = torch.maximum(needed, (place * focal / room - seen[..., 2]).max())
+    moved = pose.clone()
+    moved[:, 2, 3] += needed
+    return moved
 
 
 @checked

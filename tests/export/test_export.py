@@ -16,7 +16,7 @@ from hyperplanes.export.mesh_filling import fill_hidden
 from hyperplanes.export.mesh_level import Agreement, agreement, choose_level
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
-from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.views import Views
 
@@ -191,6 +191,29 @@ def test_an_orbit_looks_at_the_middle_from_one_height():
     torch.testing.assert_close(height, torch.full((8,), 5 * math.sin(0.4)), atol=1e-3, rtol=0)
     middle = cameras.project(torch.tensor(CENTRE).expand(8, 1, 3)).reshape(8, 2)
     torch.testing.assert_close(middle, torch.full((8, 2), 15.5), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("distance", "moved"), [(5.0, False), (1.9, True)])
+def test_an_orbit_after_close_ups_stands_back_until_the_object_fits(distance, moved):
+    """A ball of angular radius asin(r / d): it fits into half the opening angle from 5 away, and not from 1.9."""
+    eyes = camera.centres(views(40).cameras) - torch.tensor(CENTRE)
+    eyes[::2] *= distance / 5  # close-ups and, for the rest of the outline, some from afar
+    eyes[1::8] *= distance / 5
+    pose = camera.look_at(eyes + torch.tensor(CENTRE), CENTRE)
+    cameras = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.9), pose, 48, 48)
+    rays = cast(
+        cameras, torch.arange(40).repeat_interleave(48 * 48), pixel_grid(48, 48).repeat(40, 1), Sphere(CENTRE, RADIUS)
+    )
+    masks = (rays.far > rays.near).float().reshape(40, 1, 48, 48)
+    scene = Views(torch.ones(40, 3, 48, 48), cameras, masks, bounds=BOUNDS)
+    orbit = orbit_cameras(scene, 8)
+    away = (camera.centres(orbit) - torch.tensor(CENTRE)).norm(dim=1)
+    assert away.max() - away.min() < 1e-3
+    assert (float(away[0]) > distance + 0.1) == moved
+    surface = torch.tensor(CENTRE) + 0.95 * RADIUS * torch.nn.functional.normalize(torch.randn(500, 3), dim=1)
+    pixels = orbit.project(surface.expand(8, 500, 3))
+    assert float(pixels.min()) > 0
+    assert float(pixels.max()) < 47
 
 
 @pytest.mark.parametrize("kind", ["webp", "gif"])
