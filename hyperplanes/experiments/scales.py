@@ -166,7 +166,7 @@ SCALES: dict[str, Scale] = {
         ),
         Scale(
             name="small",
-            about="about half an hour a seed of all ten on one core: 32x32, procedural objects",
+            about="all ten in some hours on one core: 32x32, procedural objects",
             presets={128: "quick", 200: "quick"},
             resolution=32,
             objects=50,
@@ -174,7 +174,7 @@ SCALES: dict[str, Scale] = {
             steps=200,
             max_steps=150,
             max_curve_steps=1000,
-            evaluated=3,
+            evaluated=10,
             most_seeds=3,
             changes={
                 "model.network.depth": 3,

@@ -229,7 +229,7 @@ def test_scales_make_things_smaller_and_say_so():
     assert [scale.method("hyperplanes_100") for scale in (smoke, small)] == ["hyperplanes_2", "hyperplanes_100"]
     assert [scale.planes(25) for scale in (smoke, small, paper)] == [4, 25, 25]
     # docs/paper.md, "at which size"
-    assert (small.resolution, small.objects - small.held_out, small.steps, small.evaluated) == (32, 40, 200, 3)
+    assert (small.resolution, small.objects - small.held_out, small.steps, small.evaluated) == (32, 40, 200, 10)
     assert (smoke.resolution, smoke.steps, smoke.evaluated, smoke.most_seeds) == (16, 2, 1, 1)
     assert (SCALES["gpu"].steps, SCALES["gpu"].evaluated, paper.steps, paper.evaluated) == (5000, 5, None, None)
     iterations = EXPERIMENTS["iterations"]
