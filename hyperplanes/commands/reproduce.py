@@ -1,7 +1,7 @@
 """Run a table or a figure of the HyperPlanes paper and print it beside the paper's numbers.
 
-The scale `smoke` takes seconds and shows that everything runs; `small` makes all ten tables in an hour or two on one
-core, on procedural objects of 32x32 pixels that `hyperplanes generate` makes; `gpu` is sized for all ten in about a day
+The scale `smoke` takes seconds and shows that everything runs; `small` makes all ten tables in some hours on one core,
+on procedural objects of 32x32 pixels that `hyperplanes generate` makes; `gpu` is sized for all ten in about a day
 on one card, and `paper` is the paper's setting, both on data sets as they were published, one folder a class. These two
 say first how long they will take by what they have measured here, as --estimate does for any. All tables share --out: a
 data set, a training or an evaluation that lies there is not made again, so Ctrl-C and the same command go on. The table
