@@ -16,7 +16,7 @@ from pathlib import Path
 
 from benchmarks._timing import timed
 from benchmarks.reporting import Row, finish
-from benchmarks.views import suite_folders
+from benchmarks.views import add_data_options, suite_folders
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import Pictures
 from hyperplanes.adaptation.checkpoints import find_checkpoint
@@ -37,10 +37,7 @@ def main(arguments: list[str]) -> int:
         arguments: see --help.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks baked", description=__doc__)
-    parser.add_argument("--checkpoint", default="small", help="a folder, or the name of a packaged model")
-    parser.add_argument("--data", type=Path, nargs="+", help="data sets, or single scenes")
-    parser.add_argument("--suite", help="instead of --data, as in `python -m benchmarks views`")
-    parser.add_argument("--root", type=Path, default=Path("data"), help="of the suites")
+    add_data_options(parser)
     parser.add_argument("--counts", type=int, nargs="+", default=[25], help="numbers of support views")
     parser.add_argument("--objects", type=int, default=3, help="of each data set")
     parser.add_argument("--query", type=int, default=3, help="views of each object to be judged by")

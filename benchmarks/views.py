@@ -48,7 +48,7 @@ from hyperplanes.utilities.metrics import psnr
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Task, Tasks, Views
 
-__all__ = ["METHODS", "PARTS", "adapters", "main", "suite_folders"]
+__all__ = ["METHODS", "PARTS", "adapters", "add_data_options", "main", "suite_folders"]
 
 QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_seconds")
 
@@ -60,10 +60,7 @@ def main(arguments: list[str]) -> int:
         arguments: see --help.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks views", description=__doc__)
-    parser.add_argument("--checkpoint", default="small", help="a folder, or the name of a packaged model")
-    parser.add_argument("--data", type=Path, nargs="+", help="data sets, or single scenes")
-    parser.add_argument("--suite", choices=SUITES, help="instead of --data: data sets in the folder --root")
-    parser.add_argument("--root", type=Path, default=Path("data"), help="of the suites")
+    add_data_options(parser)
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 3, 5, 10, 25], help="numbers of support views")
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="of fine-tuning, and of the same field "
                         "from random weights")  # fmt: skip
@@ -132,14 +129,20 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
+def add_data_options(parser: argparse.ArgumentParser) -> None:
+    """--checkpoint, and --data or --suite and --root, which `suite_folders` reads."""
+    parser.add_argument("--checkpoint", default="small", help="a folder, or the name of a packaged model")
+    parser.add_argument("--data", type=Path, nargs="+", help="data sets, or single scenes")
+    parser.add_argument("--suite", choices=SUITES, help="instead of --data: data sets in the folder --root")
+    parser.add_argument("--root", type=Path, default=Path("data"), help="of the suites")
+
+
 def suite_folders(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -> list[Path]:
     """The data sets that --data, or --suite and --root, name; the parser says what is wrong with them."""
     if (chosen.data is None) == (chosen.suite is None):
         parser.error("--data, --suite: expected one of the two")
     if chosen.suite is None:
         return chosen.data
-    if chosen.suite not in SUITES:
-        parser.error(f"--suite: expected one of {', '.join(SUITES)}, got {chosen.suite}")
     folders = [chosen.root / name for name in SUITES[chosen.suite]]
     for path in folders:
         if not path.exists():
