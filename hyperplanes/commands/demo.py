@@ -112,8 +112,8 @@ def run(arguments: Arguments) -> int:
         with console.bar(title) as bar:
             yield lambda cell, seed, score, done, total: bar.show(done, total, f"{score.name} {score.psnr:.2f} dB")
 
-    runner = partial(make_runner, console=console, device=arguments.device, announce=lambda line: None, begin=begin)
-    demonstration = Demonstration(settings, arguments.out, runner, console.say, evaluating)
+    runner = partial(make_runner, console=console, device=arguments.device, announce=lambda line: None)
+    demonstration = Demonstration(settings, arguments.out, runner, begin, console.say, evaluating)
     steps = list(demonstration.steps().items())[: 1 if arguments.first_only else None]
     for number, (name, work) in enumerate(steps, 1):
         heading, begun = f"[{number}/{len(steps)}] {name}", False

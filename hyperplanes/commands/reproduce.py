@@ -93,6 +93,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
     from hyperplanes.experiments.estimate import estimate
     from hyperplanes.experiments.figures import curves_of, figure_of, pictures_of
+    from hyperplanes.experiments.workspace import Workspace
     from hyperplanes.utilities.formatting import format_duration
     from hyperplanes.utilities.plots import save_figure
     from hyperplanes.utilities.writing import write_json, write_whole
@@ -108,7 +109,7 @@ def run(arguments: Arguments) -> int:
         console.say(f"{cell.row}, {cell.column}, seed {seed}: {score.name} {score.psnr:.2f} dB")
 
     runner = make_runner(
-        arguments.out,
+        Workspace(arguments.out),
         scale,
         console=console,
         device=arguments.device,

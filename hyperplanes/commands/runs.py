@@ -12,27 +12,29 @@ if TYPE_CHECKING:
     from hyperplanes.experiments.engine import Runner
     from hyperplanes.experiments.experiment import Trained
     from hyperplanes.experiments.scales import Scale
+    from hyperplanes.experiments.workspace import Workspace
     from hyperplanes.views import Tasks
 
 __all__ = ["make_runner"]
 
 
 def make_runner(
-    out: Path, scale: Scale, *, console: Console, device: str, announce: Callable[[str], None], **more: Any
+    workspace: Workspace, scale: Scale, *, console: Console, device: str, announce: Callable[[str], None], **given: Any
 ) -> Runner:
     """A runner that generates, trains and says how it goes.
 
     Args:
-        out: the folder.
+        workspace: the folder for everything.
         scale: how large.
         console: where it is said.
         device: auto, or the name of one.
         announce: called with a line before a training.
-        more: of `Runner`.
+        given: of `DataSets`: which are given, and how they are read.
     """
     from hyperplanes.commands import find_verb
     from hyperplanes.commands.train import follow
     from hyperplanes.data.devices import choose_device
+    from hyperplanes.experiments.data_sets import DataSets
     from hyperplanes.experiments.engine import Runner
     from hyperplanes.training import start_training
 
@@ -53,4 +55,5 @@ def make_runner(
         with console.bar(trained.method) as bar:
             follow(trainer, bar)
 
-    return Runner(out, scale, generate=generate, train=train, device=where, **more)
+    data = DataSets(workspace, scale, generate=generate, device=where, **given)
+    return Runner(workspace, data, train=train, device=where)

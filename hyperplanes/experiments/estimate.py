@@ -60,8 +60,8 @@ def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
         evaluation = 0.0
         for cell in experiment.cells:
             if cell.trained == trained:
-                names = runner.names(cell.on, cell.split, experiment.objects)
-                task = runner.tasks(cell.on).task(names[0])
+                names = runner.data.evaluated(cell.on, cell.split, experiment.objects)
+                task = runner.data.tasks(cell.on).task(names[0])
                 tuning = re.search(r"_(\d+)$", runner.scale.method(cell.method))
                 tuned = runner.fine_tuning(cell).rays if learned is None else learned.test_rays
                 rays = tuned * int(tuning[1]) if tuning else 0

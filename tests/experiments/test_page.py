@@ -4,7 +4,6 @@ import base64
 import io
 import re
 from dataclasses import replace
-from functools import partial
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
@@ -15,6 +14,7 @@ from PIL import Image
 from small_demo import demo_folder
 
 from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.experiments.demonstration.settings import DemoSettings
 from hyperplanes.experiments.demonstration.steps import Demonstration
 from hyperplanes.experiments.engine import Runner
@@ -187,11 +187,15 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     with pytest.raises(CheckpointError, match="small"):
         HyperPlanes.from_pretrained("small")  # a folder of that name goes first, where a name is given
     shown, balls = [], NamedBalls(train=0, test=1, views=6, size=(24, 24))
-    monkeypatch.setattr(Runner, "tasks", lambda runner, class_name: balls)
-    monkeypatch.setattr(Runner, "folder", lambda runner, class_name: tmp_path)
+    monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: balls)
+    monkeypatch.setattr(DataSets, "folder", lambda data, class_name: tmp_path)
     settings = replace(DemoSettings.quick_check(), first=("car",), first_counts=(2, 3), frames=4)
-    make_runner = partial(Runner, generate=None, train=None, device=torch.device("cpu"))
-    Demonstration(settings, tmp_path, make_runner, shown.append, None).show_packaged()
+    cpu = torch.device("cpu")
+
+    def make_runner(workspace, scale):
+        return Runner(workspace, DataSets(workspace, scale, generate=None, device=cpu), train=None, device=cpu)
+
+    Demonstration(settings, tmp_path, make_runner, lambda: None, shown.append, None).show_packaged()
     assert (tmp_path / "first.html").exists()
     rows = [line.partition(":")[0] for line in shown]
     assert rows == ["nearest of 3 views, copied", "2 views", "3 views", "the first page"]

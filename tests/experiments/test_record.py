@@ -5,9 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.experiments.demonstration.settings import DemoSettings
 from hyperplanes.experiments.engine import Runner
 from hyperplanes.experiments.record import Record
+from hyperplanes.experiments.workspace import Workspace
 from hyperplanes.utilities.checkpoints import CheckpointError
 from tests.reference_rendering import Balls
 
@@ -43,7 +45,7 @@ def test_a_damaged_record_is_one_line(tmp_path):
 
 def test_a_training_in_a_folder_of_its_own_is_made_anew_when_its_data_changes(tmp_path, monkeypatch):
     """The folder has the same name, the model and the objects too: the data alone has other pixels."""
-    monkeypatch.setattr(Runner, "tasks", lambda runner, class_name: Balls())
+    monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
     settings, trained = DemoSettings.quick_check(), []
 
     def train(what, chosen, data, reference, folder):
@@ -54,7 +56,9 @@ def test_a_training_in_a_folder_of_its_own_is_made_anew_when_its_data_changes(tm
     def run(resolution):
         scale = replace(settings.scale, resolution=resolution)
         places = {each: each for each in ("hyperplanes", "point_multiplane")}
-        runner = Runner(tmp_path, scale, generate=None, train=train, device=torch.device("cpu"), places=places)
+        workspace, cpu = Workspace(tmp_path, places), torch.device("cpu")
+        data = DataSets(workspace, scale, generate=None, device=cpu)
+        runner = Runner(workspace, data, train=train, device=cpu)
         for each in settings.table.trainings:
             assert runner.checkpoint(settings.table, each, 0) == tmp_path / each.method
 

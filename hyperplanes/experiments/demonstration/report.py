@@ -58,8 +58,8 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
     exhibits, names = [], []
     for on in dict.fromkeys(cell.on for cell in settings.packaged.cells):
         cells = [cell for cell in settings.packaged.cells if cell.on == on]
-        for name in runner.names(on, "all", settings.packaged.objects):
-            task = Shown(runner.tasks(on), most, QUERY_VIEWS).task(name)
+        for name in runner.data.evaluated(on, "all", settings.packaged.objects):
+            task = Shown(runner.data.tasks(on), most, QUERY_VIEWS).task(name)
             around = model.adapt(task.support).render(orbit_cameras(task.support, settings.frames // 2)).images
             read, query = range(len(task.support)), range(len(task.query))
             exhibits.append(_exhibit(runner, cells, scores, task, read, query, to_pixels(around)))
@@ -112,7 +112,7 @@ def write_report(folder: Path, runner: Runner, settings: DemoSettings) -> None:
     scores = {cell.row: runner.score(settings.table, cell, settings.seed) for cell in settings.table.cells}
     write_json(folder / "metrics.json", {row: score.as_json() for row, score in scores.items()})
     model = HyperPlanes.from_pretrained(find_checkpoint(folder / "hyperplanes")).to(runner.device)
-    data = runner.tasks(settings.class_name)
+    data = runner.data.tasks(settings.class_name)
     cells = [cell for cell in settings.table.cells if cell.row in settings.methods]
     exhibits, rounds = [], []
     for name in sorted(data.names("test"))[: settings.exhibits]:
@@ -211,9 +211,9 @@ def _how_it_was_made(settings: DemoSettings, folder: Path, runner: Runner) -> li
     """Data, training, machine and time, label and value."""
     where, trained = environment(), settings.objects - settings.held_out
     steps = read_json(folder / "hyperplanes" / "training.json")["step"]
-    manifest = read_json(runner.folder(settings.class_name) / "manifest.json")
-    times = {name: runner.record.seconds(name) for name in ("data", *MODELS)}
-    times["data"] += runner.record.seconds("unseen")
+    manifest = read_json(runner.data.folder(settings.class_name) / "manifest.json")
+    times = {name: runner.workspace.record.seconds(name) for name in ("data", *MODELS)}
+    times["data"] += runner.workspace.record.seconds("unseen")
     return [
         ("objects", f"{trained} procedural {settings.class_name}s to train on, {settings.held_out} held out"),
         ("images", f"{settings.views} an object, {settings.resolution} px, half support, half query"),

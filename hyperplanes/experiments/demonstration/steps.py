@@ -12,6 +12,8 @@ from hyperplanes.experiments.demonstration.report import describe_count, write_f
 from hyperplanes.experiments.demonstration.settings import MODELS, TUNED, DemoSettings
 from hyperplanes.experiments.engine import OnScore, Runner
 from hyperplanes.experiments.experiment import Cell
+from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.workspace import Workspace
 from hyperplanes.methods import at_steps
 from hyperplanes.utilities.writing import write_json
 
@@ -24,7 +26,8 @@ class Demonstration:
     Args:
         settings: how large.
         out: the folder for everything.
-        make_runner: a `Runner` of a folder, a scale and the names of its folders.
+        make_runner: a `Runner` of a workspace and a scale.
+        begin: called before anything is made.
         say: called with a line.
         evaluating: a context with the title of a row, for as long as it is evaluated: what its scores are told to.
     """
@@ -33,15 +36,17 @@ class Demonstration:
         self,
         settings: DemoSettings,
         out: Path,
-        make_runner: Callable[..., Runner],
+        make_runner: Callable[[Workspace, Scale], Runner],
+        begin: Callable[[], None],
         say: Callable[[str], None],
         evaluating: Callable[[str], AbstractContextManager[OnScore]],
     ) -> None:
         self.settings, self.out, self.say, self.evaluating = settings, out, say, evaluating
         classes = [*settings.first, "meshes"]
-        self.packaged = make_runner(out / "first", settings.packaged_scale, places={name: name for name in classes})
+        first = Workspace(out / "first", {name: name for name in classes}, begin)
+        self.packaged = make_runner(first, settings.packaged_scale)
         places = {settings.class_name: "data", settings.unseen_class: "unseen"} | {name: name for name in MODELS}
-        self.runner = make_runner(out, settings.scale, places=places)
+        self.runner = make_runner(Workspace(out, places, begin), settings.scale)
 
     def steps(self) -> dict[str, Callable[[], object]]:
         """What does each step, unless it was done before, by its name."""
@@ -49,7 +54,7 @@ class Demonstration:
         trained = {each.method: each for each in table.trainings}
         return {
             "packaged model": self.show_packaged,
-            "data": lambda: [self.runner.folder(name) for name in table.classes],
+            "data": lambda: [self.runner.data.folder(name) for name in table.classes],
             **{name: partial(self.runner.checkpoint, table, trained[name], seed) for name in MODELS},
             **{f"evaluate {c.row}": partial(self.evaluate, c) for c in table.cells},
             "fine-tuning": self.tune,
@@ -61,12 +66,12 @@ class Demonstration:
         settings, page = self.settings, self.out / "first.html"
         names = ("first", "first_resolution", "first_counts", "seed", "frames")
         deciding = {name: getattr(settings, name) for name in names} | {"meshes": str(settings.meshes)}
-        self.packaged.make(page.name, deciding, [page], lambda: self._show_packaged(page))
+        self.packaged.workspace.make(page.name, deciding, [page], lambda: self._show_packaged(page))
 
     def _show_packaged(self, page: Path) -> None:
         experiment, scores = self.settings.packaged, {}
         for name in sorted(experiment.classes, key=lambda name: name != "meshes"):  # they may be wrong input
-            self.packaged.folder(name)
+            self.packaged.data.folder(name)
         for row in experiment.rows:
             cells = [cell for cell in experiment.cells if cell.row == row]
             found = [self.packaged.score(experiment, cell, self.settings.seed) for cell in cells]
@@ -83,7 +88,7 @@ class Demonstration:
     def tune(self) -> None:
         """PSNR over fine-tuning steps, in tuning.json by method and number of steps."""
         path = self.out / "tuning.json"
-        self.runner.make("fine-tuning", self._deciding, [path], lambda: self._tune(path))
+        self.runner.workspace.make("fine-tuning", self._deciding, [path], lambda: self._tune(path))
 
     def _tune(self, path: Path) -> None:
         found: dict[str, float] = {}
@@ -98,14 +103,14 @@ class Demonstration:
         outputs = [self.out / name for name in ("metrics.json", "report.html", "overview.png")]
         shown = {"exhibits": self.settings.exhibits, "frames": self.settings.frames}
         work = partial(write_report, self.out, self.runner, self.settings)
-        self.runner.make("report", {**self._deciding, **shown}, outputs, work)
+        self.runner.workspace.make("report", {**self._deciding, **shown}, outputs, work)
 
     @property
     def _deciding(self) -> Mapping[str, object]:
         """What decides the evaluations: data, trainings, and the numbers of fine-tuning steps."""
         settings, runner, table = self.settings, self.runner, self.settings.table
         return {
-            "data": [runner.data_name(name) for name in table.classes],
+            "data": [runner.data.name(name) for name in table.classes],
             "trainings": [runner.training_name(table, each, settings.seed) for each in table.trainings],
             "rows": settings.rows,
             "tuning": settings.tuning,

@@ -1,0 +1,95 @@
+"""The data sets of an experiment: given ones, and those that are generated at its scale."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hyperplanes.data import open_dataset
+from hyperplanes.data.devices import TasksOnDevice
+from hyperplanes.data.support import WithBounds
+from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.workspace import Workspace, unique_name
+from hyperplanes.views import Tasks
+
+__all__ = ["DataSets"]
+
+
+class DataSets:
+    """Objects by class, each data set opened once, and generated where none was given.
+
+    Args:
+        workspace: the folder in which they are generated.
+        scale: how many objects and views, and how large.
+        generate: called with what decides a data set and the folder it is to lie in; goes on where it stopped.
+        device: where views are kept.
+        given: folders by class, instead of generated data sets.
+        legacy: as in `open_dataset`.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        scale: Scale,
+        *,
+        generate: Callable[[Mapping[str, Any], Path], None],
+        device: torch.device,
+        given: Mapping[str, Path] | None = None,
+        legacy: bool = False,
+    ) -> None:
+        self.workspace, self.scale, self.generate, self.device = workspace, scale, generate, device
+        self.given, self.legacy = given or {}, legacy
+        self._tasks: dict[str, TasksOnDevice] = {}
+
+    def tasks(self, class_name: str) -> Tasks:
+        """The data set of a class; ValueError where none was given and the scale generates none."""
+        if class_name not in self._tasks:
+            data: Tasks = open_dataset(self.folder(class_name), legacy=self.legacy)
+            if self.scale.bounds is not None:
+                data = WithBounds(data, self.scale.bounds)
+            self._tasks[class_name] = TasksOnDevice(data, self.device)
+        return self._tasks[class_name]
+
+    def folder(self, class_name: str) -> Path:
+        """The folder of the data set of a class; as `tasks`."""
+        if class_name in self.given:
+            return self.given[class_name].resolve()
+        settings = self._settings(class_name)
+        work = partial(self.generate, settings)
+        return self.workspace.folder("data", class_name, self.name(class_name), settings, work)
+
+    def name(self, class_name: str) -> str:
+        """What tells the data set of a class from others: the folder of a given one, or a name with a checksum."""
+        if class_name in self.given:
+            return str(self.given[class_name].resolve())
+        return unique_name(class_name, self._settings(class_name))
+
+    def evaluated(self, class_name: str, split: str, most: int | None = None) -> list[str]:
+        """The objects of a class that are evaluated, `most` at the most; ValueError where there are none."""
+        found = list(self.tasks(class_name).names(split))
+        if not found:
+            raise ValueError(f"data: expected {class_name} objects in the {split} split, got none")
+        if split == "train" and self.scale.held_out:  # as many as held-out ones
+            found = found[: self.scale.held_out]
+        return found[: self.scale.evaluated][:most]
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """How data sets are read, where it is not the usual way; JSON-able."""
+        bounds = {} if self.scale.bounds is None else {"bounds": asdict(self.scale.bounds)}
+        return ({"legacy": True} if self.legacy else {}) | bounds
+
+    def _settings(self, class_name: str) -> dict[str, Any]:
+        scale = self.scale
+        if scale.resolution is None:
+            raise ValueError(
+                f"data: expected --data {class_name}=FOLDER, as the scale {scale.name} takes data sets as they were "
+                "published, got none; or take --scale small"
+            )
+        sizes = {name: getattr(scale, name) for name in ("resolution", "objects", "held_out", "views")}
+        return {"class": class_name, **sizes, **scale.data.get(class_name, {})}

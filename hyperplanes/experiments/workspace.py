@@ -1,0 +1,61 @@
+"""The folder of an experiment: data sets, trainings and pages, each made once with the same settings."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hyperplanes.experiments.record import Record, plain
+from hyperplanes.utilities.encoding import encode_json
+
+__all__ = ["Workspace", "unique_name"]
+
+
+class Workspace:
+    """A folder in which what is not made yet is made, and what was interrupted goes on.
+
+    Args:
+        out: the folder.
+        places: folders by class and by method, for an experiment that has the workspace for itself: results lie under
+            these names, scores/ and pictures/, and those that were made with other settings are removed. Without it
+            they lie in data/, trainings/ and evaluations/, which all experiments share.
+        begin: called before anything is made.
+    """
+
+    def __init__(
+        self, out: Path, places: Mapping[str, str] | None = None, begin: Callable[[], None] = lambda: None
+    ) -> None:
+        self.out, self.places, self.begin = out, places, begin
+        self.record = Record(out / "stages.json")
+
+    def make(self, name: str, settings: Mapping[str, Any], outputs: Sequence[Path], work: Callable[[], object]) -> None:
+        """Do a piece of work, unless it was done with these settings and its outputs are still there."""
+        if not self.record.done(name, settings, *outputs):
+            self.begin()
+            with self.record.working(name, settings, *outputs):
+                work()
+
+    def folder(
+        self, kind: str, place: str, name: str, settings: Mapping[str, Any], work: Callable[[Path], None]
+    ) -> Path:
+        """The folder of a data set or of a training, which is made there unless it was.
+
+        Args:
+            kind: data or trainings.
+            place: the class or the method, whose folder `places` gives.
+            name: what tells it from others of its kind, as by `unique_name`.
+            settings: all that decides its content.
+            work: called with the folder.
+        """
+        path = f"{kind}/{name}" if self.places is None else self.places[place]
+        folder = self.out / path
+        self.make(path, {"name": name, **settings}, [folder], partial(work, folder))
+        return folder
+
+
+def unique_name(start: str, settings: Mapping[str, Any]) -> str:
+    """A readable name with a checksum of what decides the content."""
+    return f"{start}-{hashlib.sha256(encode_json(plain(settings))).hexdigest()[:10]}"
