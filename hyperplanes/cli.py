@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
-from importlib.metadata import entry_points
 from types import ModuleType
 from typing import Any, get_type_hints
 
 from hyperplanes.commands import EXAMPLES, find_verb, find_verbs, split_settings
+from hyperplanes.utilities.entry_points import find_entries
 from hyperplanes.utilities.interrupts import Terminated, interruptible
 
 __all__ = ["main"]
@@ -124,7 +124,7 @@ def _check_ranges(parsed: Any) -> None:
 def _brought(module: ModuleType) -> list[str]:
     """What other installed packages add to the names that a verb takes; only their names are read."""
     groups: dict[str, str] = getattr(module, "BROUGHT", {})
-    found = {what: sorted(each.name for each in entry_points(group=group)) for what, group in groups.items()}
+    found = {what: sorted(each.name for each in find_entries(group)) for what, group in groups.items()}
     return [f"{what} of other packages: {', '.join(names)}." for what, names in found.items() if names]
 
 

@@ -69,7 +69,7 @@ def test_the_template_of_a_package_adds_its_field_and_its_method(monkeypatch, tm
         for group, entries in named.items()
     }
     monkeypatch.syspath_prepend(ROOT / "examples/plugin")
-    monkeypatch.setattr(entry_points, "entry_points", lambda group: found.get(group, ()))
+    monkeypatch.setattr(entry_points, "find_entries", lambda group: found.get(group, ()))
     monkeypatch.setitem(
         PRESETS, "quick", dataclasses.replace(PRESETS["quick"], model=small_model(hypernetwork=None).config)
     )

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+from hyperplanes.utilities.entry_points import find_entries
+
 __all__ = ["EXAMPLES", "VERBS", "Verb", "find_verb", "find_verbs", "split_settings"]
 
 
@@ -58,10 +60,8 @@ EXAMPLES = """\
 
 def find_verbs() -> dict[str, Verb]:
     """All verbs by name: those of this package, then those of the other packages that are installed."""
-    from importlib.metadata import entry_points
-
     own = {name: Verb(f"{__name__}.{name}", about) for name, about in VERBS.items()}
-    return own | {entry.name: entry.load() for entry in entry_points(group=__name__) if entry.name not in own}
+    return own | {entry.name: entry.load() for entry in find_entries(__name__) if entry.name not in own}
 
 
 def find_verb(name: str) -> Verb:

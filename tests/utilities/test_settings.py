@@ -260,7 +260,7 @@ def other_package(monkeypatch):
     """An installed distribution with entry points of both groups."""
     monkeypatch.setattr(
         entry_points,
-        "entry_points",
+        "find_entries",
         lambda group: EntryPoints(
             EntryPoint(name, value, group)._for(FakeDistribution()) for name, value in BROUGHT.get(group, {}).items()
         ),
@@ -296,7 +296,7 @@ def test_a_method_of_another_package_is_made_and_described(other_package):
 def test_names_that_other_packages_bring_are_in_the_help(monkeypatch, capsys):
     brought = {"hyperplanes.methods": ["copycat"], "hyperplanes.fields": ["constant"]}
     points = {group: [EntryPoint(name, "nowhere:nothing", group) for name in names] for group, names in brought.items()}
-    monkeypatch.setattr("hyperplanes.cli.entry_points", lambda group: points.get(group, []))
+    monkeypatch.setattr("hyperplanes.cli.find_entries", lambda group: points.get(group, []))
     with pytest.raises(SystemExit):
         main(["evaluate", "--help"])
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
