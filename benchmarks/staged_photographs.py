@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
 from scipy import ndimage
+from torch.nn.functional import grid_sample
 
 from data_gen.meshes.mesh import Mesh, mesh_parts
 from data_gen.rendering.mesh_renderer import MeshRenderer
@@ -191,26 +193,21 @@ def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float) 
 
 def _texture(points: Array, table: Array, frequency: float) -> Array:
     """Colours from noise of four octaves, trilinear between the entries of a table that repeats."""
-    total = np.zeros((len(points), 3), np.float32)
     side = len(table)
-    flat = table.reshape(-1, 3)
+    repeated = np.pad(table, ((0, 1), (0, 1), (0, 1), (0, 0)), mode="wrap") - 0.5
+    volume = torch.from_numpy(repeated).permute(3, 2, 1, 0)[None]  # (1, 3, z, y, x)
+    total = torch.zeros(3, len(points))
     for octave in range(4):
-        where = (points * (frequency * 2.1**octave)).astype(np.float32)
-        low = np.floor(where)
-        part, low = where - low, low.astype(np.int64)
-        for corner in np.ndindex(2, 2, 2):
-            i, j, k = ((low + corner) % side).T
-            weight = np.where(corner, part, 1 - part).prod(-1, keepdims=True)
-            total += (0.75**octave) * weight * (flat[(i * side + j) * side + k] - 0.5)
-    return (0.5 + 0.55 * total).clip(0, 1)
+        where = np.mod(points * (frequency * 2.1**octave), side).astype(np.float32)
+        grid = torch.from_numpy(2 / side * where - 1)[None, None, None]
+        total += 0.75**octave * grid_sample(volume, grid, align_corners=True).reshape(3, -1)
+    return (0.5 + 0.55 * total).clamp(0, 1).T.numpy()
 
 
 def _without_lens(slopes: Array, lens: tuple[float, float]) -> Array:
     """Slopes of the rays through distorted ones."""
     if not any(lens):
         return slopes
-    import torch
-
     coefficients = torch.tensor([[*lens, 0, 0, 0, 0, 0, 0]], dtype=torch.float64)
     count, limit = len(slopes), turning_radius(coefficients)
     found, _ = inverse_distortion(torch.from_numpy(slopes), coefficients.expand(count, -1), limit.expand(count), 1e-6)

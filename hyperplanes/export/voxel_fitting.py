@@ -93,15 +93,20 @@ def fit_voxels(
     groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
     descent = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, DECAY ** (1 / max(1, steps)))
+    # what the kernel reads and writes: fresh memory for each step takes longer to get than to fill
+    values, gradients = baked.values.clone(), torch.empty(torch.get_num_threads(), *baked.values.shape)
+    depth.grad, colour.grad = torch.zeros_like(depth), torch.zeros_like(colour)
     generator, step_length = torch.Generator().manual_seed(seed), 2 * baked.bounds.radius / STEPS_A_DIAMETER
     for step in range(steps):
         # squared error of some rays, and its gradient by the kernel
         drawn, truth = _draw(sources, generator)
-        values, basis = torch.cat([depth / voxel, colour], 1), spherical_harmonics(drawn.directions)
+        values[:, :1], values[:, 1:], basis = depth / voxel, colour, spherical_harmonics(drawn.directions)
         _, gradient = voxel_gradients(
-            baked.index, values, baked.bounds, drawn, basis, truth, step=step_length, empty=scene.distances
-        )
-        depth.grad, colour.grad = gradient[:, :1] / voxel, gradient[:, 1:].contiguous()
+            baked.index, values, baked.bounds, drawn, basis, truth, step=step_length, empty=scene.distances,
+            out=gradients,
+        )  # fmt: skip
+        depth.grad.copy_(gradient[:, :1] / voxel)
+        colour.grad.copy_(gradient[:, 1:])
         descent.step()
         schedule.step()
         depth.clamp_(min=SMALLEST_DEPTH)

@@ -22,6 +22,7 @@ __all__ = ["first_hits"]
 STEPS = 128  # along a diameter of the scene, where rays look for their first occupied voxel
 ROUND = 8  # of them at once, without a compiler
 RAYS = 2048  # that one call of the kernel works on
+RAYS_AT_ONCE = 1 << 17  # that are cast together: those of many photographs would take gigabytes
 
 
 @torch.no_grad()
@@ -44,13 +45,12 @@ def first_hits(
     centre = torch.tensor(occupancy.bounds.centre, device=device)
     far = (camera.centres(cameras) - centre).norm(dim=1) + occupancy.bounds.radius
     result = far[:, None, None].repeat(1, height, width)
-    shown = torch.ones(len(result), height, width, dtype=torch.bool, device=device)
-    if masks is not None:
-        shown = torch.as_tensor(masks, device=device)[:, 0] > 0
-    view, row, column = shown.nonzero().unbind(1)
-    rays = cast(cameras, view, torch.stack([column, row], -1).to(result), occupancy.bounds)
+    masks = torch.ones_like(result) if masks is None else torch.as_tensor(masks, device=device)[:, 0]
     compiled = result.device.type == "cpu" and result.dtype == torch.float32 and find_spec("numba")
-    result[view, row, column] = (_hits_compiled if compiled else _hits_torch)(occupancy, rays)
+    for view, (hits, mask) in enumerate(zip(result, masks, strict=True)):
+        for pixels in (mask > 0).nonzero().split(RAYS_AT_ONCE):
+            rays = cast(cameras, torch.full_like(pixels[:, 0], view), pixels.flip(1).to(result), occupancy.bounds)
+            hits[pixels.unbind(1)] = (_hits_compiled if compiled else _hits_torch)(occupancy, rays)
     return result
 
 

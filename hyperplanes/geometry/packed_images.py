@@ -26,7 +26,11 @@ class PackedImages:
     @property
     def widths(self) -> tuple[int, int, int]:
         """Bits of each channel."""
-        return (self.bits, self.bits, self.bits if self.bits == 8 else self.bits - 1)
+        return _widths(self.bits)
+
+
+def _widths(bits: int) -> tuple[int, int, int]:
+    return bits, bits, bits if bits == 8 else bits - 1
 
 
 @torch.no_grad()
@@ -47,17 +51,23 @@ def pack(images: Float[Tensor, "view channel height width"]) -> PackedImages | N
     least, most = torch.aminmax(images)
     if not (least >= 0 and most <= 1):
         return None
-    scaled = images.float() * 255
-    eight = scaled.round()
-    if (scaled - eight).abs().max() < 1e-2:
-        return PackedImages(_words(eight, 8), 8)
-    steps = images.new_tensor([2047.0, 2047.0, 1023.0], dtype=torch.float32)[:, None, None]
-    return PackedImages(_words((images.float() * steps).round(), 11), 11)
+    # one view after the other: the temporaries of all take several times their memory
+    bits = 8 if all(_is_eight_bits(view) for view in images) else 11
+    words = torch.empty(images[:, 0].shape, dtype=torch.int32, device=images.device)
+    for view, image in zip(words, images, strict=True):
+        view.copy_(_words(image, bits))
+    return PackedImages(words, bits)
 
 
-def _words(channels: Tensor, bits: int) -> Tensor:
-    whole = channels.to(torch.int32)
-    return whole[:, 0] | (whole[:, 1] << bits) | (whole[:, 2] << 2 * bits)
+def _is_eight_bits(image: Tensor) -> bool:
+    scaled = image.float() * 255
+    return bool((scaled - scaled.round()).abs().max() < 1e-2)
+
+
+def _words(image: Float[Tensor, "channel height width"], bits: int) -> Int32[Tensor, "height width"]:
+    steps = image.new_tensor([(1 << width) - 1 for width in _widths(bits)], dtype=torch.float32)
+    whole = (image.float() * steps[:, None, None]).round().to(torch.int32)
+    return whole[0] | (whole[1] << bits) | (whole[2] << 2 * bits)
 
 
 def unpack(packed: PackedImages) -> Float[Tensor, "view 3 height width"]:

@@ -165,9 +165,10 @@ class VisibilityPlanes:
     ) -> None:
         self.colours = ImagePlanes(images, cameras)
         self.occupancy = occupancy
-        depth = first_hits(occupancy, cameras, masks).to(images)
-        opacity = torch.ones_like(images[:, 0]) if masks is None else masks[:, 0].to(images)
-        self.depth_opacity: Float[Tensor, "view height width 2"] = torch.stack([depth, opacity], -1)
+        self.depth_opacity: Float[Tensor, "view height width 2"] = images.new_ones(*images[:, 0].shape, 2)
+        self.depth_opacity[..., 0] = first_hits(occupancy, cameras, masks)
+        if masks is not None:
+            self.depth_opacity[..., 1] = masks[:, 0]
         matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)

@@ -93,6 +93,7 @@ def voxel_gradients(
     *,
     step: float,
     empty: UInt8[Tensor, "cell_x cell_y cell_z"],
+    out: Float[Tensor, "thread row 28"] | None = None,
 ) -> tuple[float, Float[Tensor, "row 28"]]:
     """The mean squared error of the pixels of `render_voxels`, and its gradient with respect to `values`.
 
@@ -105,13 +106,15 @@ def voxel_gradients(
         truth: what the pixels should be.
         step: as there.
         empty: the result of `distance_to_filled`.
+        out: a gradient for each thread of PyTorch, to be written over; the first becomes the result.
 
     Returns:
         The error, and its gradient.
     """
-    kernel = compile_function(voxel_rays.add_gradients)
-    chunk = max(1, -(-len(rays) // torch.get_num_threads()))  # one a thread, each with a gradient of its own
-    found = torch.zeros(-(-len(rays) // chunk), *values.shape)
+    kernel, threads = compile_function(voxel_rays.add_gradients), torch.get_num_threads()
+    chunk = max(1, -(-len(rays) // threads))  # one a thread, each with a gradient of its own
+    found = torch.empty(threads, *values.shape) if out is None else out
+    found.zero_()
     arrays = _arrays(index, values, bounds, rays, basis, empty)
     numbers, colours = _numbers(step, STOP), truth.float().contiguous().numpy()
 
@@ -119,7 +122,9 @@ def voxel_gradients(
         return kernel(*arrays, *numbers, colours, found[first // chunk].numpy(), first, last)
 
     error = sum(parallel_for(work, len(rays), chunk))
-    return error / (3 * len(rays)), (found.sum(0) if len(found) > 1 else found[0]) / (3 * len(rays))
+    for other in found[1:]:
+        found[0] += other
+    return error / (3 * len(rays)), found[0].div_(3 * len(rays))
 
 
 def _arrays(

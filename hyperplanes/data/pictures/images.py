@@ -155,12 +155,12 @@ def composite_over_white(
     >>> [round(value, 3) for value in composite_over_white(pixel)[0].flatten().tolist()]
     [0.8, 1.0, 0.8]
     """
-    scaled = np.multiply(rgba.numpy(), np.float32(1 / 255))  # numpy: torch's threads cost more than they bring here
-    alpha = scaled[:, 3:]
-    colour = scaled[:, :3] - 1
+    pixels = rgba.numpy()  # torch's threads cost more than they bring here
+    colour, alpha = (np.multiply(part, np.float32(1 / 255), order="C") for part in (pixels[:, :3], pixels[:, 3:]))
+    colour -= 1
     colour *= alpha
     colour += 1
-    return torch.from_numpy(colour), torch.from_numpy(alpha.copy())
+    return torch.from_numpy(colour), torch.from_numpy(alpha)
 
 
 def _open(path: Path) -> Image.Image:
