@@ -81,7 +81,7 @@ def run(arguments: Arguments) -> int:
     shown, query = task.support.to(device), task.query
     field, _ = adapt_to(model, shown, task.name, console, steps=arguments.steps)
     assert isinstance(field, AdaptedField)
-    baked = bake_field(field, shown, arguments.voxels, arguments.fit, console)
+    baked = bake_field(field, shown, arguments.voxels, fit=arguments.fit, console=console)
     baked.save(arguments.out)
     console.say(f"{arguments.out}: {arguments.out.stat().st_size / 2**20:.1f} MiB")
     scene = BakedScene(baked)

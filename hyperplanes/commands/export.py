@@ -37,7 +37,8 @@ class Arguments(ObjectArguments):
         what: Any of them.
         frames: Of the turntable.
         size: Pixels along the longer side of the turntable; as the images when not given.
-        turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
+        turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`. Voxels draw it where
+            `render --representation auto` takes them.
         mesh_format: The format of the mesh: glb has a texture and normals, ply and obj a colour a vertex.
         faces: Of a mesh with a texture, at most.
         texture: Pixels along the longer side of the texture, about.
@@ -83,11 +84,13 @@ def run(arguments: Arguments) -> int:
     """Adapt and write what was asked for."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.data.devices import choose_device
+    from hyperplanes.export.animation import choose_representation
     from hyperplanes.export.baking import coarsening, default_side
-    from hyperplanes.export.images import save_images, save_turntable
+    from hyperplanes.export.images import encode_animation, orbit_cameras, save_images, to_pixels
     from hyperplanes.export.mesh import check_voxels
     from hyperplanes.export.page import page_of, save_page, turning_picture
     from hyperplanes.utilities.errors import prefix_errors
+    from hyperplanes.utilities.writing import write_whole
 
     if arguments.level is not None and not arguments.level > 0:
         raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")
@@ -103,13 +106,23 @@ def run(arguments: Arguments) -> int:
     refuse_sources(out / "images", arguments.views, task.query.names)
     shown, query = task.support.to(device), task.query.to(device)
     field, _ = adapt_to(source, shown, task.name, console, steps=arguments.steps)
+    made: dict[int, BakedField] = {}
+
+    def voxels(adapted: AdaptedField, views: Views, side: int) -> BakedField:
+        if side not in made:  # by the turntable, for the page
+            made[side] = bake_field(adapted, views, side, fit=arguments.fit, console=console)
+        return made[side]
+
     if "images" in arguments.what:
         paths = save_images(render_views(field, query.cameras, console).images, out / "images", query.names)
         poses = "shown" if arguments.all_views else "query"
         console.say(f"{out / 'images'}: {len(paths)} pictures of the {poses} poses")
     if "turntable" in arguments.what:
         path = out / f"turntable.{arguments.turntable}"
-        save_turntable(field, shown, path, frames=arguments.frames, size=arguments.size)
+        cameras = orbit_cameras(shown, arguments.frames, size=arguments.size)
+        drawing = choose_representation(field, shown, cameras, make=voxels)
+        pictures = render_views(drawing, cameras, console)
+        write_whole(path, encode_animation(to_pixels(pictures.images), arguments.turntable))
         console.say(f"{path}: {arguments.frames} frames")
     if "mesh" in arguments.what:
         solid = field if isinstance(field, AdaptedField) else field.adapted
@@ -125,7 +138,7 @@ def run(arguments: Arguments) -> int:
     if {"page", "splats"} & set(arguments.what):
         if isinstance(field, AdaptedField):
             side = arguments.page_voxels or default_side(shown.size)
-            baked = bake_field(field, shown, side, arguments.fit, console)
+            baked = voxels(field, shown, side)
         else:
             baked = field.field
         if "page" in arguments.what:

@@ -182,7 +182,7 @@ def render_views(
     )
 
 
-def bake_field(field: AdaptedField, shown: Views, side: int, fit: int, console: Console) -> BakedField:
+def bake_field(field: AdaptedField, shown: Views, side: int, *, fit: int, console: Console) -> BakedField:
     """The voxels of a field, fitted to the views that it was adapted to, with progress lines.
 
     Args:

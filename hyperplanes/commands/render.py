@@ -18,6 +18,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
@@ -38,12 +39,12 @@ from hyperplanes.utilities.formatting import format_duration
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
+    from hyperplanes.export.animation import Representation
     from hyperplanes.rendering.images import Pictures
     from hyperplanes.views import Views
 
 __all__ = ["Arguments", "run"]
 
-VOXEL_VIEWS, VOXEL_PIXELS = 16, 2_000_000  # from which on voxels draw an orbit: they are as good, and made sooner
 LARGEST_ORBIT = 400  # pixels of an orbit's pictures where none were asked for: time grows with their square
 ROUND = 4.0  # seconds of a turntable
 
@@ -65,7 +66,7 @@ class Arguments(ObjectArguments):
         turntable: The format of the animation; mp4 and webm need `pip install hyperplanes[video]`.
         representation: What draws the pictures: the field itself, or voxels that are baked from it and fitted to the
             shown views, which takes half a minute once and milliseconds a picture. auto takes voxels for an orbit or
-            a path, where 16 views or more are shown and there are two million pixels to draw.
+            a path of so many pictures that they are drawn sooner so, where 16 views or more are shown.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
             marching through what is not empty.
     """
@@ -100,16 +101,15 @@ class Asked:
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
-    from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
     from hyperplanes.evaluation.suitability import held_out_psnr, worse_than_copying
-    from hyperplanes.export.baking import BakedScene, default_side
+    from hyperplanes.export.animation import choose_representation
+    from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.images import encode_animation
     from hyperplanes.export.outputs import output_frames, save_outputs
     from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
-    from hyperplanes.geometry import cameras as camera
     from hyperplanes.utilities.writing import write_whole
 
     _check(arguments)
@@ -121,9 +121,8 @@ def run(arguments: Arguments) -> int:
     asked = _asked(arguments, shown, known, up, console)
     settings = FineTuning(trainable=arguments.fine_tune)
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
-    if isinstance(field, AdaptedField) and _takes_voxels(arguments, asked, len(shown)):
-        side = default_side(max(shown.size, camera.image_size(asked.cameras)))
-        field = BakedScene(bake_field(field, shown, side, VOXEL_STEPS, console))
+    make = partial(bake_field, fit=VOXEL_STEPS, console=console)
+    field = choose_representation(field, shown, asked.cameras, _representation(arguments, asked), make=make)
     started = time.perf_counter()
     pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / asked.cameras.batch_size
@@ -153,16 +152,12 @@ def run(arguments: Arguments) -> int:
     return 0
 
 
-def _takes_voxels(arguments: Arguments, asked: Asked, shown: int) -> bool:
-    """Whether baked voxels draw the pictures: when told so, or where that is faster and loses nothing."""
-    if arguments.representation != "auto":
-        return arguments.representation == "voxels"
-    from hyperplanes.geometry import cameras as camera
-
-    height, width = camera.image_size(asked.cameras)
-    pixels = asked.cameras.batch_size * height * width
+def _representation(arguments: Arguments, asked: Asked) -> Representation:
+    """What draws the pictures: as told, and by default the field, but for the colours of animations."""
     colours_alone = set(arguments.rendered_output_names) == {"rgb"} and arguments.protocol == "default"
-    return asked.animation is not None and colours_alone and shown >= VOXEL_VIEWS and pixels >= VOXEL_PIXELS
+    if arguments.representation == "auto" and (asked.animation is None or not colours_alone):
+        return "field"
+    return arguments.representation
 
 
 def _check(arguments: Arguments) -> None:

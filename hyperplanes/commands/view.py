@@ -8,6 +8,7 @@ Example:
     hyperplanes view example-car
     hyperplanes view photos/ --steps 100
     hyperplanes view photos/ --checkpoint chair.safetensors
+    hyperplanes view photos/ --refine-poses
     hyperplanes view photos/ --compare hull_blend scratch_100
 """
 
@@ -24,6 +25,7 @@ import tyro
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import bake_field, load_source
 from hyperplanes.commands.options import OptionalInt, ViewsUp
+from hyperplanes.commands.poses import refine_task
 from hyperplanes.commands.scene import read_scene
 
 if TYPE_CHECKING:
@@ -52,6 +54,8 @@ class Arguments:
             hull_blend, nearest_view, hyperplanes (the model after one step), or scratch_100.
         port: Of the page on this machine.
         second_pass: Render the views first, and take colours from those that see the surface found there.
+        refine_poses: Refine the poses of the views first, and keep them where views that the model is not given are
+            shown better by half a decibel: for poses that are a little wrong.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held.
         downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
@@ -66,6 +70,7 @@ class Arguments:
     compare: tuple[str, ...] = ()
     port: Annotated[int, range(65_536)] = 8080
     second_pass: bool = False
+    refine_poses: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
     device: str = "auto"
@@ -80,6 +85,8 @@ def run(arguments: Arguments) -> int:
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
+    if arguments.refine_poses:
+        task = refine_task(source, task, console, all_views=True)
     shown = task.support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
     baked = isinstance(source, BakedScene)
@@ -151,5 +158,5 @@ def _adapt(
         if not wanted.empty():
             return
     if arguments.fit and field is not None:
-        baked = bake_field(field, shown, default_side(shown.size), arguments.fit, console)
+        baked = bake_field(field, shown, default_side(shown.size), fit=arguments.fit, console=console)
         viewer.show(BakedScene(baked), f"{len(shown)} support views, {steps} steps, {len(baked.values):,} baked voxels")

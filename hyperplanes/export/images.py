@@ -16,6 +16,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.adaptation.base import Renderable
+from hyperplanes.export.animation import choose_representation
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.utilities.arguments import checked
@@ -242,8 +243,8 @@ def save_turntable(
     """Render one round around the object and write it as an animation.
 
     Args:
-        field: what is seen.
-        views: whose lens, distance and up are taken.
+        field: what is seen; voxels of it draw a long round (`animation.choose_representation`).
+        views: its support views, whose lens, distance and up are taken.
         path: ends in .webp, .gif, .mp4 or .webm.
         frames: of the round.
         size: pixels along the longer side; that of the views where absent.
@@ -253,6 +254,7 @@ def save_turntable(
     """
     path = Path(path)
     kind = format_of(path, TURNTABLE_FORMATS)
-    pictures = field.render(orbit_cameras(views, frames, size=size))
+    cameras = orbit_cameras(views, frames, size=size)
+    pictures = choose_representation(field, views, cameras).render(cameras)
     write_whole(path, encode_animation(to_pixels(pictures.images), kind))
     return path

@@ -23,7 +23,7 @@ RAYS = 8192
 DENSITY_RATE = 0.05  # of optical depth through a voxel
 COLOUR_RATE = 0.01
 DECAY = 0.1  # of both rates, from the first step to the last
-STEPS_A_DIAMETER = 256
+STOP = 0.01  # transmittance below which a ray is finished: what lies behind has next to no gradient
 SMALLEST_DEPTH = 1e-4  # of a voxel: colour has no gradient where density is zero
 ENOUGH = 16  # views by which voxels are fitted without a guide
 
@@ -81,7 +81,7 @@ def fit_voxels(
     Returns:
         Voxels at the same places.
     """
-    scene, voxel = BakedScene(baked, STEPS_A_DIAMETER), 2 * baked.bounds.radius / baked.side
+    scene, voxel = BakedScene(baked), 2 * baked.bounds.radius / baked.side
     share = max(0.0, 1 - len(views) / ENOUGH) if guide is not None else 0.0
     sources = [_Source.of(views, scene, rays, 1 - share)]
     if guide is not None and share:
@@ -96,14 +96,14 @@ def fit_voxels(
     # what the kernel reads and writes: fresh memory for each step takes longer to get than to fill
     values, gradients = baked.values.clone(), torch.empty(torch.get_num_threads(), *baked.values.shape)
     depth.grad, colour.grad = torch.zeros_like(depth), torch.zeros_like(colour)
-    generator, step_length = torch.Generator().manual_seed(seed), 2 * baked.bounds.radius / STEPS_A_DIAMETER
+    generator = torch.Generator().manual_seed(seed)
     for step in range(steps):
         # squared error of some rays, and its gradient by the kernel
         drawn, truth = _draw(sources, generator)
         values[:, :1], values[:, 1:], basis = depth / voxel, colour, spherical_harmonics(drawn.directions)
         _, gradient = voxel_gradients(
-            baked.index, values, baked.bounds, drawn, basis, truth, step=step_length, empty=scene.distances,
-            out=gradients,
+            baked.index, values, baked.bounds, drawn, basis, truth, step=voxel, empty=scene.distances,
+            out=gradients, stop=STOP,
         )  # fmt: skip
         depth.grad.copy_(gradient[:, :1] / voxel)
         colour.grad.copy_(gradient[:, 1:])

@@ -94,6 +94,7 @@ def voxel_gradients(
     step: float,
     empty: UInt8[Tensor, "cell_x cell_y cell_z"],
     out: Float[Tensor, "thread row 28"] | None = None,
+    stop: float = STOP,
 ) -> tuple[float, Float[Tensor, "row 28"]]:
     """The mean squared error of the pixels of `render_voxels`, and its gradient with respect to `values`.
 
@@ -107,6 +108,7 @@ def voxel_gradients(
         step: as there.
         empty: the result of `distance_to_filled`.
         out: a gradient for each thread of PyTorch, to be written over; the first becomes the result.
+        stop: as there.
 
     Returns:
         The error, and its gradient.
@@ -116,7 +118,7 @@ def voxel_gradients(
     found = torch.empty(threads, *values.shape) if out is None else out
     found.zero_()
     arrays = _arrays(index, values, bounds, rays, basis, empty)
-    numbers, colours = _numbers(step, STOP), truth.float().contiguous().numpy()
+    numbers, colours = _numbers(step, stop), truth.float().contiguous().numpy()
 
     def work(first: int, last: int) -> float:
         return kernel(*arrays, *numbers, colours, found[first // chunk].numpy(), first, last)

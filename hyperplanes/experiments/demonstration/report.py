@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from kornia.geometry.camera import PinholeCamera
 from PIL import Image
 
 from hyperplanes.adaptation.checkpoints import find_checkpoint, packaged_folder
@@ -25,13 +26,14 @@ from hyperplanes.experiments.engine import Runner, curve_of
 from hyperplanes.experiments.experiment import Cell
 from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
 from hyperplanes.experiments.page.content import Pixels
+from hyperplanes.export.animation import choose_representation
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.environment import environment
 from hyperplanes.utilities.formatting import format_duration
 from hyperplanes.utilities.writing import write_json, write_whole
-from hyperplanes.views import Task
+from hyperplanes.views import Task, Views
 
 __all__ = ["describe_count", "overview", "write_first_page", "write_report"]
 
@@ -60,9 +62,9 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
         cells = [cell for cell in settings.packaged.cells if cell.on == on]
         for name in runner.data.evaluated(on, "all", settings.packaged.objects):
             task = Shown(runner.data.tasks(on), most, QUERY_VIEWS).task(name)
-            around = model.adapt(task.support).render(orbit_cameras(task.support, settings.frames // 2)).images
+            around = _round(model, task.support, orbit_cameras(task.support, settings.frames // 2))
             read, query = range(len(task.support)), range(len(task.query))
-            exhibits.append(_exhibit(runner, cells, scores, task, read, query, to_pixels(around)))
+            exhibits.append(_exhibit(runner, cells, scores, task, read, query, around))
             names.append(f"{on}/{name}")
     height, width = task.query.size
     page = Report(
@@ -96,6 +98,12 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
     write_whole(path, render_page(page).encode())
 
 
+def _round(model: HyperPlanes, support: Views, cameras: PinholeCamera) -> Pixels:
+    """The frames of a turntable in one step."""
+    field = choose_representation(model.adapt(support), support, cameras)
+    return to_pixels(field.render(cameras).images)
+
+
 def describe_count(row: str, most: int) -> str:
     """A row of the first page in words."""
     return f"nearest of {most} views, copied" if row == "nearest_view" else f"{row.removeprefix('views_')} views"
@@ -121,7 +129,7 @@ def write_report(folder: Path, runner: Runner, settings: DemoSettings) -> None:
         task = replace(task, support=model.arrange(task.support))
         size = SCALE if exhibits else HERO_SCALE
         around = orbit_cameras(task.support, settings.frames, size=round(size * settings.resolution))
-        rounds.append(to_pixels(model.adapt(task.support).render(around).images))
+        rounds.append(_round(model, task.support, around))
         query = sorted({count // 4, 3 * count // 4})
         exhibits.append(_exhibit(runner, cells, scores, task, read, query, rounds[-1]))
     picture = overview(exhibits[:3], rounds[:3], round(SCALE * settings.resolution))

@@ -16,6 +16,8 @@ from hyperplanes.geometry.kernels.blocks import inlined
 __all__ = ["add_gradients", "render"]
 
 MAX_SAMPLES = 1024  # of positive density on a ray whose gradient is computed
+HARMONICS = 9
+NUMBERS = 1 + 3 * HARMONICS  # of a voxel: loops of a constant length are unrolled and vectorised
 
 
 @inlined
@@ -70,7 +72,7 @@ def _next_sample(index, values, empty, origin, along, first, last, step, per_cel
                 continue
             weight *= values[row, 0]
             density += weight
-            for number in range(mixed.shape[0]):
+            for number in range(NUMBERS):
                 mixed[number] += weight * values[row, number]
         if density > zero:
             return sample, t, x, y, z, density
@@ -80,12 +82,11 @@ def _next_sample(index, values, empty, origin, along, first, last, step, per_cel
 @no_type_check
 def _colour(basis, ray, mixed, density):
     """Red, green and blue of a sample, before they are clamped: the spherical harmonics of the ray's direction."""
-    harmonics = basis.shape[1]
     r = g = b = np.float32(0.0)
-    for number in range(harmonics):
+    for number in range(HARMONICS):
         r += basis[ray, number] * mixed[1 + number]
-        g += basis[ray, number] * mixed[1 + harmonics + number]
-        b += basis[ray, number] * mixed[1 + 2 * harmonics + number]
+        g += basis[ray, number] * mixed[1 + HARMONICS + number]
+        b += basis[ray, number] * mixed[1 + 2 * HARMONICS + number]
     return r / density, g / density, b / density
 
 
@@ -109,7 +110,7 @@ def render(index, values, empty, origins, directions, near, far, basis, step, li
         The samples of positive density.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
-    mixed = np.empty(values.shape[1], np.float32)
+    mixed = np.empty(NUMBERS, np.float32)
     total = 0
     for ray in range(start, stop):
         origin = origins[ray, 0], origins[ray, 1], origins[ray, 2]
@@ -144,9 +145,9 @@ def add_gradients(  # noqa: PLR0913
     index, values, empty, origins, directions, near, far, basis, step, limit, background, truth, gradient, start, stop
 ):
     """Adds the gradient of the squared errors of rays start..stop to `gradient`; returns the sum of the errors."""
-    harmonics = basis.shape[1]
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
-    mixed = np.empty(values.shape[1], np.float32)
+    mixed = np.empty(NUMBERS, np.float32)
+    by_number = np.zeros(NUMBERS, np.float32)  # of a sample, by its interpolated numbers; density has its own way
     places = np.empty((MAX_SAMPLES, 3), np.float32)
     densities = np.empty(MAX_SAMPLES, np.float32)
     colours = np.empty((MAX_SAMPLES, 3), np.float32)  # before they are clamped
@@ -199,6 +200,12 @@ def add_gradients(  # noqa: PLR0913
             by_red = weight * wrong_r if zero < r < one else zero
             by_green = weight * wrong_g if zero < g < one else zero
             by_blue = weight * wrong_b if zero < b < one else zero
+            for number in range(HARMONICS):
+                of_basis = basis[ray, number]
+                by_number[1 + number] = of_basis * by_red
+                by_number[1 + HARMONICS + number] = of_basis * by_green
+                by_number[1 + 2 * HARMONICS + number] = of_basis * by_blue
+            mean = by_red * r + by_green * g + by_blue * b
             # The share of each voxel around the sample in its density and its colour.
             x, y, z = places[kept, 0], places[kept, 1], places[kept, 2]
             cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
@@ -207,16 +214,9 @@ def add_gradients(  # noqa: PLR0913
                 row, at_corner = _corner(index, cell_x, cell_y, cell_z, x, y, z, corner)
                 if row < 0:
                     continue
-                share = at_corner * values[row, 0] / density
-                own_r, own_g, own_b = zero, zero, zero
-                for number in range(harmonics):
-                    of_basis = basis[ray, number]
-                    own_r += of_basis * values[row, 1 + number]
-                    own_g += of_basis * values[row, 1 + harmonics + number]
-                    own_b += of_basis * values[row, 1 + 2 * harmonics + number]
-                    gradient[row, 1 + number] += share * of_basis * by_red
-                    gradient[row, 1 + harmonics + number] += share * of_basis * by_green
-                    gradient[row, 1 + 2 * harmonics + number] += share * of_basis * by_blue
-                mixing = by_red * (own_r - r) + by_green * (own_g - g) + by_blue * (own_b - b)
-                gradient[row, 0] += at_corner * (by_density + mixing / density)
+                share, own = at_corner * values[row, 0] / density, zero
+                for number in range(NUMBERS):
+                    own += by_number[number] * values[row, number]
+                    gradient[row, number] += share * by_number[number]
+                gradient[row, 0] += at_corner * (by_density + (own - mean) / density)
     return total

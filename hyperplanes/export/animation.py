@@ -1,0 +1,85 @@
+"""What draws an animation of an object: its field, or voxels fitted to its views where many pictures are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, TypeAlias
+
+from kornia.geometry.camera import PinholeCamera
+
+from hyperplanes.adaptation.base import AdaptedField, Renderable
+from hyperplanes.export.baking import BakedScene, bake, default_side
+from hyperplanes.export.voxel_fitting import ENOUGH, fit_voxels, render_guide
+from hyperplanes.fields.baked import BakedField
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.views import Views
+
+__all__ = ["Representation", "choose_representation", "draws_by_voxels", "fitted_voxels"]
+
+Representation: TypeAlias = Literal["auto", "field", "voxels"]
+
+PIXELS = 24
+"""Of all pictures together, for each voxel of a face of the grid: from so many on baking, fitting and drawing voxels
+takes less time than drawing the field, on two cores."""
+
+
+def draws_by_voxels(views: int, cameras: PinholeCamera, side: int) -> bool:
+    """Whether voxels draw the pictures sooner than the field, and as well: many pictures of an object of many views.
+
+    >>> import torch
+    >>> poses, lens = torch.eye(4).expand(48, 4, 4), camera.symmetric_intrinsics(400, 400, 0.8)
+    >>> orbit = camera.pinhole(lens, poses, 400, 400)
+    >>> draws_by_voxels(25, orbit, 256), draws_by_voxels(3, orbit, 256)
+    (True, False)
+    >>> draws_by_voxels(25, camera.select(orbit, [0]), 256)
+    False
+
+    Args:
+        views: how many the field was adapted to; with few of them, voxels show less than the field.
+        cameras: of the pictures.
+        side: voxels an axis.
+    """
+    height, width = camera.image_size(cameras)
+    return views >= ENOUGH and cameras.batch_size * height * width >= PIXELS * side**2
+
+
+def fitted_voxels(adapted: AdaptedField, views: Views, side: int) -> BakedField:
+    """The voxels of a field, fitted to its support views.
+
+    Args:
+        adapted: what is baked.
+        views: its support views.
+        side: voxels an axis.
+    """
+    return fit_voxels(bake(adapted, side=side), views, guide=render_guide(adapted, views))
+
+
+def choose_representation(
+    field: Renderable,
+    views: Views,
+    cameras: PinholeCamera,
+    representation: Representation = "auto",
+    *,
+    make: Callable[[AdaptedField, Views, int], BakedField] = fitted_voxels,
+) -> Renderable:
+    """What draws the pictures of an animation.
+
+    Args:
+        field: of the object; what is no adapted field, such as baked voxels, draws itself.
+        views: its support views, to which voxels are fitted.
+        cameras: of all pictures.
+        representation: "field", "voxels", or what `draws_by_voxels` says; on a GPU, where fields are drawn at once,
+            "auto" is the field.
+        make: makes the voxels, of the field, the views and the number of voxels an axis.
+
+    Returns:
+        The field itself, or its voxels.
+    """
+    if not isinstance(field, AdaptedField) or representation == "field":
+        return field
+    side = default_side(max(views.size, camera.image_size(cameras), key=max))
+    if representation == "auto":
+        on_cpu = field.occupancy.occupied.device.type == "cpu"
+        if not (on_cpu and draws_by_voxels(len(views), cameras, side)):
+            return field
+    return BakedScene(make(field, views, side))

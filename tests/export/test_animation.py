@@ -1,0 +1,36 @@
+"""Source of truth: voxels draw long animations of many views, on a CPU; what is told is done."""
+
+import pytest
+import torch
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.export.animation import choose_representation
+from hyperplanes.export.baking import BakedScene
+from hyperplanes.fields.baked import BakedField
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering.renderer import RayMarching
+from hyperplanes.views import Views
+
+FIELD = AdaptedField(lambda points, directions: (points, points[:, 0]), full(Sphere(), 4), RayMarching(steps=8))
+VOXELS = BakedField(torch.full((4, 4, 4), -1, dtype=torch.int32), torch.zeros(0, 28), Sphere())
+
+
+@pytest.mark.parametrize(
+    ("frames", "side", "shown", "representation", "by_voxels"),
+    [
+        (48, 400, 25, "auto", True),
+        (8, 400, 25, "auto", False),  # few pictures
+        (48, 400, 15, "auto", False),  # few views
+        (1, 8, 3, "voxels", True),
+        (48, 400, 25, "field", False),
+    ],
+)
+def test_voxels_draw_long_animations_of_many_views(frames, side, shown, representation, by_voxels):
+    lens = camera.symmetric_intrinsics(side, side, 0.8)
+    cameras = camera.pinhole(lens, torch.eye(4).expand(frames, 4, 4), side, side)
+    views = Views(torch.ones(shown, 3, 8, 8), camera.pinhole(lens, torch.eye(4).expand(shown, 4, 4), 8, 8))
+    found = choose_representation(FIELD, views, cameras, representation, make=lambda *_: VOXELS)
+    assert isinstance(found, BakedScene) == by_voxels
+    assert choose_representation(found, views, cameras, representation) is found or not by_voxels
