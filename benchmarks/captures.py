@@ -5,36 +5,56 @@
 Every object stands on a table in a textured room and is photographed through a lens, with other exposures, blur and
 noise for each picture. The poses that were found are brought into the true world by the similarity that fits the
 cameras' centres best; masks are compared where the lens has been taken out. With --checkpoint, a model adapts to half
-of the views, once with what was found and once with what is true, and the other half are compared with its renderings.
+of the views, and the other half, over white by their true masks, are compared with its renderings: with what was found,
+with what is true, with masks that are damaged on purpose (every fourth lacks a part, or has one too many, and all are
+soft), and without masks, with a learned background and without.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from scipy import ndimage
 
 from benchmarks.reporting import Row, finish
 from benchmarks.staged_photographs import Staged, stage, walk_around
 from data_gen.meshes.find import find_meshes
 from data_gen.meshes.mesh import load_mesh
+from hyperplanes.adaptation.background import separate_background
+from hyperplanes.adaptation.base import Adapter
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.capture import Settings, capture
+from hyperplanes.capture.masks import consistency
+from hyperplanes.capture.masks.consistency import agree
+from hyperplanes.capture.pipeline import ROOM
+from hyperplanes.capture.placement import object_points, object_sphere
 from hyperplanes.capture.scene import straightened
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.data import read_task
 from hyperplanes.data.formats.transforms_document import transforms_document
-from hyperplanes.data.pictures.images import read_image
+from hyperplanes.data.pictures.images import Pixels, composite_over_white, read_image
+from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.utilities.writing import write_json, write_whole
+from hyperplanes.views import Views
 
-__all__ = ["PoseErrors", "compare_poses", "main"]
+__all__ = ["PoseErrors", "compare_poses", "damaged_masks", "main"]
+
+HEIGHTS = (15.0, 45.0)  # of the rounds, in degrees: with 36 photographs a step of 20 degrees
+SOFT = 0.008  # of the longer side: deviation of the blur of a damaged mask
+PART = 0.25  # of the area of the object, that is lost or added
 
 
 @dataclass(frozen=True)
@@ -111,13 +131,17 @@ def main(arguments: list[str]) -> int:
 def _measured(path: Path | None, index: int, folder: Path, options: argparse.Namespace) -> Row:
     size = 3 * options.size // 4, options.size
     mesh = None if path is None else load_mesh(path)
-    staged = stage(walk_around(options.views, index), size, seed=index, mesh=mesh)
+    staged = stage(walk_around(options.views, index, HEIGHTS), size, seed=index, mesh=mesh)
     staged.save(folder / "photographs")
     started = time.perf_counter()
     captured = capture(folder / "photographs", folder / "scene", Settings(options.size, options.mask))
     seconds = time.perf_counter() - started
     model = SparseModel.load(folder / "scene" / "capture" / "poses" / "model.npz")
     errors = compare_poses(np.linalg.inv(model.camera_from_world), staged.world_from_camera[model.pictures])
+    truth = {
+        _name(view): _straight(staged, view, model.calibrations[row], model.lenses[row])
+        for row, view in enumerate(model.pictures.tolist())
+    }
     row: Row = {
         "name": "ellipsoid" if path is None else path.stem,
         "views": options.views,
@@ -126,50 +150,141 @@ def _measured(path: Path | None, index: int, folder: Path, options: argparse.Nam
         "degrees_median": float(np.median(errors.degrees)),
         "percent_median": float(np.median(errors.percent)),
         "mask": captured.mask,
-        "mask_iou": _mask_overlap(folder / "scene", model, staged),
+        "mask_iou": _overlap(_read_masks(folder / "scene", truth), truth),
         "seconds": seconds,
     }
     if options.checkpoint is not None:
-        _write_true(folder / "true", staged)
-        row["psnr"] = _quality(folder / "scene", options.checkpoint)
-        row["psnr_true"] = _quality(folder / "true", options.checkpoint)
+        checkpoint = HyperPlanes.from_pretrained(Path(options.checkpoint))
+        true = {
+            _name(view): _straight(staged, view, staged.calibration, staged.lens) for view in range(len(staged.masks))
+        }
+        _write_true(folder / "true", staged, true)
+        row["psnr"] = _quality(folder / "scene", checkpoint, truth)
+        row["psnr_true"] = _quality(folder / "true", checkpoint, true)
         row["psnr_loss"] = float(row["psnr_true"]) - float(row["psnr"])
+        row["psnr_nearest"] = _quality(folder / "true", NearestView(), true)
+        row |= _damaged(folder, model, truth, checkpoint, index)
+        row |= _without_masks(folder / "scene", truth, checkpoint)
     print(row, flush=True)
     return row
 
 
-def _mask_overlap(scene: Path, model: SparseModel, staged: Staged) -> float:
-    """Mean intersection over union of the masks of a scene with the true ones."""
+def _name(view: int) -> str:
+    return f"photo_{view:03d}"
+
+
+def _straight(staged: Staged, view: int, calibration: np.ndarray, lens: Sequence[float]) -> Pixels:
+    """A photograph with its true mask as alpha, without its lens."""
+    rgba = np.concatenate([staged.photographs[view], 255 * staged.masks[view][..., None].astype(np.uint8)], -1)
+    return straightened(rgba, calibration, np.array(lens), opaque=False)
+
+
+def _read_masks(scene: Path, names: Iterable[str]) -> list[np.ndarray]:
+    """The masks of a scene, opacity in [0, 1]."""
+    return [read_image(scene / "masks" / f"{name}.png")[0][..., 0] / 255 for name in names]
+
+
+def _overlap(masks: Sequence[np.ndarray], truth: Mapping[str, Pixels]) -> float:
+    """Mean intersection over union of masks with the true ones."""
     result = []
-    for row, index in enumerate(model.pictures.tolist()):
-        path = scene / "masks" / f"photo_{index:03d}.png"
-        if not path.is_file():
-            return float("nan")
-        true = np.zeros((*staged.masks[index].shape, 4), np.uint8)
-        true[...] = 255 * staged.masks[index][..., None].astype(np.uint8)
-        straight = straightened(true, model.calibrations[row], model.lenses[row], opaque=True)[..., 0] > 127
-        found = read_image(path)[0][..., 0] > 127
-        result.append((found & straight).sum() / max(1, (found | straight).sum()))
+    for mask, picture in zip(masks, truth.values(), strict=True):
+        found, true = mask > 0.5, picture[..., 3] > 127
+        result.append((found & true).sum() / max(1, (found | true).sum()))
     return float(np.mean(result))
 
 
-def _write_true(folder: Path, staged: Staged) -> None:
+def _write_true(folder: Path, staged: Staged, pictures: Mapping[str, Pixels]) -> None:
     """The scene with true poses and masks."""
-    names = []
-    for index, (photograph, mask) in enumerate(zip(staged.photographs, staged.masks, strict=True)):
-        rgba = np.concatenate([photograph, 255 * mask[..., None].astype(np.uint8)], -1)
-        straight = straightened(rgba, staged.calibration, np.array(staged.lens), opaque=False)
-        names.append(f"images/photo_{index:03d}.png")
-        write_whole(folder / names[-1], encode_png(straight), durable=False)
-    calibrations = np.tile(staged.calibration, (len(names), 1, 1))
-    size = staged.photographs[0].shape[:2]
+    for name, picture in pictures.items():
+        write_whole(folder / "images" / f"{name}.png", encode_png(picture), durable=False)
+    calibrations = np.tile(staged.calibration, (len(pictures), 1, 1))
     sphere = (0.0, 0.0, 0.0), 1.0
+    size, names = staged.photographs[0].shape[:2], [f"images/{name}.png" for name in pictures]
     document = transforms_document(staged.world_from_camera, calibrations, size, names, sphere=sphere)
     write_json(folder / "transforms.json", document | {"up": "y"})
 
 
-def _quality(scene: Path, checkpoint: str) -> float:
-    """PSNR in dB of the views that were not shown."""
+def _quality(
+    scene: Path, method: Adapter, truth: Mapping[str, Pixels], prepare: Callable[[Views], Views] | None = None
+) -> float:
+    """PSNR in dB of the views that were not shown, against the photographs over white by their true masks.
+
+    Args:
+        scene: what is read.
+        method: what adapts to half of it.
+        truth: the photographs.
+        prepare: what is done with the support views before.
+    """
     task = read_task(scene, up="auto")
-    pictures = HyperPlanes.from_pretrained(Path(checkpoint)).adapt(task.support).render(task.query.cameras).images
-    return float(psnr(pictures.clamp(0, 1), task.query.images).mean())
+    shown = task.support if prepare is None else prepare(task.support)
+    pictures = method.adapt(shown).render(task.query.cameras).images.clamp(0, 1)
+    wanted = np.stack([truth[Path(name).stem] for name in task.query.names]).transpose(0, 3, 1, 2)
+    true, _ = composite_over_white(torch.from_numpy(np.ascontiguousarray(wanted)))
+    return float(psnr(pictures, true).mean())
+
+
+def _damaged(folder: Path, model: SparseModel, truth: Mapping[str, Pixels], checkpoint: HyperPlanes, seed: int) -> Row:
+    """What masks that are wrong on purpose do: as they are, mended by one mask's word, and by the vote of all."""
+    masks = damaged_masks([picture[..., 3] / 255 for picture in truth.values()], seed)
+    around = object_sphere(model, object_points(model, masks))
+    room = Sphere(around.centre, ROOM * around.radius)
+    ways = {"damaged": masks}
+    for way, most in (("one_word", 0.0), ("vote", consistency.MOST_VOTES)):
+        with patch.object(consistency, "MOST_VOTES", most):
+            ways[f"damaged_{way}"] = agree(masks, model, room).masks
+    result: Row = {}
+    for way, found in ways.items():
+        scene = folder / way
+        shutil.rmtree(scene, ignore_errors=True)
+        shutil.copytree(folder / "scene", scene, ignore=shutil.ignore_patterns("capture"))
+        for name, mask in zip(truth, found, strict=True):
+            pixels = (mask * 255).round().astype(np.uint8)
+            write_whole(scene / "masks" / f"{name}.png", encode_png(pixels), durable=False)
+        result[f"mask_iou_{way}"] = _overlap(found, truth)
+        try:
+            result[f"psnr_{way}"] = _quality(scene, checkpoint, truth)
+        except ValueError:  # a hull that is carved to nothing
+            result[f"psnr_{way}"] = float("nan")
+    return result
+
+
+def damaged_masks(masks: Sequence[np.ndarray], seed: int) -> list[np.ndarray]:
+    """Masks with soft borders, of which every fourth has lost a part of the object, or holds something beside it.
+
+    Args:
+        masks: opacity in [0, 1].
+        seed: of where.
+    """
+    generator, result = np.random.default_rng(seed), []
+    for index, mask in enumerate(masks):
+        soft = ndimage.gaussian_filter(mask.astype(float), SOFT * max(mask.shape))
+        if index % 4 == 1:
+            edge = np.argwhere(np.greater(mask > 0.5, ndimage.binary_erosion(mask > 0.5)))
+            row, column = edge[generator.integers(len(edge))]
+            rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
+            disc = (rows - row) ** 2 + (columns - column) ** 2 < PART * (mask > 0.5).sum() / np.pi
+            soft[disc] = float(index % 8 == 5)
+        result.append(soft)
+    return result
+
+
+def _without_masks(scene: Path, truth: Mapping[str, Pixels], checkpoint: HyperPlanes) -> Row:
+    """The same poses without masks: as the model takes them, with a learned background, and fitted without a room."""
+
+    def bare(views: Views) -> Views:
+        pictures = np.stack([truth[Path(name).stem][..., :3] for name in views.names]).transpose(0, 3, 1, 2)
+        return replace(views, images=torch.from_numpy(np.ascontiguousarray(pictures)).float() / 255, masks=None)
+
+    def learned(views: Views, *, room: bool) -> Views:
+        views = bare(views)
+        return separate_background(views, room=room).cut_out(views)
+
+    found: Row = {"psnr_no_masks": _quality(scene, checkpoint, truth, bare)}
+    for name, room in (("learned_background", True), ("no_room", False)):
+        try:
+            found[f"psnr_{name}"] = _quality(
+                scene, checkpoint, truth, lambda views, room=room: learned(views, room=room)
+            )
+        except ValueError:  # masks that leave nothing
+            found[f"psnr_{name}"] = float("nan")
+    return found

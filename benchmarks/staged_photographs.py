@@ -192,12 +192,12 @@ def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float) 
 
 
 def _texture(points: Array, table: Array, frequency: float) -> Array:
-    """Colours from noise of four octaves, trilinear between the entries of a table that repeats."""
+    """Colours from noise of six octaves, trilinear between the entries of a table that repeats."""
     side = len(table)
     repeated = np.pad(table, ((0, 1), (0, 1), (0, 1), (0, 0)), mode="wrap") - 0.5
     volume = torch.from_numpy(repeated).permute(3, 2, 1, 0)[None]  # (1, 3, z, y, x)
     total = torch.zeros(3, len(points))
-    for octave in range(4):
+    for octave in range(6):
         where = np.mod(points * (frequency * 2.1**octave), side).astype(np.float32)
         grid = torch.from_numpy(2 / side * where - 1)[None, None, None]
         total += 0.75**octave * grid_sample(volume, grid, align_corners=True).reshape(3, -1)

@@ -1,6 +1,7 @@
-"""Adapted fields kept on disk by what they were made of, so that two commands on the same views adapt once.
+"""What was made of views kept on disk by what it was made of, so that two commands on the same views make it once.
 
-They lie in `$HYPERPLANES_CACHE/adapted`, by default `~/.cache/hyperplanes/adapted`, which may be deleted at any time.
+Adapted fields lie in `$HYPERPLANES_CACHE/adapted`, by default `~/.cache/hyperplanes/adapted`, refined poses and learned
+backgrounds beside them. All of it may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,9 +26,9 @@ from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, sav
 from hyperplanes.utilities.environment import cache_folder
 from hyperplanes.views import Views
 
-__all__ = ["keep_field", "kept_folder", "recall_field"]
+__all__ = ["keep_field", "keep_tensors", "kept_file", "kept_folder", "recall_field", "recall_tensors"]
 
-MOST = 10  # fields that are kept; the oldest goes first
+MOST = 10  # of a kind that are kept; the oldest goes first
 SURFACE = "surface.safetensors"
 
 
@@ -40,21 +41,77 @@ def kept_folder(model: HyperPlanes, views: Views, steps: Steps, settings: FineTu
         steps: of fine-tuning.
         settings: of fine-tuning.
     """
-    digest = hashlib.sha256(_code().encode())
-    digest.update(json.dumps([model.config.as_json(), str(steps), repr(settings), repr(views.bounds)]).encode())
-    for part in _tensors(model, views):
-        digest.update(f"{part.dtype}{tuple(part.shape)}".encode())
-        digest.update(part.detach().cpu().contiguous().numpy().tobytes())
-    base = Path(os.environ.get("HYPERPLANES_CACHE") or cache_folder() / "hyperplanes")
-    return base / "adapted" / digest.hexdigest()[:32]
+    options = [model.config.as_json(), str(steps), repr(settings)]
+    return _home() / "adapted" / _digest(options, views, _weights(model))
 
 
-def _tensors(model: HyperPlanes, views: Views) -> Iterator[Tensor]:
+def kept_file(kind: str, views: Views, model: HyperPlanes | None = None, *options: object) -> Path:
+    """Where the tensors that were made of views are kept, whether they are there or not.
+
+    Args:
+        kind: of tensors, the name of a folder.
+        views: what they were made of.
+        model: what had a say in it, if any.
+        options: what else had, as JSON can hold it.
+    """
+    options = (*options, None if model is None else model.config.as_json())
+    return _home() / kind / f"{_digest(options, views, [] if model is None else _weights(model))}.safetensors"
+
+
+def keep_tensors(file: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Keep some tensors; of more than ten such files the oldest are deleted.
+
+    Args:
+        file: of `kept_file`.
+        tensors: by their names.
+    """
+    save_tensors(file, dict(tensors))
+    _delete_oldest(file.parent)
+
+
+def recall_tensors(file: Path, names: Sequence[str]) -> dict[str, Tensor] | None:
+    """The tensors that were kept, or None where none were, or others, or some that cannot be read.
+
+    Args:
+        file: of `kept_file`.
+        names: of those that there should be.
+    """
+    try:
+        found = load_tensors(file) if file.exists() else {}
+    except CheckpointError:
+        return None
+    return found if set(found) == set(names) else None
+
+
+def _home() -> Path:
+    return Path(os.environ.get("HYPERPLANES_CACHE") or cache_folder() / "hyperplanes")
+
+
+def _weights(model: HyperPlanes) -> Iterator[Tensor]:
     yield from (value for _, value in sorted(model.state_dict().items()))
+
+
+def _digest(options: Iterable[object], views: Views, weights: Iterable[Tensor]) -> str:
+    """A hash of all that something was made of, the code that made it included."""
+    digest = hashlib.sha256(_code().encode())
+    digest.update(json.dumps([*options, repr(views.bounds)]).encode())
+    for part in (*weights, *_parts(views)):
+        digest.update(f"{part.dtype}{tuple(part.shape)}".encode())
+        digest.update(part.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+    return digest.hexdigest()[:32]
+
+
+def _parts(views: Views) -> Iterator[Tensor]:
     cameras = views.cameras
     yield from (views.images, cameras.intrinsics, cameras.extrinsics)
     distortion = getattr(cameras, "distortion", None)
     yield from (part for part in (views.masks, distortion) if isinstance(part, Tensor))
+
+
+def _delete_oldest(folder: Path) -> None:
+    others = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
+    for path in others[:-MOST]:
+        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 @cache
@@ -78,9 +135,7 @@ def keep_field(model: HyperPlanes, field: AdaptedField, folder: Path) -> None:
     if surface is not None:
         save_tensors(folder / SURFACE, {"distances": surface.cpu()})
     model.with_weights_of(field).save(folder)
-    others = sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime)
-    for path in others[:-MOST]:
-        shutil.rmtree(path, ignore_errors=True)
+    _delete_oldest(folder.parent)
 
 
 def recall_field(folder: Path, views: Views, device: torch.device | str = "cpu") -> AdaptedField | None:

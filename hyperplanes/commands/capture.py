@@ -85,6 +85,6 @@ def run(arguments: Arguments) -> int:
     console.say(f"{captured.folder}: a scene, in {format_duration(time.perf_counter() - started)}; for a turntable:")
     console.say(
         f"  hyperplanes render --checkpoint small --views {captured.folder} --all-views --orbit 48 "
-        f"--out {captured.folder}/turntable"
+        f"--out {captured.folder}/turntable" + (" --learn-background" if captured.mask == "none" else "")
     )
     return 0

@@ -62,6 +62,8 @@ class ObjectArguments:
         second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
             visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
+        learn_background: For photographs without masks: learn what lies in the sphere of the scene and the room around
+            it together, and cut the former out.
         refine_poses: Refine the poses of all views first, and keep them where support views that the model is not given
             are shown better by half a decibel: for poses that are a little wrong.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
@@ -77,6 +79,7 @@ class ObjectArguments:
     steps: Steps = 0
     second_pass: bool = False
     all_views: bool = False
+    learn_background: bool = False
     refine_poses: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None

@@ -22,14 +22,21 @@ __all__ = ["read_object", "read_path", "read_scene", "refuse_sources", "say_up"]
 
 
 def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, console: Console) -> tuple[Task, str]:
-    """As `read_scene`, of the options that the verbs of one object share; poses are refined where that is asked for.
+    """As `read_scene`, of the options that the verbs of one object share.
+
+    The background is learned and poses are refined where that is asked for.
 
     Args:
         arguments: the options.
         source: what will adapt to the views.
         console: where it is said.
+
+    Raises:
+        ValueError: a baked file, which adapts to nothing, and an option that is for adapting.
     """
+    from hyperplanes.commands.background import cut_out_task
     from hyperplanes.commands.poses import refine_task
+    from hyperplanes.export.baking import BakedScene
 
     task, up = read_scene(
         arguments.views,
@@ -38,6 +45,10 @@ def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, co
         up=arguments.up,
         downscale=arguments.downscale,
     )
+    if arguments.learn_background:
+        if isinstance(source, BakedScene):
+            raise ValueError("--learn-background: expected a model that adapts to the views, got a baked file")
+        task = cut_out_task(task, console, all_views=arguments.all_views)
     if arguments.refine_poses:
         task = refine_task(source, task, console, all_views=arguments.all_views)
     return task, up

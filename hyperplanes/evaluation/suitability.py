@@ -36,7 +36,7 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
         what = "no alpha and no masks" if shown.masks is None else f"masks that cover {covered:.0%}"
         found.append(
             f"the views have {what}, and the model was trained on objects over white: it takes the background for the "
-            "object; cut the object out (RGBA images, or a folder masks/)"
+            "object; cut the object out (RGBA images, or a folder masks/), or give --learn-background"
         )
     planes = model.config.network.planes
     if len(shown) < planes and len(model.rig):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import pose_refinement
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.pose_refinement import refine_poses
 from hyperplanes.commands import poses as command
 from hyperplanes.commands.console import Console
@@ -83,18 +84,26 @@ def test_what_cannot_be_refined_is_refused(views):
 
 
 @pytest.mark.parametrize(("better", "said"), [(True, "poses: refined, turned by "), (False, "poses: as given, ")])
-def test_views_left_out_decide(views, capsys, monkeypatch, better, said):
-    """The judge's figures are given here; the poses of the one or the other come out, for support and query alike."""
+def test_views_left_out_decide_and_what_was_found_is_kept(views, capsys, monkeypatch, tmp_path, better, said):
+    """The judge's figures are given here; the poses of the one or the other come out, for support and query alike.
+
+    The same call again, with a refinement that fails, ends with the same.
+    """
     from hyperplanes.evaluation import suitability
 
     figures = iter([(20.0, 0.0), (21.0 if better else 20.4, 0.0)])
     monkeypatch.setattr(suitability, "held_out_psnr", lambda *_: next(figures))
     monkeypatch.setattr(pose_refinement, "LEVELS", ((16, 8, 2),))
-    task = Task(views[:9], views[9:], "car")
-    source = type("Model", (), {"rig": torch.zeros(0)})()
+    monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path))
+    task, source = Task(views[:9], views[9:], "car"), HyperPlanes.from_pretrained("cars-64")
     found = command.refine_task(source, task, Console())
     assert said in capsys.readouterr().out
     for old, new in ((task.support, found.support), (task.query, found.query)):
         assert (new is not old) == better
         assert torch.equal(new.images, old.images)
         assert torch.equal(new.cameras.extrinsics, old.cameras.extrinsics) != better
+    monkeypatch.setattr(pose_refinement, "refine_poses", None)
+    again = command.refine_task(source, task, Console())
+    assert said in (told := capsys.readouterr().out)
+    assert f"kept in {tmp_path}" in told
+    assert torch.equal(again.query.cameras.extrinsics, found.query.cameras.extrinsics)

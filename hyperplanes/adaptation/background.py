@@ -1,0 +1,192 @@
+"""Photographs without masks: what lies in the sphere of a scene is told from the room around it by fitting both.
+
+Two grids of density and colour are optimised together by rays of all views, one within the sphere, and one of all that
+lies outside, as far as infinity, in the contracted space of Barron et al. 2022 ("Mip-NeRF 360"). Each ray is
+composited through both. What the inner grid covers of a picture is its mask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate, softplus
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
+from hyperplanes.geometry.volume import interpolate_grid
+from hyperplanes.views import Views
+
+__all__ = ["FEWEST_VIEWS", "Separated", "separate_background"]
+
+LEVELS = ((64, 24, 32, 100), (128, 48, 64, 120), (192, 80, 96, 120))
+"""Pixels along the longer side of the pictures, cells of the inner and of the outer grid along an axis, and steps."""
+
+FEWEST_VIEWS = 5
+RAYS = 1024
+RATE, LAST_RATE = 0.2, 0.02  # of Adam
+THIN = -4.0  # what both grids begin with, before softplus: optical depth of a cell
+SAMPLES = 1.5  # within the sphere, for each cell of its grid along an axis
+BEFORE, BEHIND = 12, 64  # samples in front of the sphere and beyond it
+NEAREST = 0.1  # of the distance to the middle of a ray that misses the sphere: where its samples begin
+FARTHEST = 0.97  # of the way to infinity, in disparity
+CERTAIN = 0.02  # weight of opacities between 0 and 1
+DECIDED = 0.3  # of the steps, after which opacities are drawn to 0 and 1
+PIXELS = 256  # along the longer side of the masks, before they are enlarged
+SHARPENED = 4.0  # slope of a mask in its opacity, so that soft borders do not count as the object
+RAYS_AT_ONCE = 1 << 13
+
+Grid = Float[Tensor, "channel x y z"]
+
+
+@dataclass(frozen=True)
+class Separated:
+    """An object and the room around it.
+
+    Attributes:
+        inner: density, before softplus, as optical depth of a cell, and colour, before the sigmoid, in the sphere.
+        outer: likewise of all that lies outside, contracted to a ball of twice the radius.
+        bounds: the sphere.
+    """
+
+    inner: Grid
+    outer: Grid
+    bounds: Sphere
+
+    @torch.no_grad()
+    def render(self, cameras: camera.PinholeCamera) -> tuple[Float[Tensor, "view 3 height width"], Tensor]:
+        """Pictures of both, and how much of each pixel the object covers, (view, 1, height, width)."""
+        height, width = camera.image_size(cameras)
+        pixels, views = pixel_grid(height, width), []
+        for view in range(cameras.batch_size):
+            parts = []
+            for some in pixels.split(RAYS_AT_ONCE):
+                rays = cast(cameras, torch.full((len(some),), view), some, self.bounds)
+                parts.append(torch.cat(_composited(self.inner, self.outer, rays, self.bounds), 1))
+            views.append(torch.cat(parts).T.reshape(4, height, width))
+        found = torch.stack(views)
+        return found[:, :3], found[:, 3:]
+
+    def cut_out(self, views: Views) -> Views:
+        """Views with the masks of the object, over white.
+
+        Args:
+            views: photographs, of the scene that was fitted.
+        """
+        _, opacity = self.render(views.resized(PIXELS).cameras)
+        opacity = interpolate(opacity, views.size, mode="bilinear").to(views.images)
+        masks = (SHARPENED * (opacity - 0.5) + 0.5).clamp(0, 1)
+        return replace(views, images=views.images * masks + (1 - masks), masks=masks)
+
+
+def separate_background(
+    views: Views, *, seed: int = 0, on_step: Callable[[int, int], None] | None = None, room: bool = True
+) -> Separated:
+    """The object within the bounds of some views, and the room around it.
+
+    Args:
+        views: photographs without masks, and without lens distortion.
+        seed: of rays and samples.
+        on_step: called with the number of steps done and that of all.
+        room: without, all that the photographs show has to lie in the sphere.
+
+    Raises:
+        ValueError: fewer than five views, or cameras with lens distortion.
+    """
+    if len(views) < FEWEST_VIEWS or isinstance(views.cameras, DistortedCamera):
+        found = f"{len(views)}" + (" with lens distortion" if isinstance(views.cameras, DistortedCamera) else "")
+        raise ValueError(f"views: expected at least {FEWEST_VIEWS} without lens distortion, got {found}")
+    views = replace(views.to("cpu", torch.float32), masks=None)
+    generator = torch.Generator().manual_seed(seed)
+    inner, outer = (torch.zeros(4, 8, 8, 8) for _ in range(2))
+    inner[0] = outer[0] = THIN
+    done, total = 0, sum(level[-1] for level in LEVELS)
+    for pixels, *sides, steps in LEVELS:
+        # the same grids in smaller cells, and larger pictures
+        small = views.resized(pixels)
+        inner, outer = (_enlarged(grid, side) for grid, side in zip((inner, outer), sides, strict=True))
+        descent = torch.optim.Adam([inner, outer], lr=RATE, betas=(0.9, 0.99))
+        for _ in range(steps):
+            descent.param_groups[0]["lr"] = RATE * (LAST_RATE / RATE) ** (done / total)
+            # squared error of some rays; opacities between 0 and 1 cost something once there is a shape
+            rays, truth = small.sample_rays(RAYS, generator=generator)
+            colour, opacity = _composited(inner, outer, rays, views.bounds, generator, room)
+            loss = (colour - truth).square().mean()
+            if done > DECIDED * total:
+                loss = loss + CERTAIN * (opacity * (1 - opacity)).mean()
+            descent.zero_grad()
+            loss.backward()
+            descent.step()
+            done += 1
+            if on_step is not None:
+                on_step(done, total)
+    return Separated(inner.detach(), outer.detach(), views.bounds)
+
+
+def _enlarged(grid: Grid, side: int) -> Grid:
+    """The same in smaller cells; optical depth of a cell stays that of a cell."""
+    grid = interpolate(grid.detach()[None], (side,) * 3, mode="trilinear", align_corners=False)[0]
+    return grid.requires_grad_(True)
+
+
+def _composited(
+    inner: Grid,
+    outer: Grid,
+    rays: Rays,
+    bounds: Sphere,
+    generator: torch.Generator | None = None,
+    room: bool = True,
+) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 1"]]:
+    """Colours of rays through both grids, and the share of the inner one."""
+    count = int(SAMPLES * inner.shape[1])
+
+    def samples(number: int) -> Tensor:
+        """One in each of so many intervals of [0, 1], (ray, sample)."""
+        jitter = 0.5 if generator is None else torch.rand(len(rays), number, generator=generator)
+        return (torch.arange(number) + jitter).expand(len(rays), -1) / number
+
+    # distances: in front of the sphere, within it, and beyond it evenly in disparity
+    near, far = rays.near[:, None], rays.far[:, None]
+    start = torch.where(far > near, (near - bounds.radius).clamp_min(0.0), NEAREST * near)
+    around = torch.cat(
+        [start + (near - start) * samples(BEFORE), far + bounds.radius * (1 / (1 - FARTHEST * samples(BEHIND)) - 1)], 1
+    )
+    within = near + (far - near) * samples(count)
+    # optical depth and colour there
+    cells = ((far - near) / count * inner.shape[1] / (2 * bounds.radius)).expand(-1, count)
+    inside = _read(inner, rays.at(within), bounds, cells)
+    points = _contracted(rays.at(around), bounds)
+    lengths = torch.cat([_lengths(points[:, :BEFORE]), _lengths(points[:, BEFORE:])], 1)
+    outside = _read(outer, points, Sphere(radius=2.0), lengths * outer.shape[1] / 4)
+    if not room:  # nothing but white
+        outside = 0 * outside[0], 1 + 0 * outside[1]
+    depth, colour = (torch.cat([o[:, :BEFORE], i, o[:, BEFORE:]], 1) for i, o in zip(inside, outside, strict=True))
+    # what each takes of the light; the last sample stands for all that is behind it
+    light = torch.exp(-torch.cat([torch.zeros_like(near), depth[:, :-1].cumsum(1)], 1))
+    weights = light - torch.cat([light[:, 1:], torch.zeros_like(near)], 1)
+    return (weights[..., None] * colour).sum(1), weights[:, BEFORE : BEFORE + count].sum(1, keepdim=True)
+
+
+def _lengths(points: Float[Tensor, "ray sample 3"]) -> Float[Tensor, "ray sample"]:
+    """What each sample stands for of a line: half of the way to each of its neighbours."""
+    steps = (points[:, 1:] - points[:, :-1]).norm(dim=-1)
+    return (torch.cat([steps[:, :1], steps], 1) + torch.cat([steps, steps[:, -1:]], 1)) / 2
+
+
+def _contracted(points: Float[Tensor, "ray sample 3"], bounds: Sphere) -> Float[Tensor, "ray sample 3"]:
+    """Points in units of the sphere; outside of it, a point at distance r comes to 2 - 1 / r."""
+    points = bounds.normalise(points)
+    distance = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    return points * (2 - 1 / distance) / distance
+
+
+def _read(
+    grid: Grid, points: Float[Tensor, "ray sample 3"], bounds: Sphere, cells: Float[Tensor, "ray sample"]
+) -> tuple[Float[Tensor, "ray sample"], Float[Tensor, "ray sample 3"]]:
+    """Optical depth over so many cells, and colour."""
+    values = interpolate_grid(grid, points.reshape(-1, 3), bounds).reshape(*points.shape[:2], 4)
+    return softplus(values[..., 0]) * cells, torch.sigmoid(values[..., 1:])

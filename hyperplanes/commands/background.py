@@ -1,0 +1,63 @@
+"""Views without masks cut out of their background before a verb adapts to them."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from hyperplanes.utilities.formatting import format_duration
+
+if TYPE_CHECKING:
+    from hyperplanes.commands.console import Console
+    from hyperplanes.views import Task
+
+__all__ = ["cut_out_task"]
+
+
+def cut_out_task(task: Task, console: Console, *, all_views: bool = False) -> Task:
+    """The views with masks and over white, by a background that is learned from the support views.
+
+    Args:
+        task: the views to show and those to ask for.
+        console: where it is said.
+        all_views: both are the same.
+
+    Raises:
+        ValueError: too few views, or nothing that is told from the background.
+    """
+    from hyperplanes.adaptation.background import Separated, separate_background
+    from hyperplanes.adaptation.kept import keep_tensors, kept_file, recall_tensors
+    from hyperplanes.views import Task
+
+    shown, started = task.support, time.perf_counter()
+    if shown.masks is not None:
+        console.say("background: not learned, the views come with masks")
+        return task
+    file = kept_file("background", shown)
+    kept = recall_tensors(file, ("inner", "outer"))
+    if kept is not None:
+        found, how = Separated(kept["inner"], kept["outer"], shown.bounds), f"kept in {file}"
+    else:
+        with console.bar("learning the background") as bar:
+            found = separate_background(shown, on_step=lambda done, total: bar.show(done, total, "steps"))
+        try:
+            keep_tensors(file, {"inner": found.inner, "outer": found.outer})
+        except OSError as error:
+            console.warn(f"{file}: not kept for another time: {error}")
+        how = ""
+    support = found.cut_out(shown)
+    query = support if all_views else found.cut_out(task.query)
+    assert support.masks is not None
+    share = float(support.masks.mean())
+    if share < LEAST_SHARE:
+        raise ValueError(
+            f"--learn-background: expected an object within the bounds of {task.name}, found none "
+            f"({share:.1%} of the pictures); give masks, or photographs from more sides"
+        )
+    how = how or format_duration(time.perf_counter() - started)
+    console.say(f"background: learned; the object covers {share:.0%} of the pictures; {how}")
+    return Task(support, query, task.name)
+
+
+LEAST_SHARE = 0.002
+"""Of the pictures, below which nothing was found."""
