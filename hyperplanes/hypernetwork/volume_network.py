@@ -5,12 +5,53 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, silu
+from torch.nn.functional import conv3d, interpolate, pad, silu
 
 __all__ = ["VolumeNetwork"]
 
 FOLD = 2  # cells an axis that become channels before the first convolution
 GROUPS = 8  # of the normalisation
+
+
+class _Convolution(nn.Conv3d):
+    """A 3x3x3 convolution with zeros around its input.
+
+    The zeros before and behind are put there by hand, the others by the convolution: oneDNN, which PyTorch convolves
+    with on CPUs, has a fast gradient of the weights of 3D convolutions only where their depth is not padded. Those of
+    32 channels on four grids of 16 cells an axis take 13 ms in place of 24 (one thread, AVX2).
+
+    Args:
+        before: channels of the input.
+        after: of the output.
+        stride: of the output's cells.
+    """
+
+    def __init__(self, before: int, after: int, stride: int = 1) -> None:
+        super().__init__(before, after, 3, stride, padding=1)
+
+    def forward(self, input: Tensor) -> Tensor:
+        """The convolution."""
+        return conv3d(pad(input, (0, 0, 0, 0, 1, 1)), self.weight, self.bias, self.stride, (0, 1, 1))
+
+
+class _Pointwise(nn.Conv3d):
+    """A 1x1x1 convolution, as a product of matrices; with it a step back and forth takes two thirds of the time.
+
+    Args:
+        before: channels of the input.
+        after: of the output.
+    """
+
+    def __init__(self, before: int, after: int) -> None:
+        super().__init__(before, after, 1)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """The convolution of what the inputs are side by side, without putting them there."""
+        assert self.bias is not None
+        total, weights = self.bias[:, None], self.weight.flatten(1).split([each.shape[1] for each in inputs], 1)
+        for each, weight in zip(inputs, weights, strict=True):
+            total = torch.baddbmm(total, weight.expand(len(each), -1, -1), each.flatten(2))
+        return total.unflatten(2, inputs[0].shape[2:])
 
 
 class _Residual(nn.Module):
@@ -21,10 +62,10 @@ class _Residual(nn.Module):
         self.path = nn.Sequential(
             nn.GroupNorm(GROUPS, channels),
             nn.SiLU(),
-            nn.Conv3d(channels, channels, 3, padding=1),
+            _Convolution(channels, channels),
             nn.GroupNorm(GROUPS, channels),
             nn.SiLU(),
-            nn.Conv3d(channels, channels, 1),
+            _Pointwise(channels, channels),
         )
 
     def forward(self, value: Tensor) -> Tensor:
@@ -54,22 +95,22 @@ class VolumeNetwork(nn.Module):
         fine, middle, coarse = widths
         self.features = features
         folded = channels * FOLD**3
-        self.first = nn.Conv3d(folded, fine, 1)
+        self.first = _Pointwise(folded, fine)
         self.downwards = nn.ModuleList([_Residual(fine), _Residual(middle), _Residual(coarse)])
         self.strided = nn.ModuleList(
-            [nn.Conv3d(fine, middle, 3, stride=2, padding=1), nn.Conv3d(middle, coarse, 3, stride=2, padding=1)]
+            [_Convolution(fine, middle, stride=2), _Convolution(middle, coarse, stride=2)]
         )
         self.upwards = nn.ModuleList([_Residual(coarse), _Residual(middle), _Residual(fine)])
-        self.widened = nn.ModuleList([nn.Conv3d(coarse, middle, 1), nn.Conv3d(middle, fine, 1)])
+        self.widened = nn.ModuleList([_Pointwise(coarse, middle), _Pointwise(middle, fine)])
         self.normalisation = nn.GroupNorm(GROUPS, fine)
-        self.last = nn.Conv3d(fine + folded, features * FOLD**3, 1)
+        self.last = _Pointwise(fine + folded, features * FOLD**3)
         for parameter in self.last.parameters():
             nn.init.zeros_(parameter)
 
     def forward(self, volumes: Float[Tensor, "object channel x y z"]) -> Float[Tensor, "object feature x y z"]:
         """The features of every cell for each of several objects."""
         # to half, a quarter and an eighth of the side
-        folded = _fold(volumes).contiguous(memory_format=torch.channels_last_3d)
+        folded = _fold(volumes)
         fine = self.downwards[0](self.first(folded))
         middle = self.downwards[1](self.strided[0](fine))
         coarse = self.downwards[2](self.strided[1](middle))
@@ -77,7 +118,7 @@ class VolumeNetwork(nn.Module):
         middle = self.upwards[1](middle + _doubled(self.widened[0](self.upwards[0](coarse))))
         fine = self.upwards[2](fine + _doubled(self.widened[1](middle)))
         # the features of every cell, read beside what the cell showed
-        return _unfold(self.last(torch.cat([silu(self.normalisation(fine)), folded], 1)), self.features)
+        return _unfold(self.last(silu(self.normalisation(fine)), folded), self.features)
 
 
 def _doubled(value: Tensor) -> Tensor:

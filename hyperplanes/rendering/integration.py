@@ -22,6 +22,7 @@ MIN_WEIGHT = 0.003  # of a sample from which on its colour is evaluated
 KNOWN_SHARE = 0.95  # of a pixel's weight whose colours are evaluated at least, where its opacity is above
 MIN_OPACITY = 1 / 512
 GROWTH = 4  # every later round takes this fraction of the samples so far, and at least as many as the first
+DIFFERENTIATED = 0.01  # weight of a sample from which on it always has its gradient, below in proportion to it
 
 
 def integrate(
@@ -33,8 +34,9 @@ def integrate(
         scene: what is rendered.
         rays: with near and far.
         sampler: places the samples.
-        generator: jitters them.
-        differentiable: packed samples are evaluated all at once, for gradients; otherwise front to back.
+        generator: jitters them, and draws which packed samples have a gradient (`_by_importance`).
+        differentiable: packed samples are evaluated for gradients: all at once, or where samples are random, those that
+            matter; otherwise front to back.
 
     Returns:
         The pixels, of the field and of its coarse pass where there is one.
@@ -42,7 +44,11 @@ def integrate(
     samples = sampler.place(rays, scene.occupancy, generator)
     if isinstance(samples, DenseSamples):
         return _coarse_to_fine(scene, rays, sampler, samples, generator, differentiable)
-    return _all_at_once(scene, rays, samples) if differentiable else _front_to_back(scene, rays, samples, sampler.stop)
+    if not differentiable:
+        return _front_to_back(scene, rays, samples, sampler.stop)
+    if generator is None or sampler.stop == 0 or not _has_importance(scene, samples):
+        return _all_at_once(scene, rays, samples)
+    return _by_importance(scene, rays, samples, sampler.stop, generator)
 
 
 def _coarse_to_fine(
@@ -94,6 +100,75 @@ def _all_at_once(scene: Scene, rays: Rays, samples: PackedSamples) -> Rendered:
     alone = rank[even] + 1 == total[samples.ray[even]]
     coarse = composited(scene.proposal, samples[even], torch.where(alone, 1, 2) * samples.step)
     return replace(fine, samples=fine.samples + coarse.samples, coarse=coarse)
+
+
+def _has_importance(scene: Scene, samples: PackedSamples) -> bool:
+    """Whether a gradient is wanted whose samples can be chosen by their densities."""
+    if scene.proposal is not None or not isinstance(scene.field, SplitField) or not len(samples):
+        return False
+    return torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active()
+
+
+def _by_importance(
+    scene: Scene, rays: Rays, samples: PackedSamples, stop: float, generator: torch.Generator
+) -> Rendered:
+    """The pixels of all samples, and an unbiased estimate of their gradient from those that matter.
+
+    Densities are evaluated without gradients, and not at all behind what leaves less than `stop` of the light. The
+    gradients that go through a sample are about proportional to its weight w, since those of softplus are to a small
+    density. So it is differentiated with probability p = min(1, w / DIFFERENTIATED), and what goes through it is
+    multiplied by 1 / p (importance sampling): of the rays of a car, at a quarter of the samples. The others keep their
+    weights, and the mean colour of the ray stands for theirs, a hundredth of the pixel.
+
+    """
+    field, count = scene.field, len(rays)
+    assert isinstance(field, SplitField)
+    with torch.no_grad():
+        density, reached = _densities(field, rays, samples, stop)
+        samples, density = samples[reached], density[reached]
+        # those that are differentiated, and how likely that was
+        weights = packed_weights(density * samples.step, samples.ray, count)
+        likely = (weights / DIFFERENTIATED).clamp_max(1)
+        drawn = torch.rand(len(likely), generator=generator, dtype=likely.dtype).to(likely.device) < likely
+        chosen = drawn.nonzero()[:, 0]
+        factor = 1 / likely[chosen]
+    # their colours and densities, whose gradients are scaled; all other densities as they are
+    colour, found = evaluate(field, *_packed_points(rays, samples[chosen]))
+    colour, found = _scaled_gradient(colour, factor[:, None]), _scaled_gradient(found, factor)
+    density = density.index_put((chosen,), found)
+    with torch.no_grad():  # the mean colour of each ray, the background where none is known
+        sums = weights.new_zeros(count, 4).index_add(
+            0, samples.ray[chosen], torch.cat([colour, torch.ones_like(colour[:, :1])], 1) * weights[chosen, None]
+        )
+        mean = torch.where(sums[:, 3:] > 0, sums[:, :3] / sums[:, 3:].clamp_min(1e-12), scene.background)
+    colours = mean[samples.ray].index_put((chosen,), colour)
+    weights = packed_weights(density * samples.step, samples.ray, count)
+    return composite_packed(colours, weights, samples.distances, samples.ray, count, scene.background)
+
+
+def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: float) -> tuple[Tensor, Tensor]:
+    """The densities of samples in front of what leaves less than `stop` of the light, and which samples these are."""
+    density = samples.distances.new_zeros(len(samples))
+    rank, _ = _ranks(samples.ray, len(rays))
+    optical_depth = density.new_zeros(len(rays))
+    remaining, reach = torch.arange(len(samples), device=rank.device), 0
+    reached = torch.zeros(len(samples), dtype=torch.bool, device=rank.device)
+    while len(remaining):
+        # twice as far in every round; rays that are opaque by then leave
+        reach += max(FIRST_ROUND, reach)
+        now = rank[remaining] < reach
+        chosen, remaining = remaining[now], remaining[~now]
+        points, _ = _packed_points(rays, samples[chosen])
+        found = torch.cat([field.density_of(each) for each in _in_batches(field.hidden, points)])
+        density[chosen], reached[chosen] = found.to(density), True
+        optical_depth = optical_depth.index_add(0, samples.ray[chosen], density[chosen] * samples.step)
+        remaining = remaining[optical_depth[samples.ray[remaining]] < -math.log(stop)]
+    return density, reached.nonzero()[:, 0]
+
+
+def _scaled_gradient(value: Tensor, factor: Tensor) -> Tensor:
+    """The same numbers, whose gradients are multiplied by a factor."""
+    return value.detach() + (value - value.detach()) * factor
 
 
 def _ranks(ray: Tensor, count: int) -> tuple[Tensor, Tensor]:
