@@ -103,7 +103,7 @@ def make_optimisers(
     others = [value for value, chosen in zip(variables, hidden, strict=True) if not chosen]
     made: list[torch.optim.Optimizer] = []
     if others:
-        made.append(torch.optim.Adam(others, adam_rate, betas=betas))
+        made.append(torch.optim.Adam(others, adam_rate, betas=betas, fused=True))
     if matrices:
         made.append(Muon(matrices, muon_rate))
     return made

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, ClassVar
 
 import torch
@@ -280,10 +281,16 @@ class ImageBasedField(Field):
         """The inputs of the trunk, the least coverage, and what the colour head reads where there are directions."""
         grid = self.parameters.get("grid.weight")
         learned = grid is not None and grid.requires_grad and torch.is_grad_enabled()
-        found = self.planes.describe(points, directions, self._reading, self.bounds, None if learned else grid)
+        found = self.planes.describe(points, directions, self._reading, self.bounds, None if learned else self._cells)
         if not learned:
             return found.rows, found.coverage, found
         return torch.cat([found.rows, *self._features(points)], 1), found.coverage, found
+
+    @cached_property
+    def _cells(self) -> Float[Tensor, "channel x y z"] | None:
+        """The grid, with the numbers of a cell side by side in memory."""
+        grid = self.parameters.get("grid.weight")
+        return None if grid is None else grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2)
 
     def _features(self, points: Tensor) -> list[Float[Tensor, "point number"]]:
         """Those of the grid, the first through a sigmoid."""

@@ -301,7 +301,8 @@ class VisibilityPlanes:
             directions: unit vectors along which the points are seen; without them nothing is blended.
             reading: how many views, and how they are encoded.
             bounds: the sphere that the network sees as the unit sphere.
-            grid: features over the scene, which are written into the same rows, the first through a sigmoid.
+            grid: features over the scene, which are written into the same rows, the first through a sigmoid; in any
+                layout, without a copy where the numbers of a cell are side by side.
         """
         count, views = len(points), self.depth_opacity.shape[:3]
         packed = self.colours.packed_images(points)

@@ -97,9 +97,7 @@ class VolumeNetwork(nn.Module):
         folded = channels * FOLD**3
         self.first = _Pointwise(folded, fine)
         self.downwards = nn.ModuleList([_Residual(fine), _Residual(middle), _Residual(coarse)])
-        self.strided = nn.ModuleList(
-            [_Convolution(fine, middle, stride=2), _Convolution(middle, coarse, stride=2)]
-        )
+        self.strided = nn.ModuleList([_Convolution(fine, middle, stride=2), _Convolution(middle, coarse, stride=2)])
         self.upwards = nn.ModuleList([_Residual(coarse), _Residual(middle), _Residual(fine)])
         self.widened = nn.ModuleList([_Pointwise(coarse, middle), _Pointwise(middle, fine)])
         self.normalisation = nn.GroupNorm(GROUPS, fine)

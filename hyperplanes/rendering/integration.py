@@ -117,9 +117,8 @@ def _by_importance(
     Densities are evaluated without gradients, and not at all behind what leaves less than `stop` of the light. The
     gradients that go through a sample are about proportional to its weight w, since those of softplus are to a small
     density. So it is differentiated with probability p = min(1, w / DIFFERENTIATED), and what goes through it is
-    multiplied by 1 / p (importance sampling): of the rays of a car, at a quarter of the samples. The others keep their
-    weights, and the mean colour of the ray stands for theirs, a hundredth of the pixel.
-
+    multiplied by 1 / p (importance sampling): a quarter of the samples of a car. The others keep their weights, and the
+    mean colour of the ray stands for theirs, 1 % of the pixel.
     """
     field, count = scene.field, len(rays)
     assert isinstance(field, SplitField)
@@ -133,14 +132,13 @@ def _by_importance(
         chosen = drawn.nonzero()[:, 0]
         factor = 1 / likely[chosen]
     # their colours and densities, whose gradients are scaled; all other densities as they are
-    colour, found = evaluate(field, *_packed_points(rays, samples[chosen]))
+    colour, found = (each.to(density) for each in evaluate(field, *_packed_points(rays, samples[chosen])))
     colour, found = _scaled_gradient(colour, factor[:, None]), _scaled_gradient(found, factor)
     density = density.index_put((chosen,), found)
-    with torch.no_grad():  # the mean colour of each ray, the background where none is known
-        sums = weights.new_zeros(count, 4).index_add(
-            0, samples.ray[chosen], torch.cat([colour, torch.ones_like(colour[:, :1])], 1) * weights[chosen, None]
-        )
-        mean = torch.where(sums[:, 3:] > 0, sums[:, :3] / sums[:, 3:].clamp_min(1e-12), scene.background)
+    with torch.no_grad():  # the mean of the colours of each ray that are known, the background where none is
+        known = torch.cat([colour, torch.ones_like(colour[:, :1])], 1) * weights[chosen, None]
+        sums, share = known.new_zeros(count, 4).index_add(0, samples.ray[chosen], known).split([3, 1], 1)
+        mean = torch.where(share > 0, sums / share.clamp_min(1e-12), scene.background)
     colours = mean[samples.ray].index_put((chosen,), colour)
     weights = packed_weights(density * samples.step, samples.ray, count)
     return composite_packed(colours, weights, samples.distances, samples.ray, count, scene.background)

@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from torch.nn.functional import conv3d
 
 from hyperplanes.geometry.volume import CHANNELS, SIDE
 from hyperplanes.hypernetwork import Observed, VolumeHyperNetwork
-from hyperplanes.hypernetwork.volume_network import VolumeNetwork, _fold, _unfold
+from hyperplanes.hypernetwork.volume_network import VolumeNetwork, _Convolution, _fold, _Pointwise, _unfold
 
 GRIDS = {"coarse.grid.weight": torch.Size((2, SIDE, SIDE, SIDE)), "fine.grid.weight": torch.Size((5, SIDE, SIDE, SIDE))}
 SHAPES = {**GRIDS, "fine.layers.0.weight": torch.Size((12, 7)), "fine.layers.0.bias": torch.Size((12,))}
@@ -59,3 +60,21 @@ def test_a_cell_has_features_of_what_lies_around_it():
 def test_a_side_that_cannot_be_halved_three_times_is_refused():
     with pytest.raises(ValueError, match="side: expected a multiple of 8, got 12"):
         VolumeNetwork(CHANNELS, 12, 4)
+
+
+@pytest.mark.parametrize(("layer", "plain"), [(_Convolution(3, 5, 2), (2, 1)), (_Pointwise(3, 5), (1, 0))])
+def test_convolutions_and_their_gradients_are_those_of_pytorch(layer, plain):
+    stride, padding = plain
+    given = torch.randn(2, 3, 6, 6, 6, generator=torch.Generator().manual_seed(3), requires_grad=True)
+    found, expected = layer(given), conv3d(given, layer.weight, layer.bias, stride, padding)
+    torch.testing.assert_close(found, expected)
+    variables = [given, layer.weight, layer.bias]
+    torch.testing.assert_close(*(torch.autograd.grad((2 * each).sin().sum(), variables) for each in (found, expected)))
+
+
+def test_a_pointwise_convolution_reads_several_inputs_as_if_they_were_one():
+    layer, parts = (
+        _Pointwise(5, 4),
+        torch.randn(2, 5, 2, 2, 2, generator=torch.Generator().manual_seed(4)).split([2, 3], 1),
+    )
+    torch.testing.assert_close(layer(*parts), layer(torch.cat(parts, 1)))
