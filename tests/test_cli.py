@@ -394,7 +394,7 @@ def test_steps_chosen_on_left_out_views_are_reported(tmp_path, monkeypatch, caps
     capsys.readouterr()
     common = ["--checkpoint", str(demo), "--views", scene, "--steps", "auto", "--voxels", "32"]
     assert main(["export", *common, "--what", "mesh", "--out", str(tmp_path / "export")]) == 0
-    assert main(["bake", *common, "--out", str(tmp_path / "voxels.safetensors")]) == 0
+    assert main(["bake", *common, "--fit", "0", "--out", str(tmp_path / "voxels.safetensors")]) == 0
     adapted = r"adapted to 6 views of .* in .*, \d+ fine-tuning steps|adapted to these 6 views before"
     assert len(re.findall(adapted, capsys.readouterr().out)) == 2  # kept where the first one took long
 
@@ -517,7 +517,7 @@ def test_a_camera_path_of_nerfstudio_is_pictures_of_all_that_is_asked_for(tmp_pa
 def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     out = tmp_path / "voxels.safetensors"
     views = ["--views", str(first_object(demo_folder())), "--out", str(out)]
-    command = ["bake", "--checkpoint", str(demo_folder()), *views, "--voxels", "32"]
+    command = ["bake", "--checkpoint", str(demo_folder()), *views, "--voxels", "32", "--fit", "2"]
     assert main([*command, "--orbit", "2", "--size", "16", "--turntable", "gif"]) == 0
     assert "dB, the field" in capsys.readouterr().out
     with Image.open(tmp_path / "voxels.gif") as animation:

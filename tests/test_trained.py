@@ -97,12 +97,25 @@ def test_the_published_form_is_found_out_when_its_codes_are_dead():
 
 @cache
 def cars():
-    return held_out(3, 64)
+    """Two that look different: figures of a pair are those of its swap."""
+    return held_out(3, 64)[::2]
 
 
 @cache
-def lamps():
-    return held_out(2, 64, kind="lamp")
+def lamp():
+    return held_out(2, 64, kind="lamp")[1]
+
+
+def coarse(name):
+    """A packaged model with a hull of 64 voxels a side in place of 96: the same gaps in a third of the time."""
+    model = HyperPlanes.from_pretrained(name)
+    model.config = replace(model.config, hull_resolution=64)
+    return model
+
+
+def few(task, count):
+    """So many support views, evenly spread."""
+    return task.support[:: 25 // count][:count]
 
 
 @pytest.fixture(params=["cars-64", "small"])
@@ -124,87 +137,81 @@ def test_packaged_models_read_the_pictures(packaged):
     assert moved > 0.1 * found.norm
 
 
+def swapped_cars(model, count):
+    """What the update of the other car costs, in dB."""
+    prepared = [model.prepare(few(task, count)) for task in cars()]
+    return swap_gap(model, prepared, [task.query[:1] for task in cars()])[1]
+
+
 def test_swapping_updates_of_cars_costs_decibels():
-    model = HyperPlanes.from_pretrained("cars-64")
-    prepared = [model.prepare(task.support) for task in cars()]
-    assert swap_gap(model, prepared, [task.query[::8] for task in cars()])[1] > 0.1
+    assert swapped_cars(HyperPlanes.from_pretrained("cars-64"), 25) > 0.1
 
 
 @pytest.mark.parametrize("count", [3, 25])
 def test_swapping_updates_of_cars_costs_decibels_with_few_views_and_with_many(count):
-    model = HyperPlanes.from_pretrained("small")
-    prepared = [model.prepare(task.support[:: 25 // count][:count]) for task in cars()]
-    assert swap_gap(model, prepared, [task.query[::8] for task in cars()])[1] > 1.5  # measured: 2.4 and 1.9
+    assert swapped_cars(coarse("small"), count) > 1.5  # measured: 3.8 and 2.3
+
+
+@torch.no_grad()
+def lamp_with_the_update_of_a_car(name, count):
+    """What it costs in dB, where so many views are shown of both."""
+    model = coarse(name)
+    shown, other = (model.prepare(few(task, count)) for task in (lamp(), cars()[1]))
+    query = lamp().query[:1]
+    fields = [model.field(shown, model.theta + update) for update in model.updates([shown, other])]
+    right, wrong = (float(psnr(field.render(query.cameras).images, query.images)) for field in fields)
+    return right - wrong
 
 
 @pytest.mark.parametrize("count", [3, 25])
 def test_a_lamp_with_the_update_of_a_car_is_worse(count):
-    assert lamp_with_the_update_of_a_car(HyperPlanes.from_pretrained("small"), count) > 4  # measured: 5.0 and 5.3
+    assert lamp_with_the_update_of_a_car("small", count) > 5  # measured: 6.7 and 8.6
 
 
 def test_a_lamp_with_the_update_of_a_car_is_worse_with_25_planes_too():
-    assert lamp_with_the_update_of_a_car(HyperPlanes.from_pretrained("small-paper"), 25) > 1  # measured: 1.6
+    assert lamp_with_the_update_of_a_car("small-paper", 25) > 1.5  # measured: 2.1
 
 
 @pytest.mark.parametrize(("count", "most"), [(3, 4.5), (25, 1.0)])
 def test_a_car_that_faces_another_way_costs_little(count, most):
-    """4.1 and 0.6 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
-    model, found = HyperPlanes.from_pretrained("small"), {}
+    """3.7 and 0.5 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
+    model, found = coarse("small"), {}
     for degrees in (0, 45):
         rotation = Rotation(math.radians(degrees))
         values = []
         for task in cars():
-            shown, query = (rotation.views(part) for part in (task.support[:: 25 // count][:count], task.query[::12]))
+            shown, query = (rotation.views(part) for part in (few(task, count), task.query[:1]))
             values.append(psnr(model.adapt(shown).render(query.cameras).images, query.images).mean())
         found[degrees] = float(torch.stack(values).mean())
-    assert min(found.values()) > found[0] - most
+    assert found[45] > found[0] - most
 
 
 @cache
-def shapes():
-    """Random compositions of a seed that no training has."""
-    return held_out(3, 64, kind="random")
+def shape():
+    """A random composition of a seed that no training has."""
+    return held_out(2, 64, kind="random")[1]
 
 
-def mean_psnr(adapter, tasks, count):
-    """In dB, over two views of each object that are not among the `count` that are shown."""
+def mean_psnr(adapter, task, count):
+    """In dB, over two views that are not among the `count` that are shown."""
+    query = task.query[::12][:2]
     with torch.no_grad():
-        found = [
-            psnr(adapter.adapt(task.support[:: 25 // count][:count]).render(task.query[::12][:2].cameras).images,
-                 task.query[::12][:2].images).mean()
-            for task in tasks
-        ]  # fmt: skip
-    return float(torch.stack(found).mean())
+        return float(psnr(adapter.adapt(few(task, count)).render(query.cameras).images, query.images).mean())
 
 
-@pytest.mark.parametrize(("count", "least"), [(5, 1.0), (25, 2.0)])
-def test_objects_that_mean_nothing_are_shown_better_than_by_their_hull(count, least):
-    """By 2.7 and 4.4 dB on these."""
-    model = HyperPlanes.from_pretrained("small")
-    assert mean_psnr(model, shapes(), count) > mean_psnr(HullBlend(), shapes(), count) + least
+@pytest.mark.parametrize(("count", "least"), [(5, 2.0), (25, 3.0)])
+def test_an_object_that_means_nothing_is_shown_better_than_by_its_hull(count, least):
+    """By 3.4 and 4.6 dB; `benchmarks views` has the mean over many."""
+    assert mean_psnr(coarse("small"), shape(), count) > mean_psnr(HullBlend(), shape(), count) + least
 
 
 def test_views_that_are_held_out_find_out_what_is_wrong_for_an_object():
     """A car with what the model says of a lamp; without the judge it is what `swap_gap` measures."""
-    model = HyperPlanes.from_pretrained("small")
-    foreign = model.update(model.prepare(lamps()[0].support[::2]))
+    model = coarse("small")
+    foreign = model.update(model.prepare(lamp().support[::2]))
     model.update = lambda context: foreign
     found = {}
     for judged in (False, True):
         model.config = replace(model.config, judged=judged)
-        found[judged] = mean_psnr(model, cars()[:1], 12)
+        found[judged] = mean_psnr(model, cars()[0], 12)
     assert found[True] > found[False] + 3
-
-
-@torch.no_grad()
-def lamp_with_the_update_of_a_car(model, count):
-    """What it costs in dB, mean over lamps, where so many views are shown of both."""
-    total = 0.0
-    for lamp, car in zip(lamps(), cars(), strict=False):
-        shown, other = (model.prepare(task.support[:: 25 // count][:count]) for task in (lamp, car))
-        own, foreign = model.updates([shown, other])
-        query = lamp.query[::12]
-        fields = [model.field(shown, model.theta + update) for update in (own, foreign)]
-        right, wrong = (float(psnr(field.render(query.cameras).images, query.images).mean()) for field in fields)
-        total += (right - wrong) / len(lamps())
-    return total

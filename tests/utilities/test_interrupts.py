@@ -19,7 +19,7 @@ CALLS = {
     "adapt": [*SCENE, "{out}", "--steps", "2"],
     "render": [*SCENE, "{out}"],
     "export": [*SCENE, "{out}", "--what", "turntable", "--frames", "2"],
-    "bake": [*SCENE, "{out}/baked.safetensors", "--voxels", "16"],
+    "bake": [*SCENE, "{out}/baked.safetensors", "--voxels", "16", "--fit", "2"],
     "inspect": ["{demo}/data", "--out", "{out}"],
     "demo": ["--quick-check", "--out", "{out}"],
     "reproduce": ["target", "--scale", "smoke", "--out", "{out}"],
