@@ -52,22 +52,29 @@ def _checked(original, *, typechecker):
 
 def checked_once(function, wrap):
     """A function that is called through `wrap(function)` where a call of this kind has not been seen."""
-    seen, held = set(), threading.local()
+    seen, made, held, this_thread = set(), {}, {}, threading.get_ident  # checks take a millisecond to make: when needed
 
-    @functools.cache
     def checked():
-        return wrap(function)
+        if "function" not in made:
+            made["function"] = wrap(function)
+        return made["function"]
 
-    @functools.cache
-    def returning():
-        """The same checks around a result that is there."""
+    def check_result(result, given, named):
+        """The same checks, around a result that is there."""
 
-        def result(*_, **__):
-            return held.result
+        def returned(*_, **__):
+            return held[this_thread()]
 
-        code, globals_, closure = result.__code__, function.__globals__, result.__closure__
-        named = types.FunctionType(code, globals_, function.__name__, None, closure)
-        return wrap(functools.update_wrapper(named, function))
+        if "result" not in made:  # with the names that the annotations are made of
+            again = types.FunctionType(
+                returned.__code__, function.__globals__, function.__name__, None, returned.__closure__
+            )
+            made["result"] = wrap(functools.update_wrapper(again, function))
+        held[this_thread()] = result
+        try:
+            made["result"](*given, **named)
+        finally:
+            del held[this_thread()]
 
     @functools.wraps(function)
     def call(*given, **named):
@@ -81,9 +88,7 @@ def checked_once(function, wrap):
         both = arguments, kind(result, sizes)
         if both not in seen:
             if known:
-                held.result = result
-                returning()(*given, **named)
-                del held.result
+                check_result(result, given, named)
             seen.update((arguments, both))
         return result
 

@@ -25,7 +25,7 @@ def test_tf32_products_leave_pictures_as_they_are(monkeypatch):
     model = HyperPlanes.from_pretrained("cars-64")
     generator = torch.Generator().manual_seed(0)
     views = Views(torch.rand(25, 3, 64, 64, generator=generator), ring(25, (64, 64)), torch.ones(25, 1, 64, 64))
-    cameras = resized(select(views.cameras, [0, 9]), 32, 32)
+    cameras = resized(select(views.cameras, [9]), 16, 16)
     exact = model.adapt(views).render(cameras).images
 
     def rounded(value):

@@ -11,7 +11,7 @@ from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, small_model
 
-CONFIG = TrainingConfig(steps=200, tasks=4, rays=48, learning_rate=3e-3, held_out=0)
+CONFIG = TrainingConfig(steps=200, tasks=2, rays=48, learning_rate=3e-3, held_out=0)
 
 
 @cache
@@ -37,8 +37,8 @@ def quality(model, hidden):
 
 def test_a_field_trained_with_dropout_does_without_some_planes():
     with_it, without = trained(0.3), trained(0.0)
-    assert quality(with_it, []) > quality(without, []) - 0.5  # measured: the same
-    for hidden, gain in (([0], 0.5), ([1, 2], 1.0)):  # measured: 1.2 and 2.8 dB
+    assert quality(with_it, []) > quality(without, []) - 0.5  # measured: half a dB better
+    for hidden, gain in (([0], 0.5), ([1, 2], 1.0)):  # measured: 1.2 and 2.3 dB
         assert quality(with_it, hidden) > quality(without, hidden) + gain
 
 

@@ -66,7 +66,7 @@ def test_only_cells_of_the_hull_that_is_shown_count_and_only_the_first_features(
 
 def test_a_training_learns_what_is_behind_the_views_that_are_shown():
     model = HyperPlanes(MODEL)
-    trainer = Trainer(model, Balls(views=8, size=(24, 24)), replace(TRAINING, steps=40, volume_loss=1.0))
+    trainer = Trainer(model, Balls(views=8, size=(24, 24)), replace(TRAINING, steps=12, volume_loss=1.0))
     shown = episode(model)
 
     def loss():
@@ -74,7 +74,7 @@ def test_a_training_learns_what_is_behind_the_views_that_are_shown():
             return float(volume_loss(model.theta + model.eval().update(shown.prepared), shown))
 
     before = loss()
-    while trainer.step < 40:
+    while trainer.step < 12:
         trainer.take_step()
     assert loss() < 0.7 * before
 
