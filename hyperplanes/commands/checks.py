@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 from collections.abc import Sequence
@@ -11,6 +10,8 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
+
+from hyperplanes.utilities.environment import usable_cores
 
 __all__ = ["REQUIRED", "Check", "examine", "healthy"]
 
@@ -98,7 +99,7 @@ def _torch() -> Check:
             return Check("torch", False, True, "computes wrong sums", "pip install --force-reinstall torch")
     except (ImportError, OSError, RuntimeError) as error:
         return Check("torch", False, True, _first_line(error), "pip install torch, or make a new environment")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = usable_cores()
     where = f"CPU, {torch.get_num_threads()} threads on {cores} cores"
     if torch.cuda.is_available():
         where = f"GPU {torch.cuda.get_device_name()}, and {where}"

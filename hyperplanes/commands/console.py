@@ -92,12 +92,13 @@ class Console:
 
     Args:
         silent: nothing is shown, as in the processes of a training that another one speaks for.
+        plain: nothing is redrawn in a terminal either, which several processes share.
     """
 
-    def __init__(self, *, silent: bool = False) -> None:
+    def __init__(self, *, silent: bool = False, plain: bool = False) -> None:
         self._out = _Stream(file=cast(TextIO, _Terminal(sys.stdout)), quiet=silent)
         self._errors = _Stream(file=cast(TextIO, _Terminal(sys.stderr)), quiet=silent)
-        self._live = self._out.is_terminal and not silent
+        self._live = self._out.is_terminal and not silent and not plain
 
     def say(self, line: str) -> None:
         """A line of its own."""

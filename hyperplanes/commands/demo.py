@@ -14,23 +14,24 @@ Example:
 from __future__ import annotations
 
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import OptionalFolder
-from hyperplanes.commands.runs import make_runner
+from hyperplanes.commands.options import OptionalFolder, OptionalInt
+from hyperplanes.commands.runs import count_workers, make_runner, make_workers
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     from hyperplanes.experiments.demonstration.settings import DemoSettings
-    from hyperplanes.experiments.engine import OnScore
+    from hyperplanes.experiments.engine import OnScore, Runner
+    from hyperplanes.experiments.scales import Scale
+    from hyperplanes.experiments.workspace import Workspace
 
 __all__ = ["Arguments", "run", "settings_of"]
 
@@ -50,6 +51,7 @@ class Arguments:
         meshes: A folder with a few mesh files that the packaged model shows first, beside procedural objects.
         first_only: End after the packaged model's page.
         seed: Of everything.
+        workers: Processes that train and evaluate side by side; one a core, at most four, when not given.
         quick_check: Only see that everything runs: a few tiny objects and networks that learn nothing.
         device: auto, cpu or cuda.
     """
@@ -64,6 +66,7 @@ class Arguments:
     meshes: OptionalFolder = None
     first_only: bool = False
     seed: int = 0
+    workers: OptionalInt = None
     quick_check: bool = False
     device: str = "auto"
 
@@ -112,14 +115,25 @@ def run(arguments: Arguments) -> int:
         with console.bar(title) as bar:
             yield lambda cell, seed, score, done, total: bar.show(done, total, f"{score.name} {score.psnr:.2f} dB")
 
-    runner = partial(make_runner, console=console, device=arguments.device, announce=lambda line: None)
-    demonstration = Demonstration(settings, arguments.out, runner, begin, console.say, evaluating)
-    steps = list(demonstration.steps().items())[: 1 if arguments.first_only else None]
-    for number, (name, work) in enumerate(steps, 1):
-        heading, begun = f"[{number}/{len(steps)}] {name}", False
-        work()
-        if not begun:
-            console.say(f"{heading}: done before")
+    asked = 1 if arguments.quick_check and arguments.workers is None else arguments.workers
+    count = count_workers(asked, arguments.device)
+    with ExitStack() as stack:
+
+        def runner(workspace: Workspace, scale: Scale) -> Runner:
+            workers = make_workers(count, workspace.out, scale, arguments.device)
+            if workers is not None:
+                stack.enter_context(workers)
+            return make_runner(
+                workspace, scale, console=console, device=arguments.device, announce=lambda line: None, workers=workers
+            )
+
+        demonstration = Demonstration(settings, arguments.out, runner, begin, console.say, evaluating)
+        steps = list(demonstration.steps().items())[: 1 if arguments.first_only else None]
+        for number, (name, work) in enumerate(steps, 1):
+            heading, begun = f"[{number}/{len(steps)}] {name}", False
+            work()
+            if not begun:
+                console.say(f"{heading}: done before")
     if not arguments.first_only:
         _finish(arguments.out, console)
     return 0

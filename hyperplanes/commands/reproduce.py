@@ -17,15 +17,16 @@ Example:
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalInt
-from hyperplanes.commands.runs import make_runner
+from hyperplanes.commands.runs import make_runner, make_workers
 from hyperplanes.commands.writing import writes_to
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ class Arguments:
         seeds: Other than the scale's: seeds of trainings and of the fine-tuning of their evaluations.
         legacy: Read the principal points of published data at W / 2 at integer pixel centres, as the code published
             with them has it.
+        workers: Processes that train and evaluate side by side; times are measured by one alone.
         estimate: Only measure a few steps of every training and say how long all will take here.
         device: auto, cpu or cuda.
     """
@@ -63,6 +65,7 @@ class Arguments:
     only: tuple[str, ...] = ()
     seeds: OptionalInt = None
     legacy: bool = False
+    workers: Annotated[int, range(1, 65)] = 1
     estimate: bool = False
     device: str = "auto"
 
@@ -108,14 +111,17 @@ def run(arguments: Arguments) -> int:
     def found(cell: Cell, seed: int, score: ObjectScore, *_: int) -> None:
         console.say(f"{cell.row}, {cell.column}, seed {seed}: {score.name} {score.psnr:.2f} dB")
 
+    device, legacy = arguments.device, arguments.legacy
+    workers = make_workers(arguments.workers, arguments.out, scale, device, legacy=legacy)
     runner = make_runner(
         Workspace(arguments.out),
         scale,
         console=console,
-        device=arguments.device,
+        device=device,
         announce=console.say,
+        workers=workers,
         given=data_sets(arguments.data),
-        legacy=arguments.legacy,
+        legacy=legacy,
     )
     if arguments.estimate or scale.resolution is None:
         expected = estimate(runner, experiment, seeds)
@@ -123,7 +129,8 @@ def run(arguments: Arguments) -> int:
         console.say(f"all of it: {format_duration(expected.seconds)} on this machine")
         if arguments.estimate:
             return 0
-    outcome = runner.run(experiment, seeds, found)
+    with workers or nullcontext():
+        outcome = runner.run(experiment, seeds, found)
     folder = arguments.out / experiment.name
     command = _command(arguments, seeds)
     write_json(folder / "results.json", report.as_json(outcome, command))

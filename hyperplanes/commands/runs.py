@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,14 +13,61 @@ if TYPE_CHECKING:
     from hyperplanes.experiments.engine import Runner
     from hyperplanes.experiments.experiment import Trained
     from hyperplanes.experiments.scales import Scale
+    from hyperplanes.experiments.workers import Workers
     from hyperplanes.experiments.workspace import Workspace
     from hyperplanes.views import Tasks
 
-__all__ = ["make_runner"]
+__all__ = ["count_workers", "make_runner", "make_workers"]
+
+MOST = 4
+"""Workers where nobody says how many: each holds the data set that it trains on."""
+
+
+def count_workers(asked: int | None, device: str) -> int:
+    """As many as asked for; where nobody says, one a core, at most MOST, and one alone on a GPU."""
+    from hyperplanes.data.devices import choose_device
+    from hyperplanes.utilities.environment import usable_cores
+
+    if asked is not None:
+        if asked < 1:
+            raise ValueError(f"--workers: expected at least 1, got {asked}")
+        return asked
+    return min(MOST, usable_cores()) if choose_device(device).type == "cpu" else 1
+
+
+def make_workers(count: int, out: Path, scale: Scale, device: str, *, legacy: bool = False) -> Workers | None:
+    """Processes for the runner of a folder, a context; None for a single one, whose work this process does.
+
+    Args:
+        count: of processes.
+        out: the folder of the workspace.
+        scale: how large.
+        device: auto, or the name of one.
+        legacy: as in `open_dataset`.
+    """
+    from hyperplanes.experiments.workers import Workers
+
+    return Workers(count, partial(_worker_runner, out, scale, device, legacy)) if count > 1 else None
+
+
+def _worker_runner(out: Path, scale: Scale, device: str, legacy: bool) -> Runner:
+    """The runner of a worker process, which is given its data sets with its work."""
+    from hyperplanes.commands.console import Console
+    from hyperplanes.experiments.workspace import Workspace
+
+    console = Console(plain=True)
+    return make_runner(Workspace(out), scale, console=console, device=device, announce=lambda line: None, legacy=legacy)
 
 
 def make_runner(
-    workspace: Workspace, scale: Scale, *, console: Console, device: str, announce: Callable[[str], None], **given: Any
+    workspace: Workspace,
+    scale: Scale,
+    *,
+    console: Console,
+    device: str,
+    announce: Callable[[str], None],
+    workers: Workers | None = None,
+    **given: Any,
 ) -> Runner:
     """A runner that generates, trains and says how it goes.
 
@@ -29,6 +77,7 @@ def make_runner(
         console: where it is said.
         device: auto, or the name of one.
         announce: called with a line before a training.
+        workers: as in `Runner`.
         given: of `DataSets`: which are given, and how they are read.
     """
     from hyperplanes.commands import find_verb
@@ -56,4 +105,4 @@ def make_runner(
             follow(trainer, bar)
 
     data = DataSets(workspace, scale, generate=generate, device=where, **given)
-    return Runner(workspace, data, train=train, device=where)
+    return Runner(workspace, data, train=train, device=where, workers=workers)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import Future
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +25,7 @@ from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.experiments.experiment import Cell, Experiment, Trained
 from hyperplanes.experiments.record import plain
 from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.workers import Evaluation, Training, Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.export.images import save_images
 from hyperplanes.methods import WithSampler, make_method
@@ -71,6 +74,7 @@ class Runner:
         train: called with what is trained, its configuration, the data, the folder of the training it reads, if any,
             and that of the checkpoint; goes on where it was interrupted.
         device: where to compute.
+        workers: processes in which trainings run side by side and objects are evaluated; this one where absent.
     """
 
     def __init__(
@@ -80,8 +84,12 @@ class Runner:
         *,
         train: Callable[[Trained, Preset, Tasks, Path | None, Path], None],
         device: torch.device,
+        workers: Workers | None = None,
     ) -> None:
         self.workspace, self.data, self.scale, self.train, self.device = workspace, data, data.scale, train, device
+        self.workers = workers
+        self._evaluated: dict[Path, Future[ObjectScore]] = {}  # by workers, by the files that they go to
+        self._method_in_use: tuple[object, tuple[WithSampler, Tasks]] | None = None
 
     def run(self, experiment: Experiment, seeds: int, on_score: OnScore = lambda *_: None) -> Outcome:
         """All trainings and evaluations of an experiment.
@@ -97,6 +105,8 @@ class Runner:
         scores: dict[tuple[str, str], list[Score]] = {}
         curves: dict[str, dict[tuple[str, int], Curve]] = {}
         for seed in range(seeds):
+            self.train_all(experiment, seed)
+            self.start(experiment, seed)
             for cell in experiment.cells:
                 if cell.trained.packaged and seed:
                     continue  # the same whatever the seed
@@ -127,6 +137,26 @@ class Runner:
         settings = self._training_settings(experiment, trained, seed)
         work = partial(self.train, trained, chosen, data, reference)
         return self.workspace.folder("trainings", trained.method, name, settings, work)
+
+    def train_all(self, experiment: Experiment, seed: int) -> None:
+        """The trainings of an experiment, side by side where there are workers; those that read others come later."""
+        if self.workers is None:
+            for trained in experiment.trainings:
+                self.checkpoint(experiment, trained, seed)
+            return
+        alone = [trained for trained in experiment.trainings if not (trained.packaged or trained.reference)]
+        with ExitStack() as stack:
+            started = []
+            for trained in alone:
+                name, settings = self.training_name(experiment, trained, seed), {}
+                settings = {"name": name, **self._training_settings(experiment, trained, seed)}
+                path = self.workspace.path("trainings", trained.method, name)
+                folder = self.workspace.out / path
+                if stack.enter_context(self.workspace.making(path, settings, [folder])):
+                    job = Training(trained, self.configuration(experiment, trained, seed), folder)
+                    started.append(self.workers.train(self._given(trained.on), job))
+            for training in started:
+                training.result()
 
     def training_name(self, experiment: Experiment, trained: Trained, seed: int) -> str:
         """What tells a training from others: the name of a packaged model, or one with a checksum."""
@@ -161,8 +191,39 @@ class Runner:
             seed: of the training and of fine-tuning.
             on_score: called after every object that was not evaluated before.
         """
+        objects: list[ObjectScore] = []
+        method, names = self.scale.method(cell.method), self.data.evaluated(cell.on, cell.split, experiment.objects)
+        for count, (job, settings, path, known) in enumerate(self._evaluations(experiment, cell, seed), 1):
+            if known is None:
+                self.workspace.begin()
+                started = self._evaluated.pop(path, None)
+                found = self.evaluate(job) if started is None else started.result()
+                known = Score(method, (found,))
+                on_score(cell, seed, found, count, len(names))
+                write_json(path, {"settings": settings, "score": known.as_json()})
+            objects += known.objects
+        return Score(method, tuple(objects))
+
+    def start(self, experiment: Experiment, seed: int) -> None:
+        """Have the workers, if any, evaluate what `score` will be asked for; the trainings are done.
+
+        What a time is asked of is evaluated by this process, alone.
+        """
+        if self.workers is None:
+            return
+        for cell in experiment.cells:
+            if cell.quantity.endswith("seconds"):
+                continue
+            for job, _, path, known in self._evaluations(experiment, cell, seed):
+                if known is None and path not in self._evaluated:
+                    self._evaluated[path] = self.workers.evaluate(self._given(cell.on), job)
+
+    def _evaluations(
+        self, experiment: Experiment, cell: Cell, seed: int
+    ) -> Generator[tuple[Evaluation, dict[str, Any], Path, Score | None]]:
+        """Of every object of a cell: what is to be done, all that decides it, its file, and what is known already."""
         checkpoint = self.checkpoint(experiment, cell.trained, seed)
-        method, made = self.scale.method(cell.method), None
+        method = self.scale.method(cell.method)
         shared = {
             "checkpoint": self.training_name(experiment, cell.trained, seed),
             "method": method,
@@ -174,25 +235,29 @@ class Runner:
             **({} if cell.query is None else {"query": cell.query}),
             **self.data.reading,
         }
-        objects: list[ObjectScore] = []
-        names = self.data.evaluated(cell.on, cell.split, experiment.objects)
-        for count, name in enumerate(names, 1):
-            # what is known of the object, if it was found with the same settings
+        for name in self.data.evaluated(cell.on, cell.split, experiment.objects):
             settings = {**shared, "object": name}
-            path, pictures = self._evaluation(cell, settings), self.pictures(cell, name)
+            path, whole = self._evaluation(cell, settings), True
+            if experiment.keep_pictures:
+                whole = self.pictures(cell, name).exists()
             known = read_json(path) if path.exists() else {}
-            whole = pictures.exists() or not experiment.keep_pictures
-            # else the evaluation, its pictures first
-            if known.get("settings") != plain(settings) or not whole:
-                self.workspace.begin()
-                made = made or self._method(experiment, cell, method, checkpoint, seed)
-                keep = partial(_save_pictures, pictures) if experiment.keep_pictures else None
-                score = evaluate(method, *made, [name], keep)
-                known = {"settings": settings, "score": score.as_json()}
-                on_score(cell, seed, score.objects[0], count, len(names))
-                write_json(path, known)
-            objects += Score.of_json(method, known["score"]).objects
-        return Score(method, tuple(objects))
+            found = known.get("settings") == plain(settings) and whole
+            score = Score.of_json(method, known["score"]) if found else None
+            yield Evaluation(experiment, cell, checkpoint, seed, name), settings, path, score
+
+    def evaluate(self, job: Evaluation) -> ObjectScore:
+        """One object by the method of a cell; its pictures are written where they are kept."""
+        experiment, cell = job.experiment, job.cell
+        made_for = (experiment.name, cell, job.checkpoint, job.seed)
+        method = self.scale.method(cell.method)
+        if self._method_in_use is None or self._method_in_use[0] != made_for:
+            self._method_in_use = made_for, self._method(experiment, cell, method, job.checkpoint, job.seed)
+        keep = partial(_save_pictures, self.pictures(cell, job.name)) if experiment.keep_pictures else None
+        return evaluate(method, *self._method_in_use[1], [job.name], keep).objects[0]
+
+    def _given(self, class_name: str) -> dict[str, Path]:
+        """The data set of a class, for a worker, which generates none."""
+        return {class_name: self.data.folder(class_name)}
 
     def _evaluation(self, cell: Cell, settings: Mapping[str, Any]) -> Path:
         """The file of what a cell found of an object."""

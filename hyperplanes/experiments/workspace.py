@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,10 +34,23 @@ class Workspace:
 
     def make(self, name: str, settings: Mapping[str, Any], outputs: Sequence[Path], work: Callable[[], object]) -> None:
         """Do a piece of work, unless it was done with these settings and its outputs are still there."""
-        if not self.record.done(name, settings, *outputs):
-            self.begin()
-            with self.record.working(name, settings, *outputs):
+        with self.making(name, settings, outputs) as needed:
+            if needed:
                 work()
+
+    @contextmanager
+    def making(self, name: str, settings: Mapping[str, Any], outputs: Sequence[Path]) -> Generator[bool]:
+        """The time in which a piece of work is done, as by `make`; several may overlap.
+
+        Yields:
+            Whether it is to be done: it was not yet.
+        """
+        if self.record.done(name, settings, *outputs):
+            yield False
+            return
+        self.begin()
+        with self.record.working(name, settings, *outputs):
+            yield True
 
     def folder(
         self, kind: str, place: str, name: str, settings: Mapping[str, Any], work: Callable[[Path], None]
@@ -50,10 +64,13 @@ class Workspace:
             settings: all that decides its content.
             work: called with the folder.
         """
-        path = f"{kind}/{name}" if self.places is None else self.places[place]
-        folder = self.out / path
-        self.make(path, {"name": name, **settings}, [folder], partial(work, folder))
-        return folder
+        path = self.path(kind, place, name)
+        self.make(path, {"name": name, **settings}, [self.out / path], partial(work, self.out / path))
+        return self.out / path
+
+    def path(self, kind: str, place: str, name: str) -> str:
+        """Where `folder` is, seen from the workspace; also what its work is recorded as."""
+        return f"{kind}/{name}" if self.places is None else self.places[place]
 
 
 def unique_name(start: str, settings: Mapping[str, Any]) -> str:

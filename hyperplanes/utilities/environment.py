@@ -8,7 +8,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-__all__ = ["cache_folder", "environment", "find_commit", "find_processor"]
+__all__ = ["cache_folder", "environment", "find_commit", "find_processor", "usable_cores"]
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,6 +55,11 @@ def find_processor() -> str:
     return named[0] if named else platform.processor() or platform.machine()
 
 
+def usable_cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def environment() -> dict[str, object]:
     """The commit, the processor and the versions, as they stand in the JSON files of results."""
     import torch
@@ -62,7 +67,7 @@ def environment() -> dict[str, object]:
     return {
         "commit": find_commit(),
         "processor": find_processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": usable_cores(),
         "threads": torch.get_num_threads(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "torch": torch.__version__,

@@ -78,6 +78,13 @@ def test_nothing_is_made_twice_and_what_is_missing_is_made_again(out, given, cap
     assert (out / "target" / "table.csv").read_text() == table
 
 
+def test_processes_side_by_side_find_what_one_does(out, given, tmp_path):
+    command = ["reproduce", "target", "--scale", "smoke", *given, "--out"]
+    assert main([*command, str(out)]) == 0
+    assert main([*command, str(tmp_path), "--workers", "2"]) == 0
+    assert (tmp_path / "target" / "table.csv").read_text() == (out / "target" / "table.csv").read_text()
+
+
 def test_a_cell_is_the_evaluation_of_its_checkpoint(out, cars, given):
     main(["reproduce", "target", "--scale", "smoke", "--out", str(out), *given])
     table = json.loads((out / "target" / "results.json").read_text())["table"]

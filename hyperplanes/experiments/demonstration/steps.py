@@ -51,11 +51,10 @@ class Demonstration:
     def steps(self) -> dict[str, Callable[[], object]]:
         """What does each step, unless it was done before, by its name."""
         table, seed = self.settings.table, self.settings.seed
-        trained = {each.method: each for each in table.trainings}
         return {
             "packaged model": self.show_packaged,
             "data": lambda: [self.runner.data.folder(name) for name in table.classes],
-            **{name: partial(self.runner.checkpoint, table, trained[name], seed) for name in MODELS},
+            "train": partial(self.runner.train_all, table, seed),
             **{f"evaluate {c.row}": partial(self.evaluate, c) for c in table.cells},
             "fine-tuning": self.tune,
             "report": self.report,
@@ -81,7 +80,9 @@ class Demonstration:
         self.say(f"the first page: {page.resolve().as_uri()}")
 
     def evaluate(self, cell: Cell) -> None:
-        """A row of the table."""
+        """A row of the table; workers, if any, go on with the next ones and the chart."""
+        for experiment in (self.settings.table, self.settings.fine_tuning):
+            self.runner.start(experiment, self.settings.seed)
         with self.evaluating(cell.row) as on_score:
             self.runner.score(self.settings.table, cell, self.settings.seed, on_score)
 

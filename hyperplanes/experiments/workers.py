@@ -1,0 +1,125 @@
+"""Processes of one thread each, in which trainings run side by side and objects are evaluated.
+
+The networks of an experiment are so small that two threads take one training hardly further than one does; two
+processes take two of them, and two objects, twice as far.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import torch
+
+from hyperplanes.configuration.presets import Preset
+from hyperplanes.experiments.experiment import Cell, Experiment, Trained
+from hyperplanes.utilities.interrupts import interruptible
+
+if TYPE_CHECKING:
+    from hyperplanes.evaluation import ObjectScore
+    from hyperplanes.experiments.engine import Runner
+
+__all__ = ["Evaluation", "Training", "Workers"]
+
+
+@dataclass(frozen=True)
+class Training:
+    """What is trained, by which configuration, and the folder of its checkpoint."""
+
+    trained: Trained
+    chosen: Preset
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """An object by the method of a cell: by what training, with which seed."""
+
+    experiment: Experiment
+    cell: Cell
+    checkpoint: Path
+    seed: int
+    name: str
+
+
+class Workers:
+    """A pool of processes, which end with the context; what they were doing ends as after SIGTERM.
+
+    Args:
+        count: of processes.
+        make: makes the `Runner` of a process; pickled.
+    """
+
+    def __init__(self, count: int, make: Callable[[], Runner]) -> None:
+        self.count, self._make = count, make
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._pool is None:
+            return
+        if kind is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            for child in multiprocessing.active_children():
+                child.terminate()
+        self._pool.shutdown()
+
+    def train(self, given: Mapping[str, Path], training: Training) -> Future[None]:
+        """Train in a process.
+
+        Args:
+            given: folders of the data sets by class.
+            training: what.
+        """
+        return self._started().submit(_train, given, training)
+
+    def evaluate(self, given: Mapping[str, Path], evaluation: Evaluation) -> Future[ObjectScore]:
+        """Evaluate in a process.
+
+        Args:
+            given: folders of the data sets by class.
+            evaluation: what.
+        """
+        return self._started().submit(_evaluate, given, evaluation)
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            spawn = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(self.count, spawn, _start, (self._make,))
+        return self._pool
+
+
+_runner: Runner  # of a worker process
+
+
+def _start(make: Callable[[], Runner]) -> None:
+    global _runner
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which ends its workers
+    torch.set_num_threads(1)
+    _runner = make()
+
+
+def _with(given: Mapping[str, Path]) -> Runner:
+    _runner.data.given = {**_runner.data.given, **given}
+    return _runner
+
+
+def _train(given: Mapping[str, Path], job: Training) -> None:
+    runner = _with(given)
+    with interruptible():
+        runner.train(job.trained, job.chosen, runner.arranged(job.trained, job.chosen), None, job.folder)
+
+
+def _evaluate(given: Mapping[str, Path], job: Evaluation) -> ObjectScore:
+    with interruptible():
+        return _with(given).evaluate(job)
