@@ -1,7 +1,7 @@
 """`python -m benchmarks [--under-load] NAME [--quick] [--json FILE]`: one thing against its reference, in one run.
 
-`all` makes every row and figure. A benchmark of speed refuses to write rows while other processes keep more than
-`load.LIMIT` cores busy, unless `--under-load` is given; the load stands beside the rows.
+`all` makes every row and figure, `tables` the tables of the pages. A benchmark of speed refuses to write rows while
+other processes keep more than `load.LIMIT` cores busy, unless `--under-load` is given; the load stands beside the rows.
 """
 
 import sys
@@ -23,11 +23,14 @@ NAMES = (
     "rendering",
     "small",
     "splats",
+    "tables",
     "training",
     "views",
     "visibility",
 )
 OF_SPEED = (
+    "baked",
+    "busy",
     "generation",
     "lookup",
     "rendering",
@@ -35,7 +38,7 @@ OF_SPEED = (
     "splats",
     "training",
     "visibility",
-)  # "busy" measures beside a load of its own
+)
 UNDER_LOAD = "--under-load"
 
 

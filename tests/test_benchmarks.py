@@ -1,9 +1,13 @@
 """Benchmarks of quality. Source of truth: the same figure computed beside them, and gradients of every weight."""
 
+import importlib
+import inspect
 import json
+import re
 import subprocess
 import sys
 import time
+import types
 from dataclasses import replace
 
 import pytest
@@ -11,12 +15,14 @@ import torch
 from small_demo import demo_folder
 
 from benchmarks import __main__ as benchmarks_main
-from benchmarks import image_based, views
+from benchmarks import all as all_benchmarks
+from benchmarks import image_based, tables, views
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
 from hyperplanes.training import Trainer
+from hyperplanes.utilities.files import DataError
 from tests.reference_rendering import Balls
 from tests.training.test_volume_loss import MODEL
 
@@ -80,13 +86,65 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     assert rows == [(1, "one_step"), (2, "one_step"), (2, "1_steps"), (2, "scratch_1")]
 
 
-def test_rows_of_speed_are_not_kept_beside_other_work(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("name", benchmarks_main.OF_SPEED)
+def test_rows_of_speed_are_not_kept_beside_other_work(name, tmp_path, monkeypatch, capsys):
     """Property: with more than 0.3 cores busy nothing is measured or written; the message says how to do it anyway."""
-    monkeypatch.setattr(benchmarks_main, "load_at_start", lambda: 1.4)
-    kept = tmp_path / "lookup.json"
-    assert benchmarks_main.main(["lookup", "--quick", "--json", str(kept)]) == 2
-    assert not kept.exists()
-    assert "1.4 cores busy" in capsys.readouterr().err
+    ran = []
+    benchmark = types.SimpleNamespace(main=lambda arguments: ran.append(arguments))
+    monkeypatch.setattr(benchmarks_main, "import_module", lambda _: benchmark)
+    given = [name, "--quick", "--json", str(tmp_path / "rows.json")]
+    for load, told, times in ((1.4, [], 0), (1.4, ["--under-load"], 1), (0.2, [], 2)):
+        monkeypatch.setattr(benchmarks_main, "load_at_start", lambda load=load: load)
+        assert benchmarks_main.main([*told, *given]) == (0 if told or load < 0.3 else 2)
+        assert ran == [given[1:]] * times
+        assert ("1.4 cores busy" in capsys.readouterr().err) == (times == 0)
+
+
+def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch, capsys):
+    """Property: a benchmark that is added is one of `all`, with options that it has; it decides itself about a load."""
+    ran = []
+    run = types.SimpleNamespace(returncode=0)
+    monkeypatch.setattr(subprocess, "run", lambda command, check: ran.append(command[3:]) or run)
+    assert all_benchmarks.main(["--out", str(tmp_path)]) == 0
+    assert {name for name, *_ in ran} == set(benchmarks_main.NAMES) - {"all", "tables", *all_benchmarks.OF_DATA}
+    assert "without --data none of views, " in capsys.readouterr().out
+    ran.clear()
+    assert all_benchmarks.main(["--out", str(tmp_path), "--data", "cars", "--under-load"]) == 0
+    assert {words[1] for words in ran} == set(benchmarks_main.NAMES) - {"all", "tables"}
+    written = [words[words.index("--json") + 1] for words in ran]
+    assert len(set(written)) == len(ran)
+    for words in ran:
+        assert words[0] == "--under-load"
+        assert ("--data" in words) == (words[1] in all_benchmarks.OF_DATA)
+        module = importlib.import_module(f"benchmarks.{words[1]}")
+        options = {word for word in words[1:] if word.startswith("--")}
+        assert options <= set(re.findall(r"--[\w-]+", inspect.getsource(module) + inspect.getsource(views)))
+
+
+@pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
+def test_tables_of_pages_are_the_rows_that_were_measured(page):
+    """Another way to the same: each page is written anew from the results, `python -m benchmarks tables`."""
+    text = page.read_text(encoding="utf-8")
+    assert tables.fill(text) == text
+    assert len(tables.MARKED.findall(text)) == text.count("<!-- benchmarks ")
+
+
+def test_a_table_has_the_numbers_of_its_rows_and_the_load_they_were_measured_with(tmp_path):
+    rows = [
+        {"name": "lookup", "load": load, "policy": "passive", "threads": threads, "seconds": 0.5, "speedup": speedup}
+        for load, threads, speedup in (("idle", 1, 1), ("idle", 2, 1.75), ("busy", 1, 1), ("busy", 2, 0.9))
+    ]
+    machine = {"processor": "a processor", "cores": 4, "threads": 2, "commit": "abc1234", "load": 0.25}
+    (tmp_path / "busy.json").write_text(json.dumps({**machine, "rows": rows}))
+    found = tables.fill("before\n<!-- benchmarks busy -->\nold\n<!-- end -->\nafter", tmp_path)
+    assert found.startswith("before\n<!-- benchmarks busy -->\n")
+    assert found.endswith("<!-- end -->\nafter")
+    assert "| lookup (0.50 s by one thread) | 1.75 | 0.90 |" in found
+    assert "*a processor, 4 cores, 2 threads; commit abc1234; load of other processes: 0.25 cores.*" in found
+    assert "old" not in found
+    for name, message in (("lookup", "run python -m benchmarks lookup"), ("walking", "correct its marker")):
+        with pytest.raises(DataError, match=message):
+            tables.fill(f"<!-- benchmarks {name} -->\n<!-- end -->", tmp_path)
 
 
 def test_a_process_that_spins_is_a_load():

@@ -1,0 +1,160 @@
+"""Write the tables of benchmarks into the pages that show them, from the rows in benchmarks/results.
+
+    python -m benchmarks tables
+
+A table stands between `<!-- benchmarks NAME -->` and `<!-- end -->`, with the processor, the commit and the load that
+its rows were measured with below it. `python -m benchmarks all` ends with this.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.tables import markdown_table
+from hyperplanes.utilities.writing import write_whole
+
+__all__ = ["TABLES", "fill", "main"]
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+MARKED = re.compile(r"(<!-- benchmarks (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+Result = dict[str, Any]
+
+
+def main(arguments: list[str]) -> int:
+    """Fill the tables of all pages.
+
+    Args:
+        arguments: --results FOLDER.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks tables", description=__doc__)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="where the rows are (default: %(default)s)")
+    chosen = parser.parse_args(arguments)
+    for page in PAGES:
+        before = page.read_text(encoding="utf-8")
+        if (after := fill(before, chosen.results, page)) != before:
+            write_whole(page, after.encode())
+            print(f"benchmarks tables: {page.relative_to(ROOT)} is written anew")
+    return 0
+
+
+def fill(text: str, results: Path = RESULTS, page: Path | str = "page") -> str:
+    """A page with its tables as the results have them.
+
+    Args:
+        text: the page.
+        results: the folder of the results, NAME.json.
+        page: its name, for messages.
+
+    Returns:
+        The page. A table that no benchmark makes, or whose rows are not there, is a DataError.
+    """
+
+    def replaced(found: re.Match[str]) -> str:
+        name = found[2]
+        if name not in TABLES:
+            raise DataError(f"{page}: expected a table of {', '.join(TABLES)}, found {name}; correct its marker")
+        path = results / f"{name}.json"
+        if not path.is_file():
+            raise DataError(f"{path}: expected the rows of {page}, found nothing; run python -m benchmarks {name}")
+        result = json.loads(path.read_text(encoding="utf-8"))
+        return f"{found[1]}{TABLES[name](result).rstrip()}\n\n{_measured(result)}\n{found[3]}"
+
+    return MARKED.sub(replaced, text)
+
+
+def _measured(result: Result) -> str:
+    """What the rows depend on beside the command."""
+    load = result.get("load")
+    threads, beside = result["threads"], "not recorded" if load is None else f"{load:.2f} cores"
+    machine = f"{result['processor']}, {result['cores']} cores, {threads} thread{'s' if threads > 1 else ''}"
+    return f"*{machine}; commit {result.get('commit') or 'not recorded'}; load of other processes: {beside}.*"
+
+
+def _seconds(value: float) -> str:
+    if value < 0.1:
+        return f"{1000 * value:.0f} ms"
+    return f"{value:.{0 if value >= 10 else 1 if value >= 2 else 2}f} s"
+
+
+def _busy(result: Result) -> str:
+    rows = [row for row in result["rows"] if row["policy"] == "passive"]
+    found = {(row["name"], row["load"], row["threads"]): row for row in rows}
+    lines = []
+    for name in dict.fromkeys(row["name"] for row in rows):
+        one = _seconds(found[name, "idle", 1]["seconds"])
+        ratios = [f"{found[name, load, 2]['speedup']:.2f}" for load in ("idle", "busy")]
+        lines.append([f"{name.replace('_', '-')} ({one} by one thread)", *ratios])
+    return markdown_table(["two threads over one", "alone", "beside two busy processes"], lines)
+
+
+def _lookup(result: Result) -> str:
+    rows = [row for row in result["rows"] if (row["planes"], row["points"], row["resolution"]) == (25, 65536, 200)]
+    lines = []
+    for part, gradient in dict.fromkeys((row["part"], row["gradient"]) for row in rows):
+        ways: Result = {}
+        for row in rows:  # the first of each: later ones are of the growth with each size
+            if (row["part"], row["gradient"]) == (part, gradient):
+                ways.setdefault(row["way"], row)
+        ours, per_second = ways.get("cpu_packed", ways["cpu"]), "million_lookups_per_second"
+        over = f"{ours['speedup']:.1f} ({ours['speedup_low']:.1f} to {ours['speedup_high']:.1f})"
+        others = [f"{ways[way][per_second]:.0f}" for way in ("kornia_loop", "kornia_batched")]
+        name = f"{part}, with gradient" if gradient else part
+        lines.append([name, *others, f"**{ours[per_second]:.0f}**", over, f"{ours['over_batched']:.1f}"])
+    headings = ["Kornia, camera by camera", "Kornia batched", "ours", "over the loop", "over batched"]
+    return markdown_table(["million lookups/s", *headings], lines)
+
+
+def _rendering(result: Result) -> str:
+    named = {row["name"]: row for row in result["rows"]}
+    lines = []
+    for name, row in named.items():
+        if not (size := re.fullmatch(r"default protocol, (\d+x\d+), one view", name)):
+            continue
+        baked = named.get(f"baked, {size[1]}")
+        over = f"{row['speedup']:.0f} ({row['speedup_lowest']:.0f} to {row['speedup_highest']:.0f})"
+        adapting = _seconds(row["adapt_seconds"] + row["refine_seconds"])
+        times = [_seconds(row["reference_seconds"]), _seconds(row["seconds"]), over]
+        last = [_seconds(baked["seconds"]), f"{baked['psnr_loss']:.2f} dB"] if baked else ["-", "-"]
+        other = f", commit {row['commit']}" if "commit" in row else ""
+        lines.append([f"{size[1]}{other}", *times, f"{row['psnr_loss']:.2f} dB", adapting, *last])
+    headings = ["`paper`", "`fast`", "times faster", "PSNR lost", "adapting and refining", "baked"]
+    return markdown_table(["one view", *headings, "PSNR lost by baking"], lines)
+
+
+def _training(result: Result) -> str:
+    lines = []
+    for row in result["rows"]:
+        if found := re.fullmatch(r"packed training, (.+), 512 rays a step", row["name"]):
+            rates = [f"{row[name]:.0f}" for name in ("reference_rays_per_second", "rays_per_second")]
+            over = f"{row['speedup']:.1f} ({row['speedup_low']:.1f} to {row['speedup_high']:.1f})"
+            memory = [f"{row[name]:.0f} MB" for name in ("reference_peak_megabytes", "peak_megabytes")]
+            lines.append([found[1], *rates, over, *memory])
+    headings = ["`paper`, rays/s", "`fast`, rays/s", "times as many", "memory, `paper`", "`fast`"]
+    return markdown_table(["preset", *headings], lines)
+
+
+def _splats(result: Result) -> str:
+    lines = []
+    for row in result["rows"]:
+        kind = row["name"].split(", ")[1].partition("-")[0]
+        quality = [f"{row[name]:.2f} dB" for name in ("field_psnr", "voxel_psnr", "psnr")]
+        lines.append([kind, *quality, f"{row['splats']:,}", _seconds(row["fit_seconds"])])
+    return markdown_table(["", "the model's field", "voxels", "splats", "number", "fitted in"], lines)
+
+
+TABLES: dict[str, Callable[[Result], str]] = {
+    "busy": _busy,
+    "lookup": _lookup,
+    "rendering": _rendering,
+    "splats": _splats,
+    "training": _training,
+}
+"""What makes the table of each benchmark of its rows."""
