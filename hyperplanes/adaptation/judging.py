@@ -23,6 +23,7 @@ MARGIN = (
     0.25  # of the squared error, by which less learned has to be better: two views tell smaller differences wrongly
 )
 RAYS = 2048  # of the views that are left out
+PIXELS = 256  # along the longer side of all of them, at most: photographs have no more to say here
 
 
 @torch.no_grad()
@@ -43,6 +44,7 @@ def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
     """
     if len(support) < FEWEST:
         return STRENGTHS[0]
+    support = support.resized(PIXELS)
     standing = camera_directions(support).cpu()
     order = farthest_first(standing, int((standing @ standing.mean(0)).argmin()), len(support))
     shown, judged = support[sorted(order[:-LEFT_OUT])], support[order[-LEFT_OUT:]]

@@ -20,6 +20,7 @@ UNLIKE = 3.0  # deviations of the codes; held-out objects of a trained class hav
 ELSEWHERE = 30.0  # degrees between camera directions, on average, above which planes stand in for others
 HELD_OUT = 4  # left-out views, and pixels along their longer side
 HELD_OUT_SIZE = 64
+SHOWN_SIZE = 4 * HELD_OUT_SIZE
 
 
 def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) -> list[str]:
@@ -76,7 +77,7 @@ def worse_than_copying(shown: Views, rendered: float, copied: float, steps: obje
 def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | None:
     """PSNR of a field on support views that it was not shown, and of the nearest view copied, in one forward pass.
 
-    Up to four views are left out, and rendered at 64 pixels.
+    Up to four views are left out, and rendered at 64 pixels. The others are shown with 256 at most.
 
     Args:
         model: what adapts.
@@ -89,6 +90,7 @@ def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | Non
         return None
     holdout = torch.linspace(0, len(shown) - 1, min(HELD_OUT, len(shown) // 2) + 2)[1:-1].round().long()
     rest = [index for index in range(len(shown)) if index not in holdout.tolist()]
+    shown = shown.resized(SHOWN_SIZE)
     truth_views, remaining = shown[holdout], shown[rest]
     scale = min(1.0, HELD_OUT_SIZE / max(truth_views.size))
     size = max(1, round(truth_views.size[0] * scale)), max(1, round(truth_views.size[1] * scale))
@@ -101,8 +103,11 @@ def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | Non
 
 def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
     """Root mean square of the standardised codes, None without such, and the mean angle from the training's rig."""
+    network, angle = model.hypernetwork, 0.0
+    if not len(model.rig) and (network is None or network.reads_volume):
+        return None, angle
     with torch.no_grad():
-        context, network, angle = model.prepare(shown, carved=False), model.hypernetwork, 0.0
+        context = model.prepare(shown, carved=False)
         if len(model.rig):
             cosine = (camera_directions(context.views).to(model.rig) * model.rig).sum(-1)
             angle = float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).mean())
