@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections import Counter
@@ -15,11 +16,12 @@ import numpy as np
 from PIL import Image
 
 from hyperplanes.data.formats.unposed import photographs_folder
+from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES, Pixels, image_header, read_image, resized, turned
 from hyperplanes.data.pictures.masks import match_masks
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["FEWEST", "Photograph", "find_photographs", "list_photographs", "read_upright"]
+__all__ = ["FEWEST", "Photograph", "find_photographs", "list_photographs", "read_upright", "without_copies"]
 
 FEWEST = 3
 """Photographs from which poses can be found at all."""
@@ -124,6 +126,27 @@ def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[
         focal = _focal(tags)
         found.append(Photograph(path, name, header.upright_size, header.orientation, camera, focal, mask=mask))
     return _with_one_shape(found), notes
+
+
+def without_copies(photographs: Sequence[Photograph]) -> tuple[list[Photograph], list[str]]:
+    """The photographs without those whose file is byte for byte that of an earlier one, and a sentence about these.
+
+    Args:
+        photographs: in their order.
+    """
+    sizes = Counter(one.path.stat().st_size for one in photographs)
+    seen: set[bytes] = set()
+    kept, copies = [], []
+    for one in photographs:
+        if sizes[one.path.stat().st_size] > 1:
+            digest = hashlib.sha256(one.path.read_bytes()).digest()
+            if digest in seen:
+                copies.append(one.path.name)
+                continue
+            seen.add(digest)
+        kept.append(one)
+    notes = [f"{len(copies)} of the files are copies of others and are left out: {listed(copies)}"] if copies else []
+    return kept, notes
 
 
 def read_upright(photograph: Photograph, max_size: int) -> tuple[Pixels, bool]:

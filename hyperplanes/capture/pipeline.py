@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hyperplanes.capture.masks.choice import choose_masker
+from hyperplanes.capture.masks.choice import check_mask, choose_masker
 from hyperplanes.capture.masks.consistency import agree
 from hyperplanes.capture.photographs import (
     FEWEST,
@@ -17,6 +17,7 @@ from hyperplanes.capture.photographs import (
     find_photographs,
     list_photographs,
     read_upright,
+    without_copies,
 )
 from hyperplanes.capture.placement import Placement, find_up, object_points, object_sphere
 from hyperplanes.capture.scene import Captured, straightened, write_scene
@@ -93,8 +94,9 @@ def capture(
 
     Too few photographs, photographs without common features, and settings that cannot be are a ValueError.
     """
-    source, out = Path(source), Path(out)
-    work = _Work(Stages(out / WORK), settings or Settings(), progress or (lambda stage, done, total, text: None))
+    source, out, settings = Path(source), Path(out), settings or Settings()
+    check_mask(settings.mask)
+    work = _Work(Stages(out / WORK), settings, progress or (lambda stage, done, total, text: None))
     photographs, is_video = _photographs(source, work)
     photographs, pictures, opacities = _pictures(photographs, work)
     model = _poses(pictures, is_video, work)
@@ -124,12 +126,16 @@ def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
             raise DataError(source, "a folder of photographs, or a video", found, "check the path")
         paths = find_photographs(source)
         home = next((place for place in (source / "masks", paths[0].parent / "masks") if place.is_dir()), None)
-    wanted = work.settings.mask in ("auto", "given")
-    photographs, notes = list_photographs(paths, home if wanted else None)
+    masked = work.settings.mask in ("auto", "given")
+    photographs, notes = list_photographs(paths, home if masked else None)
+    photographs, copies = without_copies(photographs)
+    notes += copies
     work.notes += notes
     if len(photographs) < FEWEST:
         found = f"{len(photographs)} of {len(paths)}"
-        raise DataError(source, f"at least {FEWEST} photographs that can be read", found, "; ".join(notes)[:200])
+        raise DataError(
+            source, f"at least {FEWEST} different photographs that can be read", found, "; ".join(notes)[:200]
+        )
     return photographs, is_video
 
 

@@ -255,9 +255,9 @@ def _opened(pycolmap: Any, path: Path) -> Generator[Any]:
 
 @contextmanager
 def _quiet(pycolmap: Any) -> Generator[None]:
-    """COLMAP's errors alone on standard error."""
+    """Nothing of COLMAP's log on standard error: what went wrong is raised, or said by who called."""
     before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = 2
+    pycolmap.logging.minloglevel = 3
     try:
         yield
     finally:

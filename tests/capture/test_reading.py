@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hyperplanes.capture.photographs import find_photographs, list_photographs, read_upright
+from hyperplanes.capture import Settings, capture
+from hyperplanes.capture.photographs import find_photographs, list_photographs, read_upright, without_copies
 from hyperplanes.utilities.files import DataError
 
 ORIENTATION, MODEL, EXIF, FOCAL_35 = 0x0112, 0x0110, 0x8769, 0xA405
@@ -93,3 +94,19 @@ def test_a_broken_photograph_is_named_and_left_out(upright, tmp_path):
     photographs, notes = list_photographs(find_photographs(tmp_path))
     assert len(photographs) == 3
     assert [note.startswith("left out: ") and "broken.jpg" in note for note in notes] == [True]
+
+
+def test_copies_of_a_file_are_left_out(upright, tmp_path):
+    for index in range(4):
+        save(upright if index else upright[::-1], tmp_path / f"{index}.png")
+    kept, (note,) = without_copies(list_photographs(find_photographs(tmp_path))[0])
+    assert [one.path.name for one in kept] == ["0.png", "1.png"]
+    assert note == "2 of the files are copies of others and are left out: 2.png, 3.png"
+
+
+@pytest.mark.parametrize(
+    ("mask", "said"), [("netwrok", "expected one of auto, given"), ("cut {image}", "{mask} in it")]
+)
+def test_masks_that_nothing_finds_are_refused_before_poses_are_searched_for(tmp_path, mask, said):
+    with pytest.raises(ValueError, match=said):
+        capture(tmp_path / "nothing", tmp_path / "scene", Settings(mask=mask))

@@ -14,7 +14,7 @@ from hyperplanes.capture.masks.network import SalientObject, weights
 from hyperplanes.capture.packages import is_installed
 from hyperplanes.capture.sparse_model import SparseModel
 
-__all__ = ["MASKS", "Masker", "choose_masker"]
+__all__ = ["MASKS", "Masker", "check_mask", "choose_masker"]
 
 MASKS = ("auto", "given", "colour", "network", "grabcut", "none")
 """Ways to find masks; a command with {image} and {mask} in it is another."""
@@ -23,6 +23,22 @@ Masker = Callable[[np.ndarray, int], np.ndarray]
 """From a picture (height, width, 3) and the number of its camera to opacity (height, width) in [0, 1]."""
 
 LOOKED_AT = 12  # pictures by which a background is called plain
+
+
+def check_mask(name: str) -> None:
+    """Refuse a name that stands for nothing, before anything else is done.
+
+    Args:
+        name: one of MASKS, or a command.
+
+    Raises:
+        ValueError: another name, or a command without {image} and {mask}.
+    """
+    if name in MASKS:
+        return
+    if " " not in name and "{" not in name:
+        raise ValueError(f"--mask: expected one of {', '.join(MASKS)}, or a command, got {name!r}")
+    Command(name)
 
 
 def choose_masker(name: str, model: SparseModel, pictures: Sequence[np.ndarray]) -> tuple[Masker, str]:
@@ -39,6 +55,7 @@ def choose_masker(name: str, model: SparseModel, pictures: Sequence[np.ndarray])
     Raises:
         ValueError: a name that stands for nothing, or a package that is missing.
     """
+    check_mask(name)
     if name in ("auto", "given"):
         step = max(1, len(pictures) // LOOKED_AT)
         if is_plain(pictures[::step]):
@@ -60,7 +77,5 @@ def choose_masker(name: str, model: SparseModel, pictures: Sequence[np.ndarray])
         return lambda picture, camera: network(picture), "network"
     if name == "grabcut":
         return GrabCut(model), "GrabCut"
-    if " " not in name and "{" not in name:
-        raise ValueError(f"--mask: expected one of {', '.join(MASKS)}, or a command, got {name!r}")
     command = Command(name)
     return lambda picture, camera: command(picture), f"command {name}"
