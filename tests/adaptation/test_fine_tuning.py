@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.rendering import Hierarchical
@@ -32,6 +33,13 @@ def moved(model, field):
     """Names of the parameters that differ from theta."""
     theta = model.theta.under("fine")
     return {name for name, value in field.parameters.items() if not torch.equal(value, theta[name])}
+
+
+def test_an_empty_picture_is_judged_by_the_distance_of_the_views_from_white(model):
+    grey = ball_views(ring(4))
+    grey = replace(grey, images=torch.full_like(grey.images, 0.25))
+    descent, _ = make_descent(model, model.prepare(grey), WEIGHTS)
+    assert descent.errors()[1] == 0.75**2
 
 
 @pytest.mark.parametrize("settings", [PAPER, WEIGHTS])

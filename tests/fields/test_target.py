@@ -59,6 +59,13 @@ def slow_field(parameters, inputs, direction, config, radius=1.0):
 
 
 @pytest.mark.parametrize("depth", [1, 2, 5])
+def test_the_layers_that_read_a_point_are_those_of_the_trunk_that_are_as_wide_as_its_inputs(depth):
+    network = make(config=TargetConfig(depth=depth, width=8, planes=PLANES, point_frequencies=2))
+    sizes = {f"layers.{index}": layer.in_features for index, layer in enumerate(network.layers)}
+    assert network.reading_layers == tuple(name for name, size in sizes.items() if size >= network.input_size > 8)
+
+
+@pytest.mark.parametrize("depth", [1, 2, 5])
 @torch.no_grad()
 def test_a_field_is_its_formula_point_by_point(depth):
     config = TargetConfig(depth=depth, width=8, planes=PLANES, point_frequencies=2, direction_frequencies=1)
