@@ -18,9 +18,9 @@ from hyperplanes.rendering.scene import FieldFunction, Scene, SplitField, evalua
 __all__ = ["integrate"]
 
 FIRST_ROUND = 4  # samples a ray before the first test for opaque rays
-MIN_WEIGHT = 0.003  # of a sample from which on its colour is evaluated
+MIN_WEIGHT = 0.01  # of a sample from which on its colour is evaluated
 KNOWN_SHARE = 0.95  # of a pixel's weight whose colours are evaluated at least, where its opacity is above
-MIN_OPACITY = 1 / 512
+MIN_OPACITY = 1 / 64
 GROWTH = 4  # every later round takes this fraction of the samples so far, and at least as many as the first
 DIFFERENTIATED = 0.01  # weight of a sample from which on it always has its gradient, below in proportion to it
 

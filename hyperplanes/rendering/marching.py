@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Annotated
 
+import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.threads import parallel_for
+from hyperplanes.geometry.lookup_torch import transform_of
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples
@@ -16,6 +22,7 @@ from hyperplanes.utilities.arguments import checked_fields
 __all__ = ["RayMarching", "march"]
 
 CANDIDATES = 1 << 21  # samples tested against the grid at once; 12 bytes each
+RAYS = 512  # that one call of the kernel works on
 
 
 @checked_fields
@@ -94,20 +101,57 @@ def march(rays: Rays, occupancy: Occupancy, step: float, generator: torch.Genera
     Returns:
         The samples in occupied voxels.
     """
-    longest = float((rays.far - rays.near).max()) if len(rays) else 0.0
-    count = int(longest / step) + 1
     offset = torch.full((len(rays),), 0.5, dtype=rays.near.dtype)
     if generator is not None:
         offset = torch.rand(len(rays), generator=generator, dtype=rays.near.dtype)
     start = rays.near + offset.to(rays.near) * step
+    longest = float((rays.far - rays.near).max()) if len(rays) else 0.0
+    walk = _walk_compiled if _has_kernel(rays) else _walk_torch
+    return PackedSamples(*walk(rays, start, occupancy, step, int(longest / step) + 1), step)
+
+
+def _has_kernel(rays: Rays) -> bool:
+    """Whether the kernel takes these rays."""
+    kind = rays.near.dtype in (torch.float32, torch.float64) and rays.near.device.type == "cpu"
+    return kind and bool(find_spec("numba")) and not torch.compiler.is_compiling() and not transform_of(rays.origins)
+
+
+def _walk_compiled(
+    rays: Rays, start: Tensor, occupancy: Occupancy, step: float, count: int
+) -> tuple[Int[Tensor, " sample"], Float[Tensor, " sample"]]:
+    """The rays and the distances of samples, by the compiled kernel."""
+    origins, directions, first, far = (
+        each.detach().contiguous().numpy() for each in (rays.origins, rays.directions, start, rays.far)
+    )
+    number, bounds = first.dtype.type, occupancy.bounds
+    sphere, occupied = np.array([*bounds.centre, bounds.radius], number), occupancy.occupied.contiguous()
+    kernel = compile_kernel("marching.march", start.dtype)
+
+    def part(begin: int, end: int) -> tuple[Tensor, Tensor]:
+        room, found = (end - begin) * (count + 1), np.zeros(1, np.int64)
+        ray, distances = np.empty(room, np.int64), np.empty(room, number)
+        arrays = (sphere, occupied.numpy().view(np.uint8), ray, distances, found)
+        kernel(origins, directions, first, far, number(step), *arrays, begin, end)
+        return torch.from_numpy(ray[: found[0]].copy()), torch.from_numpy(distances[: found[0]].copy())
+
+    parts = parallel_for(part, len(rays), max(1, min(RAYS, CANDIDATES // count)))
+    if not parts:
+        return start.new_zeros(0, dtype=torch.long), start.new_zeros(0)
+    ray, distances = (torch.cat(each) for each in zip(*parts, strict=True))
+    return ray, distances
+
+
+def _walk_torch(
+    rays: Rays, start: Tensor, occupancy: Occupancy, step: float, count: int
+) -> tuple[Int[Tensor, " sample"], Float[Tensor, " sample"]]:
+    """The rays and the distances of samples, in plain PyTorch."""
     steps = torch.arange(count, dtype=start.dtype, device=start.device) * step
-    pieces = []
+    rows, distances = [start.new_zeros(0, dtype=torch.long)], [start.new_zeros(0)]
     for first in range(0, len(rays), max(1, CANDIDATES // count)):
         part = rays[first : first + max(1, CANDIDATES // count)]
         t = start[first : first + len(part), None] + steps
         live = occupancy.contains(part.at(t)) & (t < part.far[:, None])
         ray, index = live.nonzero().unbind(1)
-        pieces.append((ray + first, t[ray, index]))
-    if not pieces:
-        return PackedSamples(start.new_zeros(0, dtype=torch.long), start.new_zeros(0), step)
-    return PackedSamples(torch.cat([ray for ray, _ in pieces]), torch.cat([t for _, t in pieces]), step)
+        rows.append(ray + first)
+        distances.append(t[ray, index])
+    return torch.cat(rows), torch.cat(distances)

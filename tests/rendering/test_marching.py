@@ -6,6 +6,7 @@ import torch
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.rendering import march
+from hyperplanes.rendering.marching import _walk_compiled, _walk_torch
 from tests.reference_rendering import camera_at, march_ray, some_rays, voxel_is_occupied
 
 OFF_CENTRE = Sphere((0.3, -0.2, 0.1), 0.8)
@@ -36,6 +37,20 @@ def test_samples_lie_in_occupied_voxels(seed):
     occupied = grid.occupied.tolist()
     assert len(points) > 100
     assert all(voxel_is_occupied(occupied, OFF_CENTRE.centre, OFF_CENTRE.radius, p) for p in points.tolist())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_kernel_finds_what_plain_pytorch_does(dtype):
+    grid, rays = random_grid(OFF_CENTRE, 9), some_rays(700)
+    rays = Rays(*(each.to(dtype) for each in (rays.origins, rays.directions, rays.near, rays.far)))
+    start, count = rays.near + 0.01, int(float((rays.far - rays.near).max()) / 0.03) + 1
+    ray, distances = _walk_compiled(rays, start, grid, 0.03, count)
+    expected_ray, expected = _walk_torch(rays, start, grid, 0.03, count)
+    if dtype == torch.float64:
+        assert torch.equal(ray, expected_ray)
+        torch.testing.assert_close(distances, expected)
+    assert abs(len(ray) - len(expected)) <= 2  # a sample within rounding of a face
+    assert abs(float(distances.sum() - expected.sum())) < 10
 
 
 def test_samples_stand_ray_by_ray_near_ones_first():
