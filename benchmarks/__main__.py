@@ -12,6 +12,7 @@ from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.files import DataError
 
 NAMES = (
+    "adapting",
     "all",
     "baked",
     "image_based",
@@ -29,6 +30,7 @@ NAMES = (
     "visibility",
 )
 OF_SPEED = (
+    "adapting",
     "baked",
     "busy",
     "generation",

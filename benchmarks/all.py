@@ -20,6 +20,7 @@ __all__ = ["COMMANDS", "OF_DATA", "main"]
 
 RESULTS = Path(__file__).parent / "results"
 COMMANDS: dict[str, list[str]] = {
+    "adapting": [],
     "lookup": ["--plot", "lookup.png"],
     "visibility": [],
     "busy": [],

@@ -9,7 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from hyperplanes.adaptation.base import AdaptedField, Renderable
 from hyperplanes.export.baking import BakedScene, bake, default_side
-from hyperplanes.export.voxel_fitting import ENOUGH, fit_voxels, render_guide
+from hyperplanes.export.voxel_fitting import ENOUGH, STEPS, fit_voxels, render_guide
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.views import Views
@@ -43,15 +43,16 @@ def draws_by_voxels(views: int, cameras: PinholeCamera, side: int) -> bool:
     return views >= ENOUGH and cameras.batch_size * height * width >= PIXELS * side**2
 
 
-def fitted_voxels(adapted: AdaptedField, views: Views, side: int) -> BakedField:
+def fitted_voxels(adapted: AdaptedField, views: Views, side: int, *, steps: int = STEPS) -> BakedField:
     """The voxels of a field, fitted to its support views.
 
     Args:
         adapted: what is baked.
         views: its support views.
         side: voxels an axis.
+        steps: of fitting.
     """
-    return fit_voxels(bake(adapted, side=side), views, guide=render_guide(adapted, views))
+    return fit_voxels(bake(adapted, side=side), views, guide=render_guide(adapted, views), steps=steps)
 
 
 def choose_representation(
