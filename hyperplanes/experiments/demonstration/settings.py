@@ -77,7 +77,7 @@ class DemoSettings:
     frames: int = 36
     unseen_objects: int = 2
     fine_tuned: tuple[int, int] = (10, 100)
-    tuning: tuple[int, ...] = (0, 1, 3, 10, 30, 100, 300)
+    tuning: tuple[int, ...] = (0, 1, 3, 10, 30, 100)
     tuned_objects: int = 1
     first: tuple[str, ...] = ("car", "chair", "plane", "lamp")
     first_resolution: int = 128
