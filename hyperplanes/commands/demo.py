@@ -47,7 +47,7 @@ class Arguments:
         held_out: How many of them are kept from training.
         resolution: Pixels along a side.
         preset: What is trained; see `hyperplanes presets`.
-        steps: Training steps; so few that all is done in ten minutes on two cores.
+        steps: Training steps; so few that all is done in minutes on two cores.
         meshes: A folder with a few mesh files that the packaged model shows first, beside procedural objects.
         first_only: End after the packaged model's page.
         seed: Of everything.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
     from hyperplanes.experiments.engine import Runner
 
 __all__ = ["Evaluation", "Training", "Workers"]
+
+PATIENCE = 2.0
+"""Seconds in which workers end that were sent the signal as well, as by `timeout`: a second one would end a training
+before its checkpoint is written."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +75,11 @@ class Workers:
             return
         if kind is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
-            for child in multiprocessing.active_children():
-                child.terminate()
+            children, until = multiprocessing.active_children(), time.monotonic() + PATIENCE
+            for child in children:
+                child.join(max(0.0, until - time.monotonic()))
+            for child in children:
+                child.terminate()  # of those that have ended, nothing
         self._pool.shutdown()
 
     def train(self, given: Mapping[str, Path], training: Training) -> Future[None]:
