@@ -93,6 +93,24 @@ def test_inner_steps_of_rate_zero_lead_nowhere(coarse):
     assert any((value != 0).any() for value in second.values())
 
 
+@pytest.mark.parametrize("method", ["maml", "mv_meta"])
+def test_an_object_that_is_drawn_twice_has_the_gradient_and_the_loss_of_one(method):
+    """The gradient of a step is the mean over its objects, by which no rate depends on how many they are."""
+    trainer = initialisation_trainer(model_of(method), Balls(), FAST, None)
+    batch = trainer.loader.batch(0)
+
+    def gradient(times):
+        drawn = [replace(batch.rendered[0], generator=torch.Generator().manual_seed(3)) for _ in range(times)]
+        loss = trainer.objective.gradients(replace(batch, rendered=drawn))
+        return loss, {name: value.grad.clone() for name, value in trainer.model.networks.named_parameters()}
+
+    (loss, once), (same, twice) = gradient(1), gradient(2)
+    assert same == pytest.approx(loss)
+    assert any((value != 0).any() for value in once.values())
+    for name, value in once.items():
+        torch.testing.assert_close(twice[name], value)
+
+
 def test_a_single_view_an_object_is_all_that_sv_meta_sees():
     data, poisoned = Balls(), Balls()
     clean = data.task
