@@ -10,16 +10,21 @@ import typechecker
 
 SLOWEST_FIRST = (
     "test_cli",
+    "test_engine",
     "test_trained",
     "test_generate",
-    "test_distributed",
     "test_training",
-    "test_engine",
-    "test_any_number_of_views",
-    "test_inputs",
+    "test_distributed",
     "test_tutorials",
+    "test_any_number_of_views",
+    "test_baking",
+    "test_fuzz",
+    "test_objects",
     "test_mesh_renderer",
+    "test_benchmarks",
     "test_methods",
+    "test_plane_dropout",
+    "test_inputs",
 )
 """Modules that processes of the tests begin with (`make test`), so that none of them is left for the end."""
 

@@ -712,7 +712,7 @@ def test_the_demonstration_shows_the_packaged_model_before_anything_is_trained(t
 def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(PRESETS, "tiny", demo_preset())
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    command = ["train", "--data", str(demo_folder() / "data"), "--preset", "tiny", "--steps", "24", "--out"]
+    command = ["train", "--data", str(demo_folder() / "data"), "--preset", "tiny", "--steps", "10", "--out"]
     step = Trainer.take_step
 
     def interrupted(trainer):
