@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +24,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy import ndimage
+from torch.nn.functional import interpolate
 
 from benchmarks.reporting import Row, finish
 from benchmarks.staged_photographs import Staged, stage, walk_around
@@ -52,6 +52,7 @@ from hyperplanes.views import Views
 
 __all__ = ["PoseErrors", "compare_poses", "damaged_masks", "main"]
 
+SHOWN, COMPARED = 320, 160  # pixels along the longer side of the views that are shown, and of those compared
 HEIGHTS = (15.0, 45.0)  # of the rounds, in degrees: with 36 photographs a step of 20 degrees
 SOFT = 0.008  # of the longer side: deviation of the blur of a damaged mask
 PART = 0.25  # of the area of the object, that is lost or added
@@ -133,9 +134,7 @@ def _measured(path: Path | None, index: int, folder: Path, options: argparse.Nam
     mesh = None if path is None else load_mesh(path)
     staged = stage(walk_around(options.views, index, HEIGHTS), size, seed=index, mesh=mesh)
     staged.save(folder / "photographs")
-    started = time.perf_counter()
     captured = capture(folder / "photographs", folder / "scene", Settings(options.size, options.mask))
-    seconds = time.perf_counter() - started
     model = SparseModel.load(folder / "scene" / "capture" / "poses" / "model.npz")
     errors = compare_poses(np.linalg.inv(model.camera_from_world), staged.world_from_camera[model.pictures])
     truth = {
@@ -151,7 +150,6 @@ def _measured(path: Path | None, index: int, folder: Path, options: argparse.Nam
         "percent_median": float(np.median(errors.percent)),
         "mask": captured.mask,
         "mask_iou": _overlap(_read_masks(folder / "scene", truth), truth),
-        "seconds": seconds,
     }
     if options.checkpoint is not None:
         checkpoint = HyperPlanes.from_pretrained(Path(options.checkpoint))
@@ -216,10 +214,12 @@ def _quality(
         prepare: what is done with the support views before.
     """
     task = read_task(scene, up="auto")
-    shown = task.support if prepare is None else prepare(task.support)
-    pictures = method.adapt(shown).render(task.query.cameras).images.clamp(0, 1)
+    shown = (task.support if prepare is None else prepare(task.support)).resized(SHOWN)
+    cameras = task.query.resized(COMPARED).cameras
+    pictures = method.adapt(shown).render(cameras).images.clamp(0, 1)
     wanted = np.stack([truth[Path(name).stem] for name in task.query.names]).transpose(0, 3, 1, 2)
     true, _ = composite_over_white(torch.from_numpy(np.ascontiguousarray(wanted)))
+    true = interpolate(true, pictures.shape[2:], mode="area")
     return float(psnr(pictures, true).mean())
 
 
