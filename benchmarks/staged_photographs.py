@@ -125,6 +125,7 @@ def stage(
         [[focal * max(size), 0, (width - 1) / 2], [0, focal * max(size), (height - 1) / 2], [0, 0, 1.0]]
     )
     drawn, floor = _drawn(mesh, poses, calibration, size)
+    source = _lens_source(size, calibration, lens)
     rows, columns = np.mgrid[: height * samples, : width * samples]
     pixels = (np.stack([columns, rows], -1).reshape(-1, 2) + 0.5) / samples - 0.5
     slopes = _without_lens((pixels - calibration[:2, 2]) / calibration[[0, 1], [0, 1]], lens)
@@ -132,7 +133,7 @@ def stage(
     for view, pose in enumerate(poses):
         colour, mask = _seen(pose, slopes.reshape(height, samples, width, samples, 2), texture, mesh is None, floor)
         if drawn is not None:
-            over = _through_lens(drawn[view].astype(np.float32) / 255, calibration, lens)
+            over = _through_lens(drawn[view].astype(np.float32) / 255, source)
             colour = over[..., :3] + colour * (1 - over[..., 3:])
             mask = over[..., 3]
         colour = colour * np.exp(generator.normal(0, exposure))
@@ -214,17 +215,15 @@ def _without_lens(slopes: Array, lens: tuple[float, float]) -> Array:
     return found.numpy()
 
 
-def _through_lens(picture: Array, calibration: Array, lens: tuple[float, float]) -> Array:
-    """A pinhole's picture as the lens shows it."""
-    height, width = picture.shape[:2]
-    rows, columns = np.mgrid[:height, :width]
+def _lens_source(size: tuple[int, int], calibration: Array, lens: tuple[float, float]) -> Array:
+    """Where a pinhole shows what the lens shows in each pixel, (row, column)."""
+    rows, columns = np.mgrid[: size[0], : size[1]]
     pixels = np.stack([columns, rows], -1).reshape(-1, 2)
     focal, centre = calibration[[0, 1], [0, 1]], calibration[:2, 2]
-    source = _without_lens((pixels - centre) / focal, lens) * focal + centre
-    return np.stack(
-        [
-            ndimage.map_coordinates(picture[..., channel], source[:, ::-1].T, order=1).reshape(height, width)
-            for channel in range(picture.shape[2])
-        ],
-        -1,
-    )
+    return (_without_lens((pixels - centre) / focal, lens) * focal + centre)[:, ::-1]
+
+
+def _through_lens(picture: Array, source: Array) -> Array:
+    """A pinhole's picture as the lens shows it."""
+    channels = [ndimage.map_coordinates(channel, source.T, order=1) for channel in np.moveaxis(picture, -1, 0)]
+    return np.stack(channels, -1).reshape(picture.shape)
