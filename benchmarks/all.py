@@ -30,7 +30,7 @@ COMMANDS: dict[str, list[str]] = {
     "training": [],
     "training_curves": ["--curves", "120", "--plot", "training_curves.png"],
     "generation": [],
-    "captures": [],
+    "captures": ["--checkpoint", "small"],
 }
 """Names of results, and options of the benchmarks beside --json; pictures lie in the folder of results."""
 
