@@ -24,6 +24,7 @@ NAMES = (
     "rendering",
     "small",
     "splats",
+    "steps",
     "tables",
     "training",
     "views",
@@ -38,6 +39,7 @@ OF_SPEED = (
     "rendering",
     "small",
     "splats",
+    "steps",
     "training",
     "visibility",
 )

@@ -27,6 +27,7 @@ COMMANDS: dict[str, list[str]] = {
     "rendering": ["--sizes", "64", "128", "200", "400", "--plot", "rendering.png"],
     "small": ["--second-pass"],
     "splats": [],
+    "steps": [],
     "training": [],
     "training_curves": ["--curves", "120", "--plot", "training_curves.png"],
     "generation": [],

@@ -141,6 +141,37 @@ def _training(result: Result) -> str:
     return markdown_table(["preset", *headings], lines)
 
 
+PARTS = {
+    "update": "the hypernetwork, forward",
+    "rays": "rays and their colours",
+    "rendering": "the field at the samples, forward",
+    "gradients": "backward, of both",
+    "optimisers": "the optimisers",
+}
+"""Of a step of training, by the names of the profiler's marks."""
+
+
+def _steps(result: Result) -> str:
+    found = {row["name"]: row["seconds"] for row in result["rows"]}
+    step = next(row for row in result["rows"] if row["name"].startswith("step of small"))
+    times = f"**{_seconds(step['seconds'])}**", _seconds(step["reference_seconds"]), f"{step['speedup']:.2f}"
+    lines = [["a step", *times]]
+    for part, name in PARTS.items():
+        seconds = [found[f"part of a step, {way}: {part}"] for way in ("ours", "reference")]
+        lines.append([name, *map(_seconds, seconds), f"{seconds[1] / seconds[0]:.2f}"])
+    lines.append(["an episode, its pictures in memory", _seconds(found["an episode, its pictures in memory"]), "", ""])
+    return markdown_table(["", "now", "every sample differentiated", "ratio"], lines)
+
+
+def _small(result: Result) -> str:
+    lines = []
+    for row in result["rows"]:
+        times = [f"**{_seconds(row['seconds'])}**", _seconds(row["reference_seconds"]), f"{row['speedup']:.1f}"]
+        quality = [f"{row['psnr']:.2f} dB", f"{row['psnr_loss']:.2f} dB"]
+        lines.append([row["name"].split(", ")[2], *times, *quality, _seconds(row["refine_seconds"])])
+    return markdown_table(["picture", "a view", "reference", "ratio", "PSNR", "lost", "finding voxels, once"], lines)
+
+
 def _splats(result: Result) -> str:
     lines = []
     for row in result["rows"]:
@@ -154,7 +185,9 @@ TABLES: dict[str, Callable[[Result], str]] = {
     "busy": _busy,
     "lookup": _lookup,
     "rendering": _rendering,
+    "small": _small,
     "splats": _splats,
+    "steps": _steps,
     "training": _training,
 }
 """What makes the table of each benchmark of its rows."""

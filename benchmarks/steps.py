@@ -1,0 +1,105 @@
+"""Steps of training of the preset `small` on a data set, and where their time goes.
+
+    OMP_NUM_THREADS=1 python -m benchmarks steps --data data/cars --json FILE
+
+Steps of the packaged weights in turn: as they are taken, and the reference, which differentiates every sample that lies
+in the hull and convolves by PyTorch's modules. Both take the same episodes. Beside them, what it takes to make one
+episode ready whose pictures are in memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import conv3d
+
+from benchmarks._timing import interleaved, ratio, timed
+from benchmarks.objects import held_out
+from benchmarks.reporting import Row, finish
+from benchmarks.training import Objects, step_parts
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.presets import preset
+from hyperplanes.data import open_dataset
+from hyperplanes.hypernetwork import volume_network
+from hyperplanes.rendering.renderer import RayMarching
+from hyperplanes.training import Trainer
+from hyperplanes.views import Tasks
+
+__all__ = ["main"]
+
+RATE = 1e-6  # so small that the weights stay what they are, and the work with them
+
+
+def main(arguments: list[str]) -> int:
+    """Measure, print, and write the rows where asked.
+
+    Args:
+        arguments: see --help.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks steps", description=__doc__)
+    parser.add_argument("--data", type=Path, help="a data set; procedural cars where absent")
+    parser.add_argument("--untrained", action="store_true", help="begin with first weights, not the packaged ones")
+    parser.add_argument("--repeats", type=int, default=12, help="steps of each (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="two objects, one step of each")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    chosen = parser.parse_args(arguments)
+    size, views, repeats = (64, 8, 1) if chosen.quick else (128, 50, chosen.repeats)
+    data: Tasks = Objects(held_out(4, size, views)) if chosen.data is None else open_dataset(chosen.data)
+    ours, reference = (_trainer(data, stop, chosen.untrained) for stop in (RayMarching().stop, 0.0))
+    reference.loader.get = ours.loader.get  # type: ignore[method-assign]
+    names = [name for step in range(repeats + 2) for name in ours.loader.names_of(step)]
+    for name in names:
+        ours.loader.get(name)
+    again = [timed(lambda name=name: ours.loader._load(name))[0] for name in names[: max(1, repeats)]]
+    rows = _compare(ours, reference, repeats)
+    rows.append({"name": "an episode, its pictures in memory", "seconds": statistics.median(again)})
+    return finish("steps", rows, chosen.json)
+
+
+def _trainer(data: Tasks, stop: float, untrained: bool) -> Trainer:
+    """A training that stays where it is; `stop` 0 differentiates every sample."""
+    settings = preset("small")
+    model = HyperPlanes(settings.model) if untrained else HyperPlanes.from_pretrained("small")
+    model.config = replace(model.config, sampling=replace(settings.model.sampling, stop=stop))
+    rates = {f"{name}learning_rate": RATE for name in ("", "muon_", "hypernetwork_")}
+    return Trainer(model, data, replace(settings.training, prefetch=0, **rates))
+
+
+def _compare(ours: Trainer, reference: Trainer, repeats: int) -> list[Row]:
+    """Seconds of a step of each, in turn, and of its parts."""
+
+    def plain_step() -> None:
+        with _plainly():
+            reference.take_step()
+
+    times = interleaved({"ours": ours.take_step, "reference": plain_step}, repeats, seconds=120)
+    config = ours.config
+    row: Row = {"name": f"step of small, {config.tasks} x {config.rays} rays", "threads": torch.get_num_threads()}
+    row["seconds"] = statistics.median(times["ours"].wall)
+    row["reference_seconds"] = statistics.median(times["reference"].wall)
+    row |= ratio(times["reference"].wall, times["ours"].wall)
+    rows = [row, *step_parts("ours", ours)]
+    with _plainly():
+        return [*rows, *step_parts("reference", reference)]
+
+
+@contextmanager
+def _plainly() -> Generator[None]:
+    """The time in which the U-Net convolves by PyTorch's modules alone."""
+
+    def pointwise(layer: nn.Conv3d, *inputs: Tensor) -> Tensor:
+        return conv3d(torch.cat(inputs, 1), layer.weight, layer.bias)
+
+    with (
+        patch.object(volume_network._Convolution, "forward", nn.Conv3d.forward),
+        patch.object(volume_network._Pointwise, "forward", pointwise),
+    ):
+        yield
