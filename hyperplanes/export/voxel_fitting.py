@@ -20,8 +20,8 @@ __all__ = ["STEPS", "fit_voxels", "render_guide"]
 
 STEPS = 80
 RAYS = 8192
-DENSITY_RATE = 0.1  # of optical depth through a voxel
-COLOUR_RATE = 0.02
+DENSITY_RATE = 0.05  # of optical depth through a voxel
+COLOUR_RATE = 0.01
 DECAY = 0.1  # of both rates, from the first step to the last
 STOP = 0.01  # transmittance below which a ray is finished: what lies behind has next to no gradient
 SMALLEST_DEPTH = 1e-4  # of a voxel: colour has no gradient where density is zero
