@@ -32,6 +32,9 @@ PATIENCE = 2.0
 """Seconds in which workers end that were sent the signal as well, as by `timeout`: a second one would end a training
 before its checkpoint is written."""
 
+SAVING = 10.0
+"""Seconds that they have for it."""
+
 
 @dataclass(frozen=True)
 class Training:
@@ -80,6 +83,10 @@ class Workers:
                 child.join(max(0.0, until - time.monotonic()))
             for child in children:
                 child.terminate()  # of those that have ended, nothing
+            until = time.monotonic() + SAVING
+            for child in children:  # one that ended with the lock of the pool's queue leaves others waiting for it
+                child.join(max(0.0, until - time.monotonic()))
+                child.kill()
         self._pool.shutdown()
 
     def train(self, given: Mapping[str, Path], training: Training) -> Future[None]:
