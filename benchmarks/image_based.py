@@ -146,6 +146,7 @@ class _FeatureField(ImageBasedField):
         return torch.cat([super().slots(points, seen, colours), features], -1)
 
     @cached_property
+    @torch.enable_grad()  # densities are asked for first, without gradients
     def _feature_planes(self) -> ImagePlanes:
         planes, weights = self.planes.colours, self.parameters
         value = relu(conv2d(2 * planes.images - 1, weights["encoder.0.weight"], weights["encoder.0.bias"], padding=1))

@@ -22,7 +22,11 @@ One with an attribute `thread_safe` that is true is evaluated by several threads
 
 @runtime_checkable
 class SplitField(Protocol):
-    """A field whose colours can be asked for later than its densities, at some of the points."""
+    """A field whose colours can be asked for later than its densities, at some of the points.
+
+    In training its densities are asked for without gradients first, to choose the samples that get one: what a field
+    keeps from call to call, such as features of its views, is to be computed under `torch.enable_grad()`.
+    """
 
     def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Both at once, as any field."""
