@@ -50,7 +50,7 @@ def main(arguments: list[str]) -> int:
         chosen.counts, chosen.objects, chosen.query, chosen.side, chosen.fit = [3], 1, 1, 32, 2
     model = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint)))
     rows = []
-    for path in suite_folders(parser, chosen):
+    for _, path in suite_folders(parser, chosen):
         data = open_dataset(path)
         names = sorted(data.names("test"))[: chosen.objects]
         for count in chosen.counts:

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.reporting import Row
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.tables import markdown_table
 from hyperplanes.utilities.writing import write_whole
@@ -61,13 +62,17 @@ def fill(text: str, results: Path = RESULTS, page: Path | str = "page") -> str:
         name = found[2]
         if name not in TABLES:
             raise DataError(f"{page}: expected a table of {', '.join(TABLES)}, found {name}; correct its marker")
-        path = results / f"{name}.json"
-        if not path.is_file():
-            raise DataError(f"{path}: expected the rows of {page}, found nothing; run python -m benchmarks {name}")
-        result = json.loads(path.read_text(encoding="utf-8"))
-        return f"{found[1]}{TABLES[name](result).rstrip()}\n\n{_measured(result)}\n{found[3]}"
+        made = [_read(results / f"{each}.json", page) for each in SOURCES.get(name, (name,))]
+        measured = "\n".join(dict.fromkeys(_measured(result) for result in made))
+        return f"{found[1]}{TABLES[name](*made).rstrip()}\n\n{measured}\n{found[3]}"
 
     return MARKED.sub(replaced, text)
+
+
+def _read(path: Path, page: Path | str) -> Result:
+    if not path.is_file():
+        raise DataError(f"{path}: expected the rows of {page}, found nothing; run python -m benchmarks {path.stem}")
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def _measured(result: Result) -> str:
@@ -84,6 +89,24 @@ def _seconds(value: float) -> str:
     return f"{value:.{0 if value >= 10 else 1 if value >= 2 else 2}f} s"
 
 
+def _adapting(result: Result) -> str:
+    lines = []
+    for row in result["rows"]:
+        lines.append([row["name"].split(", ", 2)[2], _seconds(row["seconds"]), f"{row['psnr']:.2f} dB"])
+    return markdown_table(["from files to something that renders", "seconds", "PSNR"], lines)
+
+
+def _baked(result: Result) -> str:
+    lines = []
+    for row in result["rows"]:
+        quality = [f"{row[name]:.2f} dB" for name in ("field", "baked", "fitted")]
+        times = [_seconds(row[name] / 1000) for name in ("field_ms", "voxels_ms")]
+        name = f"{row['name']} ({row['objects']}), {row['views']} views"
+        lines.append([name, *quality, *times, _seconds(row["bake_seconds"] + row["fit_seconds"])])
+    headings = ["field, one step", "voxels as baked", "fitted", "a view by the field", "by voxels", "made in"]
+    return markdown_table(["", *headings], lines)
+
+
 def _busy(result: Result) -> str:
     rows = [row for row in result["rows"] if row["policy"] == "passive"]
     found = {(row["name"], row["load"], row["threads"]): row for row in rows}
@@ -93,6 +116,16 @@ def _busy(result: Result) -> str:
         ratios = [f"{found[name, load, 2]['speedup']:.2f}" for load in ("idle", "busy")]
         lines.append([f"{name.replace('_', '-')} ({one} by one thread)", *ratios])
     return markdown_table(["two threads over one", "alone", "beside two busy processes"], lines)
+
+
+def _generation(result: Result) -> str:
+    lines = []
+    for row in result["rows"]:
+        if row["name"].startswith("generate, "):
+            rates = [f"{row[name]:.0f}" for name in ("reference_images_per_second", "images_per_second")]
+            over = f"{row['speedup']:.1f} ({row['speedup_low']:.1f} to {row['speedup_high']:.1f})"
+            lines.append([row["name"].removeprefix("generate, "), *rates, over, f"{row['processor_speedup']:.1f}"])
+    return markdown_table(["", "loop, images/s", "ours, images/s", "ratio", "in processor time"], lines)
 
 
 def _lookup(result: Result) -> str:
@@ -125,7 +158,7 @@ def _rendering(result: Result) -> str:
         last = [_seconds(baked["seconds"]), f"{baked['psnr_loss']:.2f} dB"] if baked else ["-", "-"]
         other = f", commit {row['commit']}" if "commit" in row else ""
         lines.append([f"{size[1]}{other}", *times, f"{row['psnr_loss']:.2f} dB", adapting, *last])
-    headings = ["`paper`", "`fast`", "times faster", "PSNR lost", "adapting and refining", "baked"]
+    headings = ["`paper`", "`ray_marching`", "ratio", "PSNR lost", "adapting and refining", "baked"]
     return markdown_table(["one view", *headings, "PSNR lost by baking"], lines)
 
 
@@ -137,7 +170,7 @@ def _training(result: Result) -> str:
             over = f"{row['speedup']:.1f} ({row['speedup_low']:.1f} to {row['speedup_high']:.1f})"
             memory = [f"{row[name]:.0f} MB" for name in ("reference_peak_megabytes", "peak_megabytes")]
             lines.append([found[1], *rates, over, *memory])
-    headings = ["`paper`, rays/s", "`fast`, rays/s", "times as many", "memory, `paper`", "`fast`"]
+    headings = ["`paper`, rays/s", "`ray_marching`, rays/s", "ratio", "memory, `paper`", "`ray_marching`"]
     return markdown_table(["preset", *headings], lines)
 
 
@@ -181,13 +214,105 @@ def _splats(result: Result) -> str:
     return markdown_table(["", "the model's field", "voxels", "splats", "number", "fitted in"], lines)
 
 
-TABLES: dict[str, Callable[[Result], str]] = {
+NAMES = {
+    "cars": "cars",
+    "chairs": "chairs",
+    "planes": "planes",
+    "lamps": "lamps",
+    "random-unseen": "compositions of random shapes",
+    "chair": "a chair (Blender, CC0)",
+}
+"""Data sets of the suites, as the pages call them."""
+METHODS = {
+    "nearest_view": "the nearest view",
+    "hull_blend": "`hull_blend`",
+    "swapped": "the update of another object",
+    "one_step": "**`small`**",
+}
+"""Rows of the table of views, in its order."""
+
+
+RowsOfViews = dict[tuple[str, int], Row]  # by method and number of views
+
+
+def _of_views(results: tuple[Result, ...]) -> tuple[dict[str, RowsOfViews], list[int]]:
+    """Rows of every data set, by the name that the pages call it, and all numbers of views."""
+    found: dict[str, RowsOfViews] = {}
+    for row in (row for result in results for row in result["rows"]):
+        name = f"CC0 {NAMES[row['data']]}" if row["suite"] == "cc0" else NAMES[row["data"]]
+        found.setdefault(name, {})[row["name"], row["views"]] = row
+    return found, sorted({count for rows in found.values() for _, count in rows})
+
+
+def _table_of_views(counts: list[int], lines: list[list[str]]) -> str:
+    return markdown_table(["", *(f"{count} view{'s' if count > 1 else ''}" for count in counts)], lines)
+
+
+def _views(*results: Result) -> str:
+    found, counts = _of_views(results)
+    lines = []
+    for name, rows in found.items():
+        number = next(iter(rows.values()))["objects"]
+        for method, label in METHODS.items():
+            scores = [rows.get((method, count)) for count in counts]
+            if any(scores):
+                cells = (f"{row['psnr']:.2f}" if row else "-" for row in scores)
+                lines.append([f"{name} ({number}): {label}", *cells])
+    return _table_of_views(counts, lines)
+
+
+def _views_over(*results: Result) -> str:
+    found, counts = _of_views(results)
+    lines = []
+    for name, rows in found.items():
+        cells = []
+        for row in (rows.get(("one_step", count)) for count in counts):
+            cell = f"{row['over_hull_blend']:+.2f}" if row else "-"
+            if row and "over_hull_blend_low" in row:
+                cell += f" ({row['over_hull_blend_low']:+.1f} to {row['over_hull_blend_high']:+.1f})"
+            cells.append(cell)
+        lines.append([name, *cells])
+    return _table_of_views(counts, lines)
+
+
+def _views_summary(*results: Result) -> str:
+    found, _ = _of_views(results)
+    lines = []
+    for name, rows in found.items():
+        pairs = ((rows["one_step", count], rows["hull_blend", count]) for count in SUMMARY)
+        lines.append([name, *(f"{ours['psnr']:.1f} ({blended['psnr']:.1f})" for ours, blended in pairs)])
+    return _table_of_views(list(SUMMARY), lines)
+
+
+def _views_tuned(result: Result) -> str:
+    found, counts = _of_views((result,))
+    lines = []
+    for name, rows in found.items():
+        for count in counts:
+            scores = [rows[method, count]["psnr"] for method in ("hull_blend", "one_step", "100_steps", "scratch_100")]
+            objects = rows["one_step", count]["objects"]
+            lines.append([f"{name} ({objects})", str(count), *(f"{score:.2f}" for score in scores)])
+    return markdown_table(["", "views", "`hull_blend`", "one step", "100 steps", "100 from random weights"], lines)
+
+
+SUMMARY = (3, 5, 25)  # numbers of views in README
+OF_VIEWS = ("views_procedural", "views_cc0", "views_random", "views_posed")
+SOURCES = {"views": OF_VIEWS, "views_over": OF_VIEWS, "views_summary": OF_VIEWS}
+"""Files of rows of tables that are not made of the file of their name."""
+TABLES: dict[str, Callable[..., str]] = {
+    "adapting": _adapting,
+    "baked": _baked,
     "busy": _busy,
+    "generation": _generation,
     "lookup": _lookup,
     "rendering": _rendering,
     "small": _small,
     "splats": _splats,
     "steps": _steps,
     "training": _training,
+    "views": _views,
+    "views_over": _views_over,
+    "views_summary": _views_summary,
+    "views_tuned": _views_tuned,
 }
 """What makes the table of each benchmark of its rows."""

@@ -1,7 +1,7 @@
 """PSNR over the number of support views: a model that takes any number of them, beside what learns nothing.
 
     python -m benchmarks views --checkpoint small --data data/cars data/chairs --json FILE
-    python -m benchmarks views --suite random --objects 10 --json FILE
+    python -m benchmarks views --suite procedural random --objects 10 --json FILE
     python -m benchmarks views --suite srn --inputs 64 128 --objects 10 --json FILE
 
 Of every held-out object some query views are kept back to be judged by; of all others, support and query alike, so many
@@ -92,7 +92,7 @@ def main(arguments: list[str]) -> int:
         chosen.counts = [len(chosen.inputs)]
     model, rows, sheet = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint))), [], []
     model.config = replace(model.config, second_pass=chosen.second_pass or model.config.second_pass)
-    for path in folders:
+    for suite, path in folders:
         data = open_dataset(path)
         names = sorted(data.names("test"))[: chosen.objects]
         seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count: truth and prediction of every view
@@ -103,6 +103,7 @@ def main(arguments: list[str]) -> int:
             plain: Score | None = None
             for method, adapter in adapters(model, shown, names, chosen.methods, steps).items():
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
+                row |= {"suite": suite} if suite else {}
                 row |= {"second_pass": True} if chosen.second_pass else {}
                 row |= {"rotated": chosen.rotated} if chosen.rotated else {}
                 made = seen.setdefault(count, []) if method == "one_step" else []
@@ -133,20 +134,23 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
     """--checkpoint, and --data or --suite and --root, which `suite_folders` reads."""
     parser.add_argument("--checkpoint", default="small", help="a folder, or the name of a packaged model")
     parser.add_argument("--data", type=Path, nargs="+", help="data sets, or single scenes")
-    parser.add_argument("--suite", choices=SUITES, help="instead of --data: data sets in the folder --root")
+    parser.add_argument("--suite", choices=SUITES, nargs="+", help="instead of --data: data sets in the folder --root")
     parser.add_argument("--root", type=Path, default=Path("data"), help="of the suites")
 
 
-def suite_folders(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -> list[Path]:
-    """The data sets that --data, or --suite and --root, name; the parser says what is wrong with them."""
+def suite_folders(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -> list[tuple[str, Path]]:
+    """The data sets that --data, or --suite and --root, name, each with its suite, "" for none.
+
+    The parser says what is wrong with them.
+    """
     if (chosen.data is None) == (chosen.suite is None):
         parser.error("--data, --suite: expected one of the two")
     if chosen.suite is None:
-        return chosen.data
-    folders = [chosen.root / name for name in SUITES[chosen.suite]]
-    for path in folders:
+        return [("", path) for path in chosen.data]
+    folders = [(suite, chosen.root / name) for suite in chosen.suite for name in SUITES[suite]]
+    for suite, path in folders:
         if not path.exists():
-            parser.error(f"--root: expected {path}, found nothing there; make it by\n  {made_by(chosen.suite, path)}")
+            parser.error(f"--root: expected {path}, found nothing there; make it by\n  {made_by(suite, path)}")
     return folders
 
 

@@ -147,6 +147,28 @@ def test_a_table_has_the_numbers_of_its_rows_and_the_load_they_were_measured_wit
             tables.fill(f"<!-- benchmarks {name} -->\n<!-- end -->", tmp_path)
 
 
+def test_tables_of_views_take_the_rows_of_all_suites(tmp_path):
+    """By hand: two suites of one object name; a number of views that only one of them was measured with."""
+    machine = {"processor": "a processor", "cores": 4, "threads": 2, "commit": "abc1234", "load": 0.25}
+    for suite, counts in (("procedural", (3, 5, 25)), ("cc0", (3, 5, 10, 25)), ("random", ()), ("posed", ())):
+        rows = []
+        for count in counts:
+            row = {"suite": suite, "data": "cars", "views": count, "objects": 10}
+            over = {"over_hull_blend": 2.5, "over_hull_blend_low": 2.04, "over_hull_blend_high": 2.96}
+            rows.append({"name": "hull_blend", "psnr": 20.0 + count, **row})
+            rows.append({"name": "one_step", "psnr": 22.5 + count, **row, **over})
+        (tmp_path / f"views_{suite}.json").write_text(json.dumps({**machine, "rows": rows}))
+    found = {
+        name: tables.fill(f"<!-- benchmarks {name} -->\n<!-- end -->", tmp_path)
+        for name in ("views", "views_over", "views_summary")
+    }
+    assert "| cars (10): **`small`** | 25.50 | 27.50 | - | 47.50 |" in found["views"]
+    assert "| CC0 cars (10): `hull_blend` | 23.00 | 25.00 | 30.00 | 45.00 |" in found["views"]
+    assert "| cars | +2.50 (+2.0 to +3.0) | +2.50 (+2.0 to +3.0) | - | +2.50 (+2.0 to +3.0) |" in found["views_over"]
+    assert "| CC0 cars | 25.5 (23.0) | 27.5 (25.0) | 47.5 (45.0) |" in found["views_summary"]
+    assert found["views"].count("commit abc1234") == 1
+
+
 def test_a_process_that_spins_is_a_load():
     """Property: one spinning process keeps about one core busy, less where others run beside it."""
     from benchmarks.load import measure_load
