@@ -1,6 +1,6 @@
 """Poses and masks that `capture` finds for staged photographs, against those that they were taken with.
 
-    python -m benchmarks captures --meshes FOLDER --count 3 --json FILE
+    python -m benchmarks captures --meshes MESH_OR_FOLDER ... --checkpoint small --json FILE
 
 Every object stands on a table in a textured room and is photographed through a lens, with other exposures, blur and
 noise for each picture. The poses that were found are brought into the true world by the similarity that fits the
@@ -8,15 +8,20 @@ cameras' centres best; masks are compared where the lens has been taken out. Wit
 of the views, and the other half, over white by their true masks, are compared with its renderings: with what was found,
 with what is true, with masks that are damaged on purpose (every fourth lacks a part, or has one too many, and all are
 soft), and without masks, with a learned background and without.
+
+Each scene is measured in parts, which are kept in the folder --keep: the same call of the same commit goes on where it
+was interrupted. Rows of other scenes that FILE holds stay there, with the commit that they were measured with.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from unittest.mock import patch
 
@@ -26,12 +31,13 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch.nn.functional import interpolate
 
-from benchmarks.reporting import Row, finish
+from benchmarks.reporting import Row, finish, write_rows
 from benchmarks.staged_photographs import Staged, stage, walk_around
 from data_gen.meshes.find import find_meshes
 from data_gen.meshes.mesh import load_mesh
 from hyperplanes.adaptation.background import separate_background
 from hyperplanes.adaptation.base import Adapter
+from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.capture import Settings, capture
@@ -41,11 +47,14 @@ from hyperplanes.capture.pipeline import ROOM
 from hyperplanes.capture.placement import object_points, object_sphere
 from hyperplanes.capture.scene import straightened
 from hyperplanes.capture.sparse_model import SparseModel
+from hyperplanes.capture.stages import Stages, fingerprint
 from hyperplanes.data import read_task
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.pictures.images import Pixels, composite_over_white, read_image
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.environment import find_commit
+from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.utilities.writing import write_json, write_whole
 from hyperplanes.views import Views
@@ -53,7 +62,8 @@ from hyperplanes.views import Views
 __all__ = ["PoseErrors", "compare_poses", "damaged_masks", "main"]
 
 SHOWN, COMPARED = 320, 160  # pixels along the longer side of the views that are shown, and of those compared
-HEIGHTS = (15.0, 45.0)  # of the rounds, in degrees: with 36 photographs a step of 20 degrees
+HEIGHTS = (12.0, 35.0, 58.0)  # of the rounds, in degrees: with 36 photographs a step of 30 degrees
+OCTAVES = 4  # of the noise on table and walls: a coarse texture, with few details to recognise
 SOFT = 0.008  # of the longer side: deviation of the blur of a damaged mask
 PART = 0.25  # of the area of the object, that is lost or added
 
@@ -107,64 +117,144 @@ def main(arguments: list[str]) -> int:
         arguments: see --help.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks captures", description=__doc__)
-    parser.add_argument("--meshes", type=Path, help="a folder of meshes; an ellipsoid where it is not given")
-    parser.add_argument("--count", type=int, default=3, help="objects")
-    parser.add_argument("--views", type=int, default=45)
-    parser.add_argument("--size", type=int, default=640, help="pixels along the longer side")
+    parser.add_argument("--meshes", type=Path, nargs="+", help="meshes, and folders of them; ellipsoids if not given")
+    parser.add_argument("--count", type=int, default=3, help="objects of each folder, or ellipsoids")
+    parser.add_argument("--views", type=int, default=36)
+    parser.add_argument("--size", type=int, default=560, help="pixels along the longer side")
     parser.add_argument("--mask", default="auto", help="as of `hyperplanes capture`")
     parser.add_argument("--checkpoint", help="a model to compare new views with")
-    parser.add_argument("--keep", type=Path, help="a folder for the photographs and the scenes")
-    parser.add_argument("--quick", action="store_true", help="one object, 24 small pictures")
+    parser.add_argument(
+        "--parts", nargs="+", choices=list(PARTS), default=list(PARTS), help="of a measurement (default: all)"
+    )
+    parser.add_argument(
+        "--keep", type=Path, default=Path("runs/captures"), help="for photographs and scenes (default: %(default)s)"
+    )
+    parser.add_argument("--quick", action="store_true", help="one object, 24 small pictures; nothing is kept")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     if options.quick:
         options.count, options.views, options.size = 1, 24, 400
-    paths: list[Path | None] = [None] * options.count
-    if options.meshes is not None:
-        found = [item.path for item in find_meshes(options.meshes)]
-        paths = list(found[:: max(1, len(found) // options.count)][: options.count])
     with tempfile.TemporaryDirectory() as scratch:
-        home = options.keep or Path(scratch)
-        rows = [_measured(path, index, home / f"{index:02d}", options) for index, path in enumerate(paths)]
+        if options.quick:
+            options.keep = Path(scratch)
+        scenes = _scenes(options)
+        rows = _rows_of_others(options.json, {scene.name for scene in scenes})
+        for scene in scenes:
+            rows.append(scene.measure())
+            if options.json is not None:
+                write_rows("captures", rows, options.json)
     return finish("captures", rows, options.json)
 
 
-def _measured(path: Path | None, index: int, folder: Path, options: argparse.Namespace) -> Row:
-    size = 3 * options.size // 4, options.size
-    mesh = None if path is None else load_mesh(path)
-    staged = stage(walk_around(options.views, index, HEIGHTS), size, seed=index, mesh=mesh)
-    staged.save(folder / "photographs")
-    captured = capture(folder / "photographs", folder / "scene", Settings(options.size, options.mask))
-    model = SparseModel.load(folder / "scene" / "capture" / "poses" / "model.npz")
-    errors = compare_poses(np.linalg.inv(model.camera_from_world), staged.world_from_camera[model.pictures])
-    truth = {
-        _name(view): _straight(staged, view, model.calibrations[row], model.lenses[row])
-        for row, view in enumerate(model.pictures.tolist())
-    }
-    row: Row = {
-        "name": "ellipsoid" if path is None else path.stem,
-        "views": options.views,
-        "posed": len(model),
-        "within_half_degree_1_percent": errors.within(0.5, 1.0),
+def _scenes(options: argparse.Namespace) -> list[_Scene]:
+    """One for each mesh."""
+    paths: dict[str, Path | None] = {}
+    if options.meshes is None:
+        paths = {f"ellipsoid_{index}": None for index in range(options.count)}
+    for given in options.meshes or ():
+        found = [given] if given.is_file() else [item.path for item in find_meshes(given)]
+        for path in found[:: max(1, len(found) // options.count)][: options.count]:
+            if path.stem in paths:
+                raise DataError(path, "meshes of different names", "two of one name", "rename one")
+            paths[path.stem] = path
+    return [_Scene(name, path, index, options) for index, (name, path) in enumerate(paths.items())]
+
+
+def _rows_of_others(path: Path | None, names: set[str]) -> list[Row]:
+    """The rows of a file that are not about to be measured."""
+    if path is None or not path.is_file():
+        return []
+    return [row for row in json.loads(path.read_text(encoding="utf-8"))["rows"] if row["name"] not in names]
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """An object that is photographed, and what is kept of its measurement."""
+
+    name: str
+    path: Path | None
+    seed: int
+    options: argparse.Namespace
+    key: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        asked = [getattr(self.options, name) for name in ("views", "size", "mask", "checkpoint")]
+        object.__setattr__(self, "key", fingerprint(find_commit(), self.path, self.seed, asked))
+
+    @property
+    def folder(self) -> Path:
+        return self.options.keep / self.name
+
+    def measure(self) -> Row:
+        """All parts, those left out that were done."""
+        row: Row = {"name": self.name, "commit": find_commit(), "views": self.options.views}
+        stages = Stages(self.folder)
+        for part, measured in PARTS.items():
+            if part == "capture" or (part in self.options.parts and self.options.checkpoint is not None):
+                done = stages.begin(part, self.key)
+                row |= stages.finish(part, self.key, measured(self)) if done is None else done
+        print(row, flush=True)
+        return row
+
+    @cached_property
+    def staged(self) -> Staged:
+        size = 3 * self.options.size // 4, self.options.size
+        mesh = None if self.path is None else load_mesh(self.path)
+        poses = walk_around(self.options.views, self.seed, HEIGHTS)
+        return stage(poses, size, seed=self.seed, mesh=mesh, octaves=OCTAVES)
+
+    @property
+    def scene(self) -> Path:
+        """What `capture` writes."""
+        return self.folder / "capture" / "scene"
+
+    @cached_property
+    def model(self) -> SparseModel:
+        """What structure from motion found."""
+        return SparseModel.load(self.scene / "capture" / "poses" / "model.npz")
+
+    @cached_property
+    def truth(self) -> dict[str, Pixels]:
+        """The photographs that were posed, with their true masks, as the cameras that were found have them."""
+        found = zip(self.model.pictures.tolist(), self.model.calibrations, self.model.lenses, strict=True)
+        return {_name(view): _straight(self.staged, view, calibration, lens) for view, calibration, lens in found}
+
+    @cached_property
+    def checkpoint(self) -> HyperPlanes:
+        return HyperPlanes.from_pretrained(find_checkpoint(Path(self.options.checkpoint)))
+
+
+def _captured(scene: _Scene) -> Row:
+    """Poses and masks that were found."""
+    photographs = scene.folder / "capture" / "photographs"
+    if not photographs.is_dir():  # else their capture was interrupted, and goes on
+        scene.staged.save(photographs)
+    captured = capture(photographs, scene.scene, Settings(scene.options.size, scene.options.mask))
+    errors = compare_poses(np.linalg.inv(scene.model.camera_from_world), _true_poses(scene))
+    return {
+        "posed": len(scene.model),
+        "within_half_degree_1_percent": errors.within(0.5, 1.0) * len(scene.model) / scene.options.views,
         "degrees_median": float(np.median(errors.degrees)),
         "percent_median": float(np.median(errors.percent)),
         "mask": captured.mask,
-        "mask_iou": _overlap(_read_masks(folder / "scene", truth), truth),
+        "mask_iou": _overlap(_read_masks(scene.scene, scene.truth), scene.truth),
     }
-    if options.checkpoint is not None:
-        checkpoint = HyperPlanes.from_pretrained(Path(options.checkpoint))
-        true = {
-            _name(view): _straight(staged, view, staged.calibration, staged.lens) for view in range(len(staged.masks))
-        }
-        _write_true(folder / "true", staged, true)
-        row["psnr"] = _quality(folder / "scene", checkpoint, truth)
-        row["psnr_true"] = _quality(folder / "true", checkpoint, true)
-        row["psnr_loss"] = float(row["psnr_true"]) - float(row["psnr"])
-        row["psnr_nearest"] = _quality(folder / "true", NearestView(), true)
-        row |= _damaged(folder, model, truth, checkpoint, index)
-        row |= _without_masks(folder / "scene", truth, checkpoint)
-    print(row, flush=True)
-    return row
+
+
+def _true_poses(scene: _Scene) -> Float[np.ndarray, "camera 4 4"]:
+    """Of the photographs that were posed, world_from_camera."""
+    return scene.staged.world_from_camera[scene.model.pictures]
+
+
+def _new_views(scene: _Scene) -> Row:
+    """Views that the model was not shown, by what was found and by what is true."""
+    staged, folder = scene.staged, scene.folder / "views" / "true"
+    true = {_name(view): _straight(staged, view, staged.calibration, staged.lens) for view in range(len(staged.masks))}
+    _write_true(folder, staged, true)
+    found = _quality(scene.scene, scene.checkpoint, scene.truth)
+    best = _quality(folder, scene.checkpoint, true)
+    nearest = _quality(folder, NearestView(), true)
+    return {"psnr": found, "psnr_true": best, "psnr_loss": best - found, "psnr_nearest": nearest}
 
 
 def _name(view: int) -> str:
@@ -212,20 +302,27 @@ def _quality(
         method: what adapts to half of it.
         truth: the photographs.
         prepare: what is done with the support views before.
+
+    Returns:
+        PSNR; NaN where the masks leave nothing.
     """
     task = read_task(scene, up="auto")
     shown = (task.support if prepare is None else prepare(task.support)).resized(SHOWN)
     cameras = task.query.resized(COMPARED).cameras
-    pictures = method.adapt(shown).render(cameras).images.clamp(0, 1)
+    try:
+        pictures = method.adapt(shown).render(cameras).images.clamp(0, 1)
+    except ValueError:  # a hull that is carved to nothing
+        return float("nan")
     wanted = np.stack([truth[Path(name).stem] for name in task.query.names]).transpose(0, 3, 1, 2)
     true, _ = composite_over_white(torch.from_numpy(np.ascontiguousarray(wanted)))
     true = interpolate(true, pictures.shape[2:], mode="area")
     return float(psnr(pictures, true).mean())
 
 
-def _damaged(folder: Path, model: SparseModel, truth: Mapping[str, Pixels], checkpoint: HyperPlanes, seed: int) -> Row:
+def _damaged(scene: _Scene) -> Row:
     """What masks that are wrong on purpose do: as they are, mended by one mask's word, and by the vote of all."""
-    masks = damaged_masks([picture[..., 3] / 255 for picture in truth.values()], seed)
+    truth, model = scene.truth, scene.model
+    masks = damaged_masks([picture[..., 3] / 255 for picture in truth.values()], scene.seed)
     around = object_sphere(model, object_points(model, masks))
     room = Sphere(around.centre, ROOM * around.radius)
     ways = {"damaged": masks}
@@ -234,17 +331,14 @@ def _damaged(folder: Path, model: SparseModel, truth: Mapping[str, Pixels], chec
             ways[f"damaged_{way}"] = agree(masks, model, room).masks
     result: Row = {}
     for way, found in ways.items():
-        scene = folder / way
-        shutil.rmtree(scene, ignore_errors=True)
-        shutil.copytree(folder / "scene", scene, ignore=shutil.ignore_patterns("capture"))
+        folder = scene.folder / "damaged" / way
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(scene.scene, folder, ignore=shutil.ignore_patterns("capture"))
         for name, mask in zip(truth, found, strict=True):
             pixels = (mask * 255).round().astype(np.uint8)
-            write_whole(scene / "masks" / f"{name}.png", encode_png(pixels), durable=False)
+            write_whole(folder / "masks" / f"{name}.png", encode_png(pixels), durable=False)
         result[f"mask_iou_{way}"] = _overlap(found, truth)
-        try:
-            result[f"psnr_{way}"] = _quality(scene, checkpoint, truth)
-        except ValueError:  # a hull that is carved to nothing
-            result[f"psnr_{way}"] = float("nan")
+        result[f"psnr_{way}"] = _quality(folder, scene.checkpoint, truth)
     return result
 
 
@@ -268,23 +362,25 @@ def damaged_masks(masks: Sequence[np.ndarray], seed: int) -> list[np.ndarray]:
     return result
 
 
-def _without_masks(scene: Path, truth: Mapping[str, Pixels], checkpoint: HyperPlanes) -> Row:
-    """The same poses without masks: as the model takes them, with a learned background, and fitted without a room."""
+def _without_masks(scene: _Scene) -> Row:
+    """The same poses without masks: as the model takes them, and with a learned background."""
 
     def bare(views: Views) -> Views:
-        pictures = np.stack([truth[Path(name).stem][..., :3] for name in views.names]).transpose(0, 3, 1, 2)
+        pictures = np.stack([scene.truth[Path(name).stem][..., :3] for name in views.names]).transpose(0, 3, 1, 2)
         return replace(views, images=torch.from_numpy(np.ascontiguousarray(pictures)).float() / 255, masks=None)
 
-    def learned(views: Views, *, room: bool) -> Views:
+    def learned(views: Views) -> Views:
         views = bare(views)
-        return separate_background(views, room=room).cut_out(views)
+        return separate_background(views).cut_out(views)
 
-    found: Row = {"psnr_no_masks": _quality(scene, checkpoint, truth, bare)}
-    for name, room in (("learned_background", True), ("no_room", False)):
-        try:
-            found[f"psnr_{name}"] = _quality(
-                scene, checkpoint, truth, lambda views, room=room: learned(views, room=room)
-            )
-        except ValueError:  # masks that leave nothing
-            found[f"psnr_{name}"] = float("nan")
-    return found
+    ways = {"no_masks": bare, "learned_background": learned}
+    return {f"psnr_{way}": _quality(scene.scene, scene.checkpoint, scene.truth, made) for way, made in ways.items()}
+
+
+PARTS: dict[str, Callable[[_Scene], Row]] = {
+    "capture": _captured,
+    "views": _new_views,
+    "damaged": _damaged,
+    "without_masks": _without_masks,
+}
+"""Of a measurement, in their order; all but the first need a model."""

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from benchmarks.load import load_at_start
 from hyperplanes.utilities.environment import environment
+from hyperplanes.utilities.writing import write_whole
 
-__all__ = ["Row", "finish"]
+__all__ = ["Row", "finish", "write_rows"]
 
 Row = dict[str, str | float | int]
 
@@ -28,7 +29,17 @@ def finish(name: str, rows: list[Row], json_file: Path | None) -> int:
         numbers = (f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items())
         print("  ".join(numbers).removeprefix("name "))
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        content = {"benchmark": name, **environment(), "load": round(load_at_start(), 2), "rows": rows}
-        json_file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_rows(name, rows, json_file)
     return 0
+
+
+def write_rows(name: str, rows: list[Row], json_file: Path) -> None:
+    """Write rows with the commit and the hardware.
+
+    Args:
+        name: of the benchmark.
+        rows: what was measured.
+        json_file: where to.
+    """
+    content = {"benchmark": name, **environment(), "load": round(load_at_start(), 2), "rows": rows}
+    write_whole(json_file, (json.dumps(content, indent=2) + "\n").encode())

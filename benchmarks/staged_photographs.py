@@ -103,6 +103,7 @@ def stage(
     noise: float = 0.01,
     focal: float = 1.15,
     samples: int = 2,
+    octaves: int = 6,
 ) -> Staged:
     """Take the photographs.
 
@@ -117,6 +118,7 @@ def stage(
         noise: standard deviation of the noise of a grey pixel, of 1.
         focal: focal length in units of the longer side.
         samples: along a side of a pixel, of the room and the ellipsoid.
+        octaves: of the noise that room and table are painted with; fewer leave out the finest details.
     """
     generator = np.random.default_rng(seed)
     texture = generator.random((32, 32, 32, 3)).astype(np.float32)
@@ -131,7 +133,8 @@ def stage(
     slopes = _without_lens((pixels - calibration[:2, 2]) / calibration[[0, 1], [0, 1]], lens)
     photographs, masks = [], []
     for view, pose in enumerate(poses):
-        colour, mask = _seen(pose, slopes.reshape(height, samples, width, samples, 2), texture, mesh is None, floor)
+        some = slopes.reshape(height, samples, width, samples, 2)
+        colour, mask = _seen(pose, some, texture, mesh is None, floor, octaves)
         if drawn is not None:
             over = _through_lens(drawn[view].astype(np.float32) / 255, source)
             colour = over[..., :3] + colour * (1 - over[..., 3:])
@@ -162,7 +165,7 @@ def _drawn(
     return premultiplied, lowest
 
 
-def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float) -> tuple[Array, Array]:
+def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float, octaves: int) -> tuple[Array, Array]:
     """Colour and coverage by the ellipsoid, the mean of the samples (row, sample, column, sample, 2) a pixel."""
     shape, slopes = slopes.shape[:4], slopes.reshape(-1, 2)
     ways = np.concatenate([slopes, np.ones_like(slopes[:, :1])], -1) @ pose[:3, :3].T
@@ -172,7 +175,7 @@ def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float) 
         table = np.where(ways[:, 1] < 0, (floor - eye[1]) / ways[:, 1], np.inf)
     distance = np.minimum(walls, table)
     points = eye + distance[:, None] * ways
-    colour = _texture(points, texture, 1.6)
+    colour = _texture(points, texture, 1.6, octaves)
     colour = (0.35 * colour + 0.65 * colour.mean(-1, keepdims=True)) * np.where(table < walls, 0.95, 0.75)[:, None]
     covered = np.zeros(len(ways))
     if ball:
@@ -183,7 +186,7 @@ def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float) 
         normal = near / AXES**2
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         shade = 0.45 + 0.55 * (normal @ (LIGHT / np.linalg.norm(LIGHT))).clip(0)
-        colour[hit] = (0.25 + 0.75 * _texture(near, texture, 4.0)) * shade[:, None] * [1.0, 0.7, 0.45]
+        colour[hit] = (0.25 + 0.75 * _texture(near, texture, 4.0, octaves)) * shade[:, None] * [1.0, 0.7, 0.45]
         covered[hit] = 1.0
 
     def mean(values: Array) -> Array:
@@ -192,13 +195,13 @@ def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float) 
     return mean(colour), mean(covered)[..., 0]
 
 
-def _texture(points: Array, table: Array, frequency: float) -> Array:
-    """Colours from noise of six octaves, trilinear between the entries of a table that repeats."""
+def _texture(points: Array, table: Array, frequency: float, octaves: int) -> Array:
+    """Colours from noise of some octaves, trilinear between the entries of a table that repeats."""
     side = len(table)
     repeated = np.pad(table, ((0, 1), (0, 1), (0, 1), (0, 0)), mode="wrap") - 0.5
     volume = torch.from_numpy(repeated).permute(3, 2, 1, 0)[None]  # (1, 3, z, y, x)
     total = torch.zeros(3, len(points))
-    for octave in range(6):
+    for octave in range(octaves):
         where = np.mod(points * (frequency * 2.1**octave), side).astype(np.float32)
         grid = torch.from_numpy(2 / side * where - 1)[None, None, None]
         total += 0.75**octave * grid_sample(volume, grid, align_corners=True).reshape(3, -1)

@@ -6,6 +6,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+from hyperplanes.utilities.interrupts import keep_handlers
+
 __all__ = ["is_installed", "require"]
 
 
@@ -15,7 +17,7 @@ def is_installed(name: str) -> bool:
 
 
 def require(name: str, purpose: str) -> Any:
-    """A package of the extra `photos`.
+    """A package of the extra `photos`; signals are handled as before, which pycolmap's import would change.
 
     Args:
         name: of its module.
@@ -25,7 +27,8 @@ def require(name: str, purpose: str) -> Any:
         ValueError: it is not installed, or cannot be imported.
     """
     try:
-        return import_module(name)
+        with keep_handlers():
+            return import_module(name)
     except ImportError as error:
         missing = f"expected the package {name}, which {purpose}, found {error}"
         raise ValueError(f"{missing}; pip install 'hyperplanes[photos]'") from error

@@ -47,7 +47,8 @@ QUALITY = 96  # of JPEG, without subsampled colours
 
 ADVICE = (
     "walk around the object in small steps, about 10 degrees apart, so that neighbouring photographs show mostly the "
-    "same; keep the light and the object still; leave something with texture around it, such as a newspaper under it"
+    "same, and no more than 20 degrees from one height to the next; keep the light and the object still; leave "
+    "something with texture around it, such as a newspaper under it"
 )
 
 
@@ -187,7 +188,8 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
     """The largest model; other features are tried while it holds few of the pictures."""
     order = work.settings.order
     sequential = order == "sequence" or (order == "auto" and is_video)
-    key = fingerprint([asdict(picture) for picture in pictures], sequential, work.stages.key("pictures"))
+    how = [asdict(features) for features in ATTEMPTS]
+    key = fingerprint([asdict(picture) for picture in pictures], sequential, work.stages.key("pictures"), how)
     folder = work.stages.folder / "poses"
     done = work.stages.begin("poses", key)
     if done is not None:

@@ -9,7 +9,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["SIGNALS", "HungUp", "Terminated", "interruptible", "listened_to"]
+__all__ = ["SIGNALS", "HungUp", "Terminated", "interruptible", "keep_handlers", "listened_to"]
 
 AGAIN_SECONDS = 0.2
 """After which an interrupt that was swallowed is raised again."""
@@ -80,6 +80,22 @@ def interruptible() -> Generator[None]:
         sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def keep_handlers() -> Generator[None]:
+    """Python's handlers of SIGNALS are in place again afterwards, whatever native code has put over them.
+
+    Python does not see that: `signal.getsignal` goes on naming its own. The import of pycolmap does so (glog prints a
+    stack trace for SIGTERM). Only the main thread can put them back.
+    """
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                if (handler := signal.getsignal(number)) is not None:
+                    signal.signal(number, handler)
 
 
 def _is_passed_on() -> bool:

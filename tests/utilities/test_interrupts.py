@@ -1,5 +1,6 @@
 """Source of truth: what every verb promises of Ctrl-C and SIGTERM: one line, an exit code, no half-written file."""
 
+import ctypes
 import os
 import signal
 import weakref
@@ -9,7 +10,7 @@ import pytest
 from small_demo import demo_folder, first_object
 
 from hyperplanes.cli import main
-from hyperplanes.utilities.interrupts import Terminated, interruptible
+from hyperplanes.utilities.interrupts import Terminated, interruptible, keep_handlers
 
 SCENE = ["--checkpoint", "{demo}", "--views", "{scene}", "--out"]
 CALLS = {
@@ -105,3 +106,15 @@ def test_cleaning_up_is_not_interrupted_again(monkeypatch):
     with pytest.raises(KeyboardInterrupt), interruptible():
         work()
     assert ended
+
+
+def test_native_code_does_not_keep_signals_from_python():
+    """Of `pycolmap`, whose import takes SIGTERM for a trace of its own; here it is libc that ignores the signal."""
+
+    def ignored_by_libc():
+        with keep_handlers():
+            ctypes.CDLL(None).signal(signal.SIGTERM, ctypes.c_void_p(int(signal.SIG_IGN)))
+        signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Terminated), interruptible():
+        ignored_by_libc()
