@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -18,7 +18,19 @@ if TYPE_CHECKING:
     from hyperplanes.geometry.rays import Sphere
     from hyperplanes.views import Task, Views
 
-__all__ = ["read_object", "read_path", "read_scene", "refuse_sources", "say_up"]
+__all__ = ["prepare_task", "read_object", "read_path", "read_scene", "refuse_sources", "say_up"]
+
+
+class Preparation(Protocol):
+    """Options of what is done with views before anything adapts to them."""
+
+    @property
+    def learn_background(self) -> bool:
+        """Whether the object is cut out of a background that is learned."""
+
+    @property
+    def refine_poses(self) -> bool:
+        """Whether poses are refined."""
 
 
 def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, console: Console) -> tuple[Task, str]:
@@ -30,6 +42,28 @@ def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, co
         arguments: the options.
         source: what will adapt to the views.
         console: where it is said.
+    """
+    task, up = read_scene(
+        arguments.views,
+        console,
+        all_views=arguments.all_views,
+        up=arguments.up,
+        downscale=arguments.downscale,
+    )
+    return prepare_task(arguments, task, source, console, all_views=arguments.all_views), up
+
+
+def prepare_task(
+    arguments: Preparation, task: Task, source: HyperPlanes | BakedScene, console: Console, *, all_views: bool
+) -> Task:
+    """Views whose background is learned and whose poses are refined, where that is asked for.
+
+    Args:
+        arguments: what is asked for.
+        task: the views to show and those to ask for.
+        source: what will adapt to them.
+        console: where it is said.
+        all_views: both are the same.
 
     Raises:
         ValueError: a baked file, which adapts to nothing, and an option that is for adapting.
@@ -38,20 +72,13 @@ def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, co
     from hyperplanes.commands.poses import refine_task
     from hyperplanes.export.baking import BakedScene
 
-    task, up = read_scene(
-        arguments.views,
-        console,
-        all_views=arguments.all_views,
-        up=arguments.up,
-        downscale=arguments.downscale,
-    )
     if arguments.learn_background:
         if isinstance(source, BakedScene):
             raise ValueError("--learn-background: expected a model that adapts to the views, got a baked file")
-        task = cut_out_task(task, console, all_views=arguments.all_views)
+        task = cut_out_task(task, console, all_views=all_views)
     if arguments.refine_poses:
-        task = refine_task(source, task, console, all_views=arguments.all_views)
-    return task, up
+        task = refine_task(source, task, console, all_views=all_views)
+    return task
 
 
 def read_scene(

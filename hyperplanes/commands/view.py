@@ -9,6 +9,7 @@ Example:
     hyperplanes view photos/ --steps 100
     hyperplanes view photos/ --checkpoint chair.safetensors
     hyperplanes view photos/ --refine-poses
+    hyperplanes view photos/ --learn-background
     hyperplanes view photos/ --compare hull_blend scratch_100
 """
 
@@ -25,8 +26,7 @@ import tyro
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import bake_field, load_source
 from hyperplanes.commands.options import OptionalInt, ViewsUp
-from hyperplanes.commands.poses import refine_task
-from hyperplanes.commands.scene import read_scene
+from hyperplanes.commands.scene import prepare_task, read_scene
 
 if TYPE_CHECKING:
     import torch
@@ -54,6 +54,8 @@ class Arguments:
             hull_blend, nearest_view, hyperplanes (the model after one step), or scratch_100.
         port: Of the page on this machine.
         second_pass: Render the views first, and take colours from those that see the surface found there.
+        learn_background: For photographs without masks: learn what lies in the sphere of the scene and the room around
+            it together, and cut the former out.
         refine_poses: Refine the poses of the views first, and keep them where views that the model is not given are
             shown better by half a decibel: for poses that are a little wrong.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
@@ -70,6 +72,7 @@ class Arguments:
     compare: tuple[str, ...] = ()
     port: Annotated[int, range(65_536)] = 8080
     second_pass: bool = False
+    learn_background: bool = False
     refine_poses: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
@@ -85,9 +88,7 @@ def run(arguments: Arguments) -> int:
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
-    if arguments.refine_poses:
-        task = refine_task(source, task, console, all_views=True)
-    shown = task.support.to(device)
+    shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
     baked = isinstance(source, BakedScene)
     others = _others(arguments, device)
