@@ -6,8 +6,8 @@ Every object stands on a table in a textured room and is photographed through a 
 noise for each picture. The poses that were found are brought into the true world by the similarity that fits the
 cameras' centres best; masks are compared where the lens has been taken out. With --checkpoint, a model adapts to half
 of the views, and the other half, over white by their true masks, are compared with its renderings: with what was found,
-with what is true, with masks that are damaged on purpose (every fourth lacks a part, or has one too many, and all are
-soft), and without masks, with a learned background and without.
+with what is true, with masks that are damaged on purpose (a quarter of them lacks a part, or has one too many, and all
+are soft), and without masks, with a learned background and without.
 
 Each scene is measured in parts, which are kept in the folder --keep: the same call of the same commit goes on where it
 was interrupted. Rows of other scenes that FILE holds stay there, with the commit that they were measured with.
@@ -343,22 +343,21 @@ def _damaged(scene: _Scene) -> Row:
 
 
 def damaged_masks(masks: Sequence[np.ndarray], seed: int) -> list[np.ndarray]:
-    """Masks with soft borders, of which every fourth has lost a part of the object, or holds something beside it.
+    """Masks with soft borders, of which a quarter, at random, lacks a part of the object or holds something beside it.
 
     Args:
         masks: opacity in [0, 1].
-        seed: of where.
+        seed: of which, and where.
     """
-    generator, result = np.random.default_rng(seed), []
-    for index, mask in enumerate(masks):
-        soft = ndimage.gaussian_filter(mask.astype(float), SOFT * max(mask.shape))
-        if index % 4 == 1:
-            edge = np.argwhere(np.greater(mask > 0.5, ndimage.binary_erosion(mask > 0.5)))
-            row, column = edge[generator.integers(len(edge))]
-            rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
-            disc = (rows - row) ** 2 + (columns - column) ** 2 < PART * (mask > 0.5).sum() / np.pi
-            soft[disc] = float(index % 8 == 5)
-        result.append(soft)
+    generator = np.random.default_rng(seed)
+    result = [ndimage.gaussian_filter(mask.astype(float), SOFT * max(mask.shape)) for mask in masks]
+    for number, index in enumerate(generator.permutation(len(masks))[: len(masks) // 4].tolist()):
+        inside = masks[index] > 0.5
+        edge = np.argwhere(np.greater(inside, ndimage.binary_erosion(inside)))
+        row, column = edge[generator.integers(len(edge))]
+        rows, columns = np.mgrid[: inside.shape[0], : inside.shape[1]]
+        disc = (rows - row) ** 2 + (columns - column) ** 2 < PART * inside.sum() / np.pi
+        result[index][disc] = float(number % 2)
     return result
 
 
