@@ -18,6 +18,7 @@ import torch
 
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Renderable
 from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromScratch, random_model, shuffled
+from hyperplanes.adaptation.fine_tuning import NoProgressError
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
@@ -32,7 +33,17 @@ from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.errors import did_you_mean
 from hyperplanes.views import Views
 
-__all__ = ["METHODS", "Method", "Request", "WithSampler", "at_steps", "describe_method", "find_methods", "make_method"]
+__all__ = [
+    "METHODS",
+    "Method",
+    "Request",
+    "Unchecked",
+    "WithSampler",
+    "at_steps",
+    "describe_method",
+    "find_methods",
+    "make_method",
+]
 
 
 @dataclass(frozen=True)
@@ -329,3 +340,23 @@ class WithSampler:
         if self.sampling is None or not isinstance(made, AdaptedField):
             return made
         return replace(made, sampling=self.sampling)
+
+
+@dataclass(frozen=True)
+class Unchecked:
+    """A method whose fine-tuning counts as it ended, even where that is an empty picture: a table hides no failure.
+
+    Attributes:
+        adapter: the method.
+    """
+
+    adapter: Adapter
+
+    def adapt(self, support: Views) -> Renderable:
+        """What the method makes of one object."""
+        try:
+            return self.adapter.adapt(support)
+        except NoProgressError as error:
+            if error.field is None:
+                raise
+            return error.field

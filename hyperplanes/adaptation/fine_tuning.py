@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -18,9 +19,21 @@ from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-__all__ = ["fine_tune", "fine_tune_to", "make_descent"]
+__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "make_descent"]
 
 NEARLY = 0.99  # of the error of an empty picture, which a field that has lost everything may miss by rounding
+
+
+class NoProgressError(ValueError):
+    """Gradient steps that end neither below the error before them nor below that of an empty picture.
+
+    Attributes:
+        field: what they made all the same; None where its error is no number.
+    """
+
+    def __init__(self, message: str, field: AdaptedField | None = None) -> None:
+        super().__init__(message)
+        self.field = field
 
 
 def fine_tune(
@@ -78,6 +91,9 @@ def fine_tune_to(
         views: where rays come from; those of the planes where absent.
         schedule: the number of steps in which the rates fall; `steps` where absent.
         on_step: as in `fine_tune`.
+
+    Raises:
+        NoProgressError: the steps lowered nothing: wild rates end in pictures that are empty, or in no numbers.
     """
     check_fine_tuning(settings, steps, len(views or context.views), network.config, network.target)
     if not steps:
@@ -92,22 +108,16 @@ def fine_tune_to(
             on_step(done)
         if done == steps:
             break
-    _check_progress(before, *descent.errors(), steps)
+    after, empty = descent.errors()
     with torch.no_grad():
-        return network.rendering_field(context, variables.weights())
-
-
-def _check_progress(before: float, after: float, empty: float, steps: int) -> None:
-    """Refuse what steps at a wild rate make: numbers that are not finite, or pictures that are empty or worse.
-
-    Raises:
-        ValueError: the squared error is no number, or neither below that before the steps nor below an empty picture's.
-    """
+        made = network.rendering_field(context, variables.weights())
     if not after < max(before, empty * NEARLY):
-        raise ValueError(
+        raise NoProgressError(
             f"fine-tuning: expected {steps} steps to lower the squared error, {before:.3g}, got {after:.3g}, where an "
-            f"empty picture has {empty:.3g}; lower learning_rate and muon_learning_rate, or take the field of 0 steps"
+            f"empty picture has {empty:.3g}; lower learning_rate and muon_learning_rate, or take the field of 0 steps",
+            made if math.isfinite(after) else None,
         )
+    return made
 
 
 def make_descent(

@@ -28,7 +28,7 @@ from hyperplanes.experiments.scales import Scale
 from hyperplanes.experiments.workers import Evaluation, Training, Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.export.images import save_images
-from hyperplanes.methods import WithSampler, make_method
+from hyperplanes.methods import Unchecked, WithSampler, make_method
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.writing import write_json
 from hyperplanes.views import Task, Tasks
@@ -297,7 +297,7 @@ class Runner:
             preset=scaled_preset(experiment, self.scale),
         )
         sampling = None if cell.trained.packaged else PROTOCOLS[self.scale.protocol]
-        return WithSampler(adapter, sampling), tasks
+        return WithSampler(Unchecked(adapter), sampling), tasks
 
     def fine_tuning(self, cell: Cell) -> FineTuning:
         """Rays, optimiser and rates of the gradient steps of a cell; a learned initialisation states its own."""
