@@ -35,8 +35,8 @@ COMMANDS: dict[str, list[str]] = {
 }
 """Names of results, and options of the benchmarks beside --json; pictures lie in the folder of results."""
 
-OF_DATA: dict[str, list[str]] = {"views": [], "baked": [], "image_based": [], "hypernetwork": []}
-"""Those that are given --data too."""
+OF_DATA = ("views", "baked", "image_based", "hypernetwork")
+"""Those that are given --data, and no other option."""
 
 
 def main(arguments: list[str]) -> int:
@@ -52,7 +52,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--under-load", action="store_true", help="measure beside other work, too")
     chosen = parser.parse_args(arguments)
     data = ["--data", *map(str, chosen.data)]
-    commands = COMMANDS | ({name: [*data, *options] for name, options in OF_DATA.items()} if chosen.data else {})
+    commands = COMMANDS | (dict.fromkeys(OF_DATA, data) if chosen.data else {})
     failed = []
     for name, options in commands.items():
         options = [str(chosen.out / each) if each.endswith(".png") else each for each in options]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
-from concurrent.futures import Future
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import Future, as_completed
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -25,7 +25,7 @@ from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.experiments.experiment import Cell, Experiment, Trained
 from hyperplanes.experiments.record import plain
 from hyperplanes.experiments.scales import Scale
-from hyperplanes.experiments.workers import Evaluation, Training, Workers
+from hyperplanes.experiments.workers import Result, Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.export.images import save_images
 from hyperplanes.methods import Unchecked, WithSampler, make_method
@@ -60,6 +60,17 @@ class Outcome:
     curves: Mapping[str, list[Curve]]
     seeds: int
     objects: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """An object by the method of a cell: by what training, with which seed."""
+
+    experiment: Experiment
+    cell: Cell
+    checkpoint: Path
+    seed: int
+    name: str
 
 
 class Runner:
@@ -133,30 +144,51 @@ class Runner:
             return packaged_folder(trained.packaged)
         reference = trained.reference and self.checkpoint(experiment, trained.reference, seed)
         chosen = self.configuration(experiment, trained, seed)
-        data, name = self.arranged(trained, chosen), self.training_name(experiment, trained, seed)
-        settings = self._training_settings(experiment, trained, seed)
-        work = partial(self.train, trained, chosen, data, reference)
-        return self.workspace.folder("trainings", trained.method, name, settings, work)
+        work = partial(self.train, trained, chosen, self.arranged(trained, chosen), reference)
+        return self.workspace.folder(*self._training(experiment, trained, seed), work)
 
-    def train_all(self, experiment: Experiment, seed: int) -> None:
-        """The trainings of an experiment, side by side where there are workers; those that read others come later."""
+    def train_all(self, experiment: Experiment, seed: int, evaluated: Sequence[Experiment] = ()) -> None:
+        """The trainings of an experiment, side by side where there are workers; those that read others come later.
+
+        Each is recorded, with its own duration, when it ends.
+
+        Args:
+            experiment: which.
+            seed: of the trainings.
+            evaluated: what workers that have nothing left to train begin with, as by `start`.
+        """
         if self.workers is None:
             for trained in experiment.trainings:
                 self.checkpoint(experiment, trained, seed)
             return
-        alone = [trained for trained in experiment.trainings if not (trained.packaged or trained.reference)]
-        with ExitStack() as stack:
-            started = []
-            for trained in alone:
-                name, settings = self.training_name(experiment, trained, seed), {}
-                settings = {"name": name, **self._training_settings(experiment, trained, seed)}
-                path = self.workspace.path("trainings", trained.method, name)
-                folder = self.workspace.out / path
-                if stack.enter_context(self.workspace.making(path, settings, [folder])):
-                    job = Training(trained, self.configuration(experiment, trained, seed), folder)
-                    started.append(self.workers.train(self._given(trained.on), job))
-            for training in started:
-                training.result()
+        running: dict[Future[None], ExitStack] = {}
+
+        def finish_next() -> None:
+            training = next(as_completed(running))
+            recorded = running.pop(training)
+            training.result()
+            recorded.close()
+
+        with ExitStack() as unfinished:
+            for trained in experiment.trainings:
+                if trained.packaged or trained.reference:
+                    continue
+                if len(running) == self.workers.count:  # one that waits takes no time
+                    finish_next()
+                recorded = unfinished.enter_context(ExitStack())
+                making = self.workspace.making_folder(*self._training(experiment, trained, seed))
+                folder, needed = recorded.enter_context(making)
+                if needed:
+                    work = partial(_train, trained, self.configuration(experiment, trained, seed), folder)
+                    running[self.workers.submit(self._given(trained.on), work)] = recorded
+            while running:
+                finish_next()
+                for each in evaluated:
+                    self.start(each, seed)
+
+    def _is_trained(self, experiment: Experiment, trained: Trained, seed: int) -> bool:
+        """Whether `checkpoint` would make nothing."""
+        return bool(trained.packaged) or self.workspace.has_folder(*self._training(experiment, trained, seed))
 
     def training_name(self, experiment: Experiment, trained: Trained, seed: int) -> str:
         """What tells a training from others: the name of a packaged model, or one with a checksum."""
@@ -164,6 +196,11 @@ class Runner:
             return trained.packaged
         start = f"{Path(self.data.name(trained.on)).name}-{trained.method}-{seed}"
         return unique_name(start, self._training_settings(experiment, trained, seed))
+
+    def _training(self, experiment: Experiment, trained: Trained, seed: int) -> tuple[str, str, str, dict[str, Any]]:
+        """What `Workspace.folder` tells the folder of a training by."""
+        name = self.training_name(experiment, trained, seed)
+        return "trainings", trained.method, name, self._training_settings(experiment, trained, seed)
 
     def _training_settings(self, experiment: Experiment, trained: Trained, seed: int) -> dict[str, Any]:
         """All that decides a training."""
@@ -205,18 +242,30 @@ class Runner:
         return Score(method, tuple(objects))
 
     def start(self, experiment: Experiment, seed: int) -> None:
-        """Have the workers, if any, evaluate what `score` will be asked for; the trainings are done.
+        """Have the workers, if any, evaluate what `score` will be asked for, as far as trainings are done.
 
         What a time is asked of is evaluated by this process, alone.
         """
         if self.workers is None:
             return
         for cell in experiment.cells:
-            if cell.quantity.endswith("seconds"):
+            if cell.quantity.endswith("seconds") or not self._is_trained(experiment, cell.trained, seed):
                 continue
             for job, _, path, known in self._evaluations(experiment, cell, seed):
                 if known is None and path not in self._evaluated:
-                    self._evaluated[path] = self.workers.evaluate(self._given(cell.on), job)
+                    self._evaluated[path] = self.workers.submit(self._given(cell.on), partial(_evaluate, job))
+
+    def do_all(self, class_name: str, works: Sequence[Callable[[Runner], Result]]) -> list[Result]:
+        """What pieces of work return, side by side where there are workers.
+
+        Args:
+            class_name: of the data set that they read.
+            works: each called with the runner of its process; pickled where there are workers.
+        """
+        if self.workers is None:
+            return [work(self) for work in works]
+        started = [self.workers.submit(self._given(class_name), work) for work in works]
+        return [each.result() for each in started]
 
     def _evaluations(
         self, experiment: Experiment, cell: Cell, seed: int
@@ -327,6 +376,14 @@ def curve_of(checkpoint: Path) -> Curve:
 def file_name(row: str) -> str:
     """The heading of a row in file names."""
     return row.replace(":", "-on-")
+
+
+def _train(trained: Trained, chosen: Preset, folder: Path, runner: Runner) -> None:
+    runner.train(trained, chosen, runner.arranged(trained, chosen), None, folder)
+
+
+def _evaluate(job: Evaluation, runner: Runner) -> ObjectScore:
+    return runner.evaluate(job)
 
 
 def _save_pictures(folder: Path, score: ObjectScore, task: Task, pictures: Pictures) -> None:

@@ -11,22 +11,21 @@ import signal
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import torch
 
-from hyperplanes.configuration.presets import Preset
-from hyperplanes.experiments.experiment import Cell, Experiment, Trained
 from hyperplanes.utilities.interrupts import interruptible
 
 if TYPE_CHECKING:
-    from hyperplanes.evaluation import ObjectScore
     from hyperplanes.experiments.engine import Runner
 
-__all__ = ["Evaluation", "Training", "Workers"]
+__all__ = ["Result", "Workers"]
+
+Result = TypeVar("Result")
+"""What a piece of work returns."""
 
 PATIENCE = 2.0
 """Seconds in which workers end that were sent the signal as well, as by `timeout`: a second one would end a training
@@ -34,26 +33,6 @@ before its checkpoint is written."""
 
 SAVING = 10.0
 """Seconds that they have for it."""
-
-
-@dataclass(frozen=True)
-class Training:
-    """What is trained, by which configuration, and the folder of its checkpoint."""
-
-    trained: Trained
-    chosen: Preset
-    folder: Path
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """An object by the method of a cell: by what training, with which seed."""
-
-    experiment: Experiment
-    cell: Cell
-    checkpoint: Path
-    seed: int
-    name: str
 
 
 class Workers:
@@ -89,23 +68,14 @@ class Workers:
                 child.kill()
         self._pool.shutdown()
 
-    def train(self, given: Mapping[str, Path], training: Training) -> Future[None]:
-        """Train in a process.
+    def submit(self, given: Mapping[str, Path], work: Callable[[Runner], Result]) -> Future[Result]:
+        """Do a piece of work in a process, as soon as one is free.
 
         Args:
-            given: folders of the data sets by class.
-            training: what.
+            given: folders of the data sets by class; a worker generates none.
+            work: called with the runner of the process; pickled, as its result is.
         """
-        return self._started().submit(_train, given, training)
-
-    def evaluate(self, given: Mapping[str, Path], evaluation: Evaluation) -> Future[ObjectScore]:
-        """Evaluate in a process.
-
-        Args:
-            given: folders of the data sets by class.
-            evaluation: what.
-        """
-        return self._started().submit(_evaluate, given, evaluation)
+        return self._started().submit(_do, given, work)
 
     def _started(self) -> ProcessPoolExecutor:
         if self._pool is None:
@@ -124,17 +94,7 @@ def _start(make: Callable[[], Runner]) -> None:
     _runner = make()
 
 
-def _with(given: Mapping[str, Path]) -> Runner:
+def _do(given: Mapping[str, Path], work: Callable[[Runner], Result]) -> Result:
     _runner.data.given = {**_runner.data.given, **given}
-    return _runner
-
-
-def _train(given: Mapping[str, Path], job: Training) -> None:
-    runner = _with(given)
     with interruptible():
-        runner.train(job.trained, job.chosen, runner.arranged(job.trained, job.chosen), None, job.folder)
-
-
-def _evaluate(given: Mapping[str, Path], job: Evaluation) -> ObjectScore:
-    with interruptible():
-        return _with(given).evaluate(job)
+        return work(_runner)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,9 +63,34 @@ class Workspace:
             settings: all that decides its content.
             work: called with the folder.
         """
+        with self.making_folder(kind, place, name, settings) as (folder, needed):
+            if needed:
+                work(folder)
+        return folder
+
+    @contextmanager
+    def making_folder(
+        self, kind: str, place: str, name: str, settings: Mapping[str, Any]
+    ) -> Generator[tuple[Path, bool]]:
+        """The time in which the folder of a data set or of a training is made, as by `folder`; several may overlap.
+
+        Args:
+            kind: as in `folder`.
+            place: as in `folder`.
+            name: as in `folder`.
+            settings: as in `folder`.
+
+        Yields:
+            The folder, and whether it is to be made: it was not yet.
+        """
         path = self.path(kind, place, name)
-        self.make(path, {"name": name, **settings}, [self.out / path], partial(work, self.out / path))
-        return self.out / path
+        with self.making(path, {"name": name, **settings}, [self.out / path]) as needed:
+            yield self.out / path, needed
+
+    def has_folder(self, kind: str, place: str, name: str, settings: Mapping[str, Any]) -> bool:
+        """Whether `folder` would make nothing."""
+        path = self.path(kind, place, name)
+        return self.record.done(path, {"name": name, **settings}, self.out / path)
 
     def path(self, kind: str, place: str, name: str) -> str:
         """Where `folder` is, seen from the workspace; also what its work is recorded as."""

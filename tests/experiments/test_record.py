@@ -1,5 +1,9 @@
 """Source of truth: what was begun, interrupted and finished; files that are there and that are gone."""
 
+import json
+import threading
+import time
+from concurrent.futures import Future
 from dataclasses import replace
 
 import pytest
@@ -67,3 +71,52 @@ def test_a_training_in_a_folder_of_its_own_is_made_anew_when_its_data_changes(tm
     assert len(trained) == 2
     run(32)
     assert len(trained) == 4
+
+
+class ManualWorkers:
+    """Workers for two pieces of work at a time, which end when the test says so."""
+
+    count = 2
+
+    def __init__(self):
+        self.submitted = []
+
+    def submit(self, given, work):
+        self.submitted.append((work.func.__name__, work.args, Future()))
+        return self.submitted[-1][2]
+
+
+def test_each_of_several_trainings_is_recorded_when_it_ends(tmp_path, monkeypatch):
+    """The first ends, the second is interrupted after that: by whom nothing is lost, and no time counted twice."""
+    monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
+    table, cpu, workers = DemoSettings.quick_check().table, torch.device("cpu"), ManualWorkers()
+    workspace = Workspace(tmp_path, {"hyperplanes": "hyperplanes", "point_multiplane": "point_multiplane"})
+    data = DataSets(workspace, DemoSettings.quick_check().scale, generate=None, device=cpu, given={"car": tmp_path})
+    runner = Runner(workspace, data, train=print, device=cpu, workers=workers)
+
+    def end_one_after_the_other():
+        until = time.monotonic() + 5
+
+        def wait_for(condition):
+            while not condition() and time.monotonic() < until:
+                time.sleep(0.01)
+
+        wait_for(lambda: len(workers.submitted) == 2)
+        ends = {args[0].method: end for _, args, end in workers.submitted}
+        (tmp_path / "point_multiplane").mkdir()
+        (tmp_path / "point_multiplane" / "model.json").write_text(json.dumps({"network": {"planes": 2}}))
+        ends["point_multiplane"].set_result(None)
+        wait_for(lambda: len(workers.submitted) > 2)
+        ends["hyperplanes"].set_exception(KeyboardInterrupt())
+
+    ending = threading.Thread(target=end_one_after_the_other)
+    ending.start()
+    only_cars = replace(table, cells=tuple(cell for cell in table.cells if cell.on == "car"))
+    with pytest.raises(KeyboardInterrupt):
+        runner.train_all(table, 0, [only_cars])
+    ending.join()
+    written = json.loads((tmp_path / "stages.json").read_text())
+    assert {name: written[name]["done"] for name in written} == {"point_multiplane": True, "hyperplanes": False}
+    assert written["point_multiplane"]["seconds"] < written["hyperplanes"]["seconds"]
+    evaluated = {args[0].cell.method for name, args, _ in workers.submitted if name == "_evaluate"}
+    assert evaluated == {"point_multiplane", "scratch_2", "nearest_view"}, "begun beside the second training"

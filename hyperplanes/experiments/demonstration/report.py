@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 from kornia.geometry.camera import PinholeCamera
 from PIL import Image
 
 from hyperplanes.adaptation.checkpoints import find_checkpoint, packaged_folder
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.data.dataset import EXAMPLES, read_task
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import Score
 from hyperplanes.experiments.demonstration.settings import (
@@ -35,7 +38,7 @@ from hyperplanes.utilities.formatting import format_duration
 from hyperplanes.utilities.writing import write_json, write_whole
 from hyperplanes.views import Task, Views
 
-__all__ = ["describe_count", "overview", "write_first_page", "write_report"]
+__all__ = ["compile_kernels", "describe_count", "overview", "write_first_page", "write_report"]
 
 HERO_SCALE, SCALE = 2.5, 1.5
 """Sides of turntables as multiples of the images': of the first object, which is shown large, and of the others."""
@@ -104,6 +107,13 @@ def _round(model: HyperPlanes, support: Views, cameras: PinholeCamera) -> Pixels
     return to_pixels(field.render(cameras).images)
 
 
+def compile_kernels(device: torch.device) -> None:
+    """Have everything compiled and loaded that the packaged model renders with, by one small view of an example."""
+    example = read_task(EXAMPLES / "example-car")
+    model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(device)
+    model.adapt(example.support[:3]).render(example.query[:1].cameras)
+
+
 def describe_count(row: str, most: int) -> str:
     """A row of the first page in words."""
     return f"nearest of {most} views, copied" if row == "nearest_view" else f"{row.removeprefix('views_')} views"
@@ -119,22 +129,30 @@ def write_report(folder: Path, runner: Runner, settings: DemoSettings) -> None:
     """
     scores = {cell.row: runner.score(settings.table, cell, settings.seed) for cell in settings.table.cells}
     write_json(folder / "metrics.json", {row: score.as_json() for row, score in scores.items()})
-    model = HyperPlanes.from_pretrained(find_checkpoint(folder / "hyperplanes")).to(runner.device)
-    data = runner.data.tasks(settings.class_name)
+    checkpoint, data = find_checkpoint(folder / "hyperplanes"), runner.data.tasks(settings.class_name)
+    names = sorted(data.names("test"))[: settings.exhibits]
+    sides = [round((SCALE if place else HERO_SCALE) * settings.resolution) for place in range(len(names))]
+    works = [partial(_turntable, checkpoint, settings, *each) for each in zip(names, sides, strict=True)]
+    rounds = runner.do_all(settings.class_name, works)
+    model = HyperPlanes.from_pretrained(checkpoint).to(runner.device)
     cells = [cell for cell in settings.table.cells if cell.row in settings.methods]
-    exhibits, rounds = [], []
-    for name in sorted(data.names("test"))[: settings.exhibits]:
+    exhibits = []
+    for name, around in zip(names, rounds, strict=True):
         task = data.task(name)
         read, count = model.prepare(task.support, carved=False).hyperplanes.tolist(), len(task.query)
         task = replace(task, support=model.arrange(task.support))
-        size = SCALE if exhibits else HERO_SCALE
-        around = orbit_cameras(task.support, settings.frames, size=round(size * settings.resolution))
-        rounds.append(_round(model, task.support, around))
         query = sorted({count // 4, 3 * count // 4})
-        exhibits.append(_exhibit(runner, cells, scores, task, read, query, rounds[-1]))
+        exhibits.append(_exhibit(runner, cells, scores, task, read, query, around))
     picture = overview(exhibits[:3], rounds[:3], round(SCALE * settings.resolution))
     write_whole(folder / "overview.png", encode_png(picture, small=True))
     write_whole(folder / "report.html", render_page(_describe(folder, runner, settings, scores, exhibits)).encode())
+
+
+def _turntable(checkpoint: Path, settings: DemoSettings, name: str, side: int, runner: Runner) -> Pixels:
+    """The frames of the turntable of an object of the class that was trained on, so many pixels a side."""
+    model = HyperPlanes.from_pretrained(checkpoint).to(runner.device)
+    support = model.arrange(runner.data.tasks(settings.class_name).task(name).support)
+    return _round(model, support, orbit_cameras(support, settings.frames, size=side))
 
 
 def _exhibit(
@@ -222,12 +240,15 @@ def _how_it_was_made(settings: DemoSettings, folder: Path, runner: Runner) -> li
     manifest = read_json(runner.data.folder(settings.class_name) / "manifest.json")
     times = {name: runner.workspace.record.seconds(name) for name in ("data", *MODELS)}
     times["data"] += runner.workspace.record.seconds("unseen")
+    count = 1 if runner.workers is None else runner.workers.count
+    beside = f"in one of {count} processes side by side, of one thread each" if count > 1 else "in one process, alone"
     return [
         ("objects", f"{trained} procedural {settings.class_name}s to train on, {settings.held_out} held out"),
         ("images", f"{settings.views} an object, {settings.resolution} px, half support, half query"),
         ("renderer of the data", str(manifest.get("renderer", "unknown"))),
         ("training", f"{steps:,} steps of each model, preset {settings.preset}, seed {settings.seed}"),
         ("time", ", ".join(f"{name} {format_duration(seconds)}" for name, seconds in times.items())),
+        ("seconds to adapt and a view", f"measured {beside}"),
         ("machine", f"{where['gpu'] or where['processor']}, {where['cores']} cores, torch {where['torch']}"),
         ("commit", str(where["commit"])),
         ("paper", "Batorski et al., HyperPlanes: Hypernetwork Approach to Rapid NeRF Adaptation, arXiv 2402.01524"),

@@ -128,7 +128,8 @@ class DemoSettings:
         return self._experiment(cells, objects=MOST - len(self.first), keep_pictures=True)
 
     def _cell(self, row: str, method: str, on: str = "") -> Cell:
-        trained = Trained(self.class_name, method if method in MODELS else "hyperplanes")
+        # the same field from random weights is that of either training: it waits for the one that ends first
+        trained = Trained(self.class_name, "hyperplanes" if method.startswith("hyperplanes") else "point_multiplane")
         return Cell(row, "", trained, method, on or self.class_name, trainable="weights")
 
     def _experiment(
@@ -158,7 +159,7 @@ class DemoSettings:
     @property
     def packaged_scale(self) -> Scale:
         """One object a class from cameras anywhere, and the mesh files."""
-        drawn = {"rig": "random", "seed": self.seed}
+        drawn = {"rig": "random", "seed": self.seed, "views": self.views}
         return Scale(
             name="demonstration",
             about="what the packaged model is shown",

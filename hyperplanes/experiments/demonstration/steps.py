@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 
 from hyperplanes.evaluation import Score
-from hyperplanes.experiments.demonstration.report import describe_count, write_first_page, write_report
+from hyperplanes.experiments.demonstration.report import compile_kernels, describe_count, write_first_page, write_report
 from hyperplanes.experiments.demonstration.settings import MODELS, TUNED, DemoSettings
 from hyperplanes.experiments.engine import OnScore, Runner
 from hyperplanes.experiments.experiment import Cell
@@ -54,7 +55,7 @@ class Demonstration:
         return {
             "packaged model": self.show_packaged,
             "data": lambda: [self.runner.data.folder(name) for name in table.classes],
-            "train": partial(self.runner.train_all, table, seed),
+            "train": partial(self.runner.train_all, table, seed, [table, self.settings.fine_tuning]),
             **{f"evaluate {c.row}": partial(self.evaluate, c) for c in table.cells},
             "fine-tuning": self.tune,
             "report": self.report,
@@ -69,8 +70,12 @@ class Demonstration:
 
     def _show_packaged(self, page: Path) -> None:
         experiment, scores = self.settings.packaged, {}
-        for name in sorted(experiment.classes, key=lambda name: name != "meshes"):  # they may be wrong input
-            self.packaged.data.folder(name)
+        with ThreadPoolExecutor(1) as beside:
+            # while other processes render, kernels are compiled that were not yet
+            ready = beside.submit(compile_kernels, self.packaged.device)
+            for name in sorted(experiment.classes, key=lambda name: name != "meshes"):  # they may be wrong input
+                self.packaged.data.folder(name)
+            ready.result()
         for row in experiment.rows:
             cells = [cell for cell in experiment.cells if cell.row == row]
             found = [self.packaged.score(experiment, cell, self.settings.seed) for cell in cells]
@@ -80,7 +85,7 @@ class Demonstration:
         self.say(f"the first page: {page.resolve().as_uri()}")
 
     def evaluate(self, cell: Cell) -> None:
-        """A row of the table; workers, if any, go on with the next ones and the chart."""
+        """A row of the table; workers, if any, go on with the next ones and the chart of fine-tuning."""
         for experiment in (self.settings.table, self.settings.fine_tuning):
             self.runner.start(experiment, self.settings.seed)
         with self.evaluating(cell.row) as on_score:
