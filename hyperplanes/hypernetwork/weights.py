@@ -31,9 +31,9 @@ class LowRankReader(nn.Module):
         self.left, self.right = nn.ParameterList(), nn.ParameterList()
         for shape in (shapes[name] for name in self.names):
             rows = RANK if len(shape) == 2 else RANK**2
-            self.left.append(nn.Parameter(torch.randn(rows, shape[0]) / shape[0] ** 0.5))
+            self.left.append(_random(rows, shape[0], shape[0]))
             columns = (shape[1], RANK) if len(shape) == 2 else (1, 1)
-            self.right.append(nn.Parameter(torch.randn(columns) / columns[0] ** 0.5))
+            self.right.append(_random(*columns, columns[0]))
         self.code = nn.Linear(RANK**2 * len(self.names), code)
 
     def forward(self, theta: Mapping[str, Tensor]) -> Float[Tensor, " code"]:
@@ -43,3 +43,13 @@ class LowRankReader(nn.Module):
             for name, left, right in zip(self.names, self.left, self.right, strict=True)
         ]
         return self.code(torch.cat([each.flatten() for each in read]))
+
+
+def _random(rows: int, columns: int, summed: int) -> nn.Parameter:
+    """Normal values whose products with as many numbers as are summed stay as large as these.
+
+    On the device "meta" there are none, as when a checkpoint is read: PyTorch would load its compiler for them, in two
+    seconds.
+    """
+    values = torch.empty(rows, columns)
+    return nn.Parameter(values if values.is_meta else values.normal_().div_(summed**0.5))

@@ -247,6 +247,17 @@ def test_all_of_theta_or_the_updated_layers_are_read():
         make(replace(CONFIG, weights_seen="some"))
 
 
+def test_where_only_shapes_are_asked_for_no_number_is_drawn(monkeypatch):
+    # Source of truth: the reader with its numbers. To draw any on "meta", PyTorch loads its compiler, in two seconds.
+    shapes = {"w": torch.Size([6, 5]), "b": torch.Size([6])}
+    expected = {name: value.shape for name, value in LowRankReader(shapes, 3).state_dict().items()}
+    monkeypatch.setattr(torch.Tensor, "normal_", None)
+    monkeypatch.setattr(torch, "randn", None)
+    with torch.device("meta"):
+        found = LowRankReader(shapes, 3).state_dict()
+    assert {name: value.shape for name, value in found.items()} == expected
+
+
 @torch.no_grad()
 def test_what_is_read_of_a_matrix_and_a_bias():
     # Closed form: the code of W and b is A (U W V, u b) + c, by hand from the reader's own numbers.
