@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 USE := $(VENV)/.ready
 DEVELOP := $(VENV)/.ready-dev
 WHAT_DECIDES := pyproject.toml setup.cfg constraints.txt scripts/setup
+# Bytecode is kept, whatever the environment says: else each of many processes compiles all sources again.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test fuzz lint types bench docs clean setup dev
 
@@ -12,7 +14,7 @@ demo: $(USE)  ## meshes, training, new views and a page about them: runs/demo/re
 	$(BIN)/hyperplanes demo $(DEMO)
 
 test: $(DEVELOP)  ## all tests, on the CPU, by two processes (WORKERS=8: more)
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadscope --no-loadscope-reorder $(TESTS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadscope --no-loadscope-reorder $(TESTS)
 
 fuzz: $(DEVELOP)  ## 10,000 damaged files are read or refused in one line
 	$(BIN)/python -m tests.fuzz --files 10000 $(FUZZ)
