@@ -116,7 +116,7 @@ class Runner:
         scores: dict[tuple[str, str], list[Score]] = {}
         curves: dict[str, dict[tuple[str, int], Curve]] = {}
         for seed in range(seeds):
-            self.train_all(experiment, seed)
+            self.train_all(experiment, seed, [experiment])
             self.start(experiment, seed)
             for cell in experiment.cells:
                 if cell.trained.packaged and seed:
@@ -182,9 +182,9 @@ class Runner:
                     work = partial(_train, trained, self.configuration(experiment, trained, seed), folder)
                     running[self.workers.submit(self._given(trained.on), work)] = recorded
             while running:
-                finish_next()
                 for each in evaluated:
                     self.start(each, seed)
+                finish_next()
 
     def _is_trained(self, experiment: Experiment, trained: Trained, seed: int) -> bool:
         """Whether `checkpoint` would make nothing."""
