@@ -157,10 +157,15 @@ class Runner:
             seed: of the trainings.
             evaluated: what workers that have nothing left to train begin with, as by `start`.
         """
-        if self.workers is None:
-            for trained in experiment.trainings:
-                self.checkpoint(experiment, trained, seed)
-            return
+        if self.workers is not None:
+            self._train_side_by_side(self.workers, experiment, seed, evaluated)
+        for trained in experiment.trainings:
+            self.checkpoint(experiment, trained, seed)
+
+    def _train_side_by_side(
+        self, workers: Workers, experiment: Experiment, seed: int, evaluated: Sequence[Experiment]
+    ) -> None:
+        """The trainings that read no other one."""
         running: dict[Future[None], ExitStack] = {}
 
         def finish_next() -> None:
@@ -173,14 +178,14 @@ class Runner:
             for trained in experiment.trainings:
                 if trained.packaged or trained.reference:
                     continue
-                if len(running) == self.workers.count:  # one that waits takes no time
+                if len(running) == workers.count:  # one that waits takes no time
                     finish_next()
                 recorded = unfinished.enter_context(ExitStack())
                 making = self.workspace.making_folder(*self._training(experiment, trained, seed))
                 folder, needed = recorded.enter_context(making)
                 if needed:
                     work = partial(_train, trained, self.configuration(experiment, trained, seed), folder)
-                    running[self.workers.submit(self._given(trained.on), work)] = recorded
+                    running[workers.submit(self._given(trained.on), work)] = recorded
             while running:
                 for each in evaluated:
                     self.start(each, seed)
