@@ -295,14 +295,50 @@ def _views_tuned(result: Result) -> str:
     return markdown_table(["", "views", "`hull_blend`", "one step", "100 steps", "100 from random weights"], lines)
 
 
+def _captures(result: Result) -> str:
+    lines = []
+    for row in result["rows"]:
+        found = [f"{row['posed']} of {row['views']}", f"{row['within_half_degree_1_percent']:.0%}"]
+        quality = [f"{row[name]:.2f} dB" for name in ("psnr_true", "psnr", "psnr_loss", "psnr_nearest")]
+        lines.append([row["name"], *found, f"{row['mask_iou']:.3f}", *quality])
+    headings = ["posed", "right poses", "masks", "true poses and masks", "as found", "lost", "nearest photograph"]
+    return markdown_table(["", *headings], lines)
+
+
+WAYS = {
+    "damaged": "masks damaged on purpose, as they are",
+    "damaged_one_word": "the same, mended by a hull that one mask rules a place out of",
+    "damaged_vote": "the same, mended by the vote of views, as `capture` does",
+    "learned_background": "no masks, learned background",
+    "no_masks": "no masks",
+}
+"""What else photographs are shown with, by the names in rows of captures."""
+
+
+def _captures_masks(result: Result) -> str:
+    rows = [row for row in result["rows"] if all(f"psnr_{way}" in row for way in WAYS)]
+    lines = [["as `capture` found them", *(f"{row['psnr']:.2f} dB ({row['mask_iou']:.3f})" for row in rows)]]
+    for way, label in WAYS.items():
+        shares = (f" ({row[f'mask_iou_{way}']:.3f})" if f"mask_iou_{way}" in row else "" for row in rows)
+        lines.append([label, *(f"{row[f'psnr_{way}']:.2f} dB{share}" for row, share in zip(rows, shares, strict=True))])
+    return markdown_table(["masks", *(row["name"] for row in rows)], lines)
+
+
 SUMMARY = (3, 5, 25)  # numbers of views in README
 OF_VIEWS = ("views_procedural", "views_cc0", "views_random", "views_posed")
-SOURCES = {"views": OF_VIEWS, "views_over": OF_VIEWS, "views_summary": OF_VIEWS}
+SOURCES = {
+    "captures_masks": ("captures",),
+    "views": OF_VIEWS,
+    "views_over": OF_VIEWS,
+    "views_summary": OF_VIEWS,
+}
 """Files of rows of tables that are not made of the file of their name."""
 TABLES: dict[str, Callable[..., str]] = {
     "adapting": _adapting,
     "baked": _baked,
     "busy": _busy,
+    "captures": _captures,
+    "captures_masks": _captures_masks,
     "generation": _generation,
     "lookup": _lookup,
     "rendering": _rendering,

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from hyperplanes.capture.video import VIDEO_SUFFIXES
 from hyperplanes.data.formats.unposed import photographs_folder
 from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES, Pixels, image_header, read_image, resized, turned
@@ -26,6 +27,7 @@ __all__ = ["FEWEST", "Photograph", "find_photographs", "list_photographs", "read
 FEWEST = 3
 """Photographs from which poses can be found at all."""
 
+_LOOKED_AT = 1000  # entries of a folder
 _HEIF = frozenset({".heic", ".heif"})
 _MAKE, _MODEL, _EXIF = 0x010F, 0x0110, 0x8769
 _FOCAL, _FOCAL_35, _PIXELS_X = 0x920A, 0xA405, 0xA002
@@ -88,10 +90,19 @@ def find_photographs(folder: Path) -> list[Path]:
     found = sorted(found + heif, key=_natural)
     if len(found) < FEWEST:
         count = f"{len(found)} photographs" if len(found) != 1 else "1 photograph"
-        raise DataError(
-            folder, f"at least {FEWEST} photographs of one object", count, "20 to 60 from all around are a good number"
-        )
+        raise DataError(folder, f"at least {FEWEST} photographs of one object", count, _elsewhere(folder))
     return found
+
+
+def _elsewhere(folder: Path) -> str:
+    """What to do about a folder with too few photographs: a folder or a video in it may be what was meant."""
+    children = sorted(child for _, child in zip(range(_LOOKED_AT), folder.iterdir(), strict=False))
+    for child in children:
+        if child.name != "masks" and child.is_dir() and (home := photographs_folder(child, PICTURE_SUFFIXES | _HEIF)):
+            return f"there are some in {home}: give that folder"
+        if child.is_file() and child.suffix.lower() in VIDEO_SUFFIXES:
+            return f"there is a video in it: give {child}"
+    return "20 to 60 from all around are a good number"
 
 
 def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[list[Photograph], list[str]]:

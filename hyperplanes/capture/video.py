@@ -42,9 +42,8 @@ def take_frames(path: Path, folder: Path, count: int, progress: Callable[[str, i
         frames = reader.read_frames(str(path))
         about = next(frames)
     except (OSError, RuntimeError, StopIteration, KeyError) as error:
-        raise DataError(
-            path, "a video", f"something else ({str(error).splitlines()[-1:]})", "export it again"
-        ) from error
+        said = (str(error).splitlines() or ["no frames"])[-1].strip()
+        raise DataError(path, "a video", f"something else ({said})", "export it again") from error
     total = max(1, round(about["duration"] * about["fps"]))
     if total < 3 or not count >= 3:
         frames.close()

@@ -22,6 +22,7 @@ from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.images import render_images
 from hyperplanes.rendering.renderer import RayMarching
+from hyperplanes.rendering.scene import SplitField
 from hyperplanes.rendering.transmittance import transmittance
 from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
 from hyperplanes.utilities.arguments import checked
@@ -176,15 +177,16 @@ def _voxels(
 ) -> tuple[Bool[Tensor, " point"], Float[Tensor, "filled 28"]]:
     """Which points have density, and the density and coefficients of those."""
     field, length = adapted.field, adapted.occupancy.bounds.radius / 64
-    hidden = field.hidden(points) if isinstance(field, MLPField) else points
-    density = field.density_of(hidden) if isinstance(field, MLPField) else adapted.density(points)
+    hidden = field.hidden(points) if isinstance(field, SplitField) else points
+    density = field.density_of(hidden) if isinstance(field, SplitField) else adapted.density(points)
     some = 1 - torch.exp(-density * length) > MIN_OPACITY
     some &= arriving.amax(1) * (1 - torch.exp(-density * voxel)) > MIN_WEIGHT
     hidden, density, arriving = hidden[some], density[some], arriving[some]
     if isinstance(field, MLPField):
         colours = field.colours_along(hidden, view)
     else:
-        colours = torch.stack([field(hidden, each.expand(len(hidden), 3))[0] for each in view], 1)
+        colour = field.colour_of if isinstance(field, SplitField) else lambda *seen: field(*seen)[0]
+        colours = torch.stack([colour(hidden, each.expand(len(density), 3)) for each in view], 1)
     return some, torch.cat([density[:, None], _harmonics(colours, view, arriving)], 1)
 
 

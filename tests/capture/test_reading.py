@@ -1,5 +1,7 @@
 """Source of truth: pictures whose pixels are known before they were turned, scaled and saved."""
 
+import re
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -84,6 +86,17 @@ def test_masks_beside_turned_photographs_are_turned_with_them(upright, tmp_path,
 def test_too_few_photographs_are_refused(upright, tmp_path):
     save(upright, tmp_path / "only.png")
     with pytest.raises(DataError, match="at least 3 photographs .* found 1 photograph;"):
+        find_photographs(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "advice"), [("day/1.png", "some in {}/day: give"), ("walk.mp4", "give {}/walk.mp4")])
+def test_what_may_have_been_meant_by_a_folder_without_photographs_is_named(name, advice, upright, tmp_path):
+    if name.endswith(".png"):
+        (tmp_path / "day").mkdir()
+        save(upright, tmp_path / name)
+    else:
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=re.escape(advice.format(tmp_path))):
         find_photographs(tmp_path)
 
 
