@@ -42,7 +42,7 @@ WORK = "capture"
 
 ROOM = 1.5  # times the radius of the points of the object, within which its hull is carved: what is smooth has none
 
-ENOUGH = 0.8  # of the photographs: with fewer registered, other features are tried
+ENOUGH = 0.8  # of the photographs: with fewer registered, there is advice
 QUALITY = 96  # of JPEG, without subsampled colours
 
 ADVICE = (
@@ -196,6 +196,11 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
         return SparseModel.load(folder / "model.npz")
     best: SparseModel | None = None
     for number, features in enumerate(ATTEMPTS):
+        count = 0 if best is None else len(best)
+        if number and count >= features.below * len(pictures):
+            break
+        if number:
+            work.notes.append(f"{count} of {len(pictures)} photographs posed: tried again with {features.name}")
         found = find_poses(
             pictures,
             work.stages.folder / "pictures",
@@ -206,10 +211,6 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
         )
         if found is not None and (best is None or len(found) > len(best)):
             best = found
-        if best is not None and len(best) >= ENOUGH * len(pictures):
-            break
-        count = 0 if best is None else len(best)
-        work.notes.append(f"with {features.name}: {count} of {len(pictures)} photographs posed")
     if best is None or len(best) < FEWEST:
         raise DataError(
             work.stages.folder.parent,

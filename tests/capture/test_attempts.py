@@ -1,0 +1,38 @@
+"""Source of truth: the shares of registered pictures below which `ATTEMPTS` says that other features are tried."""
+
+import types
+
+import pytest
+
+from hyperplanes.capture import Settings, pipeline
+from hyperplanes.capture.stages import Stages
+from hyperplanes.capture.structure_from_motion import Picture
+
+
+class Model:
+    """As much of a sparse model as says how many pictures it holds."""
+
+    reprojection_error = 0.0
+
+    def __init__(self, count):
+        self.count = count
+
+    def __len__(self):
+        return self.count
+
+    def save(self, path):
+        path.touch()
+
+
+@pytest.mark.parametrize(
+    ("found", "kept", "advised"),
+    [([19], 19, False), ([18, 16], 18, False), ([9, 20], 20, False), ([None, 8, 7], 8, True)],
+)
+def test_other_features_are_tried_while_too_few_pictures_are_registered(found, kept, advised, tmp_path, monkeypatch):
+
+    models = iter([None if count is None else Model(count) for count in found])
+    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: next(models))
+    work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(), progress=print, notes=[])
+    model = pipeline._poses([Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)], False, work)
+    assert (len(model), list(models)) == (kept, [])
+    assert len(work.notes) == len(found) - 1 + advised
