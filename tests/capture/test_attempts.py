@@ -29,7 +29,6 @@ class Model:
     [([19], 19, False), ([18, 16], 18, False), ([9, 20], 20, False), ([None, 8, 7], 8, True)],
 )
 def test_other_features_are_tried_while_too_few_pictures_are_registered(found, kept, advised, tmp_path, monkeypatch):
-
     models = iter([None if count is None else Model(count) for count in found])
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: next(models))
     work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(), progress=print, notes=[])
