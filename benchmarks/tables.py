@@ -299,7 +299,8 @@ def _captures(result: Result) -> str:
     lines = []
     for row in result["rows"]:
         found = [f"{row['posed']} of {row['views']}", f"{row['within_half_degree_1_percent']:.0%}"]
-        quality = [f"{row[name]:.2f} dB" for name in ("psnr_true", "psnr", "psnr_loss", "psnr_nearest")]
+        scores = [row.get(name) for name in ("psnr_true", "psnr", "psnr_loss", "psnr_nearest")]
+        quality = ["-" if score is None else f"{score:.2f} dB" for score in scores]  # where a part was not measured
         lines.append([row["name"], *found, f"{row['mask_iou']:.3f}", *quality])
     headings = ["posed", "right poses", "masks", "true poses and masks", "as found", "lost", "nearest photograph"]
     return markdown_table(["", *headings], lines)
