@@ -6,7 +6,8 @@
 Of a procedural car that no training saw, or of a posed scene: the time to a field, to the voxels that hold something, a
 view at several sizes, the second pass that renders all shown views, and PSNR. The reference is the same field, whose
 inputs PyTorch looks up, gathers and concatenates, and which is asked for the colour of every sample in every voxel of
-the visual hull that is not empty. Both run in turn, in one process.
+the visual hull that is not empty and in those around them, until rays are as opaque as in training. Both run in turn,
+in one process.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.data import read_task
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.rendering.marching import RayMarching
+from hyperplanes.rendering.refinement import refine as refine_voxels
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task
 
@@ -68,14 +72,16 @@ def measure(model: HyperPlanes, task: Task, repeats: int, second_pass: bool) -> 
     refine, _ = timed(lambda: adapted.refined_occupancy)
     with _plainly():
         adapted(*2 * (adapted.occupancy.centres()[:1],))  # compiles
-        plain_refine, _ = timed(lambda: _again(adapted).refined_occupancy)
+        plain_refine, voxels = timed(lambda: refine_voxels(adapted.occupancy, adapted.density))
+    assert isinstance(adapted.sampling, RayMarching)
+    every = RayMarching(adapted.sampling.for_rendering.steps, adapted.sampling.stop)
     views = [(7 * number + 3) % len(task.query) for number in range(repeats)]
     seconds, reference, found, expected = [], [], [], []
     for view in views:
         one = camera.select(task.query.cameras, [view])
         time, pictures = timed(lambda one=one: adapted.render(one))
         with _plainly():
-            plain_time, plain = timed(lambda one=one: _unsplit(adapted).render(one))
+            plain_time, plain = timed(lambda one=one: _unsplit(adapted, voxels).render(one, every))
         seconds.append(time)
         reference.append(plain_time)
         found.append(_quality(pictures, task, view))
@@ -109,16 +115,11 @@ def _quality(pictures: Pictures, task: Task, view: int) -> float:
     return float(psnr(pictures.images, task.query.images[view : view + 1]).mean())
 
 
-def _again(adapted: AdaptedField) -> AdaptedField:
-    """The same field, of which nothing is refined yet."""
-    return replace(adapted)
-
-
-def _unsplit(adapted: AdaptedField) -> AdaptedField:
-    """The same field as a mere function, all of whose colours are evaluated, in the same voxels."""
+def _unsplit(adapted: AdaptedField, voxels: Occupancy) -> AdaptedField:
+    """The same field as a mere function, all of whose colours are evaluated, and of whose voxels none is trimmed."""
     field: Callable = adapted.field
     result = replace(adapted, field=lambda points, directions: field(points, directions))
-    result.__dict__["refined_occupancy"] = adapted.refined_occupancy
+    result.__dict__["refined_occupancy"] = voxels
     return result
 
 

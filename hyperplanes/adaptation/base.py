@@ -27,6 +27,7 @@ from hyperplanes.views import Views
 
 __all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
 
+MARGIN_LOSS = 0.2  # opacity that a ray may lose in the voxels around those that have density
 POINTS = 1 << 12  # whose density one thread evaluates
 
 
@@ -93,7 +94,7 @@ class AdaptedField:
     @cached_property
     def refined_occupancy(self) -> Occupancy:
         """The voxels of `occupancy` in which the field has density; computed when the first view is rendered."""
-        return refine(self.occupancy, self.density)
+        return refine(self.occupancy, self.density, margin_loss=MARGIN_LOSS)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without colour where the field can do that."""

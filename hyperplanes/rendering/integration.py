@@ -17,11 +17,12 @@ from hyperplanes.rendering.scene import FieldFunction, Scene, SplitField, evalua
 
 __all__ = ["integrate"]
 
-FIRST_ROUND = 4  # samples a ray before the first test for opaque rays
+FIRST_ROUND = 2  # samples a ray before the first test for opaque rays
 MIN_WEIGHT = 0.01  # of a sample from which on its colour is evaluated
 KNOWN_SHARE = 0.95  # of a pixel's weight whose colours are evaluated at least, where its opacity is above
 MIN_OPACITY = 1 / 64
 GROWTH = 4  # every later round takes this fraction of the samples so far, and at least as many as the first
+FIRST_REACH = 4  # samples a ray whose densities are evaluated first to draw those that have a gradient
 DIFFERENTIATED = 0.01  # weight of a sample from which on it always has its gradient, below in proportion to it
 
 
@@ -153,7 +154,7 @@ def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: floa
     reached = torch.zeros(len(samples), dtype=torch.bool, device=rank.device)
     while len(remaining):
         # twice as far in every round; rays that are opaque by then leave
-        reach += max(FIRST_ROUND, reach)
+        reach += max(FIRST_REACH, reach)
         now = rank[remaining] < reach
         chosen, remaining = remaining[now], remaining[~now]
         points, _ = _packed_points(rays, samples[chosen])
@@ -177,19 +178,25 @@ def _ranks(ray: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float) -> Rendered:
-    """Rounds of a few samples a ray; rays whose transmittance has fallen below `stop` leave (early ray termination)."""
+    """Rounds of a few samples a ray; rays whose transmittance has fallen below `stop` leave (early ray termination).
+
+    These are rendered as opaque: what lies behind has the colour of what is in front.
+    """
     split = scene.field if stop > 0 and isinstance(scene.field, SplitField) else None
-    optical_depth = samples.distances.new_zeros(len(rays))
     limit = -math.log(stop) if stop > 0 else math.inf
-    remaining = torch.arange(len(samples), device=samples.ray.device)
-    rank, _ = _ranks(samples.ray, len(rays))
+    total = torch.bincount(samples.ray, minlength=len(rays))
+    end = total.cumsum(0)
+    place, optical_depth = end - total, samples.distances.new_zeros(len(rays))  # of the next sample; in front of it
+    remaining = total.nonzero()[:, 0]
     colours, weights, evaluated = [rays.origins.new_zeros(0, 3)], [optical_depth[:0]], [remaining[:0]]
     known, reach = [remaining[:0] > 0], 0
     while len(remaining):
-        # This round: the samples of the rays left whose rank is below `reach`.
-        reach += max(FIRST_ROUND, reach // GROWTH)
-        now = rank[remaining] < reach
-        chosen, remaining = remaining[now], remaining[~now]
+        # This round: the next samples of the rays left.
+        count = max(FIRST_ROUND, reach // GROWTH)
+        reach += count
+        index = place[remaining, None] + torch.arange(count, device=remaining.device)
+        chosen = index[index < end[remaining, None]]
+        place[remaining] += count
         part = samples[chosen]
         points, directions = _packed_points(rays, part)
         if split is None:
@@ -198,7 +205,7 @@ def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float
             hidden, colour = _in_batches(split.hidden, points), torch.zeros_like(points)
             density = torch.cat([split.density_of(each) for each in hidden])
         # Weights within the round, times the transmittance of what earlier rounds passed through.
-        added = density * part.step
+        added = density * samples.step
         weight = packed_weights(added, part.ray, len(rays)) * torch.exp(-optical_depth[part.ray])
         seen = weight > MIN_WEIGHT
         if split is not None:
@@ -208,8 +215,10 @@ def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float
         known.append(seen)
         evaluated.append(chosen)
         optical_depth = optical_depth.index_add(0, part.ray, added)
-        remaining = remaining[optical_depth[samples.ray[remaining]] < limit]
+        remaining = remaining[(optical_depth < limit)[remaining] & (place < end)[remaining]]
     part, weight, colour = samples[torch.cat(evaluated)], torch.cat(weights), torch.cat(colours)
+    opacity = torch.where(optical_depth < limit, 1.0, -torch.expm1(-optical_depth))
+    weight = weight / opacity.clamp_min(1e-12)[part.ray]
     if split is not None:
         colour = _filled(scene, rays, part, weight, colour, torch.cat(known))
     return composite_packed(colour, weight, part.distances, part.ray, len(rays), scene.background)

@@ -23,6 +23,7 @@ __all__ = ["RayMarching", "march"]
 
 CANDIDATES = 1 << 21  # samples tested against the grid at once; 12 bytes each
 RAYS = 512  # that one call of the kernel works on
+STOP_FACTOR, HIGHEST_STOP = 4.0, 0.1  # of `stop` for pictures, where what lies behind has the colour in front
 
 
 @checked_fields
@@ -50,8 +51,8 @@ class RayMarching:
 
     @property
     def for_rendering(self) -> RayMarching:
-        """5 samples for 3 in training, where they are jittered."""
-        return RayMarching(self.steps * 5 // 3, self.stop)
+        """5 samples for 3 in training, where they are jittered; rays end sooner, and are opaque then."""
+        return RayMarching(self.steps * 5 // 3, max(self.stop, min(HIGHEST_STOP, STOP_FACTOR * self.stop)))
 
     @property
     def summary(self) -> str:

@@ -15,12 +15,18 @@ __all__ = ["refine"]
 
 CHUNK = 1 << 14  # voxels in one call of the density
 OPAQUE = 1.0  # optical depth of a voxel from which on it hides what lies behind it
+PROBE = 0.4  # of a voxel's side, from its centre
 COARSE_FIRST = 60_000  # occupied voxels from which on half the resolution is evaluated first
 
 
 @torch.no_grad()
 def refine(
-    occupancy: Occupancy, density: Callable[[Tensor], Tensor], *, opacity_loss: float = 0.05, margin: int = 1
+    occupancy: Occupancy,
+    density: Callable[[Tensor], Tensor],
+    *,
+    opacity_loss: float = 0.05,
+    margin: int = 1,
+    margin_loss: float | None = None,
 ) -> Occupancy:
     """The voxels of a grid in which a field is not empty.
 
@@ -43,11 +49,13 @@ def refine(
         density: world points (point, 3) -> density per world unit (point,).
         opacity_loss: upper bound of the opacity that a ray loses, if all dropped voxels lay along it.
         margin: voxels to dilate by.
+        margin_loss: `opacity_loss` of the margin, of which voxels are kept that reach its density at PROBE of the way
+            from their centre to the voxels that were found; absent, all of the margin is kept.
 
     Returns:
         A grid of the same side and bounds.
     """
-    threshold = -math.log1p(-opacity_loss) / (2 * occupancy.bounds.radius)
+    threshold = _density_of(opacity_loss, occupancy)
     side, bounds = occupancy.occupied.shape[0], occupancy.bounds
     asked, large = occupancy.occupied, side >= 64 and int(occupancy.occupied.sum()) > COARSE_FIRST
     # of large grids only what a grid of half the resolution keeps is asked
@@ -63,13 +71,39 @@ def refine(
     while True:
         near = Occupancy(kept, bounds).dilated().occupied if large else occupancy.occupied
         asked = near & occupancy.occupied & ~kept & ~divided
-        if not asked.any():
-            return Occupancy(kept, bounds)
         divided |= asked
         found = _filled(occupancy, asked, density, threshold, 2)
         if not found.any():
-            return Occupancy(kept, bounds)
+            break
+        filled = filled | found
         kept = kept | _dilated(occupancy, found, margin)
+    if margin_loss is None:
+        return Occupancy(kept, bounds)
+    return _trimmed(Occupancy(kept, bounds), filled, density, _density_of(margin_loss, occupancy))
+
+
+def _density_of(opacity_loss: float, occupancy: Occupancy) -> float:
+    """The density of which a diameter of the scene is so opaque."""
+    return -math.log1p(-opacity_loss) / (2 * occupancy.bounds.radius)
+
+
+def _trimmed(grid: Occupancy, filled: Tensor, density: Callable[[Tensor], Tensor], threshold: float) -> Occupancy:
+    """The filled voxels of a grid, and those of the others that have density towards them.
+
+    Each of the others is evaluated once, on the line from its centre to the mean of the filled ones among its 26
+    neighbours; where there is no such line it is kept.
+    """
+    margin = Occupancy(grid.occupied & ~filled, grid.bounds)
+    places, padded = margin.occupied.nonzero(), torch.nn.functional.pad(filled, (1,) * 6)
+    offsets = torch.cartesian_prod(*[torch.arange(-1, 2, device=filled.device)] * 3)
+    towards = torch.zeros(len(places), 3, device=filled.device)
+    for offset in offsets:
+        towards += padded[tuple((places + 1 + offset).T)][:, None] * offset
+    longest = towards.abs().amax(1, keepdim=True)
+    points = margin.centres() + towards / longest.clamp_min(1) * (PROBE * grid.voxel)
+    kept = grid.occupied.clone()
+    kept[margin.occupied] = (_densities(points, density) > threshold) | (longest[:, 0] == 0)
+    return Occupancy(kept, grid.bounds)
 
 
 def _filled_from_outside(

@@ -49,6 +49,24 @@ def test_a_large_grid_is_asked_coarsely_first_and_ends_the_same(side):
     assert torch.equal(large.occupied, direct.dilated().occupied)
 
 
+def test_of_the_margin_what_has_no_density_towards_the_filled_voxels_is_dropped():
+    # Closed form: a ball, of which no point half a voxel deep is lost; the margin is evaluated once a voxel.
+    asked = []
+
+    def density(points):
+        asked.append(len(points))
+        return ball(0.5)(points)
+
+    whole = refine(full(Sphere(), 32), density)
+    before = sum(asked)
+    trimmed = refine(full(Sphere(), 32), density, margin_loss=0.2)
+    assert sum(asked) - 2 * before <= int(whole.occupied.sum())
+    assert not (trimmed.occupied & ~whole.occupied).any()
+    assert trimmed.occupied.sum() < 0.8 * whole.occupied.sum()
+    points = torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    assert trimmed.contains(points[points.norm(dim=1) < 0.5 - trimmed.voxel / 2]).all()
+
+
 def test_a_field_that_is_empty_leaves_nothing():
     assert not refine(full(Sphere(), 16), lambda points: points.new_zeros(len(points))).occupied.any()
 

@@ -382,6 +382,18 @@ def test_colours_that_hardly_count_are_not_asked_for(share):
 
 
 @torch.no_grad()
+def test_a_ray_that_is_stopped_is_opaque_and_has_the_colour_of_what_it_met():
+    # Closed form: fog of one colour before black, which a ray that goes on still sees a little of.
+    rays = some_rays(30)
+    stopped = render(fog(20.0), rays, RayMarching(64, 0.2), occupancy=GRID, differentiable=False, background=0.0)
+    opaque = stopped.opacity > 1 - 1e-5
+    assert opaque.any()
+    assert (stopped.opacity[~opaque] <= 0.8).all()
+    expected = torch.tensor([0.2, 0.4, 0.6]).to(stopped.colour).expand(int(opaque.sum()), 3)
+    torch.testing.assert_close(stopped.colour[opaque], expected)
+
+
+@torch.no_grad()
 def test_a_threshold_of_zero_never_stops():
     rays = some_rays(30)
     whole = render(fog(50.0), rays, RayMarching(64, 0.0), occupancy=GRID, differentiable=False)
@@ -454,6 +466,7 @@ def test_samplers_say_what_they_need():
     for sampling in PROTOCOLS:
         assert isinstance(sampling, Sampler)
     assert RayMarching(60, 0.1).for_rendering == RayMarching(100, 0.1)
+    assert RayMarching(60, 0.01).for_rendering == RayMarching(100, 0.04)
     assert Hierarchical(3, 4).for_rendering == Hierarchical(3, 4)
     assert RayMarching().needs_occupancy
     assert not Hierarchical().needs_occupancy
