@@ -15,7 +15,7 @@ __all__ = ["refine"]
 
 CHUNK = 1 << 14  # voxels in one call of the density
 OPAQUE = 1.0  # optical depth of a voxel from which on it hides what lies behind it
-PROBE = 0.4  # of a voxel's side, from its centre
+ALONG = 0.2  # of the longest part of a direction, from which on its other parts count
 COARSE_FIRST = 60_000  # occupied voxels from which on half the resolution is evaluated first
 
 
@@ -49,8 +49,8 @@ def refine(
         density: world points (point, 3) -> density per world unit (point,).
         opacity_loss: upper bound of the opacity that a ray loses, if all dropped voxels lay along it.
         margin: voxels to dilate by.
-        margin_loss: `opacity_loss` of the margin, of which voxels are kept that reach its density at PROBE of the way
-            from their centre to the voxels that were found; absent, all of the margin is kept.
+        margin_loss: `opacity_loss` of the margin, of which voxels are kept that reach its density where they are next
+            to the voxels that were found; absent, all of the margin is kept.
 
     Returns:
         A grid of the same side and bounds.
@@ -90,8 +90,9 @@ def _density_of(opacity_loss: float, occupancy: Occupancy) -> float:
 def _trimmed(grid: Occupancy, filled: Tensor, density: Callable[[Tensor], Tensor], threshold: float) -> Occupancy:
     """The filled voxels of a grid, and those of the others that have density towards them.
 
-    Each of the others is evaluated once, on the line from its centre to the mean of the filled ones among its 26
-    neighbours; where there is no such line it is kept.
+    Each of the others is evaluated once, at the corner, or the middle of an edge or a face, that lies towards the
+    filled ones among its 26 neighbours: a flat surface that enters the voxel from there enters by that point. Where
+    there is no such point, as between two surfaces, it is kept.
     """
     margin = Occupancy(grid.occupied & ~filled, grid.bounds)
     places, padded = margin.occupied.nonzero(), torch.nn.functional.pad(filled, (1,) * 6)
@@ -99,10 +100,10 @@ def _trimmed(grid: Occupancy, filled: Tensor, density: Callable[[Tensor], Tensor
     towards = torch.zeros(len(places), 3, device=filled.device)
     for offset in offsets:
         towards += padded[tuple((places + 1 + offset).T)][:, None] * offset
-    longest = towards.abs().amax(1, keepdim=True)
-    points = margin.centres() + towards / longest.clamp_min(1) * (PROBE * grid.voxel)
+    towards = torch.where(towards.abs() > ALONG * towards.abs().amax(1, keepdim=True), towards.sign(), 0.0)
+    found = _densities(margin.centres() + towards * (grid.voxel / 2), density) > threshold
     kept = grid.occupied.clone()
-    kept[margin.occupied] = (_densities(points, density) > threshold) | (longest[:, 0] == 0)
+    kept[margin.occupied] = found | (towards == 0).all(1)
     return Occupancy(kept, grid.bounds)
 
 
