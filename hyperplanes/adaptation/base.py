@@ -27,7 +27,7 @@ from hyperplanes.views import Views
 
 __all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
 
-MARGIN_LOSS = 0.2  # opacity that a ray may lose in the voxels around those that have density
+MARGIN_LOSS = 0.05  # opacity that a ray may lose in the voxels around those that have density
 POINTS = 1 << 12  # whose density one thread evaluates
 
 

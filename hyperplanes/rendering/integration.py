@@ -23,6 +23,7 @@ KNOWN_SHARE = 0.95  # of a pixel's weight whose colours are evaluated at least, 
 MIN_OPACITY = 1 / 64
 GROWTH = 4  # every later round takes this fraction of the samples so far, and at least as many as the first
 FIRST_REACH = 4  # samples a ray whose densities are evaluated first to draw those that have a gradient
+UNSEEN = 1 / 512  # `stop` up to which a ray that is stopped keeps its rest of background, half a grey level of 8 bits
 DIFFERENTIATED = 0.01  # weight of a sample from which on it always has its gradient, below in proportion to it
 
 
@@ -180,7 +181,7 @@ def _ranks(ray: Tensor, count: int) -> tuple[Tensor, Tensor]:
 def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float) -> Rendered:
     """Rounds of a few samples a ray; rays whose transmittance has fallen below `stop` leave (early ray termination).
 
-    These are rendered as opaque: what lies behind has the colour of what is in front.
+    These are rendered as opaque where that can be seen: what lies behind has the colour of what is in front.
     """
     split = scene.field if stop > 0 and isinstance(scene.field, SplitField) else None
     limit = -math.log(stop) if stop > 0 else math.inf
@@ -217,8 +218,9 @@ def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float
         optical_depth = optical_depth.index_add(0, part.ray, added)
         remaining = remaining[(optical_depth < limit)[remaining] & (place < end)[remaining]]
     part, weight, colour = samples[torch.cat(evaluated)], torch.cat(weights), torch.cat(colours)
-    opacity = torch.where(optical_depth < limit, 1.0, -torch.expm1(-optical_depth))
-    weight = weight / opacity.clamp_min(1e-12)[part.ray]
+    if stop > UNSEEN:
+        opacity = torch.where(optical_depth < limit, 1.0, -torch.expm1(-optical_depth))
+        weight = weight / opacity.clamp_min(1e-12)[part.ray]
     if split is not None:
         colour = _filled(scene, rays, part, weight, colour, torch.cat(known))
     return composite_packed(colour, weight, part.distances, part.ray, len(rays), scene.background)
