@@ -192,7 +192,6 @@ SCALES: dict[str, Scale] = {
             },
             fine_tuning=FineTuning(rays=128),
             scratch=FineTuning(rays=128),
-            shown=(1, 25),
         ),
         Scale(
             name="gpu",
