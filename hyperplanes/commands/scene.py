@@ -27,10 +27,12 @@ class Preparation(Protocol):
     @property
     def learn_background(self) -> bool:
         """Whether the object is cut out of a background that is learned."""
+        ...
 
     @property
     def refine_poses(self) -> bool:
         """Whether poses are refined."""
+        ...
 
 
 def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, console: Console) -> tuple[Task, str]:
