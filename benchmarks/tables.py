@@ -76,7 +76,9 @@ def _read(path: Path, page: Path | str) -> Result:
 
 
 def _measured(result: Result) -> str:
-    """What the rows depend on beside the command."""
+    """What the rows depend on beside the command: those of quality on the commit alone."""
+    if result["benchmark"] in OF_QUALITY:
+        return f"*Commit {result['commit']}.*"
     load = result.get("load")
     threads, beside = result["threads"], "not recorded" if load is None else f"{load:.2f} cores"
     machine = f"{result['processor']}, {result['cores']} cores, {threads} thread{'s' if threads > 1 else ''}"
@@ -222,7 +224,7 @@ NAMES = {
     "planes": "planes",
     "lamps": "lamps",
     "random-unseen": "compositions of random shapes",
-    "chair": "a chair (Blender, CC0)",
+    "chair": "the Blender chair",
 }
 """Data sets of the suites, as the pages call them."""
 METHODS = {
@@ -327,6 +329,7 @@ def _captures_masks(result: Result) -> str:
     return markdown_table(["masks", *(row["name"] for row in rows)], lines)
 
 
+OF_QUALITY = ("views",)  # benchmarks without times
 SUMMARY = (3, 5, 25)  # numbers of views in README
 OF_VIEWS = ("views_procedural", "views_cc0", "views_random", "views_posed")
 SOURCES = {
