@@ -1,10 +1,9 @@
-"""Runs an experiment: trainings and evaluations, each made once and kept in a workspace."""
+"""Runs an experiment: its trainings, and evaluations by them, each made once and kept in a workspace."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import Future, as_completed
-from contextlib import ExitStack
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,17 +13,18 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.base import Pictures
-from hyperplanes.adaptation.checkpoints import find_checkpoints, packaged_folder
+from hyperplanes.adaptation.checkpoints import find_checkpoints
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.initialisation import LEARNED
-from hyperplanes.configuration.presets import PROTOCOLS, Preset
+from hyperplanes.configuration.presets import PROTOCOLS
 from hyperplanes.data.support import Shown, WithSupport
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
-from hyperplanes.experiments.configurations import configuration, scaled_preset
+from hyperplanes.experiments.configurations import scaled_preset
 from hyperplanes.experiments.data_sets import DataSets
-from hyperplanes.experiments.experiment import Cell, Experiment, Trained
+from hyperplanes.experiments.experiment import Cell, Experiment
 from hyperplanes.experiments.record import plain
 from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.trainings import Train, Trainings
 from hyperplanes.experiments.workers import Result, Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.export.images import save_images
@@ -74,16 +74,15 @@ class Evaluation:
 
 
 class Runner:
-    """Trains and evaluates what an experiment asks for, each once with the same settings.
+    """Evaluates what an experiment asks for, by its `trainings`; each once with the same settings.
 
-    Trainings and evaluations lie in a workspace under names that hold a checksum of everything that decides them: two
-    experiments that need the same training share it, and after an interruption the same call goes on.
+    Evaluations lie in a workspace under names that hold a checksum of all that decides them: after an interruption the
+    same call goes on.
 
     Args:
         workspace: the folder for everything.
         data: the data sets, and how large everything is.
-        train: called with what is trained, its configuration, the data, the folder of the training it reads, if any,
-            and that of the checkpoint; goes on where it was interrupted.
+        train: makes a training.
         device: where to compute.
         workers: processes in which trainings run side by side and objects are evaluated; this one where absent.
     """
@@ -93,12 +92,13 @@ class Runner:
         workspace: Workspace,
         data: DataSets,
         *,
-        train: Callable[[Trained, Preset, Tasks, Path | None, Path], None],
+        train: Train,
         device: torch.device,
         workers: Workers | None = None,
     ) -> None:
-        self.workspace, self.data, self.scale, self.train, self.device = workspace, data, data.scale, train, device
+        self.workspace, self.data, self.scale, self.device = workspace, data, data.scale, device
         self.workers = workers
+        self.trainings = Trainings(workspace, data, train, workers)
         self._evaluated: dict[Path, Future[ObjectScore]] = {}  # by workers, by the files that they go to
         self._method_in_use: tuple[object, tuple[WithSampler, Tasks]] | None = None
 
@@ -121,7 +121,7 @@ class Runner:
             for cell in experiment.cells:
                 if cell.trained.packaged and seed:
                     continue  # the same whatever the seed
-                folder = self.checkpoint(experiment, cell.trained, seed)
+                folder = self.trainings.folder(experiment, cell.trained, seed)
                 curves.setdefault(_curve_name(experiment, cell), {})[str(folder), seed] = curve_of(folder)
                 scores.setdefault((cell.row, cell.column), []).append(self.score(experiment, cell, seed, on_score))
         return Outcome(
@@ -133,96 +133,15 @@ class Runner:
             {each.on: len(self.data.tasks(each.on).names("train")) for each in experiment.trainings},
         )
 
-    def configuration(self, experiment: Experiment, trained: Trained, seed: int) -> Preset:
-        """Model and training, as configured for the objects that there are."""
-        objects = len(self.data.tasks(trained.on).names("train"))
-        return configuration(experiment, trained, self.scale, objects, seed)
-
-    def checkpoint(self, experiment: Experiment, trained: Trained, seed: int) -> Path:
-        """The folder of a finished training, or of a packaged model."""
-        if trained.packaged:
-            return packaged_folder(trained.packaged)
-        reference = trained.reference and self.checkpoint(experiment, trained.reference, seed)
-        chosen = self.configuration(experiment, trained, seed)
-        work = partial(self.train, trained, chosen, self.arranged(trained, chosen), reference)
-        return self.workspace.folder(*self._training(experiment, trained, seed), work)
-
     def train_all(self, experiment: Experiment, seed: int, evaluated: Sequence[Experiment] = ()) -> None:
-        """The trainings of an experiment, side by side where there are workers; those that read others come later.
-
-        Each is recorded, with its own duration, when it ends.
+        """The trainings of an experiment, and beside the last of them what can be evaluated already.
 
         Args:
             experiment: which.
             seed: of the trainings.
             evaluated: what workers that have nothing left to train begin with, as by `start`.
         """
-        if self.workers is not None:
-            self._train_side_by_side(self.workers, experiment, seed, evaluated)
-        for trained in experiment.trainings:
-            self.checkpoint(experiment, trained, seed)
-
-    def _train_side_by_side(
-        self, workers: Workers, experiment: Experiment, seed: int, evaluated: Sequence[Experiment]
-    ) -> None:
-        """The trainings that read no other one."""
-        running: dict[Future[None], ExitStack] = {}
-
-        def finish_next() -> None:
-            training = next(as_completed(running))
-            recorded = running.pop(training)
-            training.result()
-            recorded.close()
-
-        with ExitStack() as unfinished:
-            for trained in experiment.trainings:
-                if trained.packaged or trained.reference:
-                    continue
-                if len(running) == workers.count:  # one that waits takes no time
-                    finish_next()
-                recorded = unfinished.enter_context(ExitStack())
-                making = self.workspace.making_folder(*self._training(experiment, trained, seed))
-                folder, needed = recorded.enter_context(making)
-                if needed:
-                    work = partial(_train, trained, self.configuration(experiment, trained, seed), folder)
-                    running[workers.submit(self._given(trained.on), work)] = recorded
-            while running:
-                for each in evaluated:
-                    self.start(each, seed)
-                finish_next()
-
-    def _is_trained(self, experiment: Experiment, trained: Trained, seed: int) -> bool:
-        """Whether `checkpoint` would make nothing."""
-        return bool(trained.packaged) or self.workspace.has_folder(*self._training(experiment, trained, seed))
-
-    def training_name(self, experiment: Experiment, trained: Trained, seed: int) -> str:
-        """What tells a training from others: the name of a packaged model, or one with a checksum."""
-        if trained.packaged:
-            return trained.packaged
-        start = f"{Path(self.data.name(trained.on)).name}-{trained.method}-{seed}"
-        return unique_name(start, self._training_settings(experiment, trained, seed))
-
-    def _training(self, experiment: Experiment, trained: Trained, seed: int) -> tuple[str, str, str, dict[str, Any]]:
-        """What `Workspace.folder` tells the folder of a training by."""
-        name = self.training_name(experiment, trained, seed)
-        return "trainings", trained.method, name, self._training_settings(experiment, trained, seed)
-
-    def _training_settings(self, experiment: Experiment, trained: Trained, seed: int) -> dict[str, Any]:
-        """All that decides a training."""
-        chosen, reference = self.configuration(experiment, trained, seed), trained.reference
-        return {
-            "data": list(self.data.tasks(trained.on).names("train")),
-            "reference": "" if reference is None else self.training_name(experiment, reference, seed),
-            "method": trained.method,
-            "model": chosen.model.as_json(),
-            "training": asdict(chosen.training),
-            "given": self.data.name(trained.on) if trained.on in self.data.given else "",
-            **self.data.reading,
-        }
-
-    def arranged(self, trained: Trained, chosen: Preset) -> Tasks:
-        """The data of a training, with as many support views as its model has planes."""
-        return WithSupport(self.data.tasks(trained.on), chosen.model.network.planes)
+        self.trainings.make_all(experiment, seed, lambda: [self.start(each, seed) for each in evaluated])
 
     def score(self, experiment: Experiment, cell: Cell, seed: int, on_score: OnScore = lambda *_: None) -> Score:
         """The evaluation of a cell with one seed, kept object by object.
@@ -254,7 +173,7 @@ class Runner:
         if self.workers is None:
             return
         for cell in experiment.cells:
-            if cell.quantity.endswith("seconds") or not self._is_trained(experiment, cell.trained, seed):
+            if cell.quantity.endswith("seconds") or not self.trainings.is_made(experiment, cell.trained, seed):
                 continue
             for job, _, path, known in self._evaluations(experiment, cell, seed):
                 if known is None and path not in self._evaluated:
@@ -276,10 +195,10 @@ class Runner:
         self, experiment: Experiment, cell: Cell, seed: int
     ) -> Generator[tuple[Evaluation, dict[str, Any], Path, Score | None]]:
         """Of every object of a cell: what is to be done, all that decides it, its file, and what is known already."""
-        checkpoint = self.checkpoint(experiment, cell.trained, seed)
+        checkpoint = self.trainings.folder(experiment, cell.trained, seed)
         method = self.scale.method(cell.method)
         shared = {
-            "checkpoint": self.training_name(experiment, cell.trained, seed),
+            "checkpoint": self.trainings.name(experiment, cell.trained, seed),
             "method": method,
             "on": self.data.name(cell.on),
             "free": cell.trainable if method != cell.trained.method else "",  # as earlier versions named it
@@ -326,7 +245,7 @@ class Runner:
 
     def picture(self, experiment: Experiment, cell: Cell) -> tuple[Tensor, Tensor]:
         """The first query view of the first object of a cell: the truth, and what the method shows; (3, h, w)."""
-        checkpoint = self.checkpoint(experiment, cell.trained, 0)
+        checkpoint = self.trainings.folder(experiment, cell.trained, 0)
         adapter, tasks = self._method(experiment, cell, self.scale.method(cell.method), checkpoint, 0)
         task = tasks.task(self.data.evaluated(cell.on, cell.split, experiment.objects)[0])
         query = task.query[:1]
@@ -381,10 +300,6 @@ def curve_of(checkpoint: Path) -> Curve:
 def file_name(row: str) -> str:
     """The heading of a row in file names."""
     return row.replace(":", "-on-")
-
-
-def _train(trained: Trained, chosen: Preset, folder: Path, runner: Runner) -> None:
-    runner.train(trained, chosen, runner.arranged(trained, chosen), None, folder)
 
 
 def _evaluate(job: Evaluation, runner: Runner) -> ObjectScore:

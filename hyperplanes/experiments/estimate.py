@@ -53,7 +53,7 @@ def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
     for trained in experiment.trainings:
         if trained.packaged:
             continue
-        chosen = runner.configuration(experiment, trained, 0)
+        chosen = runner.trainings.configuration(experiment, trained, 0)
         measured = _measure(runner, experiment, trained)
         training = measured.step * chosen.training.steps
         learned = chosen.model.initialisation
@@ -111,8 +111,8 @@ def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measu
 
 def _trainer(runner: Runner, experiment: Experiment, trained: Trained) -> Trainer:
     """A training that is never saved."""
-    chosen = runner.configuration(experiment, trained, 0)
-    model, data = HyperPlanes(chosen.model).to(runner.device), runner.arranged(trained, chosen)
+    chosen = runner.trainings.configuration(experiment, trained, 0)
+    model, data = HyperPlanes(chosen.model).to(runner.device), runner.trainings.arranged(trained, chosen)
     if chosen.model.initialisation is None:
         return Trainer(model, data, chosen.training)
     reference = trained.reference and _trainer(runner, experiment, trained.reference).model

@@ -64,7 +64,7 @@ def test_a_training_in_a_folder_of_its_own_is_made_anew_when_its_data_changes(tm
         data = DataSets(workspace, scale, generate=None, device=cpu)
         runner = Runner(workspace, data, train=train, device=cpu)
         for each in settings.table.trainings:
-            assert runner.checkpoint(settings.table, each, 0) == tmp_path / each.method
+            assert runner.trainings.folder(settings.table, each, 0) == tmp_path / each.method
 
     run(24)
     run(24)

@@ -117,7 +117,7 @@ class Demonstration:
         settings, runner, table = self.settings, self.runner, self.settings.table
         return {
             "data": [runner.data.name(name) for name in table.classes],
-            "trainings": [runner.training_name(table, each, settings.seed) for each in table.trainings],
+            "trainings": [runner.trainings.name(table, each, settings.seed) for each in table.trainings],
             "rows": settings.rows,
             "tuning": settings.tuning,
             "tuned_objects": settings.tuned_objects,
