@@ -325,10 +325,11 @@ def _damaged(scene: _Scene) -> Row:
     masks = damaged_masks([picture[..., 3] / 255 for picture in truth.values()], scene.seed)
     around = object_sphere(model, object_points(model, masks))
     room = Sphere(around.centre, ROOM * around.radius)
+    pictures = [read_image(scene.scene / "images" / f"{name}.jpg")[0][..., :3] for name in truth]
     ways = {"damaged": masks}
     for way, most in (("one_word", 0.0), ("vote", consistency.MOST_VOTES)):
         with patch.object(consistency, "MOST_VOTES", most):
-            ways[f"damaged_{way}"] = agree(masks, model, room).masks
+            ways[f"damaged_{way}"] = agree(masks, model, room, pictures).masks
     result: Row = {}
     for way, found in ways.items():
         folder = scene.folder / "damaged" / way

@@ -11,6 +11,7 @@ from PIL import Image
 
 from hyperplanes.capture.masks.choice import check_mask, choose_masker
 from hyperplanes.capture.masks.consistency import agree
+from hyperplanes.capture.packages import is_installed
 from hyperplanes.capture.photographs import (
     FEWEST,
     Photograph,
@@ -107,7 +108,7 @@ def capture(
         work.notes.append(f"{len(rest)} photographs could not be posed and are left out: {listed(rest)}")
     straight = _straight(model, pictures, opacities, work)
     masks, how = _masks(model, straight, [one.name for one in kept], work)
-    placement, masks = _placed(model, kept, masks, work, trusted=how == "given")
+    placement, masks = _placed(model, kept, straight, masks, work, trusted=how == "given")
     return _written(out, model, kept, straight, masks, how, placement, work)
 
 
@@ -284,6 +285,7 @@ def _masks(
 def _placed(
     model: SparseModel,
     photographs: Sequence[Photograph],
+    straight: Sequence[Pixels],
     masks: list[np.ndarray] | None,
     work: _Work,
     *,
@@ -294,7 +296,8 @@ def _placed(
     sphere = object_sphere(model, chosen)
     if masks is not None:
         work.progress("agreement", 0, 1, "of the masks with each other")
-        found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius))
+        pictures = None if trusted or not is_installed("cv2") else [picture[..., :3] for picture in straight]
+        found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius), pictures)
         if found.wrong:
             names = listed([photographs[row].name for row in found.wrong])
             done = "look at them" if trusted else "they were mended by what these show together"

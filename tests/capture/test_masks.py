@@ -73,17 +73,20 @@ def test_the_network_finds_what_stands_out():
     mask = np.hypot((rows - 75) / 50, (columns - 95) / 40) < 1
     picture = np.random.default_rng(0).normal(150, 6, (150, 200, 3))
     picture[mask] = [200, 60, 30]
-    assert overlap(SalientObject(1)(picture.clip(0, 255).astype(np.uint8)), mask) > 0.9
+    picture, masker = picture.clip(0, 255).astype(np.uint8), SalientObject(1)
+    found = masker(picture)
+    assert overlap(found, mask) > 0.9
+    np.testing.assert_allclose(masker(picture[:, ::-1]), found[:, ::-1], atol=1e-3)  # of a mirror image the mirrored
 
 
 @pytest.fixture(scope="module")
 def ball_seen():
-    """A ball seen by 24 cameras around it: the model, its sphere and its masks."""
+    """A ball seen by 16 cameras around it: the model, its sphere and its masks."""
     from hyperplanes.capture.sparse_model import SparseModel
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.geometry.rays import Sphere
 
-    count, size = 24, 96
+    count, size = 16, 96
     poses = camera.orbit(count, 3.0, 0.3).numpy().astype(float)
     calibration = np.tile(np.array([[110.0, 0, 47.5], [0, 110.0, 47.5], [0, 0, 1]]), (count, 1, 1))
     nothing = np.zeros((0, 2))
@@ -130,3 +133,16 @@ def test_masks_damaged_on_purpose_are_named_and_mended(ball_seen):
     ]
     assert volume[1] < 0.6 * volume[0]  # what single masks carve away
     assert abs(volume[2] / volume[0] - 1) < 0.05
+
+
+def test_a_piece_that_a_mask_lacks_is_found_by_its_colour():
+    pytest.importorskip("cv2")
+    from hyperplanes.capture.masks.grabcut import extended
+
+    picture, true = drawn()
+    lacking = true.astype(float)
+    lacking[50:70, 100:] = 0.0
+    found = extended(picture, lacking, np.ones((60, 80), bool))
+    assert overlap(lacking, true) < 0.92
+    assert overlap(found, true) > 0.98
+    np.testing.assert_array_equal(extended(picture, lacking, np.zeros((60, 80), bool)), lacking)  # no room, no piece

@@ -113,3 +113,22 @@ def test_reprojection_errors_of_colmap(tmp_path, binary):
     said = "\n".join(describe_scene(views, replace(found, errors={"a.png": 1.0, "b.png": 4.0})).lines())
     assert "reprojection error: 2.40 pixels (mean, 3 points), 4.00 in the worst view (b.png)" in said
     assert "reprojection error 4.0 pixels, in the median 2.5" not in said, "less than twice the median"
+
+
+def test_the_silhouette_of_a_solid_hull_has_no_gaps():
+    """A ball covers a disc, whatever the pixels that a voxel covers; holes filled (SciPy) change nothing."""
+    from scipy.ndimage import binary_fill_holes
+
+    from hyperplanes.data.inspection.silhouettes import silhouettes
+    from hyperplanes.geometry import cameras as camera
+    from hyperplanes.geometry.occupancy import Occupancy, full
+    from hyperplanes.geometry.rays import Sphere
+
+    hull = full(Sphere(), 24)
+    ball = Occupancy((hull.centres().norm(dim=-1) < 1).reshape(24, 24, 24), hull.bounds)
+    for focal in (40.0, 60.0, 75.0):  # 1.1, 1.7 and 2.1 pixels a voxel
+        calibration = torch.tensor([[[focal, 0, 63.5], [0, focal, 63.5], [0, 0, 1]]])
+        cameras = camera.pinhole(calibration, camera.orbit(3, 3.0, 0.3)[:1], 128, 128)
+        seen = silhouettes(ball.centres(), ball, cameras)[0].numpy()
+        assert (binary_fill_holes(seen) == seen).all()
+        assert np.sqrt(seen.sum() / np.pi) == pytest.approx(focal / np.sqrt(8), abs=2)

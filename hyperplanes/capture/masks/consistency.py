@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from kornia.geometry.camera import PinholeCamera
 from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
+from hyperplanes.capture.masks.grabcut import extended
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.data.inspection.silhouettes import silhouettes
 from hyperplanes.data.pictures.bounds import smallest_ball
@@ -23,8 +24,8 @@ from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["Agreement", "agree"]
 
-SIDE = 80  # voxels an axis
-LONGEST = 160  # pixels of the masks that are compared
+COARSE, FINE = 80, 120  # voxels an axis, of the hull that is searched and of the one that masks are compared with
+LONGEST = 240  # pixels of the masks that are compared
 FEWEST = 8  # views, below which masks are not judged
 SEEN = 0.25  # of the views must show a place within their borders for it to belong to the object
 MOST_VOTES = 0.125  # of the views
@@ -64,7 +65,12 @@ class Agreement:
         return np.flatnonzero(self.disagreement > DISAGREES).tolist()
 
 
-def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreement:
+def agree(
+    masks: Sequence[Mask],
+    model: SparseModel,
+    sphere: Sphere,
+    pictures: Sequence[UInt8[np.ndarray, "height width 3"]] | None = None,
+) -> Agreement:
     """Compare each mask with the silhouette of the hull of all others, and mend what they contradict.
 
     A place belongs to the hull where fewer than `votes` masks rule it out, and where a quarter of the pictures show it
@@ -76,19 +82,24 @@ def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreemen
     many. So only differences that a disc fits into count, and a mask is filled only where other cameras look from
     nearly the same side, to the left and to the right of it.
 
+    Where masks contradict each other, what they lack in thin parts is found by colour: within the hull of the others,
+    what resembles the rest of the object in its picture is added. Pieces that are missing cost more than ones too many,
+    since a field is carved out of all masks.
+
     Args:
         masks: one a camera, opacity of the picture without its lens.
         model: its cameras.
         sphere: that holds the object.
+        pictures: what the masks are of, without which nothing is found by colour.
     """
     small = [_reduced(mask) for mask in masks]
     pairs = [(each, _camera(model, row, masks[row], each.shape)) for row, each in enumerate(small)]
-    judged = _judged(pairs, sphere)
+    judged = _judged(pairs, sphere, COARSE)
     votes = _votes(judged, pairs)
     hull = judged.hull(votes)
     ball = _ball(hull)
-    if ball is not None and ZOOM * ball.radius < sphere.radius:  # the same again, finer
-        judged = _judged(pairs, Sphere(ball.centre, ZOOM * ball.radius))
+    if ball is not None:  # the same again, finer
+        judged = _judged(pairs, Sphere(ball.centre, min(ZOOM * ball.radius, sphere.radius)), FINE)
         votes = _votes(judged, pairs)
         hull = judged.hull(votes)
     if not hull.occupied.any():
@@ -96,7 +107,7 @@ def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreemen
     if len(masks) < FEWEST:
         return Agreement(list(masks), np.zeros(len(masks)), votes, hull)
     surrounded = _is_surrounded(model, hull.bounds)
-    mended, disagreement = [], []
+    mended, disagreement, outlines = [], [], []
     for row, (reduced, one) in enumerate(pairs):
         others = judged.hull(votes, without=row)
         seen = silhouettes(others.centres(), others, one)[0].numpy()
@@ -104,7 +115,11 @@ def agree(masks: Sequence[Mask], model: SparseModel, sphere: Sphere) -> Agreemen
         lost &= surrounded[row]
         mended.append(_mended(masks[row], lost, extra))
         disagreement.append((lost.sum() + extra.sum()) / max(1, seen.sum()))
-    return Agreement(mended, np.array(disagreement), votes, hull)
+        outlines.append(seen)
+    found = Agreement(mended, np.array(disagreement), votes, hull)
+    if pictures is None or not found.wrong:
+        return found
+    return replace(found, masks=[extended(*each) for each in zip(pictures, mended, outlines, strict=True)])
 
 
 def _reduced(mask: Mask) -> Bool[np.ndarray, "row column"]:
@@ -139,15 +154,19 @@ class _Judged:
         return self.ruled.sum(0, dtype=torch.int32)
 
 
-def _judged(pairs: Sequence[tuple[np.ndarray, PinholeCamera]], sphere: Sphere) -> _Judged:
-    ruled = torch.stack([_ruled_out(mask, one, sphere) for mask, one in pairs])
-    shown = sum((_ruled_out(np.zeros_like(mask), one, sphere).int() for mask, one in pairs), torch.zeros(()))
-    return _Judged(ruled, shown >= max(2.0, SEEN * len(pairs)), sphere)
+def _judged(pairs: Sequence[tuple[np.ndarray, PinholeCamera]], sphere: Sphere, side: int) -> _Judged:
+    ruled = torch.stack([_ruled_out(mask, one, sphere, side) for mask, one in pairs])
+    # what the pictures show within their borders is an empty mask's to rule out; half as fine will do
+    shown = sum((_ruled_out(np.zeros_like(mask), one, sphere, side // 2).int() for mask, one in pairs), torch.zeros(()))
+    candidate = shown >= max(2.0, SEEN * len(pairs))
+    for axis in range(3):
+        candidate = candidate.repeat_interleave(2, axis)
+    return _Judged(ruled, candidate, sphere)
 
 
-def _ruled_out(mask: np.ndarray, one: PinholeCamera, sphere: Sphere) -> Bool[Tensor, "x y z"]:
+def _ruled_out(mask: np.ndarray, one: PinholeCamera, sphere: Sphere, side: int) -> Bool[Tensor, "x y z"]:
     """The voxels that one mask rules out."""
-    return ~carve(torch.from_numpy(mask)[None, None], one, sphere, SIDE).occupied
+    return ~carve(torch.from_numpy(mask)[None, None], one, sphere, side).occupied
 
 
 def _votes(judged: _Judged, pairs: Sequence[tuple[np.ndarray, PinholeCamera]]) -> int:

@@ -1,4 +1,4 @@
-"""Masks without a network: GrabCut, told by the sparse points what is object and what is background.
+"""GrabCut: what resembles the object by colour, up to edges; told by the sparse points, or by masks that disagree.
 
 Rother, Kolmogorov and Blake, "GrabCut: interactive foreground extraction using iterated graph cuts", SIGGRAPH 2004.
 """
@@ -6,19 +6,21 @@ Rother, Kolmogorov and Blake, "GrabCut: interactive foreground extraction using 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
+from scipy import ndimage
 
 from hyperplanes.capture.masks.regions import cleaned, firm
 from hyperplanes.capture.packages import require
 from hyperplanes.capture.placement import object_points, object_sphere
 from hyperplanes.capture.sparse_model import SparseModel
 
-__all__ = ["GrabCut"]
+__all__ = ["GrabCut", "extended"]
 
 LONGEST = 320  # pixels on which the cut is made
 SEED = 0.012  # radius of what a point marks, of the longer side
 STEPS = 5
+CERTAIN = 0.03  # of the square root of a mask's area: pixels further from its border are the object
 
 
 class GrabCut:
@@ -36,19 +38,11 @@ class GrabCut:
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"], camera: int) -> Float[np.ndarray, "height width"]:
         """Opacity in [0, 1]."""
-        height, width = picture.shape[:2]
-        scale = min(1.0, LONGEST / max(height, width))
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        small = np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+        size, scale = _reduced_size(picture)
         labels = self._seeds(camera, size, scale)
         if not (labels == self._cv2.GC_FGD).any():
-            return np.zeros((height, width))
-        self._cv2.setRNGSeed(0)
-        models = np.zeros((1, 65)), np.zeros((1, 65))
-        labels, _, _ = self._cv2.grabCut(small, labels, None, *models, STEPS, self._cv2.GC_INIT_WITH_MASK)
-        inside = np.isin(labels, (self._cv2.GC_FGD, self._cv2.GC_PR_FGD))
-        opacity = Image.fromarray(inside.astype(np.float32)).resize((width, height), Image.Resampling.BICUBIC)
-        return cleaned(firm(np.asarray(opacity, np.float64)))
+            return np.zeros(picture.shape[:2])
+        return cleaned(_cut(picture, labels))
 
     def _seeds(self, camera: int, size: tuple[int, int], scale: float) -> np.ndarray:
         """What is certain, and what is likely, for GrabCut: around each point, and outside of the object's sphere."""
@@ -70,3 +64,48 @@ class GrabCut:
             for column, row in zip(x[front > 0] * scale, y[front > 0] * scale, strict=True):
                 self._cv2.circle(labels, (round(column), round(row)), radius, int(label), -1)
         return labels
+
+
+def extended(
+    picture: UInt8[np.ndarray, "height width 3"],
+    mask: Float[np.ndarray, "height width"],
+    possible: Bool[np.ndarray, "row column"],
+) -> Float[np.ndarray, "height width"]:
+    """A mask and what resembles it, as far as edges of the picture.
+
+    Args:
+        picture: 8-bit RGB.
+        mask: opacity in [0, 1], all of which stays.
+        possible: where the object may be at most, in any resolution.
+    """
+    cv2 = require("cv2", "completes masks by colour")
+    size, _ = _reduced_size(picture)
+    likely, room = (_resized(values, size) > 0.5 for values in (mask, possible))
+    depth = max(1, round(CERTAIN * float(np.sqrt(likely.sum()))))
+    certain = np.asarray(ndimage.binary_erosion(likely, iterations=depth))
+    labels = np.select([certain, likely, room], [cv2.GC_FGD, cv2.GC_PR_FGD, cv2.GC_PR_BGD], cv2.GC_BGD)
+    if not (certain.any() and (labels == cv2.GC_PR_BGD).any()):
+        return mask
+    return np.maximum(mask, _cut(picture, labels.astype(np.uint8), 2))
+
+
+def _cut(picture: np.ndarray, labels: np.ndarray, steps: int = STEPS) -> np.ndarray:
+    """Opacity of the picture by labels of it in a lower resolution, of which some are certain."""
+    cv2 = require("cv2", "cuts masks out of pictures")
+    small = np.asarray(Image.fromarray(picture).resize(labels.shape[::-1], Image.Resampling.BOX))
+    cv2.setRNGSeed(0)
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    labels, _, _ = cv2.grabCut(small, labels, None, *models, steps, cv2.GC_INIT_WITH_MASK)
+    return firm(_resized(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), picture.shape[1::-1]))
+
+
+def _reduced_size(picture: np.ndarray) -> tuple[tuple[int, int], float]:
+    """(width, height) in which a cut is made, and how many of its pixels make one of the picture."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, LONGEST / max(height, width))
+    return (max(1, round(width * scale)), max(1, round(height * scale))), scale
+
+
+def _resized(values: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    scaled = Image.fromarray(values.astype(np.float32)).resize(size, Image.Resampling.BICUBIC)
+    return np.asarray(scaled, np.float64)

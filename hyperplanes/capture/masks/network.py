@@ -61,7 +61,13 @@ class SalientObject:
         return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
-        """Opacity in [0, 1], with firm edges."""
+        """Opacity in [0, 1], with firm edges; the mean of the picture's and that of its mirror image."""
+        found = (self._probability(picture) + self._probability(picture[:, ::-1])[:, ::-1]) / 2
+        scaled = Image.fromarray(found).resize(picture.shape[1::-1], Image.Resampling.BICUBIC)
+        return cleaned(firm(np.asarray(scaled, np.float64)))
+
+    def _probability(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "side side"]:
+        """That the pixels of the scaled picture belong to the object."""
         small = np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.LANCZOS), np.float32)
         small = (small / max(1.0, float(small.max())) - MEAN) / DEVIATION
         read = small.transpose(2, 0, 1)[None].astype(np.float32)
@@ -69,6 +75,5 @@ class SalientObject:
         output = session.run([session.get_outputs()[0].name], {session.get_inputs()[0].name: read})[0][0, 0]
         low, high = float(output.min()), float(output.max())
         if high - low < 1e-3:  # nothing stands out
-            return np.zeros(picture.shape[:2])
-        scaled = Image.fromarray((output - low) / (high - low)).resize(picture.shape[1::-1], Image.Resampling.BICUBIC)
-        return cleaned(firm(np.asarray(scaled, np.float64)))
+            return np.zeros_like(output)
+        return (output - low) / (high - low)

@@ -112,7 +112,7 @@ def small_masks(views: Views) -> tuple[Float[Tensor, "view 1 height width"], Pin
 def silhouettes(
     points: Float[Tensor, "voxel 3"], hull: Occupancy, cameras: PinholeCamera
 ) -> Bool[Tensor, "view height width"]:
-    """Which pixels see a voxel: its centre's pixel, and those around it as far as half the voxel reaches.
+    """Which pixels see a voxel: its centre's pixel, those around it as far as half the voxel reaches, and gaps of two.
 
     Args:
         points: centres of the voxels.
@@ -133,5 +133,6 @@ def silhouettes(
         picture[0, row[inside], column[inside]] = 1.0
         focal = float(camera.intrinsics(cameras)[view, [0, 1], [0, 1]].max())
         reach = int(focal * hull.voxel / 2 / float(front[:, 2].median()))
-        seen[view] = max_pool2d(picture, 2 * reach + 1, 1, reach)[0] > 0
+        grown = max_pool2d(picture, 2 * reach + 3, 1, reach + 1)  # a pixel more, which closes the gaps between centres
+        seen[view] = -max_pool2d(-grown, 3, 1, 1)[0] > 0
     return seen
