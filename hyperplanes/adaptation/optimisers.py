@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hyperplanes.geometry.kernels.threads import parallel_map
+
 __all__ = ["OPTIMISERS", "Muon", "make_optimisers", "orthogonalise"]
 
 OPTIMISERS = ("adam", "muon", "sgd")
@@ -62,12 +64,13 @@ class Muon(torch.optim.Optimizer):
             with torch.enable_grad():
                 loss = closure()
         for group in self.param_groups:
-            for value in group["params"]:
-                if value.grad is None:
-                    continue
+            moved = [value for value in group["params"] if value.grad is not None]
+            for value in moved:
                 momentum = self.state[value].setdefault("momentum", torch.zeros_like(value))
                 momentum.lerp_(value.grad, 1 - group["momentum"])
-                direction = orthogonalise(value.grad.lerp(momentum, group["momentum"]))
+            # products of small matrices, which one thread each computes faster than all of them together
+            ahead = [value.grad.lerp(self.state[value]["momentum"], group["momentum"]) for value in moved]
+            for value, direction in zip(moved, parallel_map(orthogonalise, ahead), strict=True):
                 value.add_(direction, alpha=-group["lr"] * max(1, value.shape[0] / value.shape[1]) ** 0.5)
         return loss
 
