@@ -25,7 +25,7 @@ COMMANDS: dict[str, list[str]] = {
     "visibility": [],
     "busy": [],
     "rendering": ["--sizes", "64", "128", "200", "400", "--plot", "rendering.png"],
-    "small": ["--second-pass"],
+    "small": [],
     "splats": [],
     "steps": [],
     "training": [],

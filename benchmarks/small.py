@@ -3,8 +3,8 @@
     python -m benchmarks small --json FILE
     python -m benchmarks small --scene ../shared/posed/chair --views 50
 
-Of a procedural car that no training saw, or of a posed scene: the time to a field, to the voxels that hold something, a
-view at several sizes, the second pass that renders all shown views, and PSNR. The reference is the same field, whose
+Of a procedural car that no training saw, or of a posed scene: the time to a field with its voxels and its surface, a
+view at several sizes, and PSNR. The reference is the same field, whose
 inputs PyTorch looks up, gathers and concatenates, and which is asked for the colour of every sample in every voxel of
 the visual hull that is not empty and in those around them, until rays are as opaque as in training. Both run in turn,
 in one process.
@@ -49,7 +49,6 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--scene", type=Path, help="a posed scene in place of the car")
     parser.add_argument("--views", type=int, default=25, help="that are shown (default: %(default)s)")
     parser.add_argument("--repeats", type=int, default=5, help="views of each (default: %(default)s)")
-    parser.add_argument("--second-pass", action="store_true", help="measure that too")
     parser.add_argument("--quick", action="store_true", help="a car of 64 pixels, two views")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)
@@ -57,22 +56,21 @@ def main(arguments: list[str]) -> int:
     model = HyperPlanes.from_pretrained("small")
     rows = []
     if chosen.scene is not None:
-        rows.append(measure(model, _shown(read_task(chosen.scene), chosen.views), repeats, chosen.second_pass))
+        rows.append(measure(model, _shown(read_task(chosen.scene), chosen.views), repeats))
     else:
         for size in sizes:
             task = _shown(held_out(1, size, 2 * chosen.views)[0], chosen.views)
-            rows.append(measure(model, task, repeats, chosen.second_pass))
+            rows.append(measure(model, task, repeats))
     return finish("small", rows, chosen.json)
 
 
-def measure(model: HyperPlanes, task: Task, repeats: int, second_pass: bool) -> Row:
+def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
     """One object: ours and the reference in turn, view by view."""
     model.adapt(task.support)  # compiles, and fills caches
     adapt, adapted = timed(lambda: model.adapt(task.support))
-    refine, _ = timed(lambda: adapted.refined_occupancy)
     with _plainly():
         adapted(*2 * (adapted.occupancy.centres()[:1],))  # compiles
-        plain_refine, voxels = timed(lambda: refine_voxels(adapted.occupancy, adapted.density))
+        voxels = refine_voxels(adapted.occupancy, adapted.density)
     assert isinstance(adapted.sampling, RayMarching)
     every = RayMarching(adapted.sampling.for_rendering.steps, adapted.sampling.stop)
     views = [(7 * number + 3) % len(task.query) for number in range(repeats)]
@@ -87,7 +85,7 @@ def measure(model: HyperPlanes, task: Task, repeats: int, second_pass: bool) -> 
         found.append(_quality(pictures, task, view))
         expected.append(_quality(plain, task, view))
     height, width = task.query.size
-    row: Row = {
+    return {
         "name": f"small, {task.name}, {width}x{height}, {len(task.support)} views",
         "threads": torch.get_num_threads(),
         "seconds": statistics.median(seconds),
@@ -96,14 +94,7 @@ def measure(model: HyperPlanes, task: Task, repeats: int, second_pass: bool) -> 
         "psnr": statistics.fmean(found),
         "psnr_loss": statistics.fmean(expected) - statistics.fmean(found),
         "adapt_seconds": adapt,
-        "refine_seconds": refine,
-        "refine_speedup": plain_refine / refine,
     }
-    if second_pass:
-        twice = HyperPlanes.from_pretrained("small")
-        twice.config = replace(twice.config, second_pass=True)
-        row["second_pass_seconds"] = timed(lambda: twice.adapt(task.support))[0] - adapt
-    return row
 
 
 def _shown(task: Task, count: int) -> Task:
@@ -118,9 +109,7 @@ def _quality(pictures: Pictures, task: Task, view: int) -> float:
 def _unsplit(adapted: AdaptedField, voxels: Occupancy) -> AdaptedField:
     """The same field as a mere function, all of whose colours are evaluated, and of whose voxels none is trimmed."""
     field: Callable = adapted.field
-    result = replace(adapted, field=lambda points, directions: field(points, directions))
-    result.__dict__["refined_occupancy"] = voxels
-    return result
+    return replace(adapted, field=lambda points, directions: field(points, directions), refined=voxels)
 
 
 @contextmanager

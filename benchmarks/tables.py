@@ -203,9 +203,8 @@ def _small(result: Result) -> str:
     for row in result["rows"]:
         times = [f"**{_seconds(row['seconds'])}**", _seconds(row["reference_seconds"]), f"{row['speedup']:.1f}"]
         quality = [f"{row['psnr']:.2f} dB", f"{row['psnr_loss']:.2f} dB"]
-        once = [_seconds(row[name]) for name in ("refine_seconds", "second_pass_seconds")]
-        lines.append([row["name"].split(", ")[2], *times, *quality, *once])
-    headings = ["a view", "reference", "ratio", "PSNR", "lost", "finding voxels, once", "second pass over 25 views"]
+        lines.append([row["name"].split(", ")[2], *times, *quality, _seconds(row["adapt_seconds"])])
+    headings = ["a view", "reference", "ratio", "PSNR", "lost", "adapting, once"]
     return markdown_table(["picture", *headings], lines)
 
 

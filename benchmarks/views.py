@@ -78,7 +78,6 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--rotated", type=float, default=0.0, metavar="DEGREES", help="every scene, about its vertical axis"
     )
-    parser.add_argument("--second-pass", action="store_true", help="the model takes one, in all its rows")
     parser.add_argument("--pictures", type=Path, metavar="FILE", help="PNG: of each data set the best, the median and "
                         "the worst view by the most views shown; columns are the truth and the numbers of views, "
                         "ascending")  # fmt: skip
@@ -91,7 +90,6 @@ def main(arguments: list[str]) -> int:
     if chosen.inputs:
         chosen.counts = [len(chosen.inputs)]
     model, rows, sheet = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint))), [], []
-    model.config = replace(model.config, second_pass=chosen.second_pass or model.config.second_pass)
     for suite, path in folders:
         data = open_dataset(path)
         names = sorted(data.names("test"))[: chosen.objects]
@@ -104,7 +102,6 @@ def main(arguments: list[str]) -> int:
             for method, adapter in adapters(model, shown, names, chosen.methods, steps).items():
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
                 row |= {"suite": suite} if suite else {}
-                row |= {"second_pass": True} if chosen.second_pass else {}
                 row |= {"rotated": chosen.rotated} if chosen.rotated else {}
                 made = seen.setdefault(count, []) if method == "one_step" else []
                 score = evaluate(

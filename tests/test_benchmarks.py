@@ -18,9 +18,6 @@ from benchmarks import __main__ as benchmarks_main
 from benchmarks import all as all_benchmarks
 from benchmarks import image_based, tables, views
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.data import open_dataset
-from hyperplanes.data.support import Shown
-from hyperplanes.evaluation import evaluate
 from hyperplanes.training import Trainer
 from hyperplanes.utilities.files import DataError
 from tests.reference_rendering import Balls
@@ -52,29 +49,11 @@ def test_pooling_reads_the_views_of_a_point_in_no_order():
     torch.testing.assert_close(field.joined(slots), field.joined(changed))
 
 
-def test_parts_of_an_update_are_rendered_with_the_passes_that_the_whole_has():
-    model, task = HyperPlanes(replace(MODEL, second_pass=True)), Balls(views=6, size=(24, 24)).task("train0")
+def test_a_whole_update_as_parts_of_it_is_that_of_the_model():
+    model, task = HyperPlanes(MODEL), Balls(views=6, size=(24, 24)).task("train0")
     found = views.METHODS["unjudged"](model).adapt(task.support)  # outputs start at zero: nothing to leave out
-    expected = model.adapt(task.support)
-    cameras = task.query.cameras
+    expected, cameras = model.adapt(task.support), task.query.cameras
     assert torch.equal(found.render(cameras).images, expected.render(cameras).images)
-    assert found.field.planes._surface is not None
-
-
-def test_the_second_pass_of_the_benchmark_of_views_is_that_of_the_model(tmp_path):
-    data = demo_folder() / "data"
-    model = HyperPlanes(MODEL)
-    model.save(tmp_path / "model")
-    options = ["--checkpoint", str(tmp_path / "model"), "--data", str(data), "--quick", "--second-pass"]
-    assert views.main([*options, "--methods", "--json", str(tmp_path / "rows.json")]) == 0
-    (row,) = json.loads((tmp_path / "rows.json").read_text())["rows"]
-    assert (row["name"], row["views"], row["second_pass"]) == ("one_step", 3, True)
-
-    opened = open_dataset(data)
-    names = sorted(opened.names("test"))[:2]
-    model.config = replace(model.config, second_pass=True)
-    again = evaluate("one_step", model, Shown(opened, 3, 1), names)
-    assert row["psnr"] == pytest.approx(again.mean("psnr"), abs=1e-6)
 
 
 def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):

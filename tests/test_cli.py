@@ -542,8 +542,6 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     assert "steps: expected 0 with a baked file" in complaint(capsys)
     assert main(["adapt", "--checkpoint", str(out), *scene]) == 2
     assert "expected a checkpoint's folder to adapt with, got a file" in complaint(capsys)
-    assert main(["render", "--checkpoint", str(out), *scene, "--second-pass"]) == 2
-    assert "expected a checkpoint's folder to take a second pass with, got a file" in complaint(capsys)
     assert main([*command, "--voxels", "7"]) == 2
     assert "7" in complaint(capsys)
 
@@ -594,26 +592,6 @@ def test_the_scene_that_comes_with_the_package_has_a_name(tmp_path, monkeypatch,
     (tmp_path / "example-car").mkdir()  # a folder of that name goes first
     with pytest.raises(DataError, match="example-car"):
         read_scene(Path("example-car"), Console(silent=True))
-
-
-def test_a_second_pass_is_taken_by_models_that_judge_what_views_see_and_refused_by_others(tmp_path, capsys):
-    model = HyperPlanes.from_pretrained("small")
-    model.config = replace(model.config, hull_resolution=32, judged=False)  # a second a picture, not three
-    model.save(tmp_path / "small")
-    small = str(tmp_path / "small")
-    views = ["--views", str(first_object(demo_folder()))]
-    once, twice, adapted = (str(tmp_path / name) for name in ("once", "twice", "adapted"))
-    assert main(["render", "--checkpoint", small, *views, "--out", once]) == 0
-    assert main(["render", "--checkpoint", small, *views, "--out", twice, "--second-pass"]) == 0
-    assert main(["adapt", "--checkpoint", small, *views, "--out", adapted, "--second-pass"]) == 0
-    assert main(["render", "--checkpoint", adapted, *views, "--out", str(tmp_path / "by-weights")]) == 0
-    names = sorted(path.name for path in (tmp_path / "once").glob("*.png"))
-    pictures = [[pixels(tmp_path / each / name) for name in names] for each in ("once", "twice", "by-weights")]
-    assert max(abs(one - two).max() for one, two in zip(*pictures[:2], strict=True)) > 4
-    assert max(abs(one - two).max() for one, two in zip(*pictures[1:], strict=True)) <= 1
-    capsys.readouterr()
-    assert main(["render", "--checkpoint", str(demo_folder()), *views, "--out", once, "--second-pass"]) == 2
-    assert "expected a model of the field image_based, such as small" in complaint(capsys)
 
 
 def with_z_up(scene, folder):

@@ -59,6 +59,7 @@ class AdaptedField:
         sampling: the sampler that it was trained with.
         proposal: the coarse field of `Hierarchical` sampling, where it is another one.
         densities: points -> density alone, of the field and of its proposal.
+        refined: the voxels of `occupancy` in which it has density, where they are known.
     """
 
     field: FieldFunction
@@ -66,6 +67,7 @@ class AdaptedField:
     sampling: Sampler
     proposal: FieldFunction | None = None
     densities: tuple[Callable[[Tensor], Tensor], ...] = ()
+    refined: Occupancy | None = None
 
     def __repr__(self) -> str:
         side = self.occupancy.occupied.shape[0]
@@ -93,8 +95,8 @@ class AdaptedField:
 
     @cached_property
     def refined_occupancy(self) -> Occupancy:
-        """The voxels of `occupancy` in which the field has density; computed when the first view is rendered."""
-        return refine(self.occupancy, self.density, margin_loss=MARGIN_LOSS)
+        """The voxels of `occupancy` in which the field has density; computed when they are asked for first."""
+        return self.refined or refine(self.occupancy, self.density, margin_loss=MARGIN_LOSS)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without colour where the field can do that."""

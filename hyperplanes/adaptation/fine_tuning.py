@@ -134,16 +134,15 @@ def make_descent(
         context: the object.
         settings: what is optimised, rates, rays and seed.
         views: where rays come from; those of the planes where absent.
-        start: the weights to begin with, and no second pass is taken; those of `adapt` where absent.
+        start: the weights to begin with; those of `adapt` where absent.
     """
     views = context.views if views is None else views
     if settings.trainable == "weights":
         settings = settings.with_rates(network.target.fine_tuning_rates)
     variables = _variables(network, context, settings, start)
-    shown = network.second_pass(context, variables.weights()) if start is None else context
 
     def field(masked: Tensor | None) -> AdaptedField:
-        return network.field(shown if masked is None else shown.mask_views(masked), variables.weights())
+        return network.field(context if masked is None else context.mask_views(masked), variables.weights())
 
     pixels, masks_views = network.live_pixels_of(context, views), network.target.permutation_invariant
     return Descent(field, variables.tensors, views, settings, pixels, masks_views), variables

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -79,10 +78,9 @@ class HyperPlanes(HyperPlanesNetwork):
             on_trial: likewise, while "auto" finds how many they are to be; there are up to `settings.max_steps`.
 
         Returns:
-            The field. A model that takes a second pass takes it twice: the steps keep the surface of the weights that
-            they begin with, and the field has that of its own. Steps that cannot be taken are a ValueError: those of a
-            hypernetwork that the model has not, a negative number, "auto" with fewer than 3 views, or a single view of
-            a field that takes any number of them, unless `settings.mask_views` is off.
+            The field. Steps that cannot be taken are a ValueError: those of a hypernetwork that the model has not, a
+            negative number, "auto" with fewer than 3 views, or a single view of a field that takes any number of them,
+            unless `settings.mask_views` is off.
         """
         return fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
 
@@ -112,12 +110,6 @@ class HyperPlanes(HyperPlanesNetwork):
         for name, network in result.targets.items():
             network.load_state_dict(network.parameters_of(found[name]))
         return result.eval()
-
-    def with_second_pass(self) -> HyperPlanes:
-        """The same model, sharing its weights, which takes a second pass whatever it was configured to do."""
-        result = copy.copy(self)
-        result.config = replace(self.config, second_pass=True)
-        return result
 
     @checked
     def save(self, folder: Path | str, dtype: torch.dtype | None = None) -> None:

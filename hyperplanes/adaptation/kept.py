@@ -11,7 +11,6 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
-from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.utilities.environment import cache_folder
 from hyperplanes.views import Views
@@ -29,7 +27,6 @@ from hyperplanes.views import Views
 __all__ = ["keep_field", "keep_tensors", "kept_file", "kept_folder", "recall_field", "recall_tensors"]
 
 MOST = 10  # of a kind that are kept; the oldest goes first
-SURFACE = "surface.safetensors"
 
 
 def kept_folder(model: HyperPlanes, views: Views, steps: Steps, settings: FineTuning) -> Path:
@@ -131,9 +128,6 @@ def keep_field(model: HyperPlanes, field: AdaptedField, folder: Path) -> None:
         field: of `model`.
         folder: of `kept_folder`.
     """
-    surface = _surface(field)
-    if surface is not None:
-        save_tensors(folder / SURFACE, {"distances": surface.cpu()})
     model.with_weights_of(field).save(folder)
     _delete_oldest(folder.parent)
 
@@ -150,18 +144,7 @@ def recall_field(folder: Path, views: Views, device: torch.device | str = "cpu")
         return None
     try:
         model = HyperPlanes.from_pretrained(folder).to(device)
-        kept = load_tensors(folder / SURFACE) if (folder / SURFACE).exists() else {}
     except CheckpointError:
         return None
-    context = model.prepare(views)
-    if "distances" in kept:
-        distances = kept["distances"].to(device)
-        planes = model.target.with_surface(context.planes, distances, torch.ones_like(distances))
-        context = replace(context, planes=planes)
     with torch.no_grad():
-        return model.field(context, model.theta.detach())
-
-
-def _surface(field: AdaptedField) -> Tensor | None:
-    planes = getattr(field.field, "planes", None)
-    return planes.surface if isinstance(planes, VisibilityPlanes) else None
+        return model.adapt(views)

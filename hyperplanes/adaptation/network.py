@@ -18,6 +18,7 @@ from hyperplanes.fields.rig import Rig, camera_directions
 from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
+from hyperplanes.rendering.refinement import solid_voxels
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
@@ -146,22 +147,25 @@ class HyperPlanesNetwork(nn.Module):
         return Parameters((f"{name}.{key}", value) for name, part in parts.items() for key, value in part.items())
 
     def rendering_field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
-        """As `field`, after a second pass where the model takes two."""
-        return self.field(self.second_pass(context, parameters), parameters)
+        """As `field`; one that judges what views see takes colours from those that see the surface of its density.
+
+        The visual hull knows no hollows: by it, what lies in the seat of an armchair takes colours from views that do
+        not see it. Training and gradient steps do without.
+        """
+        by_hull = self.field(context, parameters)
+        if not self.target.permutation_invariant:
+            return by_hull
+        with torch.no_grad():
+            voxels = by_hull.refined_occupancy
+            surface = solid_voxels(voxels, by_hull.density)
+        planes = self.target.with_surface(context.planes, surface)
+        return replace(self.field(replace(context, planes=planes), parameters), refined=voxels)
 
     @torch.no_grad()
     def adapted_weights(self, context: SupportContext) -> Parameters:
         """Theta + delta as they are in use, whatever mode the model is in."""
         with in_use(self):
             return self.theta + self.update(context)
-
-    @torch.no_grad()
-    def second_pass(self, context: SupportContext, weights: Parameters) -> SupportContext:
-        """The planes with the surface that these weights show to each of them, where the model takes two passes."""
-        if not self.config.second_pass:
-            return context
-        seen = self.field(context, weights).render(context.views.cameras)
-        return replace(context, planes=self.target.with_surface(context.planes, seen.depth[:, 0], seen.opacity[:, 0]))
 
     def live_pixels_of(self, context: SupportContext, views: Views) -> Tensor | None:
         """Flat indices of the pixels of views that look into the hull; None where all are drawn from."""

@@ -28,45 +28,32 @@ __all__ = ["adapt_to", "bake_field", "load_adaptable", "load_source", "refuse_ba
 WORTH_KEEPING = 5.0  # seconds that adapting took
 
 
-def load_source(path: Path, device: torch.device, *, second_pass: bool = False) -> HyperPlanes | BakedScene:
+def load_source(path: Path, device: torch.device) -> HyperPlanes | BakedScene:
     """The model of a checkpoint, or the scene of a file that `bake` wrote.
 
     Args:
         path: a folder, the name of a packaged model, or a file.
         device: where the model goes; a baked scene is rendered on the CPU.
-        second_pass: as in `load_adaptable`; a baked scene takes none.
     """
     if path.is_file():
-        if second_pass:
-            refuse_baked(path, "take a second pass")
         from hyperplanes.export.baking import BakedScene
         from hyperplanes.fields.baked import BakedField
 
         return BakedScene(BakedField.load(path))
-    return load_adaptable(path, device, second_pass=second_pass)
+    return load_adaptable(path, device)
 
 
-def load_adaptable(path: Path, device: torch.device, *, second_pass: bool = False) -> HyperPlanes:
+def load_adaptable(path: Path, device: torch.device) -> HyperPlanes:
     """The model of a checkpoint.
 
     Args:
         path: a folder, or the name of a packaged model.
         device: where it goes.
-        second_pass: it takes one, whatever its checkpoint says.
-
-    Raises:
-        ValueError: a second pass of a model whose field does not judge what views see.
     """
     from hyperplanes.adaptation.checkpoints import find_checkpoint
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
 
-    model = HyperPlanes.from_pretrained(find_checkpoint(path)).to(device)
-    if second_pass:
-        if not model.target.permutation_invariant:
-            found = f"{path}, a model of {model.config.target}"
-            raise ValueError(f"second_pass: expected a model of the field image_based, such as small, got {found}")
-        model = model.with_second_pass()
-    return model
+    return HyperPlanes.from_pretrained(find_checkpoint(path)).to(device)
 
 
 def refuse_baked(path: Path, verb: str) -> None:

@@ -59,8 +59,6 @@ class ObjectArguments:
         out: The folder to write to; for `bake`, the file.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
             single forward pass.
-        second_pass: Render the shown views first, and take colours from those that see the surface found there, not the
-            visual hull: for textures and hollows; needs a model such as small.
         all_views: Show the model every view, not only the support half.
         learn_background: For photographs without masks: learn what lies in the sphere of the scene and the room around
             it together, and cut the former out.
@@ -77,7 +75,6 @@ class ObjectArguments:
     views: Path
     out: Path
     steps: Steps = 0
-    second_pass: bool = False
     all_views: bool = False
     learn_background: bool = False
     refine_poses: bool = False

@@ -53,7 +53,6 @@ class Arguments:
         compare: Methods of `hyperplanes evaluate` to see beside the model on the right half of the page, such as
             hull_blend, nearest_view, hyperplanes (the model after one step), or scratch_100.
         port: Of the page on this machine.
-        second_pass: Render the views first, and take colours from those that see the surface found there.
         learn_background: For photographs without masks: learn what lies in the sphere of the scene and the room around
             it together, and cut the former out.
         refine_poses: Refine the poses of the views first, and keep them where views that the model is not given are
@@ -71,7 +70,6 @@ class Arguments:
     fit: Annotated[int, range(10_000)] = 80
     compare: tuple[str, ...] = ()
     port: Annotated[int, range(65_536)] = 8080
-    second_pass: bool = False
     learn_background: bool = False
     refine_poses: bool = False
     up: ViewsUp = "auto"
@@ -86,7 +84,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.live import LiveViewer
 
     console, device = Console(), choose_device(arguments.device)
-    source = load_source(arguments.checkpoint, device, second_pass=arguments.second_pass)
+    source = load_source(arguments.checkpoint, device)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
     shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()

@@ -48,8 +48,6 @@ class ModelConfig:
         plane_dropout: how likely a step of training hides a plane of an object, for a field that knows planes by their
             places. It learns to do without any of them, and where there are fewer views than planes, each stands at one
             plane and the others are hidden, not filled with views that stand elsewhere.
-        second_pass: a field of any number of views renders those that it is shown, and then takes colours from the
-            views that see the surface found there, and not that of the visual hull. Training does without.
         judged: of five or more views of an object, two that are held out decide whether a field of any number of views
             is used as it was learned, halfway to the plain visual hull in blended colours, or not at all
             (`adaptation.judging`). Training does without.
@@ -65,7 +63,6 @@ class ModelConfig:
     hull_resolution: Annotated[int, range(1, 513)] = 64
     order: str = "matched"
     plane_dropout: float = 0.0
-    second_pass: bool = False
     judged: bool = False
 
     def __post_init__(self) -> None:

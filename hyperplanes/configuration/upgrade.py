@@ -27,8 +27,11 @@ OF_HEADS = tuple(each.name for each in fields(HeadConfig))
 REMOVED: dict[str, object] = {"gain": 1.0, "code_activation": "none"}
 """Settings of hypernetworks that are gone, with the value that left them off; docs/hypernetwork.md says why."""
 
+REMOVED_FROM_MODEL = ("second_pass",)
+"""Of what a model was once configured to do or not, what every one does now."""
+
 REMOVED_FROM_TRAINING: dict[str, object] = {"alternating": False, "average": 0.0}
-"""Settings of a training that are gone, likewise."""
+"""Settings of a training that are gone, with the value that left them off."""
 
 
 def upgrade_model(entries: Any) -> Any:
@@ -45,7 +48,7 @@ def upgrade_model(entries: Any) -> Any:
     """
     if not isinstance(entries, Mapping):
         return entries
-    result = {MODEL.get(name, name): value for name, value in entries.items()}
+    result = {MODEL.get(name, name): value for name, value in entries.items() if name not in REMOVED_FROM_MODEL}
     if result.get("protocol") == "marched":
         result["protocol"] = "ray_marching"
     if isinstance(target := result.get("target"), str):

@@ -136,15 +136,12 @@ class Target(nn.Module):
         """What the planes show on a grid over the scene, for a hypernetwork that reads it; here nothing."""
         return None
 
-    def with_surface(
-        self, planes: Any, distances: Float[Tensor, "view height width"], opacity: Float[Tensor, "view height width"]
-    ) -> Any:
-        """The planes with the surface that a first rendering showed each of them; here as they are.
+    def with_surface(self, planes: Any, voxels: Occupancy) -> Any:
+        """The planes with the surface of the voxels that a field fills; here as they are.
 
         Args:
             planes: of `planes_of`.
-            distances: from each camera to the surface.
-            opacity: of that rendering.
+            voxels: within the visual hull.
         """
         return planes
 

@@ -168,14 +168,9 @@ class ImageBasedNeRF(Target):
         """What the views show of the cells of the grid."""
         return volume_of(planes)
 
-    def with_surface(
-        self,
-        planes: VisibilityPlanes,
-        distances: Float[Tensor, "view height width"],
-        opacity: Float[Tensor, "view height width"],
-    ) -> VisibilityPlanes:
-        """The planes, whose colours come from those that see this surface, and no longer that of the hull."""
-        return planes.with_surface(distances, opacity)
+    def with_surface(self, planes: VisibilityPlanes, voxels: Occupancy) -> VisibilityPlanes:
+        """The planes, whose colours come from those that see the surface of these voxels, and no longer the hull's."""
+        return planes.with_surface(voxels)
 
     def bind(
         self, parameters: Parameters, planes: VisibilityPlanes | None, bounds: Sphere | None = None

@@ -193,24 +193,16 @@ class VisibilityPlanes:
         result._masked = self._masked.index_fill(0, views.to(self._masked.device), True)
         return result
 
-    @property
-    def surface(self) -> Float[Tensor, "view height width"] | None:
-        """Distances from each camera to the surface of `with_surface`, or None."""
-        return None if self._surface is None else self._surface[..., 0]
-
-    def with_surface(
-        self, distances: Float[Tensor, "view height width"], opacity: Float[Tensor, "view height width"]
-    ) -> VisibilityPlanes:
+    def with_surface(self, voxels: Occupancy) -> VisibilityPlanes:
         """The same planes, of which those nearest to a direction are judged by another surface than the hull's.
 
         Args:
-            distances: from each camera to the surface, along the rays of its pixels.
-            opacity: where it is 0.5 or less, and where the surface lies before that of the hull, the hull's counts.
+            voxels: within the hull; a pixel whose ray meets none of them sees all that lies along it.
         """
         result = copy.copy(self)
-        hull, mask = self.depth_opacity.unbind(-1)
-        surface = torch.where(opacity > 0.5, torch.maximum(distances, hull), hull)
-        result._surface = torch.stack([surface, mask], -1)
+        mask = self.depth_opacity[..., 1]
+        distances = first_hits(voxels, self.colours.cameras, mask[:, None])
+        result._surface = torch.stack([distances.to(mask), mask], -1)
         return result
 
     @torch.no_grad()

@@ -11,7 +11,7 @@ from torch import Tensor
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["refine"]
+__all__ = ["refine", "solid_voxels"]
 
 CHUNK = 1 << 14  # voxels in one call of the density
 OPAQUE = 1.0  # optical depth of a voxel from which on it hides what lies behind it
@@ -80,6 +80,28 @@ def refine(
     if margin_loss is None:
         return Occupancy(kept, bounds)
     return _trimmed(Occupancy(kept, bounds), filled, density, _density_of(margin_loss, occupancy))
+
+
+@torch.no_grad()
+def solid_voxels(
+    occupancy: Occupancy, density: Callable[[Tensor], Tensor], *, optical_depth: float = 0.03
+) -> Occupancy:
+    """The voxels that a field fills, as far as any can be seen: their first ones along a ray are its surface.
+
+    The density is evaluated at centres of voxels, from the outside inwards, as far as they are not opaque.
+
+    Args:
+        occupancy: the voxels to evaluate, such as those of `refine`.
+        density: as for `refine`.
+        optical_depth: of a voxel, from which on it counts. By less than 0.03 haze hides what lies behind it; by 0.3
+            surfaces that few views leave half transparent are lost (up to 2.9 dB with 5 views).
+
+    Returns:
+        A grid of the same side and bounds.
+    """
+    return Occupancy(
+        _filled_from_outside(occupancy, occupancy.occupied, density, optical_depth / occupancy.voxel), occupancy.bounds
+    )
 
 
 def _density_of(opacity_loss: float, occupancy: Occupancy) -> float:

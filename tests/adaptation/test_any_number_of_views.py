@@ -17,6 +17,7 @@ from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering import RayMarching
 from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.rendering.refinement import solid_voxels
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring
 
@@ -155,35 +156,40 @@ def test_fields_that_know_views_by_their_places_have_no_use_for_a_volume():
         HyperPlanes(replace(CONFIG, target="point_multiplane", network=PLACED, hypernetwork=VOLUME))
 
 
-def test_a_second_pass_takes_colours_by_the_surface_that_the_first_one_shows_every_view():
-    once, twice, support = model(**READERS["volume"]), model(**READERS["volume"], second_pass=True), views(6)
-    first = once.adapt(support)
-    seen = first.render(support.cameras)
-    planes = first.field.planes.with_surface(seen.depth[:, 0], seen.opacity[:, 0])
-    expected = replace(first, field=replace(first.field, planes=planes)).render(ring(2, (10, 13), shift=1)).images
-    assert torch.equal(picture(twice, support), expected)
-    assert not torch.allclose(picture(once, support), expected, atol=1e-4)
+HAZE = 5.0
+"""Less of the density's bias: so little of the ball is left that it hides nothing."""
+
+
+def test_colours_are_taken_from_views_that_see_the_surface_of_the_density_and_not_of_the_hull():
+    adapter, support = model(**READERS["volume"]), views(6)
+    with torch.no_grad():
+        adapter.targets["fine"].density.bias.sub_(HAZE)
+    found, context = adapter.adapt(support), adapter.prepare(support)
+    by_hull = adapter.field(context, adapter.adapted_weights(context))
+    solid = solid_voxels(by_hull.refined_occupancy, by_hull.density)
+    planes = by_hull.field.planes.with_surface(solid)
+    expected = replace(by_hull, field=replace(by_hull.field, planes=planes)).render(ring(2, (10, 13), shift=1)).images
+    assert torch.equal(picture(adapter, support), expected)
+    assert not torch.allclose(by_hull.render(ring(2, (10, 13), shift=1)).images, expected, atol=1e-4)
+    assert torch.equal(found.refined_occupancy.occupied, by_hull.refined_occupancy.occupied)
     for free in ("weights", "hypernetwork"):
-        tuned = twice.fine_tune(support, 0, FineTuning(trainable=free))
+        tuned = adapter.fine_tune(support, 0, FineTuning(trainable=free))
         torch.testing.assert_close(tuned.render(ring(2, (10, 13), shift=1)).images, expected)
 
 
-def test_the_control_of_swapped_updates_takes_the_second_pass_too():
-    twice = model(**READERS["volume"], second_pass=True)
-    objects = [views(6, colour) for colour in ((0.8, 0.2, 0.1), (0.1, 0.9, 0.3))]
-    swapped = Swapped(twice, objects).adapt(objects[0])
+def test_the_control_of_swapped_updates_judges_views_by_its_own_surface():
+    adapter = model(**READERS["volume"])
     with torch.no_grad():
-        prepared = twice.prepare(objects[0])
-        expected = twice.rendering_field(prepared, twice.theta + twice.update(twice.prepare(objects[1])))
-        once = twice.field(prepared, twice.theta + twice.update(twice.prepare(objects[1])))
+        adapter.targets["fine"].density.bias.sub_(HAZE)
+    objects = [views(6, colour) for colour in ((0.8, 0.2, 0.1), (0.1, 0.9, 0.3))]
+    swapped = Swapped(adapter, objects).adapt(objects[0])
+    with torch.no_grad():
+        prepared = adapter.prepare(objects[0])
+        weights = adapter.theta + adapter.update(adapter.prepare(objects[1]))
+        expected, by_hull = adapter.rendering_field(prepared, weights), adapter.field(prepared, weights)
     cameras = ring(2, (10, 13), shift=1)
     assert torch.equal(swapped.render(cameras).images, expected.render(cameras).images)
-    assert not torch.allclose(swapped.render(cameras).images, once.render(cameras).images, atol=1e-4)
-
-
-def test_a_second_pass_is_refused_where_the_field_does_not_judge_what_views_see():
-    with pytest.raises(ValueError, match="second_pass: .* got point_multiplane"):
-        HyperPlanes(ModelConfig(second_pass=True))
+    assert not torch.allclose(swapped.render(cameras).images, by_hull.render(cameras).images, atol=1e-4)
 
 
 class Recorder:
@@ -275,20 +281,21 @@ def test_no_step_is_the_field_of_one_step_whatever_the_share_of_fresh_weights():
 
 
 @pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("second_pass", [False, True])
-def test_a_model_in_double_precision_makes_the_same_pictures(reader, second_pass):
-    single, support = model(**READERS[reader], second_pass=second_pass), views(4)
+def test_a_model_in_double_precision_makes_the_same_pictures(reader):
+    single, support = model(**READERS[reader]), views(4)
     found = picture(copy.deepcopy(single).double(), support)
     assert found.dtype == torch.float32
     torch.testing.assert_close(found, picture(single, support), atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("free", ["weights", "hypernetwork"])
-def test_the_weights_of_one_object_make_its_field_again_after_a_second_pass(free):
-    twice, support = model(**READERS["volume"], second_pass=True), views(6)
-    tuned = twice.fine_tune(support, 10, FineTuning(free))
+def test_the_weights_of_one_object_make_its_field_and_its_surface_again(free):
+    adapter, support = model(**READERS["volume"]), views(6)
+    with torch.no_grad():
+        adapter.targets["fine"].density.bias.sub_(HAZE - 1)
+    tuned = adapter.fine_tune(support, 10, FineTuning(free))
     cameras = ring(2, (10, 13), shift=1)
-    again = twice.with_weights_of(tuned).adapt(support).render(cameras).images
+    again = adapter.with_weights_of(tuned).adapt(support).render(cameras).images
     torch.testing.assert_close(again, tuned.render(cameras).images, atol=1e-6, rtol=0)
-    before = twice.adapt(support).field.planes
+    before = adapter.adapt(support).field.planes
     assert not torch.equal(before._surface, tuned.field.planes._surface)  # that of the tuned weights

@@ -29,7 +29,7 @@ def views():
 @pytest.fixture(scope="module")
 def model():
     model = HyperPlanes.from_pretrained("small")
-    model.config = replace(model.config, second_pass=True, hull_resolution=32)
+    model.config = replace(model.config, hull_resolution=32)
     return model
 
 

@@ -8,6 +8,7 @@ import torch
 from hyperplanes.fields import ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.geometry import carve
 from hyperplanes.geometry.cameras import camera_from_world
+from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import RayMarching, render
@@ -159,11 +160,12 @@ def test_the_kernel_reads_what_plain_pytorch_does(count, grid, monkeypatch):
         parameters["grid.weight"].normal_(generator=torch.Generator().manual_seed(2))
     field, points = bound(target, views, parameters), 2.5 * points
     hiding = replace(field, planes=field.planes.mask_views(torch.tensor([0])))
-    surface = field.planes.depth_opacity[..., 0] + 0.1
-    second = replace(field, planes=field.planes.with_surface(surface, torch.ones_like(surface)))
+    occupancy = field.planes.occupancy
+    smaller = Occupancy(occupancy.occupied & ~occupancy.surface().occupied, occupancy.bounds)
+    judged = replace(field, planes=field.planes.with_surface(smaller))
 
     def outputs():
-        for each in (field, hiding, second):
+        for each in (field, hiding, judged):
             hidden = each.hidden(points)
             yield each(points, directions)
             yield each.colour_of(hidden[::3], directions[::3]), each.density_of(hidden)
