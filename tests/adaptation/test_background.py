@@ -3,15 +3,22 @@
 Source of truth: a ball in front of walls, both drawn here in closed form, and the outline of the ball.
 """
 
+import json
+from unittest.mock import Mock
+
 import pytest
 import torch
 
 from hyperplanes.adaptation import background
 from hyperplanes.adaptation.background import separate_background
+from hyperplanes.commands import view
 from hyperplanes.commands.background import cut_out_task
 from hyperplanes.commands.console import Console
+from hyperplanes.data.formats.transforms_document import transforms_document
+from hyperplanes.export import live
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.views import Task, Views
 
 SIDE, RADIUS, WALLS = 32, 0.6, 4.0
@@ -24,8 +31,8 @@ def scene():
     lens = camera.symmetric_intrinsics(SIDE, SIDE, 0.9)
     cameras = camera.pinhole(lens, camera.look_at(eyes), SIDE, SIDE)
     images, outlines = [], []
-    for view in range(len(eyes)):
-        rays = cast(cameras, torch.full((SIDE * SIDE,), view), pixel_grid(SIDE, SIDE))
+    for row in range(len(eyes)):
+        rays = cast(cameras, torch.full((SIDE * SIDE,), row), pixel_grid(SIDE, SIDE))
         middle = -(rays.origins * rays.directions).sum(1)
         square = RADIUS**2 - (rays.origins.square().sum(1) - middle**2)
         on_ball = rays.at(middle - square.clamp_min(0).sqrt())
@@ -64,6 +71,36 @@ def test_the_object_is_cut_out_of_views_that_were_fitted_and_of_others(scene, ca
     again = cut_out_task(task, Console())
     assert f"kept in {tmp_path}" in capsys.readouterr().out
     assert torch.equal(again.query.masks, found.query.masks)
+
+
+def test_view_shows_the_object_alone(scene, monkeypatch, tmp_path):
+    """What the page shows, and the model adapts to, is the ball, over white; viser and the model have no part in it."""
+    monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(background, "LEVELS", ((SIDE, 16, 16, 60),))
+    views, outlines = scene
+    poses = torch.linalg.inv(camera.camera_from_world(views.cameras).double()).numpy()
+    lenses = camera.intrinsics(views.cameras).double().numpy()
+    names = [f"{index}.png" for index in range(len(views))]
+    sphere = ((0.0, 0.0, 0.0), 1.0)
+    document = transforms_document(poses, lenses, views.size, names, sphere=sphere, alternating=False)
+    (tmp_path / "transforms.json").write_text(json.dumps(document | {"up": "y"}))
+    for name, image in zip(names, views.images, strict=True):
+        (tmp_path / name).write_bytes(encode_png((image * 255).round().byte().permute(1, 2, 0).numpy()))
+    shown = []
+
+    def interrupted(source, support, *rest):
+        shown.append(support)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(live, "LiveViewer", lambda support, *rest: shown.append(support) or Mock())
+    monkeypatch.setattr(view, "load_source", lambda *rest, **named: None)
+    monkeypatch.setattr(view, "_adapt", interrupted)
+    assert view.run(view.Arguments(tmp_path, learn_background=True)) == 0
+    assert len(shown) == 2
+    for support in shown:
+        assert overlap(support, outlines) > 0.75  # 0.36 of the whole sphere's outline
+        corner = support.images[..., 0, 0]
+        torch.testing.assert_close(corner, torch.ones_like(corner), atol=0.02, rtol=0)
 
 
 def test_without_a_room_the_sphere_holds_it(scene):
