@@ -14,16 +14,21 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import torch
 
+from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.utilities.interrupts import interruptible
 
-if TYPE_CHECKING:
-    from hyperplanes.experiments.engine import Runner
-
 __all__ = ["Result", "Workers"]
+
+
+class HasData(Protocol):
+    """What a process does its work with: `experiments.engine.Runner`."""
+
+    data: DataSets
+
 
 Result = TypeVar("Result")
 """What a piece of work returns."""
@@ -41,10 +46,10 @@ class Workers:
 
     Args:
         count: of processes.
-        make: makes the `Runner` of a process; pickled.
+        make: makes what a process does its work with; pickled.
     """
 
-    def __init__(self, count: int, make: Callable[[], Runner]) -> None:
+    def __init__(self, count: int, make: Callable[[], HasData]) -> None:
         self.count, self._make = count, make
         self._pool: ProcessPoolExecutor | None = None
 
@@ -69,12 +74,12 @@ class Workers:
                 child.kill()
         self._pool.shutdown()
 
-    def submit(self, given: Mapping[str, Path], work: Callable[[Runner], Result]) -> Future[Result]:
+    def submit(self, given: Mapping[str, Path], work: Callable[[Any], Result]) -> Future[Result]:
         """Do a piece of work in a process, as soon as one is free.
 
         Args:
             given: folders of the data sets by class; a worker generates none.
-            work: called with the runner of the process; pickled, as its result is.
+            work: called with what `make` made in the process; pickled, as its result is.
         """
         return self._started().submit(_do, given, work)
 
@@ -85,17 +90,17 @@ class Workers:
         return self._pool
 
 
-_runner: Runner  # of a worker process
+_runner: HasData  # of a worker process
 
 
-def _start(make: Callable[[], Runner]) -> None:
+def _start(make: Callable[[], HasData]) -> None:
     global _runner
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which ends its workers
     torch.set_num_threads(1)
     _runner = make()
 
 
-def _do(given: Mapping[str, Path], work: Callable[[Runner], Result]) -> Result:
+def _do(given: Mapping[str, Path], work: Callable[[Any], Result]) -> Result:
     _runner.data.given = {**_runner.data.given, **given}
     with interruptible():
         return work(_runner)
