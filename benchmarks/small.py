@@ -72,7 +72,7 @@ def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
         adapted(*2 * (adapted.occupancy.centres()[:1],))  # compiles
         voxels = refine_voxels(adapted.occupancy, adapted.density)
     assert isinstance(adapted.sampling, RayMarching)
-    every = RayMarching(adapted.sampling.for_rendering.steps, adapted.sampling.stop)
+    every = RayMarching(adapted.sampling.steps * 5 // 3, adapted.sampling.stop)
     views = [(7 * number + 3) % len(task.query) for number in range(repeats)]
     seconds, reference, found, expected = [], [], [], []
     for view in views:

@@ -13,8 +13,16 @@ from torch.nn.functional import max_pool2d
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.occupancy import Occupancy, ball_extent
+from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["footprint"]
+__all__ = ["footprint", "pixels_across"]
+
+
+def pixels_across(cameras: PinholeCamera, bounds: Sphere) -> float:
+    """How many pixels the diameter of a sphere takes where it is seen largest; from within, as from its surface."""
+    distance = (camera.centres(cameras) - camera.centres(cameras).new_tensor(bounds.centre)).norm(dim=1)
+    focal = camera.intrinsics(cameras)[:, 0, 0]
+    return float((2 * bounds.radius * focal / distance.clamp_min(bounds.radius)).max())
 
 
 @torch.no_grad()

@@ -57,8 +57,7 @@ class Hierarchical:
         """No: empty space is sampled too."""
         return False
 
-    @property
-    def for_rendering(self) -> Hierarchical:
+    def for_rendering(self, pixels: float) -> Hierarchical:
         """The same samples as in training."""
         return self
 

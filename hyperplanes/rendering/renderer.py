@@ -14,6 +14,7 @@ from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.rendering.hierarchical import Hierarchical
 from hyperplanes.rendering.images import Pictures, render_images
 from hyperplanes.rendering.integration import integrate
@@ -96,7 +97,7 @@ def render(
     bounds = bounds or (occupancy.bounds if occupancy else None)
     if isinstance(target, PinholeCamera):
         bounds = bounds or Sphere()
-        sampling = sampling or RayMarching().for_rendering
+        sampling = sampling or RayMarching().for_rendering(pixels_across(target, bounds))
     sampling = sampling or (RayMarching() if bounds else Hierarchical())
     device = target.origins.device if isinstance(target, Rays) else target.intrinsics.device
     if sampling.needs_occupancy and occupancy is None and bounds is not None:

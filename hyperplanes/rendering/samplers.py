@@ -71,9 +71,8 @@ class Sampler(Protocol):
         """Transmittance below which a ray of packed samples is finished, where no gradient is wanted; 0 never stops."""
         ...
 
-    @property
-    def for_rendering(self) -> Sampler:
-        """The sampler for images of a field that was trained with this one."""
+    def for_rendering(self, pixels: float) -> Sampler:
+        """The sampler for images of a field that was trained with this one; so many pixels cross the scene's sphere."""
         ...
 
     @property

@@ -15,6 +15,7 @@ from hyperplanes.geometry.cameras import pinhole, symmetric_intrinsics
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.rendering import Hierarchical, RayMarching, Sampler, march, render
+from hyperplanes.rendering.integration import EXACT
 from tests.reference_rendering import ball_hit, composite_ray, ring, soft_ball, some_rays
 
 DOUBLE = torch.float64
@@ -393,6 +394,31 @@ def test_a_ray_that_is_stopped_is_opaque_and_has_the_colour_of_what_it_met():
     torch.testing.assert_close(stopped.colour[opaque], expected)
 
 
+@pytest.mark.parametrize("split", [False, True])
+@torch.no_grad()
+def test_pictures_evaluate_every_second_sample_and_those_between_where_they_matter(split):
+    # Closed form: fog in a ball of radius 0.5, which steps cut too long or too short; and every sample of the rays.
+    class Fog(SplitBall):
+        def density_of(self, hidden):
+            return 8.0 * (hidden.norm(dim=-1) < 0.5)
+
+    rays, field = some_rays(300), Fog(1.0)
+    middle = -(rays.origins * rays.directions).sum(1)
+    chord = 2 * (0.25 - rays.at(middle).square().sum(1)).clamp_min(0).sqrt()
+    expected = 1 - torch.exp(-8 * chord)
+    clear = (expected > 0) & (expected < 0.95)
+    errors, samples = [], []
+    for steps, stop in ((128, EXACT), (128, 2 * EXACT), (64, EXACT)):
+        field_or_function = field if split else lambda *given: field(*given)
+        found = render(field_or_function, rays, RayMarching(steps, stop), occupancy=GRID, differentiable=False)
+        errors.append(float((found.opacity - expected)[clear].square().mean()))
+        samples.append(found.samples)
+    exact, ours, longer = errors
+    assert samples[1] < 0.7 * samples[0]
+    assert ours < 1.2 * exact
+    assert ours < 0.6 * longer
+
+
 @torch.no_grad()
 def test_a_threshold_of_zero_never_stops():
     rays = some_rays(30)
@@ -465,8 +491,10 @@ def test_a_field_with_values_of_another_shape_is_named():
 def test_samplers_say_what_they_need():
     for sampling in PROTOCOLS:
         assert isinstance(sampling, Sampler)
-    assert RayMarching(60, 0.1).for_rendering == RayMarching(100, 0.1)
-    assert RayMarching(60, 0.01).for_rendering == RayMarching(100, 0.04)
-    assert Hierarchical(3, 4).for_rendering == Hierarchical(3, 4)
+    assert RayMarching(60, 0.1).for_rendering(100) == RayMarching(100, 0.1)
+    assert (
+        RayMarching(60, 0.01).for_rendering(400) == RayMarching(200, 0.04) == RayMarching(60, 0.01).for_rendering(1e6)
+    )
+    assert Hierarchical(3, 4).for_rendering(100) == Hierarchical(3, 4)
     assert RayMarching().needs_occupancy
     assert not Hierarchical().needs_occupancy
