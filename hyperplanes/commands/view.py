@@ -16,6 +16,7 @@ Example:
 from __future__ import annotations
 
 import queue
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,6 +84,9 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.live import LiveViewer
 
+    warnings.filterwarnings(
+        "ignore", "Queued a .* on a closed connection", UserWarning
+    )  # viser's, of visitors who left
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
