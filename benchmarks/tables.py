@@ -242,7 +242,9 @@ def _of_views(results: tuple[Result, ...]) -> tuple[dict[str, RowsOfViews], list
     """Rows of every data set, by the name that the pages call it, and all numbers of views."""
     found: dict[str, RowsOfViews] = {}
     for row in (row for result in results for row in result["rows"]):
-        name = f"CC0 {NAMES[row['data']]}" if row["suite"] == "cc0" else NAMES[row["data"]]
+        name = NAMES[row["data"].removeprefix("cc0-")]
+        if row["suite"] == "cc0" or row["data"].startswith("cc0-"):
+            name = f"CC0 {name}"
         found.setdefault(name, {})[row["name"], row["views"]] = row
     return found, sorted({count for rows in found.values() for _, count in rows})
 
@@ -335,6 +337,7 @@ SOURCES = {
     "captures_masks": ("captures",),
     "views": OF_VIEWS,
     "views_over": OF_VIEWS,
+    "views_srn": ("views_srn", "views_srn_2"),
     "views_summary": OF_VIEWS,
 }
 """Files of rows of tables that are not made of the file of their name."""
@@ -353,6 +356,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "training": _training,
     "views": _views,
     "views_over": _views_over,
+    "views_srn": _views,
     "views_summary": _views_summary,
     "views_tuned": _views_tuned,
 }
