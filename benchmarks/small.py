@@ -28,9 +28,9 @@ from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.data import read_task
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.marching import RayMarching
+from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.rendering.refinement import refine as refine_voxels
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task
@@ -106,7 +106,7 @@ def _quality(pictures: Pictures, task: Task, view: int) -> float:
     return float(psnr(pictures.images, task.query.images[view : view + 1]).mean())
 
 
-def _unsplit(adapted: AdaptedField, voxels: Occupancy) -> AdaptedField:
+def _unsplit(adapted: AdaptedField, voxels: RefinedOccupancy) -> AdaptedField:
     """The same field as a mere function, all of whose colours are evaluated, and of whose voxels none is trimmed."""
     field: Callable = adapted.field
     return replace(adapted, field=lambda points, directions: field(points, directions), refined=voxels)

@@ -20,7 +20,7 @@ from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.rendering.images import Pictures
-from hyperplanes.rendering.refinement import refine
+from hyperplanes.rendering.refinement import RefinedOccupancy, refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
 from hyperplanes.rendering.scene import SplitField
 from hyperplanes.utilities.arguments import checked
@@ -69,7 +69,7 @@ class AdaptedField:
     sampling: Sampler
     proposal: FieldFunction | None = None
     densities: tuple[Callable[[Tensor], Tensor], ...] = ()
-    refined: Occupancy | None = None
+    refined: RefinedOccupancy | None = None
 
     def __repr__(self) -> str:
         side = self.occupancy.occupied.shape[0]
@@ -96,7 +96,7 @@ class AdaptedField:
         return getattr(self.field, "thread_safe", False)
 
     @cached_property
-    def refined_occupancy(self) -> Occupancy:
+    def refined_occupancy(self) -> RefinedOccupancy:
         """The voxels of `occupancy` in which the field has density; computed when they are asked for first."""
         if self.refined is not None:
             return self.refined

@@ -18,7 +18,6 @@ from hyperplanes.fields.rig import Rig, camera_directions
 from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
-from hyperplanes.rendering.refinement import solid_voxels
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
@@ -157,8 +156,7 @@ class HyperPlanesNetwork(nn.Module):
             return by_hull
         with torch.no_grad():
             voxels = by_hull.refined_occupancy
-            surface = solid_voxels(voxels, by_hull.density)
-        planes = self.target.with_surface(context.planes, surface)
+            planes = self.target.with_surface(context.planes, voxels.solid())
         return replace(self.field(replace(context, planes=planes), parameters), refined=voxels)
 
     @torch.no_grad()

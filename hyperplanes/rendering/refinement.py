@@ -4,19 +4,41 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["refine", "solid_voxels"]
+__all__ = ["RefinedOccupancy", "refine"]
 
 CHUNK = 1 << 14  # voxels in one call of the density
 OPAQUE = 1.0  # optical depth of a voxel from which on it hides what lies behind it
 ALONG = 0.2  # of the longest part of a direction, from which on its other parts count
 COARSE_FIRST = 60_000  # occupied voxels from which on half the resolution is evaluated first
+
+
+@dataclass(frozen=True)
+class RefinedOccupancy(Occupancy):
+    """The voxels in which a field is not empty.
+
+    Attributes:
+        optical_depth: of each voxel, by the density at its centre; infinite behind opaque ones, 0 where none was found.
+    """
+
+    optical_depth: Float[Tensor, "x y z"]
+
+    def solid(self, optical_depth: float = 0.03) -> Occupancy:
+        """The voxels that the field fills: the first of them along a ray is its surface.
+
+        Args:
+            optical_depth: of a voxel, from which on it counts. By less than 0.03 haze hides what lies behind it; by 0.3
+                surfaces that few views leave half transparent are lost (up to 2.9 dB with 5 views).
+        """
+        return Occupancy(self.optical_depth > optical_depth, self.bounds)
 
 
 @torch.no_grad()
@@ -27,7 +49,7 @@ def refine(
     opacity_loss: float = 0.05,
     margin: int = 1,
     margin_loss: float | None = None,
-) -> Occupancy:
+) -> RefinedOccupancy:
     """The voxels of a grid in which a field is not empty.
 
     The density is evaluated at the centre of every occupied voxel that does not lie behind opaque ones, then, in voxels
@@ -56,16 +78,18 @@ def refine(
         A grid of the same side and bounds.
     """
     threshold = _density_of(opacity_loss, occupancy)
+    least = threshold * occupancy.voxel  # optical depth
     side, bounds = occupancy.occupied.shape[0], occupancy.bounds
     asked, large = occupancy.occupied, side >= 64 and int(occupancy.occupied.sum()) > COARSE_FIRST
     # of large grids only what a grid of half the resolution keeps is asked
     if large:
         halved = _halved(occupancy)
-        coarse = _dilated(halved, _filled_from_outside(halved, halved.occupied, density, threshold), margin)
+        coarse = _dilated(halved, _from_outside(halved, halved.occupied, density) > 2 * least, margin)
         asked = (
             asked & coarse.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)[:side, :side, :side]
         )
-    filled = _filled_from_outside(occupancy, asked, density, threshold)
+    optical_depth = _from_outside(occupancy, asked, density)
+    filled = optical_depth > least
     kept, divided = _dilated(occupancy, filled, margin), torch.zeros_like(filled)
     # what lies between the centres: voxels beside those that are kept are asked in eight places
     while True:
@@ -77,31 +101,9 @@ def refine(
             break
         filled = filled | found
         kept = kept | _dilated(occupancy, found, margin)
-    if margin_loss is None:
-        return Occupancy(kept, bounds)
-    return _trimmed(Occupancy(kept, bounds), filled, density, _density_of(margin_loss, occupancy))
-
-
-@torch.no_grad()
-def solid_voxels(
-    occupancy: Occupancy, density: Callable[[Tensor], Tensor], *, optical_depth: float = 0.03
-) -> Occupancy:
-    """The voxels that a field fills, as far as any can be seen: their first ones along a ray are its surface.
-
-    The density is evaluated at centres of voxels, from the outside inwards, as far as they are not opaque.
-
-    Args:
-        occupancy: the voxels to evaluate, such as those of `refine`.
-        density: as for `refine`.
-        optical_depth: of a voxel, from which on it counts. By less than 0.03 haze hides what lies behind it; by 0.3
-            surfaces that few views leave half transparent are lost (up to 2.9 dB with 5 views).
-
-    Returns:
-        A grid of the same side and bounds.
-    """
-    return Occupancy(
-        _filled_from_outside(occupancy, occupancy.occupied, density, optical_depth / occupancy.voxel), occupancy.bounds
-    )
+    if margin_loss is not None:
+        kept = _trimmed(Occupancy(kept, bounds), filled, density, _density_of(margin_loss, occupancy))
+    return RefinedOccupancy(kept, bounds, optical_depth)
 
 
 def _density_of(opacity_loss: float, occupancy: Occupancy) -> float:
@@ -109,7 +111,7 @@ def _density_of(opacity_loss: float, occupancy: Occupancy) -> float:
     return -math.log1p(-opacity_loss) / (2 * occupancy.bounds.radius)
 
 
-def _trimmed(grid: Occupancy, filled: Tensor, density: Callable[[Tensor], Tensor], threshold: float) -> Occupancy:
+def _trimmed(grid: Occupancy, filled: Tensor, density: Callable[[Tensor], Tensor], threshold: float) -> Tensor:
     """The filled voxels of a grid, and those of the others that have density towards them.
 
     Each of the others is evaluated once, at the corner, or the middle of an edge or a face, that lies towards the
@@ -126,28 +128,25 @@ def _trimmed(grid: Occupancy, filled: Tensor, density: Callable[[Tensor], Tensor
     found = _densities(margin.centres() + towards * (grid.voxel / 2), density) > threshold
     kept = grid.occupied.clone()
     kept[margin.occupied] = found | (towards == 0).all(1)
-    return Occupancy(kept, grid.bounds)
+    return kept
 
 
-def _filled_from_outside(
-    grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor], threshold: float
-) -> Tensor:
-    """Which of the asked voxels have density above a threshold at their centre, or lie behind opaque ones.
+def _from_outside(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor]) -> Tensor:
+    """Optical depth of a voxel by the density at its centre; infinite where it lies behind opaque ones, 0 if not asked.
 
     The density is evaluated from the surface inwards, as far as voxels are not opaque: three quarters of the hull of a
     car lie behind, and no ray gets there.
     """
-    filled, done = asked.clone(), torch.zeros_like(asked)
+    result = torch.where(asked, torch.inf, 0.0)
     padded = torch.nn.functional.pad(asked, (1,) * 6)  # what lies beyond the grid is outside, too
     layer = asked & Occupancy(~padded, grid.bounds).dilated().occupied[1:-1, 1:-1, 1:-1]
     while layer.any():
-        found = _densities(Occupancy(layer, grid.bounds).centres(), density)
-        filled[layer] = found > threshold
-        done |= layer
+        found = _densities(Occupancy(layer, grid.bounds).centres(), density) * grid.voxel
+        result[layer] = found.to(result)
         passed = torch.zeros_like(asked)
-        passed[layer] = found * grid.voxel < OPAQUE
-        layer = Occupancy(passed, grid.bounds).dilated().occupied & asked & ~done
-    return filled
+        passed[layer] = found < OPAQUE
+        layer = Occupancy(passed, grid.bounds).dilated().occupied & result.isinf()
+    return result
 
 
 def _densities(points: Tensor, density: Callable[[Tensor], Tensor]) -> Tensor:

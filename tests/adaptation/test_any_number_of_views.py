@@ -17,7 +17,6 @@ from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering import RayMarching
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.rendering.refinement import solid_voxels
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring
 
@@ -166,8 +165,7 @@ def test_colours_are_taken_from_views_that_see_the_surface_of_the_density_and_no
         adapter.targets["fine"].density.bias.sub_(HAZE)
     found, context = adapter.adapt(support), adapter.prepare(support)
     by_hull = adapter.field(context, adapter.adapted_weights(context))
-    solid = solid_voxels(by_hull.refined_occupancy, by_hull.density)
-    planes = by_hull.field.planes.with_surface(solid)
+    planes = by_hull.field.planes.with_surface(by_hull.refined_occupancy.solid())
     expected = replace(by_hull, field=replace(by_hull.field, planes=planes)).render(ring(2, (10, 13), shift=1)).images
     assert torch.equal(picture(adapter, support), expected)
     assert not torch.allclose(by_hull.render(ring(2, (10, 13), shift=1)).images, expected, atol=1e-4)

@@ -132,3 +132,14 @@ def test_hard_parts_half_a_voxel_thick_are_kept(side):
     assert refined.contains(inside).all()
     assert refined.occupied.float().mean() < 0.2
     assert sum(asked) < (9 if side == 32 else 1.5) * side**3
+
+
+def test_solid_voxels_are_those_of_the_ball_and_haze_is_none():
+    # Closed form: a ball that is opaque, in haze of half the optical depth that counts.
+    grid = full(Sphere(), 32)
+    haze = 0.015 / grid.voxel
+    found = refine(grid, lambda points: ball(0.5)(points) + haze)
+    assert found.occupied.all()
+    centres = grid.centres().norm(dim=1)
+    assert torch.equal(found.solid().occupied.flatten(), centres < 0.5)
+    assert found.solid(0.01).occupied.all()
