@@ -80,10 +80,12 @@ def extended(
     """
     cv2 = require("cv2", "completes masks by colour")
     size, _ = _reduced_size(picture)
-    likely, room = (_resized(values, size) > 0.5 for values in (mask, possible))
+    likely, room = (np.asarray(_resized(values, size) > 0.5) for values in (mask, possible))
     depth = max(1, round(CERTAIN * float(np.sqrt(likely.sum()))))
-    certain = np.asarray(ndimage.binary_erosion(likely, iterations=depth))
-    labels = np.select([certain, likely, room], [cv2.GC_FGD, cv2.GC_PR_FGD, cv2.GC_PR_BGD], cv2.GC_BGD)
+    certain = np.asarray(ndimage.binary_erosion(likely, iterations=depth), bool)
+    labels = np.full(certain.shape, cv2.GC_BGD)
+    for where, label in ((room, cv2.GC_PR_BGD), (likely, cv2.GC_PR_FGD), (certain, cv2.GC_FGD)):
+        labels[where] = label
     if not (certain.any() and (labels == cv2.GC_PR_BGD).any()):
         return mask
     return np.maximum(mask, _cut(picture, labels.astype(np.uint8), 2))
@@ -96,7 +98,8 @@ def _cut(picture: np.ndarray, labels: np.ndarray, steps: int = STEPS) -> np.ndar
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     labels, _, _ = cv2.grabCut(small, labels, None, *models, steps, cv2.GC_INIT_WITH_MASK)
-    return firm(_resized(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), picture.shape[1::-1]))
+    height, width = picture.shape[:2]
+    return firm(_resized(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), (width, height)))
 
 
 def _reduced_size(picture: np.ndarray) -> tuple[tuple[int, int], float]:
@@ -106,6 +109,6 @@ def _reduced_size(picture: np.ndarray) -> tuple[tuple[int, int], float]:
     return (max(1, round(width * scale)), max(1, round(height * scale))), scale
 
 
-def _resized(values: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+def _resized(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     scaled = Image.fromarray(values.astype(np.float32)).resize(size, Image.Resampling.BICUBIC)
     return np.asarray(scaled, np.float64)
