@@ -46,11 +46,11 @@ def test_a_picture_is_what_its_rays_see(sampling, size):
 
 
 @torch.no_grad()
-def test_pictures_are_marched_with_five_samples_for_three():
-    cameras = ring(2, (12, 12))
-    field = adapted(RayMarching(48, 0.0))
-    assert torch.equal(field.render(cameras).images, field.render(cameras, RayMarching(80, 0.0)).images)
-    assert field.render(cameras).samples > 1.5 * field.render(cameras, RayMarching(48, 0.0)).samples
+def test_pictures_are_marched_with_five_samples_for_three_where_100_pixels_show_the_scene():
+    sampling = RayMarching(48, 0.0)
+    assert [sampling.for_rendering(pixels).steps for pixels in (12, 100, 400)] == [40, 80, 160]
+    cameras, field = ring(2, (12, 12)), adapted(sampling)
+    assert torch.equal(field.render(cameras).images, field.render(cameras, RayMarching(40, 0.0)).images)
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.rendering.renderer import RayMarching
+from hyperplanes.rendering.renderer import RayMarching, render
 from hyperplanes.rendering.transmittance import transmittance, transmittance_torch
 from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
 from hyperplanes.utilities.checkpoints import CheckpointError
@@ -62,7 +62,7 @@ def test_the_compiled_caster_agrees_with_packed_torch(baked):
     # Source of truth: the same voxels as a callable through the generic renderer, at the same steps.
     scene = BakedScene(baked)
     sampling = RayMarching(scene.steps, 1e-3)
-    generic = AdaptedField(baked, baked.occupancy, sampling).render(CAMERAS, sampling)
+    generic = render(baked, CAMERAS, sampling, bounds=baked.occupancy.bounds, occupancy=baked.occupancy)
     compiled = scene.render(CAMERAS)
     assert float((generic.images - compiled.images).abs().max()) < 5e-3
     assert float((generic.images - compiled.images).abs().mean()) < 1e-4
