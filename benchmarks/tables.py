@@ -78,7 +78,8 @@ def _read(path: Path, page: Path | str) -> Result:
 def _measured(result: Result) -> str:
     """What the rows depend on beside the command: those of quality on the commit alone."""
     if result["benchmark"] in OF_QUALITY:
-        return f"*Commit {result['commit']}.*"
+        commits = dict.fromkeys([result["commit"], *(row["commit"] for row in result["rows"] if "commit" in row)])
+        return f"*Commit {', '.join(commits)}.*"
     load = result.get("load")
     threads, beside = result["threads"], "not recorded" if load is None else f"{load:.2f} cores"
     machine = f"{result['processor']}, {result['cores']} cores, {threads} thread{'s' if threads > 1 else ''}"
@@ -337,7 +338,6 @@ SOURCES = {
     "captures_masks": ("captures",),
     "views": OF_VIEWS,
     "views_over": OF_VIEWS,
-    "views_srn": ("views_srn", "views_srn_2"),
     "views_summary": OF_VIEWS,
 }
 """Files of rows of tables that are not made of the file of their name."""
