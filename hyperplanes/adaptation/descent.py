@@ -18,8 +18,6 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.optimisers import make_optimisers
 from hyperplanes.configuration.fine_tuning import RATES, FineTuning
-from hyperplanes.geometry.kernels.threads import parallel_map
-from hyperplanes.geometry.rays import Rays
 from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
@@ -28,7 +26,6 @@ from hyperplanes.views import Views
 __all__ = ["Descent", "Variables", "ray_loss", "split_holdout"]
 
 HOLDOUT_RAYS = 4096  # of held-out views that "auto" compares
-PART = 512  # rays of a step whose gradients one thread finds, at most
 CHECKS = 10  # times that it compares them
 
 
@@ -123,36 +120,15 @@ class Descent:
                 rays, truth = views.sample_rays(
                     settings.rays, generator=generator, among=among, near_far=field.sampling.near_far
                 )
-                for tensor, gradient in zip(self.tensors, self._gradients(field, rays, truth, generator), strict=True):
-                    tensor.grad = gradient
+                loss = ray_loss(field.trace(rays, generator), truth)
                 # one step of every optimiser, at the rate of the schedule
+                for tensor in self.tensors:
+                    tensor.grad = None
+                loss.backward()
                 for optimiser, rate in zip(optimisers, rates, strict=True):
                     optimiser.param_groups[0]["lr"] = rate * settings.schedule(step, steps)
                     optimiser.step()
             yield step + 1
-
-    def _gradients(
-        self, field: AdaptedField, rays: Rays, truth: Tensor, generator: torch.Generator
-    ) -> Sequence[Tensor | None]:
-        """The gradients of the mean loss of rays: parts of them forward and backward, each by one thread.
-
-        What is computed depends on the parts, each of which draws from a generator of its own, and not on the threads.
-        """
-        # the graph of a hypernetwork is one for all rays
-        size = PART if self.settings.trainable == "weights" and truth.device.type == "cpu" else len(rays)
-        starts = range(0, len(rays), size)
-        generators = [generator]
-        if len(starts) > 1:
-            seeds = torch.randint(2**62, (len(starts),), generator=generator)
-            generators = [torch.Generator().manual_seed(seed) for seed in seeds.tolist()]
-
-        @torch.enable_grad()
-        def of_part(index: int) -> Sequence[Tensor | None]:
-            part = slice(starts[index], starts[index] + size)
-            loss = ray_loss(field.trace(rays[part], generators[index]), truth[part])
-            return torch.autograd.grad(loss * (len(truth[part]) / len(truth)), self.tensors, allow_unused=True)
-
-        return [_sum(each) for each in zip(*parallel_map(of_part, range(len(starts))), strict=True)]
 
     @torch.no_grad()
     def errors(self) -> tuple[float, float]:
@@ -221,12 +197,6 @@ class Descent:
             return (chosen[:, None] * area + torch.arange(area, device=chosen.device)).flatten()
         edges = torch.searchsorted(self.pixels, torch.stack([chosen, chosen + 1], 1) * area)
         return torch.cat([self.pixels[start:stop] for start, stop in edges.tolist()])
-
-
-def _sum(gradients: Sequence[Tensor | None]) -> Tensor | None:
-    """The sum of those that there are."""
-    found = [each for each in gradients if each is not None]
-    return sum(found[1:], found[0]) if found else None
 
 
 def split_holdout(support: Views, settings: FineTuning) -> tuple[Views, Views]:

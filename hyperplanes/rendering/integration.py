@@ -26,7 +26,7 @@ MIN_OPACITY = 1 / 64  # of a pixel whose colour is
 GROWTH = 4  # every later round takes this fraction of the samples so far, and at least as many as the first
 FIRST_REACH = 4  # samples a ray whose densities are evaluated first to draw those that have a gradient
 UNSEEN = 1 / 512  # `stop` up to which a ray that is stopped keeps its rest of background, half a grey level of 8 bits
-DIFFERENTIATED = 0.02  # weight of a sample from which on it always has its gradient, below in proportion to it
+DIFFERENTIATED = 0.01  # weight of a sample from which on it always has its gradient, below in proportion to it
 
 
 def integrate(
@@ -121,9 +121,8 @@ def _by_importance(
     Densities are evaluated without gradients, and not at all behind what leaves less than `stop` of the light. The
     gradients that go through a sample are about proportional to its weight w, since those of softplus are to a small
     density. So it is differentiated with probability p = min(1, w / DIFFERENTIATED), and what goes through it is
-    multiplied by 1 / p (importance sampling): a quarter of the samples in the hull of a chair. That adds 1 to 2 % to
-    the variance that a step's gradient has by the draw of its rays. The others keep their weights, and the mean colour
-    of the ray stands for theirs.
+    multiplied by 1 / p (importance sampling): a quarter of the samples of a car. The others keep their weights, and the
+    mean colour of the ray stands for theirs, 1 % of the pixel.
     """
     field, count = scene.field, len(rays)
     assert isinstance(field, SplitField)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import descent as descent_module
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
@@ -201,25 +200,3 @@ def test_from_scratch_nothing_that_was_trained_is_used(support):
 def test_settings_that_cannot_be_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         FineTuning(**settings)
-
-
-def test_gradients_are_those_of_all_rays_whatever_the_threads(model, support, monkeypatch):
-    monkeypatch.setattr(descent_module, "PART", 12)
-    descent, _ = make_descent(model, model.prepare(support), WEIGHTS)
-    field, (rays, truth) = descent.field(None), support.sample_rays(30, generator=torch.Generator().manual_seed(1))
-    # the same rays and draws in one loss
-    generator, seen = torch.Generator().manual_seed(2), []
-    for part, seed in zip(range(0, 30, 12), torch.randint(2**62, (3,), generator=generator).tolist(), strict=True):
-        seen.append(field.trace(rays[part : part + 12], torch.Generator().manual_seed(seed)).colour)
-    loss = (torch.cat(seen) - truth).square().mean()
-    expected = torch.autograd.grad(loss, descent.tensors, allow_unused=True)
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            found.append(descent._gradients(field, rays, truth, torch.Generator().manual_seed(2)))
-    finally:
-        torch.set_num_threads(before)
-    for one, two, whole in zip(*found, expected, strict=True):
-        assert whole is None or torch.equal(one, two)
-        torch.testing.assert_close(one, whole)
