@@ -19,6 +19,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.geometry.volume import interpolate_grid
+from hyperplanes.utilities.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
 
 __all__ = ["FEWEST_VIEWS", "Separated", "separate_background"]
@@ -109,7 +110,7 @@ def separate_background(
         # the same grids in smaller cells, and larger pictures
         small = views.resized(pixels)
         inner, outer = (_enlarged(grid, side) for grid, side in zip((inner, outer), sides, strict=True))
-        descent = torch.optim.Adam([inner, outer], lr=RATE, betas=(0.9, 0.99))
+        descent = Adam([inner, outer], lr=RATE, betas=(0.9, 0.99))
         for _ in range(steps):
             descent.param_groups[0]["lr"] = RATE * (LAST_RATE / RATE) ** (done / total)
             # squared error of some rays; opacities between 0 and 1 cost something once there is a shape

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.geometry.kernels.threads import parallel_map
+from hyperplanes.utilities.uncompiled_optimisers import SGD, Adam, Optimizer
 
 __all__ = ["OPTIMISERS", "Muon", "make_optimisers", "orthogonalise"]
 
@@ -38,7 +39,7 @@ def orthogonalise(matrix: Float[Tensor, "row column"]) -> Float[Tensor, "row col
     return value.mT if tall else value
 
 
-class Muon(torch.optim.Optimizer):
+class Muon(Optimizer):
     """Nesterov momentum whose update of every matrix is orthogonalised (Jordan et al. 2024).
 
     torch.optim.Muon iterates in bfloat16, which only recent CPUs compute with. On one thread, the step of six matrices
@@ -81,7 +82,7 @@ def make_optimisers(
     adam_rate: float,
     muon_rate: float,
     betas: tuple[float, float] = (0.9, 0.999),
-) -> list[torch.optim.Optimizer]:
+) -> list[Optimizer]:
     """The optimisers of a network's parameters.
 
     Args:
@@ -100,13 +101,13 @@ def make_optimisers(
     if name not in OPTIMISERS:
         raise ValueError(f"optimiser: expected one of {', '.join(map(repr, OPTIMISERS))}, got {name!r}")
     if name == "sgd":
-        return [torch.optim.SGD(list(variables), adam_rate)]
+        return [SGD(list(variables), adam_rate)]
     hidden = [name == "muon" and value.ndim == 2 and min(value.shape) >= NARROWEST for value in variables]
     matrices = [value for value, chosen in zip(variables, hidden, strict=True) if chosen]
     others = [value for value, chosen in zip(variables, hidden, strict=True) if not chosen]
-    made: list[torch.optim.Optimizer] = []
+    made: list[Optimizer] = []
     if others:
-        made.append(torch.optim.Adam(others, adam_rate, betas=betas, fused=True))
+        made.append(Adam(others, adam_rate, betas=betas, fused=True))
     if matrices:
         made.append(Muon(matrices, muon_rate))
     return made

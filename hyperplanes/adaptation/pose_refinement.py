@@ -22,6 +22,7 @@ from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.geometry.volume import interpolate_grid
 from hyperplanes.rendering.compositing import composite
+from hyperplanes.utilities.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
 
 __all__ = ["FEWEST_VIEWS", "Refined", "refine_poses"]
@@ -112,7 +113,7 @@ def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], N
     views = views.to("cpu", torch.float32)
     generator = torch.Generator().manual_seed(seed)
     cameras = _MovedCameras(views.cameras, views.bounds)
-    motion = torch.optim.Adam([cameras.twist], betas=(0.9, 0.99))
+    motion = Adam([cameras.twist], betas=(0.9, 0.99))
     grid, done, total = _first_grid(views, LEVELS[0][1]), 0, sum(steps for _, _, steps in LEVELS)
     for pixels, side, steps in LEVELS:
         # the same object in larger pictures and smaller cells
@@ -121,7 +122,7 @@ def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], N
         grid = interpolate(grid.detach()[None], (side,) * 3, mode="trilinear", align_corners=False)[0]
         occupancy = Occupancy(softplus(grid[0]) > EMPTY, views.bounds).dilated(2)
         grid = grid.clone().requires_grad_(True)
-        content = torch.optim.Adam([grid], lr=GRID_RATE, betas=(0.9, 0.99))
+        content = Adam([grid], lr=GRID_RATE, betas=(0.9, 0.99))
         for _ in range(steps):
             # rays of the cameras as they stand now, and how far the grid is from what they show
             shown = replace(small, cameras=camera.resized(cameras(), *small.size))

@@ -21,6 +21,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.splats import render_splats
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.files import format_of
+from hyperplanes.utilities.uncompiled_optimisers import Adam
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
@@ -116,7 +117,7 @@ def fit_splats(
     size = float(splats.scales.mean()) if len(splats.scales) else 1.0
     # offsets of all numbers from what they begin with, each kind with its rate
     free = {name: torch.zeros_like(getattr(splats, name)).requires_grad_() for name in RATES}
-    descent = torch.optim.Adam([{"params": [free[name]], "lr": RATES[name]} for name in RATES], betas=(0.9, 0.99))
+    descent = Adam([{"params": [free[name]], "lr": RATES[name]} for name in RATES], betas=(0.9, 0.99))
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, 0.1 ** (1 / max(1, steps)))
 
     rate = torch.tensor([1.0] + [DIRECTIONAL] * (HARMONICS - 1)).repeat(3)

@@ -14,6 +14,7 @@ from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.voxels import voxel_gradients
+from hyperplanes.utilities.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
 
 __all__ = ["STEPS", "fit_voxels", "render_guide"]
@@ -91,7 +92,7 @@ def fit_voxels(
     # optical depth of a voxel and coefficients, each with its own rate
     depth, colour = (baked.values[:, :1] * voxel).clamp_min(SMALLEST_DEPTH), baked.values[:, 1:].clone()
     groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
-    descent = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
+    descent = Adam(groups, betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, DECAY ** (1 / max(1, steps)))
     # what the kernel reads and writes: fresh memory for each step takes longer to get than to fill
     values, gradients = baked.values.clone(), torch.empty(torch.get_num_threads(), *baked.values.shape)
