@@ -32,6 +32,7 @@ if "HYPERPLANES_TESTS" not in os.environ:  # the first process: it starts the ot
     os.environ["HYPERPLANES_TESTS"] = tempfile.mkdtemp(prefix="hyperplanes-tests-")
     atexit.register(shutil.rmtree, os.environ["HYPERPLANES_TESTS"], ignore_errors=True)
 os.environ["HYPERPLANES_CACHE"] = tempfile.mkdtemp(dir=os.environ["HYPERPLANES_TESTS"])  # not the user's own
+os.environ.setdefault("LP_NUM_THREADS", "0")  # of Mesa, when it draws in this process, as workers have it
 torch.set_num_threads(1)  # small tensors: more threads only wait for each other; tests of threads set their own
 typechecker.install("hyperplanes")
 

@@ -8,6 +8,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
+from rendered_here import rendered_here
+
 from hyperplanes.cli import main
 from hyperplanes.experiments.configurations import configuration
 from hyperplanes.experiments.demonstration.settings import DemoSettings
@@ -20,7 +22,8 @@ def demo_folder():
     with open(shared / "lock", "w", encoding="utf-8") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # whoever comes first makes it
         if not (shared / "demo").exists():
-            assert main(["demo", "--quick-check", "--out", str(shared / "unfinished")]) == 0
+            with rendered_here():
+                assert main(["demo", "--quick-check", "--out", str(shared / "unfinished")]) == 0
             (shared / "unfinished").rename(shared / "demo")
     folder = Path(tempfile.mkdtemp(prefix="hyperplanes-demo-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)

@@ -42,11 +42,15 @@ class Trainings:
 
     def __init__(self, workspace: Workspace, data: DataSets, train: Train, workers: Workers | None) -> None:
         self.workspace, self.data, self.train, self.workers = workspace, data, train, workers
+        self._configured: dict[str, Preset] = {}
 
     def configuration(self, experiment: Experiment, trained: Trained, seed: int) -> Preset:
         """Model and training, as configured for the objects that there are."""
         objects = len(self.data.tasks(trained.on).names("train"))
-        return configuration(experiment, trained, self.data.scale, objects, seed)
+        deciding = repr((experiment.size, experiment.epochs, trained, objects, seed))
+        if deciding not in self._configured:  # each cell of a table asks for it several times
+            self._configured[deciding] = configuration(experiment, trained, self.data.scale, objects, seed)
+        return self._configured[deciding]
 
     def arranged(self, trained: Trained, chosen: Preset) -> Tasks:
         """The data of a training, with as many support views as its model has planes."""
@@ -112,13 +116,15 @@ class Trainings:
         """What tells a training from others: the name of a packaged model, or one with a checksum."""
         if trained.packaged:
             return trained.packaged
-        start = f"{Path(self.data.name(trained.on)).name}-{trained.method}-{seed}"
-        return unique_name(start, self._settings(experiment, trained, seed))
+        return self._named(trained, seed, self._settings(experiment, trained, seed))
+
+    def _named(self, trained: Trained, seed: int, settings: dict[str, Any]) -> str:
+        return unique_name(f"{Path(self.data.name(trained.on)).name}-{trained.method}-{seed}", settings)
 
     def _place(self, experiment: Experiment, trained: Trained, seed: int) -> tuple[str, str, str, dict[str, Any]]:
         """What `Workspace.folder` tells the folder of a training by."""
         settings = self._settings(experiment, trained, seed)
-        return "trainings", trained.method, self.name(experiment, trained, seed), settings
+        return "trainings", trained.method, self._named(trained, seed, settings), settings
 
     def _settings(self, experiment: Experiment, trained: Trained, seed: int) -> dict[str, Any]:
         """All that decides a training."""

@@ -54,6 +54,8 @@ def checked_fields(settings: type[R]) -> type[R]:
 def _checking(function: Callable[P, R], annotated: Any) -> Callable[P, R]:
     """A function that looks at its arguments first, by the annotations of itself or of a class."""
     signature = inspect.signature(function)
+    names = list(signature.parameters)
+    several = any("VAR" in each.kind.name for each in signature.parameters.values())
 
     @cache
     def hints() -> dict[str, Any]:
@@ -62,9 +64,12 @@ def _checking(function: Callable[P, R], annotated: Any) -> Callable[P, R]:
 
     @wraps(function)
     def called(*positional: P.args, **named: P.kwargs) -> R:
-        bound = signature.bind(*positional, **named)
-        for name, value in bound.arguments.items():
-            hint = hints().get(name, Any)
+        given = dict(zip(names, positional, strict=False)) | named
+        if several:
+            given = signature.bind(*positional, **named).arguments
+        looked_at = hints()
+        for name, value in given.items():
+            hint = looked_at.get(name, Any)
             if hint is not Any and not _fits(value, hint):
                 raise ValueError(f"{name}: expected {_shown(hint)}, got {kind_of(value)}")
         return function(*positional, **named)
@@ -91,10 +96,20 @@ def _parts(hint: Any) -> tuple[Any, ...]:
     return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
 
 
+_in_any_order = cache(_parts)  # `str | Path` equals `Path | str`: for messages the order as written is kept
+
+
+@cache
+def _generic(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+    return get_origin(hint), get_args(hint)
+
+
+@cache
 def _is_array(hint: Any) -> bool:
     return hasattr(hint, "array_type") and hasattr(hint, "dims")
 
 
+@cache
 def _range(hint: Any) -> range | None:
     """The values of a whole number that is annotated with them."""
     if get_origin(hint) is not Annotated:
@@ -111,9 +126,9 @@ def _is_checkable(hint: Any) -> bool:
 
 
 def _fits(value: object, hint: Any) -> bool:
-    if isinstance(value, str) and torch.device in _parts(hint):
+    if isinstance(value, str) and torch.device in _in_any_order(hint):
         return _is_device(value)
-    return any(_fits_one(value, part) for part in _parts(hint))
+    return any(_fits_one(value, part) for part in _in_any_order(hint))
 
 
 def _is_device(name: str) -> bool:
@@ -142,7 +157,7 @@ def _fits_one(value: object, hint: Any) -> bool:
         return (
             isinstance(value, Integral) and not isinstance(value, bool) and abs(int(value)) < 2**63
         )  # as tensors hold them
-    origin, arguments = get_origin(hint), get_args(hint)
+    origin, arguments = _generic(hint)
     if origin is Literal:
         return value in arguments
     if origin is Callable and isinstance(value, type):

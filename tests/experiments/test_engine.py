@@ -1,11 +1,15 @@
 """Source of truth: every experiment run small, its files, and the methods run by hand."""
 
 import csv
+import io
 import json
 import re
-from dataclasses import replace
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from functools import cache
 
 import pytest
+from rendered_here import rendered_here
 
 from hyperplanes.cli import main
 from hyperplanes.data import open_dataset
@@ -27,55 +31,74 @@ def out(tmp_path_factory):
 @pytest.fixture(scope="module")
 def cars(out):
     """The data set that `reproduce` generates where none is given."""
-    assert main(["reproduce", "time", "--scale", "smoke", "--out", str(out)]) == 0
+    with rendered_here():
+        assert main(["reproduce", "time", "--scale", "smoke", "--out", str(out)]) == 0
     (folder,) = (out / "data").glob("car-*")
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def given(cars):
     """The options that say where the data of the classes lie."""
     return ["--data", *(f"{name}={cars}" for name in CLASSES)]
 
 
+@pytest.fixture(scope="module")
+def reproduced(out, given):
+    """What `reproduce NAME` has shown and written, each experiment run once for all tests."""
+
+    @cache
+    def run(name):
+        with redirect_stdout(io.StringIO()) as shown:
+            assert main(["reproduce", name, "--scale", "smoke", "--out", str(out), *given]) == 0
+        files = {path.name: path.read_bytes() for path in (out / name).iterdir()}
+        return Reproduced(shown.getvalue(), files, json.loads(files["results.json"]))
+
+    return run
+
+
+@dataclass(frozen=True)
+class Reproduced:
+    shown: str
+    files: dict
+    results: dict
+
+    @property
+    def table(self):
+        return self.results["table"]
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_runs(name, out, given, capsys):
-    experiment = SCALES["smoke"].applied(EXPERIMENTS[name])
-    assert main(["reproduce", name, "--scale", "smoke", "--out", str(out), *given]) == 0
-    shown = capsys.readouterr().out
-    with open(out / name / "table.csv", encoding="utf-8", newline="") as file:
-        lines = list(csv.DictReader(file))
+def test_every_experiment_runs(name, reproduced):
+    experiment, found = SCALES["smoke"].applied(EXPERIMENTS[name]), reproduced(name)
+    lines = list(csv.DictReader(io.StringIO(found.files["table.csv"].decode(), newline="")))
     assert [(line["row"], line["column"]) for line in lines] == [(c.row, c.column) for c in experiment.cells]
     for line in lines:
         published = experiment.published_value(line["row"], line["column"])
         assert (line["paper"] == "") if published is None else (float(line["paper"]) == published)
         if line["quantity"] == "psnr":  # the mean of logarithms is above the logarithm of the mean
             assert float(line["pooled"]) <= float(line["value"])
-    results = json.loads((out / name / "results.json").read_text())
-    text = (out / name / "table.md").read_text()
-    assert (out / name / "figure.png").read_bytes().startswith(b"\x89PNG")
-    for note in results["differs"]:
+    text = found.files["table.md"].decode()
+    assert found.files["figure.png"].startswith(b"\x89PNG")
+    for note in found.results["differs"]:
         assert note in text
-        assert " ".join(note.split()) in " ".join(shown.split())
+        assert " ".join(note.split()) in " ".join(found.shown.split())
     assert "Paper: ShapeNet" in text
-    assert results["commit"] in text
+    assert found.results["commit"] in text
     assert experiment.where in text
 
 
-def test_nothing_is_made_twice_and_what_is_missing_is_made_again(out, given, capsys):
-    command = ["reproduce", "target", "--scale", "smoke", "--out", str(out), *given]
-    assert main(command) == 0
-    capsys.readouterr()
-    table = (out / "target" / "table.csv").read_text()
+def test_nothing_is_made_twice_and_what_is_missing_is_made_again(out, given, reproduced, capsys):
+    table = reproduced("target").files["table.csv"]
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
     gone = next((out / "evaluations").glob("car-*-hyperplanes-0-*.json"))
     gone.unlink()
-    assert main(command) == 0
+    assert main(["reproduce", "target", "--scale", "smoke", "--out", str(out), *given]) == 0
     shown = capsys.readouterr().out
     assert "training" not in shown.split("Target network")[0]
     assert shown.count("car_test_00000") <= 1
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")} == before
-    assert (out / "target" / "table.csv").read_text() == table
+    assert (out / "target" / "table.csv").read_bytes() == table
 
 
 def test_processes_side_by_side_find_what_one_does(out, given, tmp_path):
@@ -85,9 +108,8 @@ def test_processes_side_by_side_find_what_one_does(out, given, tmp_path):
     assert (tmp_path / "target" / "table.csv").read_text() == (out / "target" / "table.csv").read_text()
 
 
-def test_a_cell_is_the_evaluation_of_its_checkpoint(out, cars, given):
-    main(["reproduce", "target", "--scale", "smoke", "--out", str(out), *given])
-    table = json.loads((out / "target" / "results.json").read_text())["table"]
+def test_a_cell_is_the_evaluation_of_its_checkpoint(out, cars, reproduced):
+    table = reproduced("target").table
     data = WithSupport(open_dataset(cars), 4)
     (folder,) = (
         path.parent
@@ -100,10 +122,9 @@ def test_a_cell_is_the_evaluation_of_its_checkpoint(out, cars, given):
     assert table["SSIM"]["NeRF"]["value"] == pytest.approx(score.mean("ssim"), abs=1e-4)
 
 
-def test_what_a_cell_fine_tunes_is_what_its_column_says(out, cars, given):
+def test_what_a_cell_fine_tunes_is_what_its_column_says(out, cars, reproduced):
     """The paper's columns freeze theta and tune the hypernetwork; the last one tunes all weights."""
-    main(["reproduce", "single-class", "--scale", "smoke", "--out", str(out), *given])
-    row = json.loads((out / "single-class" / "results.json").read_text())["table"]["Test Cars"]
+    row = reproduced("single-class").table["Test Cars"]
     folder = next(  # the training of the data as given and as generated: the same weights
         path.parent
         for path in (out / "trainings").glob("car-*-hyperplanes-0-*/model.json")
@@ -119,11 +140,9 @@ def test_what_a_cell_fine_tunes_is_what_its_column_says(out, cars, given):
     assert len(set(values)) == len(values) - 1  # 10 and 100 steps are both 2 at this scale
 
 
-def test_every_row_of_an_ablation_is_another_model(out, given):
+def test_every_row_of_an_ablation_is_another_model(reproduced):
     for name in ("target", "layers", "inputs"):
-        main(["reproduce", name, "--scale", "smoke", "--out", str(out), *given])
-        table = json.loads((out / name / "results.json").read_text())["table"]
-        values = [cell["value"] for row in table.values() for cell in row.values()]
+        values = [cell["value"] for row in reproduced(name).table.values() for cell in row.values()]
         assert len(set(values)) == len(values), name
 
 

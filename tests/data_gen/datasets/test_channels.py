@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from rendered_here import rendered_here
 
 from data_gen.datasets.generate import GenerationConfig, MeshFolder, generate
 from hyperplanes.data import Dataset, mesh_path, read_channel, read_views
@@ -16,7 +17,8 @@ def ball(tmp_path_factory):
     trimesh.creation.icosphere(subdivisions=4, radius=7.0).export(folder / "meshes/ball.ply")
     channels = ("rgba", "depth", "normals", "coordinates", "mesh")
     config = GenerationConfig(held_out=0, views=2, resolution=32, workers=1, channels=channels)
-    generate(MeshFolder(folder / "meshes"), folder / "out", config)
+    with rendered_here():
+        generate(MeshFolder(folder / "meshes"), folder / "out", config)
     return folder / "out"
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from rendered_here import rendered_here
 
 from data_gen import SUPERSAMPLE
 from data_gen.commands.generate import remarks
@@ -22,6 +23,7 @@ from data_gen.datasets.generate import PICTURES, GenerationConfig, MeshFolder, P
 from data_gen.datasets.inspect import inspect
 from data_gen.datasets.manifest import verify
 from data_gen.datasets.sources import list_items
+from data_gen.rendering.renderers import CHOICE_VARIABLE, find_renderer
 from data_gen.rigs import RIG_PRESETS, fixed, make_rig
 from hyperplanes.data import DataError, Dataset
 from hyperplanes.data.inspection.describe import describe
@@ -33,6 +35,8 @@ CARS = Procedural("car", 5, seed=3)
 SPLITS = ("test", "train", "val")
 SCRIPT = """
 from data_gen.datasets.generate import *
+from data_gen.rendering import renderers
+renderers.probe = lambda name: renderers.ProbeResult(name, True, 0.0, "tried by the tests", "")
 config = GenerationConfig(views=4, resolution=16, workers=1, held_out=2)
 print(generate(Procedural("car", 5, seed=3), {out!r}, config,
     progress=lambda *state: print(*state, flush=True)))
@@ -47,10 +51,17 @@ def tree(folder):
     }
 
 
+@pytest.fixture
+def here():
+    with rendered_here():
+        yield
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     out = tmp_path_factory.mktemp("whole") / "cars"
-    report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
+    with rendered_here():
+        report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
     return out, report
 
 
@@ -88,6 +99,7 @@ def test_the_manifest_tells_how_it_was_made_and_holds_no_path_of_this_machine(wh
     }
 
 
+@pytest.mark.usefixtures("here")
 def test_verify_finds_what_is_missing_and_what_has_changed(whole, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(whole[0], out)
@@ -113,7 +125,7 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whol
         [sys.executable, "-c", SCRIPT.format(out=str(out))],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": root},
+        env={**os.environ, "PYTHONPATH": root, CHOICE_VARIABLE: find_renderer().name},
     )
     for _ in range(after):
         process.stdout.readline()
@@ -123,7 +135,8 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whol
     assert not (out / "manifest.json").exists(), "the end of the run was not awaited"
     unfinished = out / ".progress/unfinished/.junk.part"
     unfinished.write_bytes(b"half a file")
-    report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
+    with rendered_here():
+        report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
     assert report.written == 5
     assert report.reused >= after
     assert tree(out) == tree(whole[0])
@@ -153,6 +166,7 @@ def test_two_generations_do_not_write_into_one_folder(tmp_path):
         generate(CARS, tmp_path, GenerationConfig(**SMALL))
 
 
+@pytest.mark.usefixtures("here")
 def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path):
     meshes = tmp_path / "meshes"
     meshes.mkdir()
@@ -239,6 +253,7 @@ def test_arguments_that_make_no_sense_are_named(tmp_path, arguments, message):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("here")
 def test_the_authors_layout_takes_the_classes_that_their_loader_knows(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.ply")
     config = GenerationConfig(layout="hyperplanes-200", views=1, held_out=0, workers=1)
@@ -274,6 +289,7 @@ def test_random_rigs_differ_between_objects_and_agree_between_runs():
     assert not np.allclose(first, other)
 
 
+@pytest.mark.usefixtures("here")
 def test_progress_is_told(tmp_path):
     told = []
     generate(Procedural("car", 2), tmp_path, GenerationConfig(**SMALL), progress=lambda *state: told.append(state))
@@ -286,6 +302,7 @@ def test_the_manifest_names_the_version_that_made_it(whole):
     assert manifest["configuration"]["supersample"] == SUPERSAMPLE
 
 
+@pytest.mark.usefixtures("here")
 def test_files_that_have_changed_are_made_again_when_asked(tmp_path, whole):
     out = shutil.copytree(whole[0], tmp_path / "cars")
     for name in ("car_00001/images/002.png", "car_test_00000/transforms.json"):
@@ -296,6 +313,7 @@ def test_files_that_have_changed_are_made_again_when_asked(tmp_path, whole):
     assert tree(out) == tree(whole[0])
 
 
+@pytest.mark.usefixtures("here")
 def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
     car = Procedural("car", 1, seed=3)
     generate(car, tmp_path / "200", GenerationConfig(rig="paper-200", resolution=8, held_out=0, workers=1))
@@ -333,6 +351,7 @@ def test_a_class_that_the_split_file_leaves_out_whole_is_trained_on_and_named(tm
     assert not any(item.unlisted for item in list_items(MeshFolder(tmp_path / "tree"), 1))
 
 
+@pytest.mark.usefixtures("here")
 def test_an_official_split_file_decides(tmp_path):
     tree_of_cars = tmp_path / "ShapeNetCore.v1"
     for name in "abcd":

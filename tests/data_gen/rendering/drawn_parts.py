@@ -59,4 +59,4 @@ def draw_tricky(backend):
 
 
 if __name__ == "__main__":
-    np.save(sys.argv[2], draw_tricky(sys.argv[1]))
+    np.savez(sys.argv[1], **{name: draw_tricky(name) for name in sys.argv[2:]})

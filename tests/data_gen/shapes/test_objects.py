@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,10 @@ from solid_checks import fighting, islands, touch
 
 SEEDS = range(5)
 KINDS = tuple(name for name in CLASSES if name != "random")
+assemble = cache(assemble)
 
 
+@cache
 def digest(class_name: str, seed: int) -> str:
     arrays = []
     for mesh in make(class_name, seed).geometry.values():
