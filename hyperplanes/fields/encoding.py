@@ -14,7 +14,7 @@ def encoded_size(frequencies: int, size: int = 3) -> int:
     return size * (1 + 2 * frequencies)
 
 
-def encode(values: Float[Tensor, "*batch size"], frequencies: int) -> Float[Tensor, "*batch encoded"]:
+def encode(values: Float[Tensor, "*vectors"], frequencies: int, dim: int = -1) -> Float[Tensor, "*encoded"]:
     """(v, sin(2^0 v), ..., sin(2^(L-1) v), cos(2^0 v), ..., cos(2^(L-1) v)) (NeRF, Eq. 4, without its factor pi).
 
     Only the first sine and cosine are computed; the others follow by doubling the angle.
@@ -22,6 +22,7 @@ def encode(values: Float[Tensor, "*batch size"], frequencies: int) -> Float[Tens
     Args:
         values: coordinates within about [-1, 1].
         frequencies: L.
+        dim: along which a vector lies, and its encoding.
 
     >>> encode(torch.tensor([0.0, 0.0, 0.0]), 1).tolist()
     [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
@@ -33,4 +34,4 @@ def encode(values: Float[Tensor, "*batch size"], frequencies: int) -> Float[Tens
         sine_now, cosine_now = sine[-1], cosine[-1]
         sine.append(2 * sine_now * cosine_now)
         cosine.append(1 - 2 * sine_now.square())
-    return torch.cat([values, *sine, *cosine], -1)
+    return torch.cat([values, *sine, *cosine], dim)

@@ -14,20 +14,22 @@ from hyperplanes.geometry.rays import Sphere
 __all__ = ["MultiPlaneNeRF", "PointMultiPlaneNeRF"]
 
 
-def plane_features(points: Float[Tensor, "point 3"], planes: ImagePlanes) -> Float[Tensor, "point five_planes"]:
-    """z(x, I): the colours and coordinates of a point on every plane, 5 n numbers, all in [-1, 1].
+def plane_features(points: Float[Tensor, "point 3"], planes: ImagePlanes) -> list[Float[Tensor, "number point"]]:
+    """z(x, I): the colours of a point on all planes, and its coordinates there, 5 n numbers, all in [-1, 1].
 
-    Where a point is not seen, the lookup's background colour and clamped coordinate stand; a hidden plane is zeros.
+    A row holds one number of all points, as the lookup writes it: to put the numbers of each point side by side would
+    take as long as the lookup. Where a point is not seen, the lookup's background colour and clamped coordinate stand;
+    a hidden plane is zeros.
     """
     found = planes.lookup(points)
+    colours, coordinates = found.colours.permute(1, 2, 0), found.coordinates.permute(1, 2, 0)
     # colours from [0, 1] to [-1, 1], as coordinates are
-    colours, coordinates = 2 * found.colours - 1, found.coordinates
+    colours = 2 * colours - 1
     # what a masked plane shows is left out
     if planes.masked is not None:
-        shown = ~planes.masked[:, None]
+        shown = ~planes.masked[:, None, None]
         colours, coordinates = colours * shown, coordinates * shown
-    # all planes' colours, then all planes' coordinates
-    return torch.cat([colours.flatten(1), coordinates.flatten(1)], -1)
+    return [colours.flatten(0, 1), coordinates.flatten(0, 1)]
 
 
 class MultiPlaneNeRF(Target):
@@ -40,9 +42,7 @@ class MultiPlaneNeRF(Target):
 
     def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:
         """z(x, I)."""
-        if planes is None:
-            raise ValueError("planes: expected ImagePlanes, got None")
-        return plane_features(points, planes)
+        return torch.cat(plane_features(points, _given(planes))).T
 
 
 class PointMultiPlaneNeRF(MultiPlaneNeRF):
@@ -55,5 +55,11 @@ class PointMultiPlaneNeRF(MultiPlaneNeRF):
 
     def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:
         """z(x, I) and the encoded position in the unit sphere."""
-        here = encode(bounds.normalise(points), self.config.point_frequencies)
-        return torch.cat([super().inputs(points, planes, bounds), here], -1)
+        here = encode(bounds.normalise(points).T.contiguous(), self.config.point_frequencies, dim=0)
+        return torch.cat([*plane_features(points, _given(planes)), here]).T
+
+
+def _given(planes: ImagePlanes | None) -> ImagePlanes:
+    if planes is None:
+        raise ValueError("planes: expected ImagePlanes, got None")
+    return planes
