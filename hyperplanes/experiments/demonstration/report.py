@@ -29,7 +29,6 @@ from hyperplanes.experiments.engine import Runner, curve_of
 from hyperplanes.experiments.experiment import Cell
 from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
 from hyperplanes.experiments.page.content import Pixels
-from hyperplanes.export.animation import choose_representation
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import encode_png
@@ -102,9 +101,12 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
 
 
 def _round(model: HyperPlanes, support: Views, cameras: PinholeCamera) -> Pixels:
-    """The frames of a turntable in one step."""
-    field = choose_representation(model.adapt(support), support, cameras)
-    return to_pixels(field.render(cameras).images)
+    """The frames of a turntable in one step.
+
+    By the field: for so few small frames baking and fitting voxels takes longer (a round of 36 frames of 160x160 24 s
+    of one core, 13 by the field) and shows less (1.0 dB on the query views of a held-out car).
+    """
+    return to_pixels(model.adapt(support).render(cameras).images)
 
 
 def compile_kernels(device: torch.device) -> None:
