@@ -28,8 +28,9 @@ from hyperplanes.methods import METHODS, at_steps, describe_method, make_method
 from tests.reference_rendering import Balls, awaken, small_model
 
 
-@pytest.fixture
-def folders(tmp_path):
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    tmp_path = tmp_path_factory.mktemp("checkpoints")
     full, plain = tmp_path / "full", tmp_path / "plain"
     awaken(small_model()).save(full)
     small_model(hypernetwork=None).save(plain)

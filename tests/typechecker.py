@@ -95,13 +95,26 @@ def checked_once(function, wrap):
     return call
 
 
+@functools.cache
+def form(cls):
+    """How `kind` describes what is of a class: looked up once a class, as calls have a thousand arguments a step."""
+    forms = {"array": (torch.Tensor, np.ndarray), "sequence": (tuple, list), "mapping": dict, "text": str}
+    return next((name for name, classes in forms.items() if issubclass(cls, classes)), "other")
+
+
 def kind(value, sizes):
     """What a check of this value depends on; large sizes by the order in which they come, which `sizes` holds."""
-    if isinstance(value, torch.Tensor | np.ndarray):
-        shape = [size if size < NAMED else sizes.setdefault(size, -1 - len(sizes)) for size in value.shape]
-        return type(value), value.dtype, *shape
-    if isinstance(value, tuple | list):
-        return type(value), *[kind(each, sizes) for each in value]
-    if isinstance(value, dict):
+    cls = type(value)
+    shaped = form(cls)
+    if shaped == "other":
+        return cls
+    if shaped == "array":
+        found = [cls, value.dtype]
+        for size in value.shape:
+            found.append(size if size < NAMED else sizes.setdefault(size, -1 - len(sizes)))
+        return tuple(found)
+    if shaped == "sequence":
+        return cls, *[kind(each, sizes) for each in value]
+    if shaped == "mapping":
         return dict, *[(key, kind(each, sizes)) for key, each in value.items()]
-    return value if isinstance(value, str) else type(value)
+    return value

@@ -253,7 +253,7 @@ def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is(reader, fr
     def quality(field):
         return float(psnr(field.render(query.cameras).images, query.images).mean())
 
-    assert quality(adapter.fine_tune(support, 30, FineTuning(free))) > quality(adapter.adapt(support)) + gain
+    assert quality(adapter.fine_tune(support, 30, FineTuning(free, rays=RAYS))) > quality(adapter.adapt(support)) + gain
     assert all(torch.equal(value, before[name]) for name, value in adapter.state_dict().items())
 
 

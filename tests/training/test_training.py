@@ -4,9 +4,11 @@ optimisers by hand, and properties of what is drawn.
 
 import csv
 import json
+import shutil
 import signal
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +29,7 @@ from hyperplanes.utilities.interrupts import HungUp, Terminated
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, awaken, small_model
 
-FAST = TrainingConfig(steps=6, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
+FAST = TrainingConfig(steps=6, tasks=2, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
 
 
 def with_(config=FAST, **changes):
@@ -45,6 +47,20 @@ def state_of(model):
 
 def same(one, other):
     return set(one) == set(other) and all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.fixture(scope="module")
+def trained_once(tmp_path_factory):
+    """The folder of a training of one step."""
+    folder = tmp_path_factory.mktemp("trained") / "once"
+    train(small_model(), Balls(), with_(steps=1), folder)
+    return folder
+
+
+@pytest.fixture
+def trained(trained_once, tmp_path):
+    """A copy of that folder."""
+    return Path(shutil.copytree(trained_once, tmp_path / "copy"))
 
 
 @pytest.mark.parametrize(
@@ -137,22 +153,20 @@ def test_a_finished_training_is_not_repeated(tmp_path):
     assert same(again.model.state_dict(), weights)
 
 
-def test_a_training_with_other_options_is_not_resumed(tmp_path):
-    train(small_model(), Balls(), with_(steps=1), tmp_path)
+def test_a_training_with_other_options_is_not_resumed(trained):
     with pytest.raises(CheckpointError) as caught:
-        Trainer(small_model(), Balls(), with_(steps=1, rays=64, seed=3), tmp_path)
+        Trainer(small_model(), Balls(), with_(steps=1, rays=64, seed=3), trained)
     message = str(caught.value)
     assert "\n" not in message
     assert all(word in message for word in ("training.json", "expected the same training", "rays", "seed", "--out"))
-    Trainer(small_model(), Balls(), with_(steps=9), tmp_path)  # more steps of the same training are fine
+    Trainer(small_model(), Balls(), with_(steps=9), trained)  # more steps of the same training are fine
 
 
-def test_a_checkpoint_of_another_model_is_not_resumed(tmp_path):
-    train(small_model(), Balls(), with_(steps=1), tmp_path)
+def test_a_checkpoint_of_another_model_is_not_resumed(trained):
     with pytest.raises(
         CheckpointError, match="model.json: expected the model that is to be trained, found other hyper"
     ):
-        Trainer(small_model(hypernetwork=None), Balls(), with_(steps=1), tmp_path)
+        Trainer(small_model(hypernetwork=None), Balls(), with_(steps=1), trained)
 
 
 def test_theta_and_the_hypernetwork_have_optimisers_of_their_own():
@@ -237,7 +251,7 @@ def test_only_training_objects_are_trained_on():
 
 def test_progress_is_reported_with_the_held_out_quality(tmp_path):
     reports = []
-    config = with_(steps=27, rays=8, evaluate_every=26, checkpoint_every=26)
+    config = with_(steps=27, tasks=1, rays=8, evaluate_every=26, checkpoint_every=26)
     trainer = train(small_model(), Balls(), config, tmp_path, reports.append)
     assert [report.step for report in reports] == [25, 26, 27]
     assert reports[0].psnr is None
@@ -382,7 +396,7 @@ def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, 
 
 def test_checkpoints_are_written_when_they_are_due_and_not_only_with_a_report(tmp_path, monkeypatch):
     saved = []
-    trainer = Trainer(small_model(), Balls(), with_(steps=30, rays=4, checkpoint_every=7), tmp_path)
+    trainer = Trainer(small_model(), Balls(), with_(steps=30, tasks=1, rays=4, checkpoint_every=7), tmp_path)
     monkeypatch.setattr(trainer, "save", lambda: saved.append(trainer.step))
     reported = [progress.step for progress in trainer.run()]
     assert saved == [7, 14, 21, 28, 30]
@@ -399,34 +413,31 @@ def test_checkpoints_are_written_when_they_are_due_and_not_only_with_a_report(tm
         ({"hypernetwork": replace(small_model().config.hypernetwork, rank=5)}, "hypernetwork.rank"),
     ],
 )
-def test_a_model_that_differs_in_no_weight_is_another_all_the_same(tmp_path, change, name):
-    train(small_model(), Balls(), with_(steps=1), tmp_path)
+def test_a_model_that_differs_in_no_weight_is_another_all_the_same(trained, change, name):
     with pytest.raises(CheckpointError, match=f"model.json: .*found other .*{name}.*; give another --out"):
-        Trainer(small_model(**change), Balls(), with_(steps=1), tmp_path)
+        Trainer(small_model(**change), Balls(), with_(steps=1), trained)
 
 
 @pytest.mark.parametrize("name", ["step", "curve", "config", "state"])
 @pytest.mark.parametrize("value", [None, "missing", "../../elsewhere"])
-def test_a_training_file_with_a_hole_is_a_checkpoint_error(tmp_path, name, value):
-    train(small_model(), Balls(), with_(steps=1), tmp_path)
-    saved = json.loads((tmp_path / "training.json").read_text())
+def test_a_training_file_with_a_hole_is_a_checkpoint_error(trained, name, value):
+    saved = json.loads((trained / "training.json").read_text())
     saved = (
         {key: entry for key, entry in saved.items() if key != name} if value == "missing" else {**saved, name: value}
     )
-    (tmp_path / "training.json").write_text(json.dumps(saved))
+    (trained / "training.json").write_text(json.dumps(saved))
     with pytest.raises(CheckpointError, match="training.json: expected ") as caught:
-        Trainer(small_model(), Balls(), with_(steps=1), tmp_path)
+        Trainer(small_model(), Balls(), with_(steps=1), trained)
     assert "\n" not in str(caught.value)
 
 
-def test_a_state_of_another_shape_is_a_checkpoint_error(tmp_path):
-    train(small_model(), Balls(), with_(steps=1), tmp_path)
-    (path,) = tmp_path.glob("training-*.safetensors")
+def test_a_state_of_another_shape_is_a_checkpoint_error(trained):
+    (path,) = trained.glob("training-*.safetensors")
     tensors = checkpoints.load_tensors(path)
     for change in ({"0.0.exp_avg": torch.zeros(3)}, {"0.99.step": torch.zeros(())}, {"model.rig": torch.zeros(1, 3)}):
         checkpoints.save_tensors(path, {**tensors, **change})
         with pytest.raises(CheckpointError, match="training-00000001.safetensors: expected"):
-            Trainer(small_model(), Balls(), with_(steps=1), tmp_path)
+            Trainer(small_model(), Balls(), with_(steps=1), trained)
 
 
 def test_memory_is_bounded_in_bytes():
