@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -54,16 +55,27 @@ def unit(module):
     return None
 
 
+@cache
 def modules():
-    for package in OURS:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-            yield name.removesuffix(".__init__"), path
+    """(name, path) of every module of ours."""
+    paths = [path for package in OURS for path in sorted((ROOT / package).rglob("*.py"))]
+    names = [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths]
+    return list(zip(names, paths, strict=True))
 
 
+@cache
+def parsed(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imported(path):
     """Every module of ours that a file imports, at its top or in a function, or that it names in a string."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    return list(_imported(path))
+
+
+def _imported(path):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and NAMED.fullmatch(node.value):
             name = node.value.partition(":")[0].removesuffix(".")
             if is_module(name):  # and no group of entry points
@@ -130,7 +142,7 @@ def test_the_renderer_knows_no_field():
 def test_every_module_says_what_is_public():
     silent = []
     for name, path in modules():
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree = parsed(path)
         defines = any(isinstance(node, ast.FunctionDef | ast.ClassDef | ast.ImportFrom) for node in tree.body)
         assigned = [ast.unparse(node.targets[0]) for node in tree.body if isinstance(node, ast.Assign)]
         if defines and "__all__" not in assigned and path.name != "__main__.py":

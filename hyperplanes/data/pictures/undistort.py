@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -77,14 +78,7 @@ def check_lens(matrix: Array, coefficients: tuple[float, ...], size: tuple[int, 
     Raises:
         DataError: more than 2 % of the picture are beyond the fold.
     """
-    rows, columns = (np.linspace(-0.5, extent - 0.5, GRID) for extent in size)
-    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
-    points = torch.from_numpy((pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]])
-    lens = torch.tensor([coefficients], dtype=torch.float64)
-    limit = turning_radius(lens)
-    tolerance = 0.01 / float(matrix[[0, 1], [0, 1]].max())
-    _, found = inverse_distortion(points, lens.expand(len(points), -1), limit.expand(len(points)), tolerance)
-    folded = 1 - float(found.double().mean())
+    folded = _folded(tuple(matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()), tuple(coefficients), tuple(size))
     if folded > MOST_FOLDED:
         stated = ", ".join(f"{n} = {v:g}" for n, v in zip(COEFFICIENTS, coefficients, strict=True) if v)
         raise DataError(
@@ -93,6 +87,20 @@ def check_lens(matrix: Array, coefficients: tuple[float, ...], size: tuple[int, 
             f"{stated}, which folds {folded:.0%} of the picture",
             "calibrate again, or undistort the images first",
         )
+
+
+@functools.lru_cache(64)  # frames of one camera have one lens, whatever the file repeats for each
+def _folded(calibration: tuple[float, ...], coefficients: tuple[float, ...], size: tuple[int, ...]) -> float:
+    """The share of the picture that no direction, or several, are mapped to; `calibration` is fx, fy, cx, cy."""
+    focal, centre = np.array(calibration[:2]), np.array(calibration[2:])
+    rows, columns = (np.linspace(-0.5, extent - 0.5, GRID) for extent in size)
+    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    points = torch.from_numpy((pixels - centre) / focal)
+    lens = torch.tensor([coefficients], dtype=torch.float64)
+    limit = turning_radius(lens)
+    tolerance = 0.01 / float(focal.max())
+    _, found = inverse_distortion(points, lens.expand(len(points), -1), limit.expand(len(points)), tolerance)
+    return 1 - float(found.double().mean())
 
 
 def undistort(
