@@ -1,12 +1,11 @@
 """Shapes are checked in tests: the package's functions run under jaxtyping and beartype."""
 
 import atexit
+import gc
 import os
 import shutil
+import sys
 import tempfile
-
-import torch
-import typechecker
 
 SLOWEST_FIRST = (
     "test_cli",
@@ -33,11 +32,23 @@ if "HYPERPLANES_TESTS" not in os.environ:  # the first process: it starts the ot
     atexit.register(shutil.rmtree, os.environ["HYPERPLANES_TESTS"], ignore_errors=True)
 os.environ["HYPERPLANES_CACHE"] = tempfile.mkdtemp(dir=os.environ["HYPERPLANES_TESTS"])  # not the user's own
 os.environ.setdefault("LP_NUM_THREADS", "0")  # of Mesa, when it draws in this process, as workers have it
-torch.set_num_threads(1)  # small tensors: more threads only wait for each other; tests of threads set their own
-typechecker.install("hyperplanes")
+
+if (
+    "PYTEST_XDIST_WORKER" in os.environ or "-n" not in sys.argv
+):  # the process that starts others (`make test`) runs none
+    import torch
+    import typechecker
+
+    torch.set_num_threads(1)  # small tensors: more threads only wait for each other; tests of threads set their own
+    typechecker.install("hyperplanes")
 
 
 def pytest_collection_modifyitems(items):
     """Slow modules first; the others as they were."""
     order = {name: place for place, name in enumerate(SLOWEST_FIRST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
+def pytest_collection_finish():
+    """What was imported stays until the end: the garbage collector need not look at it again and again."""
+    gc.freeze()

@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from rendered_here import rendered_here
 
 from hyperplanes.cli import main
 
@@ -25,7 +26,8 @@ def test_the_tutorial_runs(path, tmp_path, monkeypatch):
         code, _, command = cell.partition("!hyperplanes ")  # what follows goes to the shell in a notebook
         exec(code, names)
         if command:
-            assert main(shlex.split(command.format(**names))) == 0, cell
+            with rendered_here():
+                assert main(shlex.split(command.format(**names))) == 0, cell
 
 
 def test_notebooks_carry_no_output():

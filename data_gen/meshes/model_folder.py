@@ -6,10 +6,12 @@ trimesh's FilePathResolver drops ShapeNet's `../images/x.jpg` without a warning,
 
 from __future__ import annotations
 
+import os
 import re
 import unicodedata
 import urllib.parse
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 from trimesh.resolvers import Resolver
@@ -200,7 +202,7 @@ class ModelFolder(Resolver):
             if found is not None:
                 return found
         for last in dict.fromkeys(PurePosixPath(each.replace("\\", "/")).name for each in candidates):
-            for folder in self._usual_folders():
+            for folder in self._usual_folders:
                 found = self._file(folder / last) if last else None
                 if found is not None:
                     why = "absolute path not followed" if _is_absolute(plain) else "not there"
@@ -225,10 +227,12 @@ class ModelFolder(Resolver):
                 yield above.joinpath(*parts[1:])
             yield above.joinpath(*parts)
 
-    def _usual_folders(self) -> Iterator[Path]:
-        for folder in dict.fromkeys((self.folder, model_root(self.path))):
-            for name in ("", "textures", "texture", "images", "maps", "materials/textures"):
-                yield folder / name
+    @cached_property
+    def _usual_folders(self) -> list[Path]:
+        """Those that there are: a mesh may name thousands of textures."""
+        names = ("", "textures", "texture", "images", "maps", "materials/textures")
+        places = dict.fromkeys((self.folder, model_root(self.path)))
+        return [folder / name for folder in places for name in names if os.path.isdir(folder / name)]
 
     def _leaves(self, place: Path) -> bool:
         try:

@@ -30,6 +30,7 @@ from hyperplanes.experiments.experiment import Cell
 from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
 from hyperplanes.experiments.page.content import Pixels
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
+from hyperplanes.geometry.cameras import resized
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.environment import environment
@@ -113,7 +114,7 @@ def compile_kernels(device: torch.device) -> None:
     """Have everything compiled and loaded that the packaged model renders with, by one small view of an example."""
     example = read_task(EXAMPLES / "example-car")
     model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(device)
-    model.adapt(example.support[:3]).render(example.query[:1].cameras)
+    model.adapt(example.support[:3]).render(resized(example.query[:1].cameras, 32, 32))
 
 
 def describe_count(row: str, most: int) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -34,6 +35,12 @@ def write(folder, change=lambda pose: pose, alpha=True):
     return folder
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Without matplotlib: what is found out does not depend on pictures, which take most of the time."""
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+
+
 def test_a_right_data_set_is_described_and_drawn(tmp_path):
     found = inspect(write(tmp_path / "ball"), tmp_path / "out")
     (one,) = found.description.objects
@@ -53,6 +60,7 @@ def test_a_right_data_set_is_described_and_drawn(tmp_path):
     assert "coverage: " in text
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("change", "name"),
     [
@@ -68,12 +76,14 @@ def test_poses_that_are_mistaken_are_recognised_and_named(tmp_path, change, name
     assert f"if the poses are {name}" in "\n".join(found.lines())
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_without_masks_it_says_that_nothing_was_checked(tmp_path):
     found = inspect(write(tmp_path / "ball", alpha=False), tmp_path / "out")
     assert not found.has_problems
     assert "conventions: not checked, there are no masks, and only 0 corners could be matched" in found.lines()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_object_that_cannot_be_read_is_listed_and_the_rest_is_looked_at(tmp_path):
     for name in ("a", "b"):
         write(tmp_path / "set" / name)
@@ -86,10 +96,8 @@ def test_an_object_that_cannot_be_read_is_listed_and_the_rest_is_looked_at(tmp_p
         inspect(tmp_path / "nothing", tmp_path / "out")
 
 
-def test_without_matplotlib_the_rest_is_still_done(tmp_path, monkeypatch):
-    import sys
-
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+@pytest.mark.usefixtures("undrawn")
+def test_without_matplotlib_the_rest_is_still_done(tmp_path):
     found = inspect(write(tmp_path / "ball"), tmp_path / "out")
     assert [path.name for path in found.files] == ["contact_sheet.png"]
     assert found.notes == ("cameras.png: not drawn, matplotlib is not installed; pip install matplotlib",)
