@@ -238,6 +238,21 @@ class Field:
             value = relu(value, inplace=True)
         return value
 
+    def viewed(self, hidden: Float[Tensor, "point width"], seen: Float[Tensor, "point number"]) -> Tensor:
+        """The layer "view" of the layer "feature" and what depends on the direction, side by side; before its ReLU."""
+        weight, bias, of_view = self._view_of_hidden()
+        return torch.addmm(linear(seen, of_view, bias), hidden, weight.T)
+
+    def _view_of_hidden(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Weights and biases of "feature" and "view" as one layer, since nothing lies between them; those of the rest.
+
+        W [F h + f, d] + b = (W_h F) h + W_d d + (W_h f + b): of `small` two fifths of the products.
+        """
+        view, width = self.parameters["view.weight"], self.target.config.width
+        own, of_view = view[:, :width], view[:, width:]
+        bias = torch.addmv(self.parameters["view.bias"], own, self.parameters["feature.bias"])
+        return own @ self.parameters["feature.weight"], bias, of_view
+
     def layer(self, name: str, value: Tensor) -> Tensor:
         """A fully connected layer of the network."""
         return linear(value, self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"])
@@ -274,16 +289,13 @@ class MLPField(Field):
         """The colour head."""
         # the viewing direction joins the features of the point, in a layer of half the width
         seen = encode(directions, self.target.config.direction_frequencies)
-        value = relu(self.layer("view", torch.cat([self.layer("feature", hidden), seen], -1)))
-        return torch.sigmoid(self.layer("colour", value))
+        return torch.sigmoid(self.layer("colour", relu(self.viewed(hidden, seen), inplace=True)))
 
     def colours_along(
         self, hidden: Float[Tensor, "point width"], directions: Float[Tensor, "direction 3"]
     ) -> Float[Tensor, "point direction 3"]:
         """The colour head for every point in every direction; what does not depend on both is computed once."""
-        width = self.target.config.width
-        weight, bias = self.parameters["view.weight"], self.parameters["view.bias"]
+        weight, bias, of_view = self._view_of_hidden()
         # W [h, d] + b = (W_h h + b) + W_d d: one product a point, one a direction
-        here = linear(self.layer("feature", hidden), weight[:, :width], bias)
-        along = linear(encode(directions, self.target.config.direction_frequencies), weight[:, width:])
-        return torch.sigmoid(self.layer("colour", relu(here[:, None] + along)))
+        here, along = linear(hidden, weight, bias), encode(directions, self.target.config.direction_frequencies)
+        return torch.sigmoid(self.layer("colour", relu(here[:, None] + linear(along, of_view))))

@@ -28,6 +28,7 @@ from hyperplanes.geometry.visibility import ANGLE, ChosenViews, Described, Readi
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.indexing import taken
 from hyperplanes.views import Views
 
 __all__ = ["ImageBasedConfig", "ImageBasedField", "ImageBasedNeRF", "FeatureGrid"]
@@ -208,7 +209,7 @@ class HiddenPoints:
     coverage: Float[Tensor, " point"]
 
     def __getitem__(self, index: slice | Tensor) -> HiddenPoints:
-        return HiddenPoints(self.points[index], self.values[index], self.coverage[index])
+        return HiddenPoints(*(taken(each, index) for each in (self.points, self.values, self.coverage)))
 
 
 @dataclass(frozen=True, repr=False)
@@ -296,8 +297,7 @@ class ImageBasedField(Field):
 
     def _coloured(self, hidden: Tensor, near: Described) -> Float[Tensor, "point 3"]:
         """As `_colour`, of what the kernel wrote."""
-        value = torch.cat([self.layer("feature", hidden), near.near_rows], 1)
-        return self._blend(value, near.near_weights, near.near_colours)
+        return self._blend(self.viewed(hidden, near.near_rows), near.near_weights, near.near_colours)
 
     def _hidden(self, points: Tensor, visibility: Visibility, shown: Tensor) -> Float[Tensor, "point width"]:
         """The trunk at points, which reads the `config.planes` views that see them best; `shown` are all colours."""
@@ -335,7 +335,9 @@ class ImageBasedField(Field):
         return _padded(slots, self.target.config.planes).flatten(1)
 
     def _density(self, hidden: Tensor, coverage: Tensor) -> Float[Tensor, " point"]:
-        raw = self.layer("density", torch.cat([hidden, coverage[:, None]], 1))[:, 0]
+        weight, bias = self.parameters["density.weight"][0], self.parameters["density.bias"]
+        # of both side by side, without putting them there
+        raw = torch.addmv(torch.addcmul(bias, coverage, weight[-1]), hidden, weight[:-1])
         return softplus(raw) * (self.target.config.density_scale / self.bounds.radius)
 
     def _colour(
@@ -361,13 +363,13 @@ class ImageBasedField(Field):
         # what the head reads: the trunk's features, the encoded direction, what each of these views shows
         slots = torch.cat([(2 * colours - 1) * valid, angle[:, :count, None] * valid, _described(seen)], -1)
         along = encode(directions, config.direction_frequencies)
-        value = torch.cat([self.layer("feature", hidden), along, _padded(slots, config.blended).flatten(1)], 1)
+        value = self.viewed(hidden, torch.cat([along, _padded(slots, config.blended).flatten(1)], 1))
         return self._blend(value, weights.log(), colours)
 
     def _blend(self, value: Tensor, weights: Tensor, colours: Tensor) -> Float[Tensor, "point 3"]:
         """The mean of colours by weights, given as logarithms, which the network multiplies; and its shift."""
         # the network's factor of each weight, as a logarithm, and its shift of the logit of the colour
-        factors, shift = self.layer("colour", relu(self.layer("view", value))).split([self.target.config.blended, 3], 1)
+        factors, shift = self.layer("colour", relu(value, inplace=True)).split([self.target.config.blended, 3], 1)
         weights = torch.softmax(weights + factors[:, : weights.shape[1]], 1)
         return torch.sigmoid(torch.logit(self.blended(weights, colours), 0.005) + shift)
 
