@@ -12,6 +12,7 @@ from typing import no_type_check
 import numpy as np
 
 from hyperplanes.geometry.kernels.blocks import inlined
+from hyperplanes.geometry.kernels.functions import exp, sine_and_cosine, tanh
 from hyperplanes.geometry.kernels.llvm import load, load_int
 from hyperplanes.geometry.kernels.visibility import (
     ACROSS,
@@ -23,6 +24,7 @@ from hyperplanes.geometry.kernels.visibility import (
     ROWS,
     SCORE,
     SHOWN,
+    TURN,
     X,
     Y,
     Z,
@@ -35,6 +37,7 @@ from hyperplanes.geometry.kernels.visibility import (
 __all__ = ["describe"]
 
 BACKGROUND = 1.0
+LEAST_TURN = math.acos(1 - 1e-6)  # of the angle between a view and a direction, as `fields.image_based` has it
 
 
 @inlined
@@ -76,7 +79,7 @@ def _encode(row, at, x, y, z, frequencies):
     if frequencies:
         for axis in range(3):
             value = row[at - 3 + axis]
-            sine, cosine = number(math.sin(value)), number(math.cos(value))
+            sine, cosine = sine_and_cosine(value)
             for octave in range(frequencies):
                 row[at + 3 * octave + axis] = sine
                 row[at + 3 * (frequencies + octave) + axis] = cosine
@@ -105,7 +108,7 @@ def _interpolate(grid, row, at, x, y, z):
         a, b, c = min(i + right, side - 1), min(j + up, side - 1), min(k + behind, side - 1)
         for channel in range(channels):
             row[at + channel] += weight * grid[a, b, c, channel]
-    row[at] = one / (one + number(math.exp(-row[at])))
+    row[at] = one / (one + exp(-row[at]))
 
 
 @inlined
@@ -126,13 +129,13 @@ def _describe_best(s, pitch, packed, shape, chosen, numbers, covered, seen, row,
         for channel in range(3):
             colours[index, channel] = two * colour[channel] - one if valid else zero
             row[at + channel] = colours[index, channel]
-        row[at + 3] = number(math.tanh(falloff * load(s, BEHIND * pitch + view))) if valid else zero
+        row[at + 3] = tanh(falloff * load(s, BEHIND * pitch + view)) if valid else zero
         row[at + 4] = load(s, OPACITY * pitch + view) if valid else zero
         row[at + 5] = one if valid else zero
         row[at + 6] = load(s, X * pitch + view) if valid else zero
         row[at + 7] = load(s, Y * pitch + view) if valid else zero
         row[at + 8] = load(s, Z * pitch + view) if valid else zero
-        weights[index] = number(math.exp(-fading * max(penalty, zero))) if valid else zero
+        weights[index] = exp(-fading * max(penalty, zero)) if valid else zero
         sum_of_weights += weights[index]
         at += 9
     for empty in range(at, at + 9 * (slots - best)):
@@ -157,18 +160,22 @@ def _describe_best(s, pitch, packed, shape, chosen, numbers, covered, seen, row,
 
 @inlined
 @no_type_check
-def _describe_nearest(s, pitch, packed, shape, chosen, scores, numbers, direction, row, at, weights, shown, colour):
+def _describe_nearest(s, pitch, packed, shape, chosen, scores, numbers, row, at, weights, shown, colour):
     """Seven numbers of each of the nearest views; their colours, and the logarithms of their weights in the blend."""
     number = s.dtype.type
     zero, one, two = number(0), number(1), number(2)
     total, height, width, slots, bits = shape[0], shape[1], shape[2], shape[4], shape[6]
     near, ranked = min(slots, total), min(slots + 1, total)
-    unseen, by_angle, falloff, smallest, most = numbers[6], numbers[7], numbers[9], numbers[10], number(1 - 1e-6)
+    unseen, by_angle, falloff, smallest, least_turn = (
+        numbers[6],
+        numbers[7],
+        numbers[9],
+        numbers[10],
+        number(LEAST_TURN),
+    )
     for index in range(ranked):  # the angle, and what the view is weighted by
         view = chosen[index]
-        cosine = direction[0] * load(s, X * pitch + view) + direction[1] * load(s, Y * pitch + view)
-        cosine += direction[2] * load(s, Z * pitch + view)
-        angle = number(math.acos(min(max(cosine, -most), most)))
+        angle = min(max(load(s, TURN * pitch + view), least_turn), number(math.pi) - least_turn)
         scores[index] = max(angle + by_angle * max(load(s, PENALTY * pitch + view), zero), smallest)
         if index < near:
             row[at + 7 * index + 3] = angle
@@ -182,7 +189,7 @@ def _describe_nearest(s, pitch, packed, shape, chosen, scores, numbers, directio
             shown[index, channel] = colour[channel]
             row[at + channel] = two * colour[channel] - one if valid else zero
         row[at + 3] = row[at + 3] if valid else zero
-        row[at + 4] = number(math.tanh(falloff * load(s, BEHIND * pitch + view))) if valid else zero
+        row[at + 4] = tanh(falloff * load(s, BEHIND * pitch + view)) if valid else zero
         row[at + 5] = load(s, OPACITY * pitch + view) if valid else zero
         row[at + 6] = one if valid else zero
         weights[index] = number(math.log(max(one / scores[index] - one / farthest, number(1e-6))))
@@ -222,32 +229,33 @@ def describe(
     for point in range(start, stop):
         x, y, z = points[point, 0], points[point, 1], points[point, 2]
         place(s, pitch, total, x, y, z, cameras, shape, numbers[0])
-        for nearest in range(2):  # what the trunk reads of the best views, then the colour head of the nearest ones
-            row = near_rows[point] if nearest else rows[point]
-            if not len(row):
-                continue
-            if not nearest or len(surface) or not rows.shape[1]:
-                judge(s, pitch, total, surface if nearest and len(surface) else maps, shape, numbers)
-            if nearest:
-                x, y, z = directions[point, 0], directions[point, 1], directions[point, 2]
-                rank(s, pitch, total, x, y, z, numbers[7])
-            else:
-                x, y, z = (x - sphere[0]) * sphere[3], (y - sphere[1]) * sphere[3], (z - sphere[2]) * sphere[3]
-            least(s, pitch, total, SCORE if nearest else PENALTY, ranked if nearest else best, chosen, scores, 0)
-            at = _encode(row, 0, x, y, z, shape[7 + nearest])
-            if nearest:
-                _describe_nearest(
-                    s, pitch, packed, shape, chosen, scores, numbers, directions[point], row, at, near_weights[point],
-                    near_colours[point], colour,
-                )  # fmt: skip
-                continue
+        if rows.shape[1]:  # what the trunk reads of the best views
+            row = rows[point]
+            judge(s, pitch, total, maps, shape, numbers)
+            least(s, pitch, total, PENALTY, best, chosen, scores, 0)
             covered, seen = one, zero
             for view in range(total):
                 covered = min(covered, load(s, OPACITY * pitch + view))
                 seen += load(s, SHOWN * pitch + view)
             coverage[point] = covered
+            x, y, z = (x - sphere[0]) * sphere[3], (y - sphere[1]) * sphere[3], (z - sphere[2]) * sphere[3]
+            at = _encode(row, 0, x, y, z, shape[7])
             at = _describe_best(
                 s, pitch, packed, shape, chosen, numbers, covered, seen, row, at, colours, weights, colour
             )
             if grid.shape[3]:
                 _interpolate(grid, row, at, x, y, z)
+        if near_rows.shape[1]:  # what the colour head reads of the nearest ones
+            row = near_rows[point]
+            if len(surface):
+                judge(s, pitch, total, surface, shape, numbers)
+            elif not rows.shape[1]:
+                judge(s, pitch, total, maps, shape, numbers)
+            x, y, z = directions[point, 0], directions[point, 1], directions[point, 2]
+            rank(s, pitch, total, x, y, z, numbers[7])
+            least(s, pitch, total, SCORE, ranked, chosen, scores, 0)
+            at = _encode(row, 0, x, y, z, shape[8])
+            _describe_nearest(
+                s, pitch, packed, shape, chosen, scores, numbers, row, at, near_weights[point], near_colours[point],
+                colour,
+            )  # fmt: skip

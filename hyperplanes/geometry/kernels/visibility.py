@@ -11,33 +11,17 @@ from typing import no_type_check
 import numpy as np
 
 from hyperplanes.geometry.kernels.blocks import inlined
+from hyperplanes.geometry.kernels.functions import acos
 from hyperplanes.geometry.kernels.llvm import load, load_int, read, store, store_int
 from hyperplanes.geometry.lookup_torch import BORDER
 
 __all__ = ["choose", "judge", "least", "place", "rank"]
 
 # Rows of the scratch: the direction from the camera, depth behind the hull, opacity and penalty, which are results;
-# then the distance, whether the view shows the point, the fractions of a pixel, the pixel, the score by direction.
-X, Y, Z, BEHIND, OPACITY, PENALTY, DISTANCE, SHOWN, ACROSS, DOWN, AT, SCORE = range(12)
-RESULTS, ROWS = 6, 12
-
-
-@inlined
-@no_type_check
-def _acos(x):
-    """The arc cosine within 1e-7 (Abramowitz and Stegun, 4.4.46)."""
-    n = type(x)
-    a = abs(x)
-    series = n(-0.0012624911)
-    series = series * a + n(0.0066700901)
-    series = series * a + n(-0.0170881256)
-    series = series * a + n(0.0308918810)
-    series = series * a + n(-0.0501743046)
-    series = series * a + n(0.0889789874)
-    series = series * a + n(-0.2145988016)
-    series = series * a + n(1.5707963050)
-    angle = np.sqrt(max(n(1) - a, n(0))) * series
-    return angle if x >= 0 else n(np.pi) - angle
+# then the distance, whether the view shows the point, the fractions of a pixel, the pixel, the score by direction, and
+# the angle in it.
+X, Y, Z, BEHIND, OPACITY, PENALTY, DISTANCE, SHOWN, ACROSS, DOWN, AT, SCORE, TURN = range(13)
+RESULTS, ROWS = 6, 13
 
 
 @inlined
@@ -121,8 +105,9 @@ def rank(s, pitch, total, along_x, along_y, along_z, by_angle):
     zero, one = number(0), number(1)
     for k in range(total):
         cosine = along_x * load(s, X * pitch + k) + along_y * load(s, Y * pitch + k) + along_z * load(s, Z * pitch + k)
-        score = _acos(min(max(cosine, -one), one)) + by_angle * max(load(s, PENALTY * pitch + k), zero)
-        store(s, SCORE * pitch + k, score)
+        turn = acos(min(max(cosine, -one), one))
+        store(s, TURN * pitch + k, turn)
+        store(s, SCORE * pitch + k, turn + by_angle * max(load(s, PENALTY * pitch + k), zero))
 
 
 @inlined
