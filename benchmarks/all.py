@@ -1,10 +1,11 @@
 """Every benchmark, one after the other: rows and figures in benchmarks/results, and the tables of the pages.
 
     python -m benchmarks all
-    python -m benchmarks all --data data/cars data/chairs
+    python -m benchmarks all --root data --data data/cars data/chairs --scene chair --meshes miner.glb taxi.glb
 
 Each runs in a process of its own, and writes the commit, the hardware and the load beside its rows. Those that judge or
-train models need data sets, and are left out without --data.
+train models need data sets: the suites of `benchmarks/views.py` below --root, others --data. Without --scene and
+--meshes, procedural objects are adapted to and photographed in place of those of the pages.
 """
 
 from __future__ import annotations
@@ -16,27 +17,47 @@ from pathlib import Path
 
 from benchmarks import tables
 
-__all__ = ["COMMANDS", "OF_DATA", "main"]
+__all__ = ["COMMANDS", "OF_DATA", "OF_SUITES", "main"]
 
 RESULTS = Path(__file__).parent / "results"
 COMMANDS: dict[str, list[str]] = {
-    "adapting": [],
-    "lookup": ["--plot", "lookup.png"],
+    "adapting": ["--side", "192"],
+    "lookup": [],
     "visibility": [],
     "busy": [],
-    "rendering": ["--sizes", "64", "128", "200", "400", "--plot", "rendering.png"],
+    "rendering": ["--sizes", "64", "128", "200", "400"],
     "small": [],
     "splats": [],
     "steps": [],
     "training": [],
-    "training_curves": ["--curves", "120", "--plot", "training_curves.png"],
+    "training_curves": ["--curves", "120"],
     "generation": [],
-    "captures": ["--checkpoint", "small"],
+    "captures": ["--checkpoint", "small", "--size", "640"],
 }
-"""Names of results, and options of the benchmarks beside --json; pictures lie in the folder of results."""
+"""Names of results, and options of the benchmarks beside --json and --plot."""
 
 OF_DATA = ("views", "baked", "image_based", "hypernetwork")
-"""Those that are given --data, and no other option."""
+"""Those that are given --data."""
+
+MORE = {"baked": ["--objects", "2", "--query", "4", "--counts", "25", "3"]}
+"""Options of those beside --data."""
+
+_TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25"]
+OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
+    "views_procedural": (["procedural"], _TEN),
+    "views_cc0": (["cc0"], _TEN),
+    "views_random": (["random"], [*_TEN, "--methods", "nearest_view", "hull_blend", "swapped"]),
+    "views_posed": (["posed"], ["--query", "5", "--counts", "1", "3", "5", "25", "50"]),
+    "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "5"]),
+    "views_tuned": (
+        ["cc0", "random", "posed", "procedural"],
+        ["--objects", "1", "--query", "2", "--counts", "25", "--steps", "100", "--methods", "hull_blend"],
+    ),
+}
+"""Results of `views` by suites below --root, and its options, in place of `views` by --data."""
+
+PLOTTED = {"lookup": "lookup.png", "rendering": "rendering.png", "training_curves": "training_curves.png"}
+"""Pictures of results, in the same folder."""
 
 
 def main(arguments: list[str]) -> int:
@@ -48,18 +69,17 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks all", description=__doc__)
     parser.add_argument("--out", type=Path, default=RESULTS, help="the folder of the results (default: %(default)s)")
     parser.add_argument("--data", type=Path, nargs="+", default=[], help="data sets for " + ", ".join(OF_DATA))
+    parser.add_argument("--root", type=Path, help="the folder of the data sets of suites")
+    parser.add_argument("--scene", type=Path, help="posed images that are adapted to")
+    parser.add_argument("--meshes", type=Path, nargs="+", help="objects of the captures")
     parser.add_argument("--quick", action="store_true", help="the short way of each: to see that they run")
     parser.add_argument("--under-load", action="store_true", help="measure beside other work, too")
     chosen = parser.parse_args(arguments)
-    data = ["--data", *map(str, chosen.data)]
-    commands = COMMANDS | (dict.fromkeys(OF_DATA, data) if chosen.data else {})
-    failed = []
-    for name, options in commands.items():
-        options = [str(chosen.out / each) if each.endswith(".png") else each for each in options]
-        benchmark = name.removesuffix("_curves")
+    failed, commands = [], _commands(chosen)
+    kept = not chosen.quick or chosen.out != RESULTS  # the rows of pages are none of the short way
+    for name, (benchmark, options) in commands.items():
         command = [sys.executable, "-m", "benchmarks", *(["--under-load"] if chosen.under_load else []), benchmark]
-        command += [*(data if name in OF_DATA else []), "--quick"] if chosen.quick else options
-        command += ["--json", str(chosen.out / f"{name}.json")]
+        command += [*options, *(["--json", str(chosen.out / f"{name}.json")] if kept else [])]
         if subprocess.run(command, check=False).returncode:
             failed.append(name)
     print(f"benchmarks all: {len(commands) - len(failed)} of {len(commands)} done", *failed, sep="; failed: ")
@@ -68,3 +88,22 @@ def main(arguments: list[str]) -> int:
     if chosen.out == RESULTS and not chosen.quick:
         tables.main([])
     return 1 if failed else 0
+
+
+def _commands(chosen: argparse.Namespace) -> dict[str, tuple[str, list[str]]]:
+    """The benchmark of each result and its options."""
+    data = ["--data", *map(str, chosen.data)]
+    given = {"adapting": ["--views", str(chosen.scene)] if chosen.scene else []}
+    given["captures"] = ["--meshes", *map(str, chosen.meshes)] if chosen.meshes else []
+    commands = {name: (name.removesuffix("_curves"), given.get(name, []), more) for name, more in COMMANDS.items()}
+    if chosen.data:
+        commands |= {name: (name, data, MORE.get(name, [])) for name in OF_DATA}
+    if chosen.root:
+        commands.pop("views", None)
+        for name, (suites, more) in OF_SUITES.items():
+            commands[name] = "views", ["--root", str(chosen.root), "--suite", *suites], more
+    result = {}
+    for name, (benchmark, source, more) in commands.items():
+        plot = ["--plot", str(chosen.out / PLOTTED[name])] if name in PLOTTED else []
+        result[name] = benchmark, [*source, *(["--quick"] if chosen.quick else [*more, *plot])]
+    return result
