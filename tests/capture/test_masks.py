@@ -99,11 +99,13 @@ def ball_seen():
     return model, Sphere(radius=1.1), [mask.astype(float) for _ in range(count)]
 
 
-def test_masks_that_agree_are_left_alone(ball_seen):
-    from hyperplanes.capture.masks.consistency import agree
+def test_masks_that_agree_are_left_alone(ball_seen, monkeypatch):
+    from hyperplanes.capture.masks import consistency
 
+    monkeypatch.setattr(consistency, "COARSE", 40)
+    monkeypatch.setattr(consistency, "FINE", 72)
     model, sphere, masks = ball_seen
-    found = agree(masks, model, sphere)
+    found = consistency.agree(masks, model, sphere)
     assert (found.votes, found.wrong) == (1, [])
     for before, after in zip(masks, found.masks, strict=True):
         np.testing.assert_array_equal(before, after)

@@ -41,6 +41,12 @@ def baked(adapted):
     return bake(adapted, side=64)
 
 
+@pytest.fixture(scope="module")
+def seen(adapted):
+    """Pictures of the field."""
+    return adapted.render(CAMERAS)
+
+
 def test_harmonics_are_orthonormal():
     # Source of truth: the integral over the sphere, by an even spread of directions.
     directions = camera.fibonacci_sphere(20_000, 1.0)[:, 2, :3]
@@ -49,9 +55,9 @@ def test_harmonics_are_orthonormal():
     assert torch.allclose(gram, torch.eye(9), atol=2e-3)
 
 
-def test_baked_pictures_are_those_of_the_field(adapted, baked):
+def test_baked_pictures_are_those_of_the_field(seen, baked):
     # Source of truth: the field itself, rendered by marching.
-    truth = adapted.render(CAMERAS)
+    truth = seen
     found = BakedScene(baked, steps=256).render(CAMERAS)
     assert float(psnr(found.images, truth.images).min()) > 34
     hit = truth.opacity > 0.99
@@ -167,9 +173,9 @@ def test_compiled_transmittance_is_that_of_plain_torch():
     torch.testing.assert_close(transmittance_torch(optical_depth, cells, directions), compiled)
 
 
-def test_fitting_brings_back_colours_and_densities(adapted):
+def test_fitting_brings_back_colours_and_densities(adapted, seen):
     # Source of truth: the field's own pictures, of cameras that are not fitted to.
-    whole, shown = bake(adapted, side=32), adapted.render(CAMERAS).images
+    whole, shown = bake(adapted, side=32), seen.images
     faded = replace(whole, values=0.9 * whole.values)
     others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
     truth, steps = adapted.render(others).images, []
@@ -180,12 +186,12 @@ def test_fitting_brings_back_colours_and_densities(adapted):
     assert torch.equal(fitted.index, whole.index)
 
 
-def test_a_guide_keeps_what_few_views_do_not_show(adapted):
+def test_a_guide_keeps_what_few_views_do_not_show(adapted, seen):
     """Two views of another brightness: without the guide all that they do not show is lost, with it little."""
-    whole, guide = bake(adapted, side=32), render_guide(adapted, Views(adapted.render(CAMERAS).images, CAMERAS)[:2])
+    whole, guide = bake(adapted, side=32), render_guide(adapted, Views(seen.images, CAMERAS)[:2])
     assert guide is not None
     assert guide.size == (CAMERAS.height[0] // 2, CAMERAS.width[0] // 2)
-    darker = Views(0.8 * adapted.render(CAMERAS).images, CAMERAS)[:2]
+    darker = Views(0.8 * seen.images, CAMERAS)[:2]
     others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
     truth = adapted.render(others).images
     alone, guided = (fit_voxels(whole, darker, guide=each, steps=30, rays=1024) for each in (None, guide))

@@ -26,7 +26,7 @@ def test_perturbations_have_the_stated_size():
 def test_wrong_cameras_are_found_again():
     scene, true = example.Blobs.make(), cameras.fibonacci_sphere(2, 2.7, -0.5, 0.8)
     start = example.perturbed(true, 5.0, 0.03, 1)
-    result = example.refine(scene, start, true, 24, 300)
+    result = example.refine(scene, start, true, 24, 160)
     degrees, percent = example.errors(result.pose, true)
     assert degrees.max() < 0.5
     assert percent.max() < 1

@@ -80,13 +80,14 @@ def test_a_training_learns_what_is_behind_the_views_that_are_shown():
 
 
 def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):
-    whole = Trainer(HyperPlanes(MODEL), Balls(), TRAINING)
+    config = replace(TRAINING, steps=2)
+    whole = Trainer(HyperPlanes(MODEL), Balls(), config)
     list(whole.run())
-    first = Trainer(HyperPlanes(MODEL), Balls(), TRAINING, tmp_path)
-    first.take_step()
+    first = Trainer(HyperPlanes(MODEL), Balls(), config, tmp_path)
     first.take_step()
     first.save()
-    second = Trainer(HyperPlanes(MODEL), Balls(), TRAINING, tmp_path)
+    second = Trainer(HyperPlanes(MODEL), Balls(), config, tmp_path)
+    assert second.step == 1
     list(second.run())
     for name, value in whole.model.state_dict().items():
         assert torch.equal(value, second.model.state_dict()[name]), name
