@@ -189,7 +189,7 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     shown, balls = [], NamedBalls(train=0, test=1, views=6, size=(24, 24))
     monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: balls)
     monkeypatch.setattr(DataSets, "folder", lambda data, class_name: tmp_path)
-    settings = replace(DemoSettings.quick_check(), first=("car",), first_counts=(2, 3), frames=4)
+    settings = replace(DemoSettings.quick_check(), first=("car",), first_counts=(3,), frames=2)
     cpu = torch.device("cpu")
 
     def make_runner(workspace, scale):
@@ -198,4 +198,4 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     Demonstration(settings, tmp_path, make_runner, lambda: None, shown.append, None).show_packaged()
     assert (tmp_path / "first.html").exists()
     rows = [line.partition(":")[0] for line in shown]
-    assert rows == ["nearest of 3 views, copied", "2 views", "3 views", "the first page"]
+    assert rows == ["nearest of 3 views, copied", "3 views", "the first page"]
