@@ -27,7 +27,20 @@ _CHUNK = 64 * memory.BLOCK  # points in one call of a kernel
 _PLANES = "Tensor points, Tensor matrices, Tensor images, Tensor? packed, int bits, Tensor? views, float nearest"
 _SAMPLED = "Tensor images, Tensor coordinates, Tensor? packed, int bits"
 _GRADIENTS = "Tensor? grad_colours, Tensor? grad_coordinates, bool geometry, bool pixels"
-_CPU: dict[str, Any] = {"mutates_args": (), "device_types": "cpu"}
+
+
+def _operator(name: str, schema: str) -> Callable[[Callable[..., Any]], Any]:
+    """A decorator: the operator `hyperplanes::NAME`, of which the function is the CPU's kernel.
+
+    `torch.library.custom_op` would import torch._dynamo at the first call, which takes 1.3 to 2 s.
+    """
+
+    def register(function: Callable[..., Any]) -> Any:
+        torch.library.define(f"hyperplanes::{name}", schema, tags=torch.Tag.pt2_compliant_tag)
+        torch.library.impl(f"hyperplanes::{name}", "cpu", function)
+        return getattr(torch.ops.hyperplanes, name).default
+
+    return register
 
 
 @dataclass(frozen=True)
@@ -113,9 +126,7 @@ def _grouped(views: np.ndarray, planes: int) -> tuple[np.ndarray, np.ndarray, in
     return np.ascontiguousarray(segments[count > 0]), position, int(padded.sum())
 
 
-@torch.library.custom_op(
-    "hyperplanes::lookup", schema=f"({_PLANES}, float background) -> (Tensor, Tensor, Tensor)", **_CPU
-)
+@_operator("lookup", f"({_PLANES}, float background) -> (Tensor, Tensor, Tensor)")
 def lookup(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
     nearest: float, background: float,
@@ -141,9 +152,7 @@ def lookup(
     return results
 
 
-@torch.library.custom_op(
-    "hyperplanes::lookup_backward", schema=f"({_PLANES}, {_GRADIENTS}) -> (Tensor, Tensor, Tensor)", **_CPU
-)
+@_operator("lookup_backward", f"({_PLANES}, {_GRADIENTS}) -> (Tensor, Tensor, Tensor)")
 def lookup_backward(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None,
     nearest: float, grad_colours: Tensor | None, grad_coordinates: Tensor | None, geometry: bool, pixels: bool,
@@ -175,7 +184,7 @@ def lookup_backward(
     return grad_points, grad_matrices, grad_images
 
 
-@torch.library.custom_op("hyperplanes::sample", schema=f"({_SAMPLED}, float background) -> Tensor", **_CPU)
+@_operator("sample", f"({_SAMPLED}, float background) -> Tensor")
 def sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bits: int, background: float) -> Tensor:
     """Colours (point, view, channel), planar in memory."""
     check_sample(images, coordinates, packed, bits)
@@ -189,11 +198,7 @@ def sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bits: int
     return colours
 
 
-@torch.library.custom_op(
-    "hyperplanes::sample_backward",
-    schema=f"({_SAMPLED}, Tensor grad_colours, bool geometry, bool pixels) -> (Tensor, Tensor)",
-    **_CPU,
-)
+@_operator("sample_backward", f"({_SAMPLED}, Tensor grad_colours, bool geometry, bool pixels) -> (Tensor, Tensor)")
 def sample_backward(
     images: Tensor, coordinates: Tensor, packed: Tensor | None, bits: int, grad_colours: Tensor, geometry: bool,
     pixels: bool,
@@ -320,33 +325,33 @@ def _fake_image_gradient(images: Tensor, like: Tensor, pixels: bool) -> Tensor:
     return pixel[..., :channels].permute(0, 3, 1, 2)
 
 
-@lookup.register_fake
+@torch.library.register_fake("hyperplanes::lookup")
 def _(points, matrices, images, packed, bits, views, nearest, background):
     return _empty(points, images, views)
 
 
-@lookup_backward.register_fake
+@torch.library.register_fake("hyperplanes::lookup_backward")
 def _(points, matrices, images, packed, bits, views, nearest, grad_colours, grad_coordinates, geometry, pixels):
     last = _fake_image_gradient(images, points, pixels)
     return *(value.new_empty(value.shape if geometry else 0) for value in (points, matrices)), last
 
 
-@sample.register_fake
+@torch.library.register_fake("hyperplanes::sample")
 def _(images, coordinates, packed, bits, background):
     return _planar(coordinates, coordinates.shape[1], images.shape[1])
 
 
-@sample_backward.register_fake
+@torch.library.register_fake("hyperplanes::sample_backward")
 def _(images, coordinates, packed, bits, grad_colours, geometry, pixels):
     grad_coordinates = _planar(coordinates, len(images), 2) if geometry else coordinates.new_empty(0)
     return _fake_image_gradient(images, coordinates, pixels), grad_coordinates
 
 
-lookup.register_autograd(_gradients, setup_context=_setup)
-sample.register_autograd(_sample_gradients, setup_context=_sample_setup)
+torch.library.register_autograd("hyperplanes::lookup", _gradients, setup_context=_setup)
+torch.library.register_autograd("hyperplanes::sample", _sample_gradients, setup_context=_sample_setup)
 
 
-@lookup.register_kernel("cuda")
+@torch.library.impl("hyperplanes::lookup", "cuda")
 def _(points, matrices, images, packed, bits, views, nearest, background):
     from hyperplanes.geometry.kernels import lookup_triton
 
@@ -354,7 +359,7 @@ def _(points, matrices, images, packed, bits, views, nearest, background):
     return lookup_triton.lookup(points, matrices, images, views, background, nearest)
 
 
-@lookup_backward.register_kernel("cuda")
+@torch.library.impl("hyperplanes::lookup_backward", "cuda")
 def _(points, matrices, images, packed, bits, views, nearest, grad_colours, grad_coordinates, geometry, pixels):
     from hyperplanes.geometry.kernels import lookup_triton
 
