@@ -69,8 +69,12 @@ def unread_pipe():
     """A pipe to write to, whose reader has gone."""
     read, write = os.pipe()
     os.close(read)
-    with suppress(BrokenPipeError), os.fdopen(write, "w") as pipe:
+    pipe = os.fdopen(write, "w")
+    try:
         yield pipe
+    finally:
+        with suppress(BrokenPipeError):
+            pipe.close()
 
 
 def test_help_loads_nothing_heavy():
