@@ -1,6 +1,6 @@
 """Elementary functions for the CPU kernels, without a call, so that LLVM vectorises loops over them (numba only).
 
-The C library's take 15 to 40 ns a value. These are for single precision, exact to about 1e-7.
+For single precision, exact to about 1e-7.
 """
 
 from __future__ import annotations
