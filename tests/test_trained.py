@@ -187,12 +187,15 @@ def test_colours_by_the_surface_of_the_density_are_better_than_by_that_of_the_hu
 
 @pytest.mark.parametrize(("count", "most"), [(3, 4.5), (25, 1.0)])
 def test_a_car_that_faces_another_way_costs_little(count, most):
-    """2.9 and -0.1 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
-    model, task, found = coarse("small"), cars()[1], {}
+    """3.7 and 0.5 dB; weights trained on one heading alone lost 9.5 and 7.7 (`benchmarks views --rotated`)."""
+    model, found = coarse("small"), {}
     for degrees in (0, 45):
         rotation = Rotation(math.radians(degrees))
-        shown, query = (rotation.views(part) for part in (few(task, count), task.query[:1]))
-        found[degrees] = float(psnr(model.adapt(shown).render(query.cameras).images, query.images))
+        values = []
+        for task in cars():
+            shown, query = (rotation.views(part) for part in (few(task, count), task.query[:1]))
+            values.append(psnr(model.adapt(shown).render(query.cameras).images, query.images).mean())
+        found[degrees] = float(torch.stack(values).mean())
     assert found[45] > found[0] - most
 
 

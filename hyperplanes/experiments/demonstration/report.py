@@ -104,8 +104,8 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
 def _round(model: HyperPlanes, support: Views, cameras: PinholeCamera) -> Pixels:
     """The frames of a turntable in one step.
 
-    By the field: for so few small frames baking and fitting voxels takes longer (a round of 36 frames of 160x160 24 s
-    of one core, 13 by the field) and shows less (1.0 dB on the query views of a held-out car).
+    By the field: for so few small frames baking and fitting voxels takes longer than 36 frames of 160x160 by the field
+    (13 s of one core) and shows less (1.0 dB on the query views of a held-out car).
     """
     return to_pixels(model.adapt(support).render(cameras).images)
 
