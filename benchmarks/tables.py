@@ -338,6 +338,7 @@ SOURCES = {
     "captures_masks": ("captures",),
     "views": OF_VIEWS,
     "views_over": OF_VIEWS,
+    "views_srn": ("views_srn", "views_srn_2"),
     "views_summary": OF_VIEWS,
 }
 """Files of rows of tables that are not made of the file of their name."""

@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import tempfile
+from itertools import pairwise
 
 SLOWEST_FIRST = (
     "test_cli",
@@ -33,9 +34,8 @@ if "HYPERPLANES_TESTS" not in os.environ:  # the first process: it starts the ot
 os.environ["HYPERPLANES_CACHE"] = tempfile.mkdtemp(dir=os.environ["HYPERPLANES_TESTS"])  # not the user's own
 os.environ.setdefault("LP_NUM_THREADS", "0")  # of Mesa, when it draws in this process, as workers have it
 
-if (
-    "PYTEST_XDIST_WORKER" in os.environ or "-n" not in sys.argv
-):  # the process that starts others (`make test`) runs none
+STARTS_OTHERS = "-n" in sys.argv and ("-n", "0") not in pairwise(sys.argv) and "PYTEST_XDIST_WORKER" not in os.environ
+if not STARTS_OTHERS:  # the process that starts others (`make test`) runs no test
     import torch
     import typechecker
 
