@@ -28,7 +28,6 @@ from hyperplanes.geometry.visibility import ANGLE, ChosenViews, Described, Readi
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
-from hyperplanes.utilities.indexing import taken
 from hyperplanes.views import Views
 
 __all__ = ["ImageBasedConfig", "ImageBasedField", "ImageBasedNeRF", "FeatureGrid"]
@@ -209,7 +208,7 @@ class HiddenPoints:
     coverage: Float[Tensor, " point"]
 
     def __getitem__(self, index: slice | Tensor) -> HiddenPoints:
-        return HiddenPoints(*(taken(each, index) for each in (self.points, self.values, self.coverage)))
+        return HiddenPoints(*(each[index] for each in (self.points, self.values, self.coverage)))
 
 
 @dataclass(frozen=True, repr=False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from importlib.util import find_spec
 
 import numpy as np
@@ -60,11 +59,6 @@ class Occupancy:
         cell = self.occupied.nonzero().float()
         unit = (cell + 0.5) * (2 / self.occupied.shape[0]) - 1
         return unit * self.bounds.radius + unit.new_tensor(self.bounds.centre)
-
-    @cached_property
-    def surface_centres(self) -> Float[Tensor, "voxel 3"]:
-        """World positions of the centres of the voxels of `surface`, kept for the next view."""
-        return self.surface().centres()
 
     def surface(self) -> Occupancy:
         """The occupied voxels with a face at an empty one or at the border of the grid: what every ray enters by."""

@@ -14,7 +14,6 @@ from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples, Sampler
 from hyperplanes.rendering.scene import FieldFunction, Scene, SplitField, evaluate, points_per_batch
-from hyperplanes.utilities.indexing import taken
 
 __all__ = ["integrate"]
 
@@ -288,7 +287,7 @@ def _colours(
         if len(chosen):
             place = batch[chosen]
             here = samples.ray[place]
-            seen = field.colour_of(values[chosen], taken(rays.directions, here))
+            seen = field.colour_of(values[chosen], rays.directions[here])
             colour[place] = (seen * scale[here, None]).to(colour)
     return torch.where(scale.isfinite()[ray, None], colour[index], background)
 
@@ -299,5 +298,5 @@ def _in_batches(function: Callable[[Tensor], Any], points: Tensor) -> list[Any]:
 
 def _packed_points(rays: Rays, samples: PackedSamples) -> tuple[Tensor, Tensor]:
     """Points of packed samples, and the directions along which they are seen."""
-    directions = taken(rays.directions, samples.ray)
-    return taken(rays.origins, samples.ray) + samples.distances[:, None] * directions, directions
+    directions = rays.directions[samples.ray]
+    return rays.origins[samples.ray] + samples.distances[:, None] * directions, directions

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.utilities.indexing import taken
 
 __all__ = ["DenseSamples", "PackedSamples", "Sampler"]
 
@@ -50,7 +49,7 @@ class PackedSamples:
         return len(self.ray)
 
     def __getitem__(self, index: slice | Tensor) -> PackedSamples:
-        return PackedSamples(taken(self.ray, index), taken(self.distances, index), self.step)
+        return PackedSamples(self.ray[index], self.distances[index], self.step)
 
 
 @runtime_checkable

@@ -12,7 +12,6 @@ from typing import no_type_check
 import numpy as np
 
 from hyperplanes.geometry.kernels.blocks import inlined
-from hyperplanes.geometry.kernels.functions import exp, sine_and_cosine, tanh
 from hyperplanes.geometry.kernels.llvm import load, load_int
 from hyperplanes.geometry.kernels.visibility import (
     ACROSS,
@@ -79,7 +78,7 @@ def _encode(row, at, x, y, z, frequencies):
     if frequencies:
         for axis in range(3):
             value = row[at - 3 + axis]
-            sine, cosine = sine_and_cosine(value)
+            sine, cosine = number(math.sin(value)), number(math.cos(value))
             for octave in range(frequencies):
                 row[at + 3 * octave + axis] = sine
                 row[at + 3 * (frequencies + octave) + axis] = cosine
@@ -108,7 +107,7 @@ def _interpolate(grid, row, at, x, y, z):
         a, b, c = min(i + right, side - 1), min(j + up, side - 1), min(k + behind, side - 1)
         for channel in range(channels):
             row[at + channel] += weight * grid[a, b, c, channel]
-    row[at] = one / (one + exp(-row[at]))
+    row[at] = one / (one + number(math.exp(-row[at])))
 
 
 @inlined
@@ -129,13 +128,13 @@ def _describe_best(s, pitch, packed, shape, chosen, numbers, covered, seen, row,
         for channel in range(3):
             colours[index, channel] = two * colour[channel] - one if valid else zero
             row[at + channel] = colours[index, channel]
-        row[at + 3] = tanh(falloff * load(s, BEHIND * pitch + view)) if valid else zero
+        row[at + 3] = number(math.tanh(falloff * load(s, BEHIND * pitch + view))) if valid else zero
         row[at + 4] = load(s, OPACITY * pitch + view) if valid else zero
         row[at + 5] = one if valid else zero
         row[at + 6] = load(s, X * pitch + view) if valid else zero
         row[at + 7] = load(s, Y * pitch + view) if valid else zero
         row[at + 8] = load(s, Z * pitch + view) if valid else zero
-        weights[index] = exp(-fading * max(penalty, zero)) if valid else zero
+        weights[index] = number(math.exp(-fading * max(penalty, zero))) if valid else zero
         sum_of_weights += weights[index]
         at += 9
     for empty in range(at, at + 9 * (slots - best)):
@@ -189,7 +188,7 @@ def _describe_nearest(s, pitch, packed, shape, chosen, scores, numbers, row, at,
             shown[index, channel] = colour[channel]
             row[at + channel] = two * colour[channel] - one if valid else zero
         row[at + 3] = row[at + 3] if valid else zero
-        row[at + 4] = tanh(falloff * load(s, BEHIND * pitch + view)) if valid else zero
+        row[at + 4] = number(math.tanh(falloff * load(s, BEHIND * pitch + view))) if valid else zero
         row[at + 5] = load(s, OPACITY * pitch + view) if valid else zero
         row[at + 6] = one if valid else zero
         weights[index] = number(math.log(max(one / scores[index] - one / farthest, number(1e-6))))
