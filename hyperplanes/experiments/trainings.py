@@ -42,15 +42,11 @@ class Trainings:
 
     def __init__(self, workspace: Workspace, data: DataSets, train: Train, workers: Workers | None) -> None:
         self.workspace, self.data, self.train, self.workers = workspace, data, train, workers
-        self._configured: dict[str, Preset] = {}
 
     def configuration(self, experiment: Experiment, trained: Trained, seed: int) -> Preset:
         """Model and training, as configured for the objects that there are."""
         objects = len(self.data.tasks(trained.on).names("train"))
-        deciding = repr((experiment.size, experiment.epochs, trained, objects, seed))
-        if deciding not in self._configured:  # each cell of a table asks for it several times
-            self._configured[deciding] = configuration(experiment, trained, self.data.scale, objects, seed)
-        return self._configured[deciding]
+        return configuration(experiment, trained, self.data.scale, objects, seed)
 
     def arranged(self, trained: Trained, chosen: Preset) -> Tasks:
         """The data of a training, with as many support views as its model has planes."""

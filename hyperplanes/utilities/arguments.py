@@ -64,9 +64,10 @@ def _checking(function: Callable[P, R], annotated: Any) -> Callable[P, R]:
 
     @wraps(function)
     def called(*positional: P.args, **named: P.kwargs) -> R:
-        given = dict(zip(names, positional, strict=False)) | named
         if several:
             given = signature.bind(*positional, **named).arguments
+        else:  # the same in a fraction of the time
+            given = dict(zip(names, positional, strict=False)) | named
         looked_at = hints()
         for name, value in given.items():
             hint = looked_at.get(name, Any)
