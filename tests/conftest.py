@@ -4,6 +4,7 @@ import atexit
 import gc
 import os
 import shutil
+import signal
 import sys
 import tempfile
 from itertools import pairwise
@@ -27,6 +28,11 @@ SLOWEST_FIRST = (
     "test_inputs",
 )
 """Modules that processes of the tests begin with (`make test`), so that none of them is left for the end."""
+
+if "PYTEST_XDIST_WORKER" not in os.environ:  # as in a terminal, in the background and under nohup, too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 if "HYPERPLANES_TESTS" not in os.environ:  # the first process: it starts the others, which share the folder
     os.environ["HYPERPLANES_TESTS"] = tempfile.mkdtemp(prefix="hyperplanes-tests-")
