@@ -128,12 +128,15 @@ class AdaptedField:
 
     @checked
     @torch.no_grad()
-    def render(self, cameras: PinholeCamera, sampling: Sampler | None = None) -> Pictures:
+    def render(
+        self, cameras: PinholeCamera, sampling: Sampler | None = None, antialias: bool | None = None
+    ) -> Pictures:
         """The pictures of cameras, without gradients; rays and pixels in single precision, whatever the field's.
 
         Args:
             cameras: any number, one image size, on any device and in any precision.
             sampling: another sampler than that of the field, whose samples are denser for pictures where it marches.
+            antialias: three rays through each pixel at an edge; where absent, where it marches.
 
         Returns:
             One picture a camera, on the device of the field.
@@ -146,6 +149,7 @@ class AdaptedField:
             bounds=self.occupancy.bounds,
             occupancy=self.refined_occupancy if sampling.needs_occupancy else None,
             proposal=self.proposal and self._in_single_precision(self.proposal),
+            antialias=antialias,
         )
 
     def _in_single_precision(self, field: FieldFunction) -> FieldFunction:

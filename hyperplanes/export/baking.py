@@ -63,7 +63,7 @@ class BakedScene:
                 self.field.index, self.field.values, bounds, rays, basis, step=step, empty=self.distances
             )
 
-        return render_images(cameras, bounds, render_rays, occupancy=self._coarse_occupancy)
+        return render_images(cameras, bounds, render_rays, occupancy=self._coarse_occupancy, antialias=True)
 
     @cached_property
     def adapted(self) -> AdaptedField:

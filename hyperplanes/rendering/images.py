@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -21,6 +22,16 @@ __all__ = ["Pictures", "render_images"]
 
 BYTES_OF_VIEW, BYTES_KEPT = 200, 32
 """That a pixel takes: of rays, while its view is rendered, and of the pictures of all views."""
+
+RAYS_OF_GROUP = 1 << 14
+"""Rays that small views are rendered together up to: in one call a view of 64x64 leaves a second thread idle."""
+
+EDGE = 0.7
+"""Difference of a pixel to a neighbour, in colour or opacity, from which on further rays are cast through it; from 0.35
+on it brings no more, with 0.9 half as much."""
+
+OFFSETS = ((-0.25, -0.25), (0.25, 0.25))
+"""Of these rays from the pixel's centre, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +60,14 @@ def render_images(
     occupancy: Occupancy | None = None,
     near_far: str = "sphere",
     background: float = 1.0,
+    antialias: bool = False,
 ) -> Pictures:
     """The images of cameras, by a function that renders rays.
 
-    Rays are cast in the precision of the cameras and rendered in single precision.
+    Rays are cast in the precision of the cameras and rendered in single precision. A pixel of a photograph is the mean
+    of what its area shows, and one ray shows its centre alone. With `antialias` pixels that differ much from one beside
+    them are the mean of three rays. Views by `small` from 25 others gain 0.2 dB by a quarter more samples, nearly as much as
+    by four rays in every pixel (docs/small.md).
 
     Args:
         cameras: any number, one image size.
@@ -61,6 +76,7 @@ def render_images(
         occupancy: pixels whose rays miss every occupied voxel are background, and no ray is rendered for them.
         near_far: as in `geometry.cast`.
         background: grey value of those pixels.
+        antialias: three rays where pixels differ; the depth stays that of the centre.
 
     Returns:
         One picture a camera.
@@ -73,14 +89,58 @@ def render_images(
     live = None if occupancy is None else footprint(occupancy, cameras).flatten(1)
     values = pixels.new_zeros(cameras.batch_size, height * width, 5)
     values[..., :3] = background
+    live = torch.ones(values.shape[:2], dtype=torch.bool, device=pixels.device) if live is None else live
     samples = 0
-    for view in range(cameras.batch_size):
-        chosen = torch.arange(len(pixels), device=pixels.device) if live is None else live[view].nonzero()[:, 0]
-        if not len(chosen):
+
+    def rendered(view: Tensor, where: Tensor) -> Rendered:
+        rays = cast(cameras, view, where, bounds, near_far=near_far)
+        return render_rays(Rays(rays.origins.float(), rays.directions.float(), rays.near.float(), rays.far.float()))
+
+    for first, last in pairwise(_groups(live.sum(1).tolist())):
+        view, chosen = live[first:last].nonzero().unbind(1)
+        if not len(view):
             continue
-        rays = cast(cameras, torch.full_like(chosen, view), pixels[chosen], bounds, near_far=near_far)
-        part = render_rays(Rays(rays.origins.float(), rays.directions.float(), rays.near.float(), rays.far.float()))
+        view += first
+        part = rendered(view, pixels[chosen])
         values[view, chosen] = torch.cat([part.colour, part.opacity[:, None], part.depth[:, None]], 1).to(values)
+        samples += part.samples
+        if not antialias:
+            continue
+        # colour and opacity of pixels at edges: the mean of three rays
+        view, chosen = _edges(values[first:last, :, :4].unflatten(1, (height, width))).flatten(1).nonzero().unbind(1)
+        view += first
+        offsets = pixels.new_tensor(OFFSETS).repeat_interleave(len(view), 0)
+        part = rendered(view.repeat(len(OFFSETS)), pixels[chosen].repeat(len(OFFSETS), 1) + offsets)
+        more = torch.cat([part.colour, part.opacity[:, None]], 1).to(values).unflatten(0, (len(OFFSETS), -1)).sum(0)
+        values[view, chosen, :4] = (values[view, chosen, :4] + more) / (1 + len(OFFSETS))
         samples += part.samples
     maps = values.reshape(cameras.batch_size, height, width, 5).permute(0, 3, 1, 2)
     return Pictures(maps[:, :3], maps[:, 3:4], maps[:, 4:], samples)
+
+
+def _groups(rays: Sequence[int]) -> list[int]:
+    """Where groups of successive views begin and end, of as many views as have RAYS_OF_GROUP rays, or of one.
+
+    >>> _groups([9000, 7000, 1000, 40000, 5000])
+    [0, 2, 3, 4, 5]
+    """
+    bounds, held = [0], 0
+    for view, count in enumerate(rays):
+        if held and held + count > RAYS_OF_GROUP:
+            bounds.append(view)
+            held = 0
+        held += count
+    return [*bounds, len(rays)]
+
+
+def _edges(values: Float[Tensor, "view height width value"]) -> Bool[Tensor, "view height width"]:
+    """The pixels one of whose values differs by EDGE or more from that of the pixel beside, above or below."""
+    found = torch.zeros(values.shape[:3], dtype=torch.bool, device=values.device)
+    for one, other, differing in (
+        (found[:, 1:], found[:, :-1], values.diff(dim=1)),
+        (found[:, :, 1:], found[:, :, :-1], values.diff(dim=2)),
+    ):
+        beside = (differing.abs() >= EDGE).any(-1)
+        one |= beside
+        other |= beside
+    return found

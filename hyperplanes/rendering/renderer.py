@@ -34,6 +34,7 @@ class _Options(TypedDict, total=False):
     background: float
     differentiable: bool | None
     chunk: int | None
+    antialias: bool | None
 
 
 @overload
@@ -61,6 +62,7 @@ def render(
     background: float = 1.0,
     differentiable: bool | None = None,
     chunk: int | None = None,
+    antialias: bool | None = None,
 ) -> Pictures | Rendered:
     """The pictures that cameras take of a field, or the pixels of single rays.
 
@@ -83,6 +85,8 @@ def render(
             cameras. Without gradients rays are rendered in chunks, so that memory does not grow with their number, and
             `RayMarching` stops where they are opaque.
         chunk: rays at once where no gradient is kept; as many as suit the sampler and the device where absent.
+        antialias: for cameras, three rays through each pixel that differs much from a neighbour; where absent, by
+            `RayMarching` without gradients. The paper's protocol is one ray a pixel.
 
     Returns:
         Pictures of cameras, pixels of rays. `RayMarching` for rays without occupancy and bounds, and fields with values
@@ -117,8 +121,9 @@ def render(
     with torch.set_grad_enabled(keep and torch.is_grad_enabled()):
         seen = occupancy if sampling.needs_occupancy else None
         return render_images(
-            target, bounds, render_rays, occupancy=seen, near_far=sampling.near_far, background=background
-        )
+            target, bounds, render_rays, occupancy=seen, near_far=sampling.near_far, background=background,
+            antialias=sampling.needs_occupancy and not keep if antialias is None else antialias,
+        )  # fmt: skip
 
 
 @torch.no_grad()

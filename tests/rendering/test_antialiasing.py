@@ -1,0 +1,87 @@
+"""Sources of truth: many rays a pixel, which show the mean over its area, and the rays that a picture is made of."""
+
+import pytest
+import torch
+
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
+from hyperplanes.rendering import Hierarchical, RayMarching, render
+from hyperplanes.rendering.images import OFFSETS
+from tests.reference_rendering import ring
+
+CAMERAS = ring(2, (24, 24))
+GRID, MARCH = full(Sphere(), 1), RayMarching(200, 0.02)
+
+
+def ball(points, directions):
+    """An opaque ball of radius 0.5, red above and blue below."""
+    colour = torch.where(points[:, 1:2] > 0, points.new_tensor([1.0, 0, 0]), points.new_tensor([0.0, 0, 1]))
+    return colour, 400.0 * (points.norm(dim=1) < 0.5)
+
+
+def mist(points, directions):
+    """A field whose pixels hardly differ from their neighbours."""
+    return torch.full_like(points, 0.5), points[:, 0].square()
+
+
+def picture(field, antialias, sampling=MARCH, cameras=CAMERAS):
+    return render(field, cameras, sampling, occupancy=GRID, antialias=antialias)
+
+
+def pooled(field, times):
+    """The mean over the area of each pixel, by so many rays along a side."""
+    height, width = camera.image_size(CAMERAS)
+    fine = picture(field, False, cameras=camera.resized(CAMERAS, times * height, times * width))
+    return [torch.nn.functional.avg_pool2d(each, times) for each in (fine.images, fine.opacity)]
+
+
+def test_pixels_at_edges_are_nearer_to_the_mean_over_their_area():
+    truth = pooled(ball, 6)
+    with_edges, without = picture(ball, True), picture(ball, False)
+    for found, plain, expected in zip(
+        (with_edges.images, with_edges.opacity), (without.images, without.opacity), truth, strict=True
+    ):
+        assert (found - expected).square().mean() < 0.4 * (plain - expected).square().mean()
+
+
+def test_they_are_the_mean_of_three_rays_and_all_others_stay():
+    found, plain = picture(ball, True), picture(ball, False)
+    changed = ((found.images != plain.images).any(1) | (found.opacity != plain.opacity)[:, 0]).nonzero()
+    assert 20 < len(changed) < 400
+    view, row, column = changed.unbind(1)
+    centres = torch.stack([column, row], 1).double()
+    rays = [
+        render(ball, cast(CAMERAS, view, centres + centres.new_tensor(offset)), MARCH, occupancy=GRID)
+        for offset in ((0, 0), *OFFSETS)
+    ]
+    mean = torch.stack([each.colour for each in rays]).mean(0)
+    torch.testing.assert_close(found.images[view, :, row, column], mean.to(found.images), atol=0.02, rtol=0)
+    assert torch.equal(found.depth, plain.depth)
+
+
+def test_further_rays_are_counted_and_only_where_pixels_differ():
+    assert picture(ball, True).samples > picture(ball, False).samples
+    found, plain = picture(mist, True), picture(mist, False)
+    assert found.samples == plain.samples
+    assert torch.equal(found.images, plain.images)
+
+
+@pytest.mark.parametrize("sampling", [MARCH, Hierarchical(16, 16)])
+def test_it_is_what_ray_marching_does_and_the_papers_protocol_does_not(sampling):
+    default = picture(ball, None, sampling).images
+    assert torch.equal(default, picture(ball, isinstance(sampling, RayMarching), sampling).images)
+    assert not torch.equal(picture(ball, True, sampling).images, picture(ball, False, sampling).images)
+
+
+def test_a_picture_with_gradients_has_one_ray_a_pixel():
+    seen = render(ball, CAMERAS, MARCH, occupancy=GRID, differentiable=True)
+    pixels = pixel_grid(24, 24)
+    rays = cast(CAMERAS, torch.zeros(len(pixels), dtype=torch.long), pixels)
+    expected = render(ball, rays, MARCH, occupancy=GRID).colour.reshape(24, 24, 3).permute(2, 0, 1)
+    torch.testing.assert_close(seen.images[0], expected.to(seen.images), atol=1e-5, rtol=0)
+
+
+def test_a_picture_that_is_one_pixel_has_no_edges():
+    cameras = camera.resized(CAMERAS, 1, 1)
+    assert torch.equal(picture(ball, True, cameras=cameras).images, picture(ball, False, cameras=cameras).images)
