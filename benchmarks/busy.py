@@ -129,10 +129,11 @@ def _work(name: str, quick: bool) -> Callable[[], object]:
 
 
 def _training(model: HyperPlanes, task: Task) -> Callable[[], object]:
-    """Steps of the packaged model's training on one object, ten views of it a step."""
-    from benchmarks.training import Objects
+    """Steps of the packaged model's training, ten views of each object."""
+    from benchmarks.training import UNSEEN, Objects
     from hyperplanes.configuration.presets import preset
     from hyperplanes.training import Trainer
 
-    objects = Objects([replace(task, name=f"{name}") for name in range(3)])  # the last two are held out
-    return Trainer(model, objects, replace(preset("small").training, tasks=1, views=(10,))).take_step
+    config = replace(preset("small").training, views=(10,))
+    objects = Objects([replace(task, name=f"{name}") for name in range(config.tasks + UNSEEN)])
+    return Trainer(model, objects, config).take_step

@@ -7,10 +7,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import conv3d, interpolate, pad, silu
 
-__all__ = ["VolumeNetwork"]
+__all__ = ["WIDTHS", "VolumeNetwork"]
 
 FOLD = 2  # cells an axis that become channels before the first convolution
-GROUPS = 8  # of the normalisation
+GROUPS = 8  # of the normalisation of WIDTHS; wider networks have more, of as many channels
+WIDTHS = (32, 64, 128)  # channels at half, a quarter and an eighth of the side
 
 
 class _Convolution(nn.Conv3d):
@@ -57,13 +58,13 @@ class _Pointwise(nn.Conv3d):
 class _Residual(nn.Module):
     """A 3x3x3 and a 1x1x1 convolution, each after normalisation and SiLU, beside a shortcut."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, groups: int) -> None:
         super().__init__()
         self.path = nn.Sequential(
-            nn.GroupNorm(GROUPS, channels),
+            nn.GroupNorm(groups, channels),
             nn.SiLU(),
             _Convolution(channels, channels),
-            nn.GroupNorm(GROUPS, channels),
+            nn.GroupNorm(groups, channels),
             nn.SiLU(),
             _Pointwise(channels, channels),
         )
@@ -82,25 +83,30 @@ class VolumeNetwork(nn.Module):
         channels: numbers that are read of a cell.
         side: cells an axis, a multiple of eight.
         features: of every cell.
-        widths: channels at half, a quarter and an eighth of the side.
+        widths: channels at half, a quarter and an eighth of the side, multiples of a GROUPS-th of WIDTHS.
 
     Raises:
-        ValueError: another side.
+        ValueError: another side, or other widths.
     """
 
-    def __init__(self, channels: int, side: int, features: int, widths: tuple[int, int, int] = (32, 64, 128)) -> None:
+    def __init__(self, channels: int, side: int, features: int, widths: tuple[int, int, int] = WIDTHS) -> None:
         super().__init__()
         if side % (4 * FOLD):
             raise ValueError(f"side: expected a multiple of {4 * FOLD}, got {side}")
         fine, middle, coarse = widths
+        group_sizes = [usual // GROUPS for usual in WIDTHS]
+        if any(width < 1 or width % size for width, size in zip(widths, group_sizes, strict=True)):
+            expected = ", ".join(map(str, group_sizes))
+            raise ValueError(f"widths: expected multiples of {expected}, got {', '.join(map(str, widths))}")
+        groups = [width // size for width, size in zip(widths, group_sizes, strict=True)]
         self.features = features
         folded = channels * FOLD**3
         self.first = _Pointwise(folded, fine)
-        self.downwards = nn.ModuleList([_Residual(fine), _Residual(middle), _Residual(coarse)])
+        self.downwards = nn.ModuleList(_Residual(*each) for each in zip(widths, groups, strict=True))
         self.strided = nn.ModuleList([_Convolution(fine, middle, stride=2), _Convolution(middle, coarse, stride=2)])
-        self.upwards = nn.ModuleList([_Residual(coarse), _Residual(middle), _Residual(fine)])
+        self.upwards = nn.ModuleList(_Residual(*each) for each in zip(widths[::-1], groups[::-1], strict=True))
         self.widened = nn.ModuleList([_Pointwise(coarse, middle), _Pointwise(middle, fine)])
-        self.normalisation = nn.GroupNorm(GROUPS, fine)
+        self.normalisation = nn.GroupNorm(groups[0], fine)
         self.last = _Pointwise(fine + folded, features * FOLD**3)
         for parameter in self.last.parameters():
             nn.init.zeros_(parameter)
