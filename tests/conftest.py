@@ -42,6 +42,7 @@ os.environ.setdefault("LP_NUM_THREADS", "0")  # of Mesa, when it draws in this p
 
 STARTS_OTHERS = "-n" in sys.argv and ("-n", "0") not in pairwise(sys.argv) and "PYTEST_XDIST_WORKER" not in os.environ
 if not STARTS_OTHERS:  # the process that starts others (`make test`) runs no test
+    gc.disable()  # until everything is imported and found
     import torch
     import typechecker
 
@@ -58,3 +59,4 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish():
     """What was imported stays until the end: the garbage collector need not look at it again and again."""
     gc.freeze()
+    gc.enable()

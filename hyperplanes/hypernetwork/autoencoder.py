@@ -14,6 +14,7 @@ from torch.nn.functional import silu
 from hyperplanes.hypernetwork.base import HyperNetwork, Observed
 from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS, encode_objects
+from hyperplanes.hypernetwork.weights import random_matrix
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
 
@@ -69,7 +70,7 @@ class Autoencoder(HyperNetwork):
         self.biases = tuple(name for name in shapes if any(name.endswith(f".{layer}.bias") for layer in inputs))
         readers = [nn.Linear(config.latent, shapes[name].numel(), bias=False) for name in self.biases]
         for reader in readers:
-            nn.init.normal_(reader.weight, std=config.latent**-0.5)
+            reader.weight = random_matrix(reader.out_features, config.latent, config.latent)
         self.readers = nn.ModuleList(readers)
 
     def forward(self, observed: Observed, theta: Mapping[str, Tensor]) -> list[Parameters]:

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hyperplanes.hypernetwork.weights import random_matrix
+
 __all__ = ["UPDATES", "FullUpdate", "LowRankUpdate"]
 
 
@@ -42,7 +44,7 @@ class LowRankUpdate(nn.Module):
         self.rank = rank if len(shape) == 2 else 0
         self.size = shape[0] * (1 + self.rank)
         if self.rank:
-            self.right = nn.Parameter(torch.randn(rank, shape[1]) / shape[1] ** 0.5)
+            self.right = random_matrix(rank, shape[1], shape[1])
 
     def forward(self, outputs: Float[Tensor, " size"], parameter: Tensor) -> Tensor:
         """diag(s) W + U V of a matrix, the outputs of a bias."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-__all__ = ["LowRankReader"]
+__all__ = ["LowRankReader", "random_matrix"]
 
 RANK = 4
 
@@ -31,9 +31,9 @@ class LowRankReader(nn.Module):
         self.left, self.right = nn.ParameterList(), nn.ParameterList()
         for shape in (shapes[name] for name in self.names):
             rows = RANK if len(shape) == 2 else RANK**2
-            self.left.append(_random(rows, shape[0], shape[0]))
+            self.left.append(random_matrix(rows, shape[0], shape[0]))
             columns = (shape[1], RANK) if len(shape) == 2 else (1, 1)
-            self.right.append(_random(*columns, columns[0]))
+            self.right.append(random_matrix(*columns, columns[0]))
         self.code = nn.Linear(RANK**2 * len(self.names), code)
 
     def forward(self, theta: Mapping[str, Tensor]) -> Float[Tensor, " code"]:
@@ -45,11 +45,16 @@ class LowRankReader(nn.Module):
         return self.code(torch.cat([each.flatten() for each in read]))
 
 
-def _random(rows: int, columns: int, summed: int) -> nn.Parameter:
+def random_matrix(rows: int, columns: int, summed: int) -> nn.Parameter:
     """Normal values whose products with as many numbers as are summed stay as large as these.
 
-    On the device "meta" there are none, as when a checkpoint is read: PyTorch would load its compiler for them, in two
-    seconds.
+    On the device "meta" there are none, as when a checkpoint is read: PyTorch would load its compiler for them, in a
+    second.
+
+    Args:
+        rows: their number.
+        columns: their number.
+        summed: how many numbers a product adds up.
     """
     values = torch.empty(rows, columns)
     return nn.Parameter(values if values.is_meta else values.normal_().div_(summed**0.5))

@@ -8,7 +8,13 @@ import pytest
 import torch
 
 from hyperplanes.fields import PointMultiPlaneNeRF, TargetConfig
-from hyperplanes.hypernetwork import ImageHyperNetwork, ImageHyperNetworkConfig, Observed
+from hyperplanes.hypernetwork import (
+    Autoencoder,
+    AutoencoderConfig,
+    ImageHyperNetwork,
+    ImageHyperNetworkConfig,
+    Observed,
+)
 from hyperplanes.hypernetwork.weights import LowRankReader
 
 CONFIG = ImageHyperNetworkConfig(views=3, normalisation="group", code=8, depth=2, width=16)
@@ -247,14 +253,21 @@ def test_all_of_theta_or_the_updated_layers_are_read():
         make(replace(CONFIG, weights_seen="some"))
 
 
-def test_where_only_shapes_are_asked_for_no_number_is_drawn(monkeypatch):
-    # Source of truth: the reader with its numbers. To draw any on "meta", PyTorch loads its compiler, in two seconds.
-    shapes = {"w": torch.Size([6, 5]), "b": torch.Size([6])}
-    expected = {name: value.shape for name, value in LowRankReader(shapes, 3).state_dict().items()}
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ImageHyperNetwork(replace(CONFIG, update="low_rank", weights_seen="all"), SHAPES),
+        lambda: Autoencoder(AutoencoderConfig(), SHAPES, ("layers.0",)),
+    ],
+    ids=["low rank", "autoencoder"],
+)
+def test_where_only_shapes_are_asked_for_no_number_is_drawn(make, monkeypatch):
+    # Source of truth: the same with its numbers. To draw any on "meta", PyTorch loads its compiler, in a second.
+    expected = {name: value.shape for name, value in make().state_dict().items()}
     monkeypatch.setattr(torch.Tensor, "normal_", None)
     monkeypatch.setattr(torch, "randn", None)
     with torch.device("meta"):
-        found = LowRankReader(shapes, 3).state_dict()
+        found = make().state_dict()
     assert {name: value.shape for name, value in found.items()} == expected
 
 
