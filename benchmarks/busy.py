@@ -3,8 +3,9 @@
     python -m benchmarks busy --json FILE
 
 Each way is a process of its own, since OpenMP reads how its threads wait when PyTorch is loaded: "passive" as
-`import hyperplanes` sets it, "active" as PyTorch has it where nobody decides. The reference of every row is one thread
-under the same load. More threads are never to be slower than one.
+`import hyperplanes` sets it, "active" as PyTorch has it where nobody decides. Which cores a process gets differs from
+process to process, so that each way is several of them in turn. The reference of every row is one thread under the same
+load. More threads are never to be slower than one.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from benchmarks._timing import ratio
 from benchmarks.reporting import Row, finish
 
 if TYPE_CHECKING:
@@ -44,7 +46,8 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks busy", description=__doc__)
     parser.add_argument("--works", nargs="+", choices=WORKS, default=list(WORKS))
     parser.add_argument("--policies", nargs="+", choices=("passive", "active"), default=["passive", "active"])
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=5, help="in each process (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=5, help="processes of each way, in turn (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="small and once: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--measure", choices=WORKS, help=argparse.SUPPRESS)  # what a process of its own does
@@ -57,12 +60,15 @@ def main(arguments: list[str]) -> int:
     for load, spinning in (("idle", 0), ("busy", cores)):
         for work in chosen.works:
             for policy in chosen.policies:
-                with _busy(spinning):
-                    times = {count: _in_process(work, count, policy, chosen) for count in counts}
+                times: dict[int, list[float]] = {count: [] for count in counts}
+                for _ in range(1 if chosen.quick else chosen.rounds):
+                    with _busy(spinning):
+                        for count in counts:
+                            times[count].append(statistics.median(_in_process(work, count, policy, chosen)))
                 for count, seconds in times.items():
                     row: Row = {"name": work, "load": load, "policy": policy, "threads": count}
-                    took, alone = statistics.median(seconds), statistics.median(times[1])
-                    rows.append({**row, "seconds": took, "speedup": alone / took})
+                    row |= {"seconds": statistics.median(seconds), **ratio(times[1], seconds)}
+                    rows.append(row)
     return finish("busy", rows, chosen.json)
 
 
