@@ -7,8 +7,8 @@
 Of every held-out object some query views are kept back to be judged by; of all others, support and query alike, so many
 are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
 (where there are masks); the same field from random weights; the model without its hypernetwork, with the update of
-another object of the data set, with its own where no left-out views may decide otherwise, and as it is used; and
-fine-tuned. Beside each mean stands how far it lies above
+another object of the data set, with its own where no left-out views may decide otherwise, with one ray a pixel, and as
+it is used; and fine-tuned. Beside each mean stands how far it lies above
 `hull_blend`, with the 95 % interval of that difference over the objects (paired, Student's t).
 
 With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
@@ -26,12 +26,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import pad
 
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
-from hyperplanes.adaptation.base import AdaptedField, Adapter
+from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Renderable
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.swapped import Swapped
@@ -261,6 +262,29 @@ class _Partly:
         return model.rendering_field(prepared, model.theta + update)
 
 
+@dataclass(frozen=True)
+class _OneRay:
+    """A model whose pictures are one ray a pixel, at edges too.
+
+    Attributes:
+        model: the model.
+    """
+
+    model: HyperPlanes
+
+    def adapt(self, support: Views) -> Renderable:
+        """The field, and its pictures so."""
+        return _Aliased(self.model.adapt(support))
+
+
+@dataclass(frozen=True)
+class _Aliased:
+    field: AdaptedField
+
+    def render(self, cameras: PinholeCamera) -> Pictures:
+        return self.field.render(cameras, antialias=False)
+
+
 def _swapped(model: HyperPlanes, shown: Tasks, names: list[str]) -> Adapter:
     return Swapped(model, [shown.task(name).support for name in names])
 
@@ -272,6 +296,7 @@ METHODS = {
     "theta": lambda model, *_: _Partly(model, lambda name: False),
     "swapped": _swapped,
     "unjudged": lambda model, *_: _Partly(model),
+    "one_ray": lambda model, *_: _OneRay(model),
 }
 
 PARTS = {
