@@ -168,7 +168,8 @@ class Views:
         generator: torch.Generator | None = None,
         among: Int[Tensor, " pixel"] | None = None,
         near_far: str = "sphere",
-    ) -> tuple[Rays, Float[Tensor, "ray 3"]]:
+        subpixels: Sequence[tuple[float, float]] = ((0.0, 0.0),),
+    ) -> tuple[Rays, Float[Tensor, "drawn 3"]]:
         """Rays through pixels drawn uniformly from all views, and the colours seen there.
 
         Args:
@@ -176,11 +177,15 @@ class Views:
             generator: where the randomness comes from; on the CPU, so that every device draws the same.
             among: flat indices (view, row, column) of the pixels to draw from; all where absent.
             near_far: as in `geometry.cast`.
+            subpixels: places in a pixel from its centre, a ray of each pixel through the first of these, then a ray of
+                each through the second, and so on (`Rendered.pooled`).
 
         Returns:
-            The rays and their true colours. No pixel to draw from raises ValueError.
+            The rays, and the true colours of the pixels. No pixel to draw from raises ValueError.
         """
-        return self.sample_masked_rays(count, generator=generator, among=among, near_far=near_far)[:2]
+        return self.sample_masked_rays(count, generator=generator, among=among, near_far=near_far, subpixels=subpixels)[
+            :2
+        ]
 
     def sample_masked_rays(
         self,
@@ -189,7 +194,8 @@ class Views:
         generator: torch.Generator | None = None,
         among: Int[Tensor, " pixel"] | None = None,
         near_far: str = "sphere",
-    ) -> tuple[Rays, Float[Tensor, "ray 3"], Float[Tensor, "ray 1"]]:
+        subpixels: Sequence[tuple[float, float]] = ((0.0, 0.0),),
+    ) -> tuple[Rays, Float[Tensor, "drawn 3"], Float[Tensor, "drawn 1"]]:
         """As `sample_rays`, with the opacity of the masks there; 1 without masks."""
         if count < 1:
             raise ValueError(f"count: expected at least 1 ray, got {count!r}")
@@ -203,7 +209,9 @@ class Views:
         if among is not None and flat.device.type == "cpu":  # elsewhere it would be waited for
             check_indices(flat, len(self) * height * width, "among", f"pixels of {len(self)} views")
         row, column = pixel // width, pixel % width
-        rays = cast(self.cameras, view, torch.stack([column, row], -1).to(self.images), self.bounds, near_far=near_far)
+        places = torch.stack([column, row], -1).to(self.images)
+        places = torch.cat([places + places.new_tensor(each) for each in subpixels])
+        rays = cast(self.cameras, view.repeat(len(subpixels)), places, self.bounds, near_far=near_far)
         colours = self.images[view, :, row, column]
         return (
             rays,

@@ -24,7 +24,9 @@ class TrainingConfig:
         tasks: objects a step.
         reference_objects: further objects a step, of which only the HyperPlanes are read. The hypernetwork standardises
             codes by the objects of the step, and cannot tell what one object alone has in common with the others.
-        rays: query rays an object and step.
+        rays: query pixels an object and step.
+        antialias: each of these pixels is the mean of three rays, as pictures have them at edges. What is trained by
+            one ray a pixel shows the mean over its area by a soft surface.
         views: numbers of support views, for a field that takes any number of them. Each episode shows one of these
             numbers of random views of its object, support and query alike, and draws rays from others. Empty: all
             support views, in every step.
@@ -65,6 +67,7 @@ class TrainingConfig:
     tasks: Annotated[int, range(1, 4097)] = 4
     reference_objects: Annotated[int, range(4097)] = 0
     rays: Annotated[int, range(1, 2**24)] = 128
+    antialias: bool = False
     views: tuple[int, ...] = ()
     episodes: Annotated[int, range(1, 4097)] = 16
     rotations: float = 0.0

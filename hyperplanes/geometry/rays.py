@@ -15,7 +15,10 @@ from hyperplanes.geometry.distortion import DistortedCamera, undistorted_pixels
 from hyperplanes.geometry.inputs import ArrayLike, as_tensor, check_indices
 from hyperplanes.utilities.arguments import checked, checked_fields, kind_of
 
-__all__ = ["Rays", "Sphere", "cast", "pixel_grid"]
+__all__ = ["SUBPIXELS", "Rays", "Sphere", "cast", "pixel_grid"]
+
+SUBPIXELS = ((0.0, 0.0), (-0.25, -0.25), (0.25, 0.25))
+"""Places in a pixel, from its centre, whose rays have the mean of its area as their mean, nearly."""
 
 
 @checked_fields

@@ -36,6 +36,18 @@ class Rendered:
         colour = self.colour + (1 - self.opacity)[:, None] * (background - 1)
         return replace(self, colour=colour, coarse=self.coarse and self.coarse.over(background))
 
+    def pooled(self, count: int) -> Rendered:
+        """The pixels of which each has so many rays, all first ones of the pixels first; the depth is that of these.
+
+        Args:
+            count: rays of a pixel.
+        """
+        if count == 1:
+            return self
+        colour, opacity = (each.unflatten(0, (count, -1)).mean(0) for each in (self.colour, self.opacity))
+        depth = self.depth[: len(opacity)]
+        return Rendered(colour, opacity, depth, self.samples, self.coarse and self.coarse.pooled(count))
+
 
 def composite(
     colour: Float[Tensor, "ray interval 3"],

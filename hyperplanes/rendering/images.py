@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
+from hyperplanes.geometry.rays import SUBPIXELS, Rays, Sphere, cast, pixel_grid
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.memory import require_memory
@@ -29,9 +29,6 @@ RAYS_OF_GROUP = 1 << 14
 EDGE = 0.7
 """Difference of a pixel to a neighbour, in colour or opacity, from which on further rays are cast through it; from 0.35
 on it brings no more, with 0.9 half as much."""
-
-OFFSETS = ((-0.25, -0.25), (0.25, 0.25))
-"""Of these rays from the pixel's centre, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +106,11 @@ def render_images(
         # colour and opacity of pixels at edges: the mean of three rays
         view, chosen = _edges(values[first:last, :, :4].unflatten(1, (height, width))).flatten(1).nonzero().unbind(1)
         view += first
-        offsets = pixels.new_tensor(OFFSETS).repeat_interleave(len(view), 0)
-        part = rendered(view.repeat(len(OFFSETS)), pixels[chosen].repeat(len(OFFSETS), 1) + offsets)
-        more = torch.cat([part.colour, part.opacity[:, None]], 1).to(values).unflatten(0, (len(OFFSETS), -1)).sum(0)
-        values[view, chosen, :4] = (values[view, chosen, :4] + more) / (1 + len(OFFSETS))
+        offsets = pixels.new_tensor(SUBPIXELS[1:])
+        places = (pixels[chosen] + offsets[:, None]).flatten(0, 1)
+        part = rendered(view.repeat(len(offsets)), places)
+        more = torch.cat([part.colour, part.opacity[:, None]], 1).to(values).unflatten(0, (len(offsets), -1)).sum(0)
+        values[view, chosen, :4] = (values[view, chosen, :4] + more) / len(SUBPIXELS)
         samples += part.samples
     maps = values.reshape(cameras.batch_size, height, width, 5).permute(0, 3, 1, 2)
     return Pictures(maps[:, :3], maps[:, 3:4], maps[:, 4:], samples)

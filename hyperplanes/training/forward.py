@@ -12,6 +12,7 @@ from torch.profiler import record_function
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.training import TrainingConfig
+from hyperplanes.geometry.rays import SUBPIXELS
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.training.episodes import Draw, Episode
@@ -58,13 +59,14 @@ def forward(model: HyperPlanes, draw: Draw, update: Parameters, config: Training
     parameters = model.theta + update
     field = model.field(prepared, parameters)
     # random rays of the query views, and the colours and opacities seen there
+    subpixels = SUBPIXELS if config.antialias else SUBPIXELS[:1]
     with record_function("step:rays"), prefix_errors(draw.name):
         rays, truth, opacity = episode.query.sample_masked_rays(
-            config.rays, generator=generator, among=episode.live, near_far=field.sampling.near_far
+            config.rays, generator=generator, among=episode.live, near_far=field.sampling.near_far, subpixels=subpixels
         )
     # samples on the rays, the field at these, and their compositing (Eq. 1)
     with record_function("step:rendering"):
-        rendered = field.trace(rays, generator)
+        rendered = field.trace(rays, generator).pooled(len(subpixels))
     # the same random background behind prediction and truth
     if config.random_background:
         rendered, truth = over_random_colour(rendered, truth, opacity, generator)

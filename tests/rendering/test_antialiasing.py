@@ -5,10 +5,9 @@ import torch
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
-from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
+from hyperplanes.geometry.rays import SUBPIXELS, Sphere, cast, pixel_grid
 from hyperplanes.rendering import Hierarchical, RayMarching, render
-from hyperplanes.rendering.images import OFFSETS
-from tests.reference_rendering import ring
+from tests.reference_rendering import ball_views, ring
 
 CAMERAS = ring(2, (24, 24))
 GRID, MARCH = full(Sphere(), 1), RayMarching(200, 0.02)
@@ -53,7 +52,7 @@ def test_they_are_the_mean_of_three_rays_and_all_others_stay():
     centres = torch.stack([column, row], 1).double()
     rays = [
         render(ball, cast(CAMERAS, view, centres + centres.new_tensor(offset)), MARCH, occupancy=GRID)
-        for offset in ((0, 0), *OFFSETS)
+        for offset in SUBPIXELS
     ]
     mean = torch.stack([each.colour for each in rays]).mean(0)
     torch.testing.assert_close(found.images[view, :, row, column], mean.to(found.images), atol=0.02, rtol=0)
@@ -85,3 +84,20 @@ def test_a_picture_with_gradients_has_one_ray_a_pixel():
 def test_a_picture_that_is_one_pixel_has_no_edges():
     cameras = camera.resized(CAMERAS, 1, 1)
     assert torch.equal(picture(ball, True, cameras=cameras).images, picture(ball, False, cameras=cameras).images)
+
+
+def test_rays_of_the_same_pixel_are_pooled_as_pictures_are():
+    views = ball_views(CAMERAS)
+    generator = [torch.Generator().manual_seed(3) for _ in range(2)]
+    among = picture(ball, True).opacity.flatten().nonzero()[:, 0]
+    rays, truth, opacity = views.sample_masked_rays(60, generator=generator[0], among=among, subpixels=SUBPIXELS)
+    single, same, _ = views.sample_masked_rays(60, generator=generator[1], among=among)
+    assert len(rays) == 3 * len(truth) == 3 * len(opacity) == 180
+    assert torch.equal(truth, same)
+    seen, first = (render(ball, each, MARCH, occupancy=GRID) for each in (rays, single))
+    pooled_rays = seen.pooled(3)
+    torch.testing.assert_close(pooled_rays.colour, (seen.colour[:60] + seen.colour[60:120] + seen.colour[120:]) / 3)
+    torch.testing.assert_close(pooled_rays.opacity, seen.opacity.view(3, 60).mean(0))
+    assert torch.equal(pooled_rays.depth, first.depth)
+    assert pooled_rays.samples == seen.samples
+    assert first.pooled(1) is first

@@ -191,6 +191,20 @@ def test_a_rate_of_zero_freezes_its_part_alone(frozen):
     assert moved == ({"hypernetwork"} if frozen == "theta" else {"networks"})
 
 
+def test_a_pixel_of_a_training_is_the_mean_of_three_rays_where_it_says_so(monkeypatch):
+    counts = []
+    trace = base.AdaptedField.trace
+    monkeypatch.setattr(
+        base.AdaptedField,
+        "trace",
+        lambda self, rays, generator=None: counts.append(len(rays)) or trace(self, rays, generator),
+    )
+    for antialias, times in ((False, 1), (True, 3)):
+        counts.clear()
+        assert 0 < losses(small_model(), with_(antialias=antialias), 1)[0] < 10
+        assert set(counts) == {times * FAST.rays}
+
+
 def test_muon_moves_the_hidden_matrices_by_its_own_rate():
     model = small_model()
     before = state_of(model)
