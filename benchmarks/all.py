@@ -42,12 +42,15 @@ OF_DATA = ("views", "baked", "image_based", "hypernetwork")
 MORE = {"baked": ["--objects", "2", "--query", "4", "--counts", "25", "3"]}
 """Options of those beside --data."""
 
-_TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25"]
+_TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", "--methods", "nearest_view", "hull_blend"]
 OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_procedural": (["procedural"], _TEN),
     "views_cc0": (["cc0"], _TEN),
-    "views_random": (["random"], [*_TEN, "--methods", "nearest_view", "hull_blend", "swapped"]),
-    "views_posed": (["posed"], ["--query", "5", "--counts", "1", "3", "5", "25", "50"]),
+    "views_random": (["random"], [*_TEN, "swapped"]),
+    "views_posed": (
+        ["posed"],
+        ["--query", "5", "--counts", "1", "3", "5", "25", "50", "--methods", "nearest_view", "hull_blend"],
+    ),
     "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "5"]),
     "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "5"]),
     "views_antialiasing": (
