@@ -53,10 +53,6 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     ),
     "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "5"]),
     "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "5"]),
-    "views_antialiasing": (
-        ["procedural", "cc0", "random", "posed"],
-        ["--objects", "4", "--query", "2", "--counts", "3", "25", "--methods", "one_ray"],
-    ),
     "views_tuned": (
         ["cc0", "random", "posed", "procedural"],
         ["--objects", "1", "--query", "2", "--counts", "25", "--steps", "100", "--methods", "hull_blend"],

@@ -301,19 +301,6 @@ def _views_tuned(result: Result) -> str:
     return markdown_table(["", "views", "`hull_blend`", "one step", "100 steps", "100 from random weights"], lines)
 
 
-def _views_antialiasing(result: Result) -> str:
-    found, counts = _of_views((result,))
-    lines = []
-    for name, rows in found.items():
-        cells = []
-        for count in counts:
-            one, three = (float(rows[method, count]["psnr"]) for method in ("one_ray", "one_step"))
-            cells += [f"{one:.2f}", f"{three:.2f} ({three - one:+.2f})"]
-        lines.append([f"{name} ({rows['one_step', counts[0]]['objects']})", *cells])
-    headings = [f"{count} views, {rays}" for count in counts for rays in ("one ray a pixel", "three at edges")]
-    return markdown_table(["", *headings], lines)
-
-
 def _captures(result: Result) -> str:
     lines = []
     for row in result["rows"]:
@@ -369,7 +356,6 @@ TABLES: dict[str, Callable[..., str]] = {
     "steps": _steps,
     "training": _training,
     "views": _views,
-    "views_antialiasing": _views_antialiasing,
     "views_over": _views_over,
     "views_srn": _views,
     "views_summary": _views_summary,

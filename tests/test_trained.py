@@ -147,9 +147,14 @@ def test_swapping_updates_of_cars_costs_decibels():
     assert swapped_cars(HyperPlanes.from_pretrained("cars-64"), 25) > 0.1
 
 
-@pytest.mark.parametrize("count", [3, 25])
-def test_swapping_updates_of_cars_costs_decibels_with_few_views_and_with_many(count):
-    assert swapped_cars(coarse("small"), count) > 1.5  # measured: 3.8 and 2.3
+@pytest.mark.parametrize(("count", "least"), [(3, 1.5), (25, 1.0)])
+def test_swapping_updates_of_cars_costs_decibels_with_few_views_and_with_many(count, least):
+    """By 4.2 and 1.3 dB; by 2.5 with 25 views before the training with three rays a pixel.
+
+    Since then a car's own update shows it as well as before, and that of the other car one of them 2.6 dB better: the
+    field trusts 25 views more.
+    """
+    assert swapped_cars(coarse("small"), count) > least
 
 
 @torch.no_grad()
