@@ -168,8 +168,7 @@ class Views:
         generator: torch.Generator | None = None,
         among: Int[Tensor, " pixel"] | None = None,
         near_far: str = "sphere",
-        subpixels: Sequence[tuple[float, float]] = ((0.0, 0.0),),
-    ) -> tuple[Rays, Float[Tensor, "drawn 3"]]:
+    ) -> tuple[Rays, Float[Tensor, "ray 3"]]:
         """Rays through pixels drawn uniformly from all views, and the colours seen there.
 
         Args:
@@ -177,15 +176,11 @@ class Views:
             generator: where the randomness comes from; on the CPU, so that every device draws the same.
             among: flat indices (view, row, column) of the pixels to draw from; all where absent.
             near_far: as in `geometry.cast`.
-            subpixels: places in a pixel from its centre, a ray of each pixel through the first of these, then a ray of
-                each through the second, and so on (`Rendered.pooled`).
 
         Returns:
-            The rays, and the true colours of the pixels. No pixel to draw from raises ValueError.
+            The rays and their true colours. No pixel to draw from raises ValueError.
         """
-        return self.sample_masked_rays(count, generator=generator, among=among, near_far=near_far, subpixels=subpixels)[
-            :2
-        ]
+        return self.sample_masked_rays(count, generator=generator, among=among, near_far=near_far)[:2]
 
     def sample_masked_rays(
         self,
@@ -196,7 +191,14 @@ class Views:
         near_far: str = "sphere",
         subpixels: Sequence[tuple[float, float]] = ((0.0, 0.0),),
     ) -> tuple[Rays, Float[Tensor, "drawn 3"], Float[Tensor, "drawn 1"]]:
-        """As `sample_rays`, with the opacity of the masks there; 1 without masks."""
+        """As `sample_rays`, with the opacity of the masks there; 1 without masks.
+
+        `subpixels` are places in a pixel, from its centre: there is a ray of each pixel through the first of them, then
+        one of each through the second, and so on (`Rendered.pooled`). Colours and opacities are one a pixel.
+
+        Raises:
+            ValueError: no pixel to draw from.
+        """
         if count < 1:
             raise ValueError(f"count: expected at least 1 ray, got {count!r}")
         height, width = self.size

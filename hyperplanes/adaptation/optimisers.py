@@ -17,7 +17,6 @@ OPTIMISERS = ("adam", "muon", "sgd")
 
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of the quintic Newton-Schulz iteration of Jordan et al. 2024
 ITERATIONS = 5
-LONG = 3  # times as many columns as rows, or rows as columns
 NARROWEST = 16  # matrices with fewer rows or columns, such as the heads of colour and density, are left to Adam
 
 
@@ -25,8 +24,7 @@ def orthogonalise(matrix: Float[Tensor, "row column"]) -> Float[Tensor, "row col
     """An approximation of U V^T, where U S V^T is the singular value decomposition of the matrix.
 
     Quintic Newton-Schulz iterations (Jordan et al. 2024, "Muon"); the singular values of the result lie between about
-    0.7 and 1.2. Every iterate of a matrix X is P X with a polynomial P of X X^T, so that those of long matrices, as
-    kernels of convolutions are, are found in products of that small matrix alone.
+    0.7 and 1.2.
 
     Args:
         matrix: of any scale.
@@ -35,39 +33,29 @@ def orthogonalise(matrix: Float[Tensor, "row column"]) -> Float[Tensor, "row col
     tall = matrix.shape[0] > matrix.shape[1]
     value = matrix.mT if tall else matrix
     value = value / value.norm().clamp_min(1e-7)
-    if value.shape[1] < LONG * value.shape[0]:
-        for _ in range(ITERATIONS):
-            gram = value @ value.mT
-            value = torch.addmm(value, torch.addmm(gram, gram, gram, beta=b, alpha=c), value, beta=a)
-    else:
-        gram, identity = value @ value.mT, torch.eye(len(value), dtype=value.dtype, device=value.device)
-        polynomial = identity
-        for _ in range(ITERATIONS):
-            factor = torch.addmm(gram, gram, gram, beta=b, alpha=c) + a * identity
-            polynomial, gram = factor @ polynomial, factor @ gram @ factor
-        value = polynomial @ value
+    for _ in range(ITERATIONS):
+        gram = value @ value.mT
+        value = torch.addmm(value, torch.addmm(gram, gram, gram, beta=b, alpha=c), value, beta=a)
     return value.mT if tall else value
 
 
 class Muon(Optimizer):
     """Nesterov momentum whose update of every matrix is orthogonalised (Jordan et al. 2024).
 
-    The kernel of a 3D convolution is the matrix of its output channels by all of its other dimensions.
-
     torch.optim.Muon iterates in bfloat16, which only recent CPUs compute with. On one thread, the step of six matrices
     of 128x128 takes 15 ms by it and 12 ms by this one where AMX is used, 55 and 10 ms with AVX-512 (no bfloat16), 277
     and 14 ms with AVX2 (ONEDNN_MAX_CPU_ISA sets them). This one iterates in the precision of the parameters.
 
     Args:
-        parameters: matrices, and kernels of 3D convolutions.
+        parameters: matrices.
         lr: learning rate; the update of a matrix has spectral norm about lr sqrt(max(1, rows / columns)).
         momentum: of the gradients.
     """
 
     def __init__(self, parameters: Iterable[Tensor], lr: float = 0.02, momentum: float = 0.95) -> None:
         super().__init__(parameters, {"lr": lr, "momentum": momentum})
-        if any(value.ndim < 2 for group in self.param_groups for value in group["params"]):
-            raise ValueError("parameters: expected matrices or kernels, got a tensor of fewer dimensions")
+        if any(value.ndim != 2 for group in self.param_groups for value in group["params"]):
+            raise ValueError("parameters: expected matrices, got a tensor of another number of dimensions")
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -82,10 +70,9 @@ class Muon(Optimizer):
                 momentum = self.state[value].setdefault("momentum", torch.zeros_like(value))
                 momentum.lerp_(value.grad, 1 - group["momentum"])
             # products of small matrices, which one thread each computes faster than all of them together
-            ahead = [value.grad.lerp(self.state[value]["momentum"], group["momentum"]).flatten(1) for value in moved]
+            ahead = [value.grad.lerp(self.state[value]["momentum"], group["momentum"]) for value in moved]
             for value, direction in zip(moved, parallel_map(orthogonalise, ahead), strict=True):
-                rate = group["lr"] * max(1, direction.shape[0] / direction.shape[1]) ** 0.5
-                value.add_(direction.view_as(value), alpha=-rate)
+                value.add_(direction, alpha=-group["lr"] * max(1, value.shape[0] / value.shape[1]) ** 0.5)
         return loss
 
 
@@ -100,8 +87,7 @@ def make_optimisers(
 
     Args:
         variables: the parameters.
-        name: "adam", "muon" for the matrices and 3D kernels of hidden layers and Adam for the rest, or "sgd", without
-            momentum.
+        name: "adam", "muon" for the matrices of hidden layers and Adam for the rest, or "sgd", without momentum.
         adam_rate: learning rate of Adam, or of plain gradient descent.
         muon_rate: learning rate of Muon.
         betas: of Adam.
@@ -116,7 +102,7 @@ def make_optimisers(
         raise ValueError(f"optimiser: expected one of {', '.join(map(repr, OPTIMISERS))}, got {name!r}")
     if name == "sgd":
         return [SGD(list(variables), adam_rate)]
-    hidden = [name == "muon" and _is_hidden(value) for value in variables]
+    hidden = [name == "muon" and value.ndim == 2 and min(value.shape) >= NARROWEST for value in variables]
     matrices = [value for value, chosen in zip(variables, hidden, strict=True) if chosen]
     others = [value for value, chosen in zip(variables, hidden, strict=True) if not chosen]
     made: list[Optimizer] = []
@@ -125,8 +111,3 @@ def make_optimisers(
     if matrices:
         made.append(Muon(matrices, muon_rate))
     return made
-
-
-def _is_hidden(value: Tensor) -> bool:
-    """Whether it is a matrix of a hidden layer or a kernel of a 3D convolution; grids of features have 4 dimensions."""
-    return value.ndim in (2, 5) and min(value.shape[0], value[0].numel()) >= NARROWEST

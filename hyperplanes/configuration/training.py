@@ -45,9 +45,7 @@ class TrainingConfig:
         optimiser: of theta: "adam" as in the paper, or "muon" for the matrices of its hidden layers.
         learning_rate: of theta, by Adam.
         muon_learning_rate: of the matrices of theta that Muon optimises.
-        hypernetwork_optimiser: of the hypernetwork, likewise.
-        hypernetwork_learning_rate: of the hypernetwork, by Adam.
-        hypernetwork_muon_learning_rate: of its matrices and kernels that Muon optimises.
+        hypernetwork_learning_rate: of the hypernetwork.
         warmup: steps in which the learning rates rise from zero.
         final_rate_factor: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
         clip: the norm to which the gradient of all weights that a step moves is cut where it is longer; 0 leaves it.
@@ -77,9 +75,7 @@ class TrainingConfig:
     optimiser: str = "adam"
     learning_rate: float = 1e-4
     muon_learning_rate: float = 0.02
-    hypernetwork_optimiser: str = "adam"
     hypernetwork_learning_rate: float = 1e-4
-    hypernetwork_muon_learning_rate: float = 0.02
     warmup: Annotated[int, range(10**10)] = 0
     final_rate_factor: float = 1.0
     clip: float = 0.0
@@ -94,7 +90,7 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         for name in (
-            *("learning_rate", "muon_learning_rate", "hypernetwork_learning_rate", "hypernetwork_muon_learning_rate"),
+            *("learning_rate", "muon_learning_rate", "hypernetwork_learning_rate"),
             *("final_rate_factor", "volume_loss", "clip"),
         ):
             if not 0 <= getattr(self, name) < math.inf:

@@ -12,7 +12,6 @@ from torch.nn.functional import relu, silu
 from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
 from hyperplanes.hypernetwork.updates import UPDATES
-from hyperplanes.hypernetwork.volume_network import WIDTHS
 from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = [
@@ -104,13 +103,7 @@ class ImageHyperNetworkConfig(HeadConfig):
 @checked_fields
 @dataclass(frozen=True)
 class VolumeHyperNetworkConfig:
-    """A hypernetwork that reads what all views show on a grid over the scene (`VolumeHyperNetwork`).
-
-    Attributes:
-        widths: channels of its U-Net at half, a quarter and an eighth of the side of the grid.
-    """
-
-    widths: tuple[int, int, int] = WIDTHS
+    """A hypernetwork that reads what all views show on a grid over the scene (`VolumeHyperNetwork`); no settings."""
 
 
 HyperNetworkConfig: TypeAlias = ImageHyperNetworkConfig | VolumeHyperNetworkConfig

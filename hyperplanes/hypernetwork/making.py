@@ -33,5 +33,5 @@ def make_hypernetwork(
         return Autoencoder(config, shapes, reading_layers)
     if isinstance(config, VolumeHyperNetworkConfig):
         assert volume_size is not None
-        return VolumeHyperNetwork(shapes, *volume_size, config.widths)
+        return VolumeHyperNetwork(shapes, *volume_size)
     return ImageHyperNetwork(config, shapes)

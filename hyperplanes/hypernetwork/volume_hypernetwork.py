@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.hypernetwork.base import HyperNetwork, Observed
-from hyperplanes.hypernetwork.volume_network import WIDTHS, VolumeNetwork
+from hyperplanes.hypernetwork.volume_network import VolumeNetwork
 from hyperplanes.parameters import Parameters
 
 __all__ = ["VolumeHyperNetwork"]
@@ -26,17 +26,14 @@ class VolumeHyperNetwork(HyperNetwork):
         shapes: of the parameters by name; those of four dimensions are grids of features, with as many cells as V.
         channels: numbers that V has of a cell.
         side: cells of V an axis.
-        widths: of `VolumeNetwork`.
     """
 
     reads_volume: ClassVar[bool] = True
 
-    def __init__(
-        self, shapes: Mapping[str, torch.Size], channels: int, side: int, widths: tuple[int, int, int] = WIDTHS
-    ) -> None:
+    def __init__(self, shapes: Mapping[str, torch.Size], channels: int, side: int) -> None:
         super().__init__()
         self.grids = {name: shape for name, shape in shapes.items() if len(shape) == 4}
-        self.encoder = VolumeNetwork(channels, side, sum(shape[0] for shape in self.grids.values()), widths)
+        self.encoder = VolumeNetwork(channels, side, sum(shape[0] for shape in self.grids.values()))
 
     def forward(self, observed: Observed, theta: Mapping[str, Tensor]) -> list[Parameters]:
         """The update of the grids for each of several objects: one tensor a grid, of its shape.

@@ -7,11 +7,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import conv3d, interpolate, pad, silu
 
-__all__ = ["WIDTHS", "VolumeNetwork"]
+__all__ = ["VolumeNetwork"]
 
 FOLD = 2  # cells an axis that become channels before the first convolution
-GROUPS = 8  # of the normalisation of WIDTHS; wider networks have more, of as many channels
-WIDTHS = (32, 64, 128)  # channels at half, a quarter and an eighth of the side
+GROUPS = 8  # of the normalisation
 
 
 class _Convolution(nn.Conv3d):
@@ -58,13 +57,13 @@ class _Pointwise(nn.Conv3d):
 class _Residual(nn.Module):
     """A 3x3x3 and a 1x1x1 convolution, each after normalisation and SiLU, beside a shortcut."""
 
-    def __init__(self, channels: int, groups: int) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
         self.path = nn.Sequential(
-            nn.GroupNorm(groups, channels),
+            nn.GroupNorm(GROUPS, channels),
             nn.SiLU(),
             _Convolution(channels, channels),
-            nn.GroupNorm(groups, channels),
+            nn.GroupNorm(GROUPS, channels),
             nn.SiLU(),
             _Pointwise(channels, channels),
         )
@@ -83,30 +82,25 @@ class VolumeNetwork(nn.Module):
         channels: numbers that are read of a cell.
         side: cells an axis, a multiple of eight.
         features: of every cell.
-        widths: channels at half, a quarter and an eighth of the side, multiples of a GROUPS-th of WIDTHS.
+        widths: channels at half, a quarter and an eighth of the side.
 
     Raises:
-        ValueError: another side, or other widths.
+        ValueError: another side.
     """
 
-    def __init__(self, channels: int, side: int, features: int, widths: tuple[int, int, int] = WIDTHS) -> None:
+    def __init__(self, channels: int, side: int, features: int, widths: tuple[int, int, int] = (32, 64, 128)) -> None:
         super().__init__()
         if side % (4 * FOLD):
             raise ValueError(f"side: expected a multiple of {4 * FOLD}, got {side}")
         fine, middle, coarse = widths
-        group_sizes = [usual // GROUPS for usual in WIDTHS]
-        if any(width < 1 or width % size for width, size in zip(widths, group_sizes, strict=True)):
-            expected = ", ".join(map(str, group_sizes))
-            raise ValueError(f"widths: expected multiples of {expected}, got {', '.join(map(str, widths))}")
-        groups = [width // size for width, size in zip(widths, group_sizes, strict=True)]
         self.features = features
         folded = channels * FOLD**3
         self.first = _Pointwise(folded, fine)
-        self.downwards = nn.ModuleList(_Residual(*each) for each in zip(widths, groups, strict=True))
+        self.downwards = nn.ModuleList([_Residual(fine), _Residual(middle), _Residual(coarse)])
         self.strided = nn.ModuleList([_Convolution(fine, middle, stride=2), _Convolution(middle, coarse, stride=2)])
-        self.upwards = nn.ModuleList(_Residual(*each) for each in zip(widths[::-1], groups[::-1], strict=True))
+        self.upwards = nn.ModuleList([_Residual(coarse), _Residual(middle), _Residual(fine)])
         self.widened = nn.ModuleList([_Pointwise(coarse, middle), _Pointwise(middle, fine)])
-        self.normalisation = nn.GroupNorm(groups[0], fine)
+        self.normalisation = nn.GroupNorm(GROUPS, fine)
         self.last = _Pointwise(fine + folded, features * FOLD**3)
         for parameter in self.last.parameters():
             nn.init.zeros_(parameter)

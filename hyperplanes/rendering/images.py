@@ -24,7 +24,8 @@ BYTES_OF_VIEW, BYTES_KEPT = 200, 32
 """That a pixel takes: of rays, while its view is rendered, and of the pictures of all views."""
 
 RAYS_OF_GROUP = 1 << 14
-"""Rays that small views are rendered together up to: in one call a view of 64x64 leaves a second thread idle."""
+"""Rays that small views are rendered together up to: by two threads 25 views of 64x64 take 0.94 s so, and 1.78 one by
+one (`small`, idle)."""
 
 EDGE = 0.7
 """Difference of a pixel to a neighbour, in colour or opacity, from which on further rays are cast through it; from 0.35
@@ -83,10 +84,12 @@ def render_images(
     require_memory("cameras", f"{cameras.batch_size} of {width}x{height}", needed, "render fewer or smaller pictures")
     pixels = pixel_grid(height, width, cameras.intrinsics.device)
     # pixels whose rays may meet something; the others are background
-    live = None if occupancy is None else footprint(occupancy, cameras).flatten(1)
+    if occupancy is None:
+        live = torch.ones(cameras.batch_size, height * width, dtype=torch.bool, device=pixels.device)
+    else:
+        live = footprint(occupancy, cameras).flatten(1)
     values = pixels.new_zeros(cameras.batch_size, height * width, 5)
     values[..., :3] = background
-    live = torch.ones(values.shape[:2], dtype=torch.bool, device=pixels.device) if live is None else live
     samples = 0
 
     def rendered(view: Tensor, where: Tensor) -> Rendered:

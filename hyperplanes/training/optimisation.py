@@ -32,12 +32,8 @@ class Optimisation:
         theta = list(model.networks.parameters())
         self.optimisers = make_optimisers(theta, config.optimiser, config.learning_rate, config.muon_learning_rate)
         if model.hypernetwork is not None:
-            self.optimisers += make_optimisers(
-                list(model.hypernetwork.parameters()),
-                config.hypernetwork_optimiser,
-                config.hypernetwork_learning_rate,
-                config.hypernetwork_muon_learning_rate,
-            )
+            rate = config.hypernetwork_learning_rate
+            self.optimisers += make_optimisers(list(model.hypernetwork.parameters()), "adam", rate, 0.0)
         self._rates = [optimiser.param_groups[0]["lr"] for optimiser in self.optimisers]
 
     @property

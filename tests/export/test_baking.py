@@ -14,6 +14,7 @@ from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Rays
+from hyperplanes.rendering import images
 from hyperplanes.rendering.renderer import RayMarching, render
 from hyperplanes.rendering.transmittance import transmittance, transmittance_torch
 from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
@@ -53,6 +54,15 @@ def test_harmonics_are_orthonormal():
     basis = spherical_harmonics(directions)
     gram = basis.T @ basis * (4 * math.pi / len(directions))
     assert torch.allclose(gram, torch.eye(9), atol=2e-3)
+
+
+def test_baked_pictures_have_further_rays_at_edges(baked, monkeypatch):
+    monkeypatch.setattr(images, "EDGE", 0.2)  # of a soft ball
+    found = BakedScene(baked).render(CAMERAS)
+    monkeypatch.setattr(images, "EDGE", math.inf)
+    plain = BakedScene(baked).render(CAMERAS)
+    assert found.samples > plain.samples
+    assert not torch.equal(found.opacity, plain.opacity)
 
 
 def test_baked_pictures_are_those_of_the_field(seen, baked):

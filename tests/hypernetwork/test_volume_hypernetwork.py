@@ -62,29 +62,6 @@ def test_a_side_that_cannot_be_halved_three_times_is_refused():
         VolumeNetwork(CHANNELS, 12, 4)
 
 
-def test_channels_that_a_wider_network_has_more_leave_the_others_alone_until_they_are_read():
-    # Property: normalisation is by groups of as many channels, so that weights can be carried over.
-    torch.manual_seed(5)
-    network, wider = VolumeNetwork(CHANNELS, SIDE, 2), VolumeNetwork(CHANNELS, SIDE, 2, (36, 80, 144))
-    torch.nn.init.normal_(network.last.weight, std=0.1)
-    with torch.no_grad():
-        for value, given in zip(wider.parameters(), network.parameters(), strict=True):
-            if given.ndim > 1:
-                value[: len(given)] = 0
-                columns = range(given.shape[1])
-                if value is wider.last.weight:  # the channels, then what the cells show
-                    columns = [*range(32), *range(36, 36 + given.shape[1] - 32)]
-                value[: len(given), list(columns)] = given
-            else:
-                value[: len(given)] = given
-        torch.testing.assert_close(wider(volumes(1)), network(volumes(1)), atol=1e-4, rtol=1e-4)
-
-
-def test_widths_of_no_whole_groups_are_refused():
-    with pytest.raises(ValueError, match="widths: expected multiples of 4, 8, 16, got 32, 60, 128"):
-        VolumeNetwork(CHANNELS, SIDE, 4, (32, 60, 128))
-
-
 @pytest.mark.parametrize(("layer", "plain"), [(_Convolution(3, 5, 2), (2, 1)), (_Pointwise(3, 5), (1, 0))])
 def test_convolutions_and_their_gradients_are_those_of_pytorch(layer, plain):
     stride, padding = plain

@@ -6,7 +6,7 @@ import torch
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import SUBPIXELS, Sphere, cast, pixel_grid
-from hyperplanes.rendering import Hierarchical, RayMarching, render
+from hyperplanes.rendering import Hierarchical, RayMarching, images, render
 from tests.reference_rendering import ball_views, ring
 
 CAMERAS = ring(2, (24, 24))
@@ -57,6 +57,32 @@ def test_they_are_the_mean_of_three_rays_and_all_others_stay():
     mean = torch.stack([each.colour for each in rays]).mean(0)
     torch.testing.assert_close(found.images[view, :, row, column], mean.to(found.images), atol=0.02, rtol=0)
     assert torch.equal(found.depth, plain.depth)
+
+
+@pytest.mark.parametrize("value", range(4))
+def test_pixels_at_edges_are_those_that_differ_from_one_beside_above_or_below(value):
+    # Brute force: a loop over pixels, of one value at a time.
+    values = torch.zeros(2, 5, 4, 4)
+    values[..., value] = torch.rand(2, 5, 4, generator=torch.Generator().manual_seed(value))
+    found = images._edges(values)
+    for view, row, column in found.new_ones(found.shape).nonzero().tolist():
+        beside = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
+        differences = [
+            abs(float(values[view, row, column, value] - values[view, *place, value]))
+            for place in beside
+            if 0 <= place[0] < 5 and 0 <= place[1] < 4
+        ]
+        assert bool(found[view, row, column]) == (max(differences) >= images.EDGE)
+    assert 0 < found.sum() < found.numel()
+
+
+def test_views_are_rendered_in_groups_to_the_same_pictures(monkeypatch):
+    together = picture(ball, True)
+    monkeypatch.setattr(images, "RAYS_OF_GROUP", 1)
+    one_by_one = picture(ball, True)
+    for name in ("images", "opacity", "depth"):
+        torch.testing.assert_close(getattr(together, name), getattr(one_by_one, name), atol=1e-6, rtol=0)
+    assert together.samples == one_by_one.samples
 
 
 def test_further_rays_are_counted_and_only_where_pixels_differ():

@@ -214,16 +214,6 @@ def test_muon_moves_the_hidden_matrices_by_its_own_rate():
     assert moved == {f"networks.fine.{name}.weight" for name in ("layers.0", "layers.1", "feature")}
 
 
-def test_muon_moves_the_matrices_of_the_hypernetwork_by_its_own_rate():
-    model = small_model()
-    before = state_of(model)
-    still = {"learning_rate": 0.0, "hypernetwork_learning_rate": 0.0}
-    losses(model, with_(hypernetwork_optimiser="muon", hypernetwork_muon_learning_rate=0.01, **still), 2)
-    moved = {name: value for name, value in model.named_parameters() if not torch.equal(value, before[name])}
-    assert moved
-    assert all(name.startswith("hypernetwork.") and value.ndim == 2 for name, value in moved.items())
-
-
 def test_without_a_hypernetwork_theta_alone_is_trained():
     trainer = Trainer(small_model(hypernetwork=None), Balls(), FAST)
     assert len(trainer.optimisation.optimisers) == 1

@@ -311,7 +311,7 @@ def test_an_entry_point_that_cannot_be_loaded_names_its_package(other_package, m
 
 
 def test_every_option_that_the_documents_name_is_one():
-    bases = [preset("quick"), preset("quick").by_protocol("paper"), preset("small")]
+    bases = [preset("quick"), preset("quick").by_protocol("paper")]
     known = {"model.hypernetwork"}
     for base in bases:
         known |= {path for path, _ in leaves({"model": base.model.as_json(), "training": asdict(base.training)})}
