@@ -62,9 +62,15 @@ def fill(text: str, results: Path = RESULTS, page: Path | str = "page") -> str:
         name = found[2]
         if name not in TABLES:
             raise DataError(f"{page}: expected a table of {', '.join(TABLES)}, found {name}; correct its marker")
-        made = [_read(results / f"{each}.json", page) for each in SOURCES.get(name, (name,))]
-        measured = "\n".join(dict.fromkeys(_measured(result) for result in made))
-        return f"{found[1]}{TABLES[name](*made).rstrip()}\n\n{measured}\n{found[3]}"
+        made = {each: _read(results / f"{each}.json", page) for each in SOURCES.get(name, (name,))}
+        origins: dict[str, list[str]] = {}  # what rows depend on: in which files those are that do
+        for source, result in made.items():
+            origins.setdefault(_measured(result), []).append(f"{source}.json")
+        if len(origins) > 1:
+            origins = {f"{origin} ({', '.join(files)})": [] for origin, files in origins.items()}
+        measured = "; ".join(origins)
+        measured = f"*{measured[0].upper()}{measured[1:]}.*"
+        return f"{found[1]}{TABLES[name](*made.values()).rstrip()}\n\n{measured}\n{found[3]}"
 
     return MARKED.sub(replaced, text)
 
@@ -79,11 +85,11 @@ def _measured(result: Result) -> str:
     """What the rows depend on beside the command: those of quality on the commit alone."""
     if result["benchmark"] in OF_QUALITY:
         commits = dict.fromkeys([result["commit"], *(row["commit"] for row in result["rows"] if "commit" in row)])
-        return f"*Commit {', '.join(commits)}.*"
+        return f"commit {', '.join(commits)}"
     load = result.get("load")
     threads, beside = result["threads"], "not recorded" if load is None else f"{load:.2f} cores"
     machine = f"{result['processor']}, {result['cores']} cores, {threads} thread{'s' if threads > 1 else ''}"
-    return f"*{machine}; commit {result.get('commit') or 'not recorded'}; load of other processes: {beside}.*"
+    return f"{machine}; commit {result.get('commit') or 'not recorded'}; load of other processes: {beside}"
 
 
 def _seconds(value: float) -> str:
@@ -314,8 +320,8 @@ def _captures(result: Result) -> str:
 
 WAYS = {
     "damaged": "masks damaged on purpose, as they are",
-    "damaged_one_word": "the same, mended by a hull that one mask rules a place out of",
-    "damaged_vote": "the same, mended by the vote of views, as `capture` does",
+    "damaged_one_word": "the same, corrected by a hull from which one mask removes a point",
+    "damaged_vote": "the same, corrected by a hull from which several have to, as `capture` does",
     "learned_background": "no masks, learned background",
     "no_masks": "no masks",
 }

@@ -101,6 +101,7 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
     settings: list[str] = []
     if "settings" in module.Arguments.__annotations__:  # options with a dot, such as --model.hypernetwork.views 3
         rest, settings = split_settings(rest)
+    rest = _with_axes(rest)
     parsed = tyro.cli(
         module.Arguments,
         prog=f"hyperplanes {verb}",
@@ -110,6 +111,21 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
     )
     _check_ranges(parsed)
     return module.run(replace(parsed, settings=tuple(settings)) if settings else parsed)
+
+
+def _with_axes(arguments: list[str]) -> list[str]:
+    """The same with `--up -y` as `--up=-y`: the parser takes what begins with a dash for an option.
+
+    >>> _with_axes(["--up", "-y", "--size", "64"])
+    ['--up=-y', '--size', '64']
+    """
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] == "--up" and argument in ("-x", "-y", "-z"):
+            joined[-1] = f"--up={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 def _check_ranges(parsed: Any) -> None:

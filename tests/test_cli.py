@@ -189,7 +189,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
             ["--meshes: expected a folder of mesh files, got OUT/none, which is nothing"],
         ),
         ([*RENDER, "--orbit", "0"], ["--orbit: expected at least 1 frame, got 0"]),
-        ([*RENDER, "--size", "32"], ["--size: expected --orbit, whose pictures it is for, got 32"]),
+        ([*RENDER, "--size", "32"], ["--size: expected --orbit or --camera-path, whose pictures it is for, got 32"]),
         ([*RENDER, "--orbit", "2", "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
         ([*BAKE, "OUT/bk"], ["--out: expected a name that ends in .safetensors, got OUT/bk"]),
         (
@@ -659,6 +659,7 @@ def test_a_single_scene_is_evaluated_with_the_way_up_that_its_cameras_tell(tmp_p
     assert quality(turned) == pytest.approx(expected, abs=1e-2)
     assert "up: z, as the cameras are held; --up says otherwise" in capsys.readouterr().out
     assert quality(turned, "--up", "0,0,2") == pytest.approx(expected, abs=1e-2)
+    assert quality(turned, "--up", "-z") == quality(turned, "--up=-z") < expected - 0.1
     assert abs(quality(turned, "--up", "y") - expected) > 0.1
     assert quality(demo / "data") == pytest.approx(expected, abs=1e-2)
     assert "up:" not in capsys.readouterr().out

@@ -239,7 +239,7 @@ def _straight(model: SparseModel, pictures: Sequence[Picture], opacities: dict[i
             picture[..., 3] = read_image(given)[0][..., 0]
         work.progress("lens", row, len(model), path.name)
         result.append(straightened(picture, model.calibrations[row], model.lenses[row], opaque=given is None))
-    work.progress("lens", len(model), len(model), "taken out of the pictures")
+    work.progress("lens", len(model), len(model), "distortion removed")
     return result
 
 

@@ -50,7 +50,7 @@ class Arguments:
         steps: Training steps; so few that all is done in minutes on two cores.
         meshes: A folder with a few mesh files that the packaged model shows first, beside procedural objects.
         first_only: End after the packaged model's page.
-        seed: Of everything.
+        seed: Of the data, the trainings and the evaluation.
         workers: Processes that train and evaluate side by side; one a core, at most four, when not given.
         quick_check: Only see that everything runs: a few tiny objects and networks that learn nothing.
         device: auto, cpu or cuda.

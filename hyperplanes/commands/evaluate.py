@@ -73,7 +73,8 @@ class Arguments:
         lpips: Measure LPIPS with these weights, a safetensors file that `hyperplanes.evaluation.perceptual` describes.
         split: Which objects.
         objects: Only the first so many.
-        support: Support views an object; more than there are go on with the query views.
+        support: Support views an object; more than the data set has are taken from its query views, and those are
+            compared although they were shown.
         preset: The shape of fields that need no checkpoint.
         up: The direction that points up in the data's world: an axis such as y or -z, three numbers such as 0,0.1,1, or
             auto: of a single scene as its cameras are held, of a data set y as in training data.

@@ -59,15 +59,16 @@ class ObjectArguments:
         out: The folder to write to; for `bake`, the file.
         steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
             single forward pass.
-        all_views: Show the model every view, not only the support half.
-        learn_background: For photographs without masks: learn what lies in the sphere of the scene and the room around
-            it together, and cut the former out.
+        all_views: Give the model all views. By default it gets every other one, the support views, and its pictures are
+            compared with the rest.
+        learn_background: For photographs without masks: fit the object (the sphere at the centre of the scene) and the
+            background together, and take what the object covers as masks.
         refine_poses: Refine the poses of all views first, and keep them where support views that the model is not given
             are shown better by half a decibel: for poses that are a little wrong.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held. Meshes, turntables and baked files have y up.
-        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
-            leave one at most when not given.
+        downscale: Reduce the images by this factor, averaging pixels. When not given, images of more than a megapixel
+            are reduced to at most one.
         device: auto, cpu or cuda.
     """
 
@@ -83,12 +84,13 @@ class ObjectArguments:
     device: str = "auto"
 
 
-def check_orbit(orbit: int | None, size: int | None) -> None:
+def check_orbit(orbit: int | None, size: int | None, *others: str) -> None:
     """Refuse frames and pixels of an orbit that cannot be rendered.
 
     Args:
         orbit: frames around the object, None for no orbit.
         size: pixels along the longer side of its pictures, None for that of the images.
+        others: options beside --orbit whose pictures may have that size.
 
     Raises:
         ValueError: no frame, no pixel, or a size of no orbit.
@@ -96,6 +98,7 @@ def check_orbit(orbit: int | None, size: int | None) -> None:
     if orbit is not None and orbit < 1:
         raise ValueError(f"--orbit: expected at least 1 frame, got {orbit}")
     if size is not None and orbit is None:
-        raise ValueError(f"--size: expected --orbit, whose pictures it is for, got {size} without; leave it out")
+        those = " or ".join(["--orbit", *others])
+        raise ValueError(f"--size: expected {those}, whose pictures it is for, got {size} without; leave it out")
     if size is not None and size < 1:
         raise ValueError(f"--size: expected at least 1 pixel, got {size}")

@@ -167,7 +167,7 @@ def _check(arguments: Arguments) -> None:
             "--protocol: expected none with --representation voxels, which are not sampled so; leave one out"
         )
     if arguments.camera_path is None:
-        check_orbit(arguments.orbit, arguments.size)
+        check_orbit(arguments.orbit, arguments.size, "--camera-path")
         if arguments.dataparser_transforms is not None:
             raise ValueError(
                 "--dataparser-transforms: expected --camera-path, whose world it is of, got none; name one"

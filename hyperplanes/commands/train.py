@@ -72,12 +72,12 @@ class Arguments:
             weights matched to mv_meta).
         field: Which target network: nerf, multiplane, point_multiplane, image_based, or that of another package; when
             not given the preset's, or for learned initialisations NeRF.
-        support: Support views and ImagePlanes an object; more than there are go on with the query views.
+        support: Support views and ImagePlanes an object; more than the data set has are taken from its query views.
         checkpoint: Weights to begin with instead of random ones: a checkpoint, or a packaged model such as small; for
             mv_matched the checkpoint of mv_meta that it is to match.
         protocol: How rays are sampled: paper is 64 + 128 times each on every ray, ray_marching only where something is;
             as the preset says where not given.
-        steps: Other than the preset's.
+        steps: Training steps; the preset's when not given.
         epochs: Instead of steps: how often each object is drawn, on average.
         seed: Of the first weights and of every draw.
         cache_size: GiB of memory for prepared objects, and as much again for their decoded pictures; 2 by default.

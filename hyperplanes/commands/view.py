@@ -54,14 +54,14 @@ class Arguments:
         compare: Methods of `hyperplanes evaluate` to see beside the model on the right half of the page, such as
             hull_blend, nearest_view, hyperplanes (the model after one step), or scratch_100.
         port: Of the page on this machine.
-        learn_background: For photographs without masks: learn what lies in the sphere of the scene and the room around
-            it together, and cut the former out.
+        learn_background: For photographs without masks: fit the object (the sphere at the centre of the scene) and the
+            background together, and take what the object covers as masks.
         refine_poses: Refine the poses of the views first, and keep them where views that the model is not given are
             shown better by half a decibel: for poses that are a little wrong.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held.
-        downscale: Take the mean of so many by so many pixels; photographs of more than a megapixel get as many as
-            leave one at most when not given.
+        downscale: Reduce the images by this factor, averaging pixels. When not given, images of more than a megapixel
+            are reduced to at most one.
         device: auto, cpu or cuda.
     """
 
