@@ -134,7 +134,7 @@ def _pole(rng: np.random.Generator, height: float, metal: Material) -> list[Part
     return parts
 
 
-def _turned_pole(rng: np.random.Generator, height: float, metal: Material) -> list[Part]:
+def _turned_pole(rng: np.random.Generator, height: float) -> list[Part]:
     """A wooden column turned on a lathe."""
     timber = wood(rng, _WOODS[int(rng.integers(len(_WOODS)))])
     count = int(rng.integers(9, 15))
@@ -148,7 +148,7 @@ def floor_stand(rng: np.random.Generator, height: float, metal: Material) -> lis
     """The stand of a floor lamp, from y = 0 to `height` on the axis, in metres."""
     makers: tuple[Callable[[], list[Part]], ...] = (
         lambda: _pole(rng, height, metal),
-        lambda: _turned_pole(rng, height, metal),
+        lambda: _turned_pole(rng, height),
         lambda: _tripod(rng, height, rng.uniform(0.26, 0.36), sample_body_material(rng), metal),
     )
     return makers[int(rng.choice(3, p=[0.45, 0.2, 0.35]))]()

@@ -78,7 +78,7 @@ class Separated:
         Args:
             views: photographs, of the scene that was fitted.
         """
-        _, opacity = self.render(views.resized(PIXELS).cameras)
+        _, opacity = self.render(views.resized(PIXELS).to("cpu", torch.float32).cameras)
         opacity = interpolate(opacity, views.size, mode="bilinear").to(views.images)
         masks = (SHARPENED * (opacity - 0.5) + 0.5).clamp(0, 1)
         return replace(views, images=views.images * masks + (1 - masks), masks=masks)

@@ -120,11 +120,18 @@ class AdaptedField:
         """Colour and density of the field."""
         return self.field(points, directions)
 
-    def trace(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
-        """The pixels of rays by the field's own sampler, with gradients: the forward pass of training."""
+    def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
+        """The pixels of rays by the field's own sampler: the forward pass of training.
+
+        Args:
+            rays: through the scene.
+            generator: of the places of samples; on the CPU.
+            differentiable: with gradients; else in chunks, each ray up to where it is opaque.
+        """
         return render(
-            self.field, rays, self.sampling, occupancy=self.occupancy, proposal=self.proposal, generator=generator
-        )
+            self.field, rays, self.sampling, occupancy=self.occupancy, proposal=self.proposal, generator=generator,
+            differentiable=differentiable,
+        )  # fmt: skip
 
     @checked
     @torch.no_grad()

@@ -138,12 +138,14 @@ class Descent:
         rays, truth = self.views.sample_rays(
             self.settings.rays, generator=generator, among=self.pixels, near_far=near_far
         )
-        return float((field.trace(rays).colour - truth).square().mean()), float((1 - truth).square().mean())
+        seen = field.trace(rays, differentiable=False).colour
+        return float((seen - truth).square().mean()), float((1 - truth).square().mean())
 
     def best_stop(
         self,
         holdout: Views,
         *,
+        unchanged: AdaptedField | None = None,
         pixels: Int[Tensor, " pixel"] | None = None,
         on_step: Callable[[int], None] | None = None,
     ) -> int:
@@ -154,6 +156,7 @@ class Descent:
 
         Args:
             holdout: the views that decide.
+            unchanged: the field of no step, where that is another one than the descent begins with.
             pixels: flat indices of their pixels that count.
             on_step: called with the number of steps done, before the first and after each.
         """
@@ -173,8 +176,9 @@ class Descent:
             # between two checks
             if step not in (0, every // 3, most) and step % every:
                 continue
+            field = unchanged if unchanged is not None and not step else self.field(None)
             with torch.no_grad():
-                error = float((self.field(None).trace(rays).colour - truth).square().mean())
+                error = float((field.trace(rays, differentiable=False).colour - truth).square().mean())
             errors[step] = error if math.isfinite(error) else math.inf
             best = min(errors, key=lambda each: errors[each])
             if step - best > 2 * every:

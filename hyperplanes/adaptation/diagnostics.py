@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.network import in_use
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
@@ -90,8 +91,6 @@ def diagnose(model: HyperPlanes, prepared: Sequence[SupportContext]) -> Diagnost
     if model.hypernetwork is None or len(prepared) < 2:
         what = "a model without one" if model.hypernetwork is None else f"{len(prepared)} objects"
         raise ValueError(f"diagnose: expected a hypernetwork and at least 2 objects, got {what}")
-    training = model.training
-    model.eval()
     # which units of the head any object activates, seen while the updates are made
     active: list[Tensor] = []
     hooks = [
@@ -99,11 +98,11 @@ def diagnose(model: HyperPlanes, prepared: Sequence[SupportContext]) -> Diagnost
         for layer in model.hypernetwork.activated
     ]
     try:
-        updates = model.updates(prepared)
+        with in_use(model):
+            updates = model.updates(prepared)
     finally:
         for hook in hooks:
             hook.remove()
-        model.train(training)
     # (object, parameter): norm of the updates, and of their differences from the mean
     flat = torch.stack([torch.cat([value.flatten() for value in update.values()]) for update in updates])
     norm = float(flat.square().sum(1).mean().sqrt())

@@ -60,11 +60,15 @@ def fine_tune(
     if steps != "auto":
         return fine_tune_to(network, network.prepare(support), steps, settings, views=support, on_step=on_step)
 
-    # how many steps show some of the views best that the others were fine-tuned without
+    # how many steps show some of the views best that the others were fine-tuned without, from as many random weights
+    settings = replace(settings, fresh=settings.fresh_share(len(support)))
     shown, holdout = split_holdout(support, settings)
     context = network.prepare(shown)
     trial, _ = make_descent(network, context, settings, shown)
-    stop = trial.best_stop(holdout, pixels=network.live_pixels_of(context, holdout), on_step=on_trial)
+    pixels = network.live_pixels_of(context, holdout)
+    with torch.no_grad():
+        unchanged = network.field(context, judged_weights(network, context))
+    stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
     context, schedule = network.prepare(support), settings.max_steps

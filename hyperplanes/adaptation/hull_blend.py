@@ -60,7 +60,7 @@ class HullBlend:
         region, sampling = hull(support, self.side), RayMarching(self.steps, STOP)
         shape = _Hull(masks, support.bounds)
         solid = AdaptedField(shape, region, sampling, densities=(shape.density,))
-        distance = solid.render(support.cameras).depth
+        distance = solid.render(support.cameras, antialias=False).depth
         distance = torch.where(distance > 0, distance, torch.inf).expand(-1, 3, -1, -1)
         eyes = camera.centres(support.cameras)
         far = 2 * float((eyes - eyes.new_tensor(support.bounds.centre)).norm(dim=1).max() + support.bounds.radius)

@@ -7,12 +7,11 @@ import torch
 from hyperplanes.adaptation.context import SupportContext, live_pixels
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.fields.rig import camera_directions
-from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.parameters import Parameters
-from hyperplanes.rendering.renderer import render
 from hyperplanes.views import Views
 
-__all__ = ["FEWEST", "MARGIN", "STRENGTHS", "judge_strength", "judged_weights"]
+__all__ = ["FEWEST", "MARGIN", "STRENGTHS", "attenuated_weights", "judge_strength", "judged_weights"]
 
 STRENGTHS = (1.0, 0.5, 0.0)
 """What is compared: the trained field, halfway to the plain visual hull in blended colours, and that alone."""
@@ -45,8 +44,7 @@ def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
     if len(support) < FEWEST:
         return STRENGTHS[0]
     support = support.resized(PIXELS)
-    standing = camera_directions(support).cpu()
-    order = farthest_first(standing, int((standing @ standing.mean(0)).argmin()), len(support))
+    order = outermost_first(camera_directions(support).cpu(), len(support))
     shown, judged = support[sorted(order[:-LEFT_OUT])], support[order[-LEFT_OUT:]]
     context = network.prepare(shown)
     weights = network.theta + network.update(context)
@@ -57,8 +55,7 @@ def judge_strength(network: HyperPlanesNetwork, support: Views) -> float:
         among=live_pixels(context.occupancy, judged),
         near_far=fields[0].sampling.near_far,
     )
-    seen = [render(each.field, rays, each.sampling, occupancy=each.occupancy, differentiable=False) for each in fields]
-    errors = [float((each.colour - truth).square().mean()) for each in seen]
+    errors = [float((each.trace(rays, differentiable=False).colour - truth).square().mean()) for each in fields]
     best = min(errors)
     return STRENGTHS[errors.index(best)] if best < (1 - MARGIN) * errors[0] else STRENGTHS[0]
 
@@ -71,7 +68,18 @@ def judged_weights(network: HyperPlanesNetwork, context: SupportContext) -> Para
         network: the model.
         context: the object.
     """
-    weights = network.adapted_weights(context)
+    return attenuated_weights(network, context, network.adapted_weights(context))
+
+
+@torch.no_grad()
+def attenuated_weights(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> Parameters:
+    """Weights attenuated as `judge_strength` says of an object and its own update, where the model is configured so.
+
+    Args:
+        network: the model.
+        context: the object.
+        weights: of the field.
+    """
     if not network.config.judged:
         return weights
     with in_use(network):

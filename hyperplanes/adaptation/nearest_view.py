@@ -43,5 +43,7 @@ class NearestView:
 
     @checked
     def adapt(self, support: Views) -> _Copies:
-        """Remember the support views."""
+        """Remember the support views; none is a ValueError."""
+        if not len(support):
+            raise ValueError("support: expected at least one view, got none")
         return _Copies(support)

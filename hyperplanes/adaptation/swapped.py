@@ -9,6 +9,8 @@ import torch
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.judging import attenuated_weights
+from hyperplanes.adaptation.network import in_use
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
@@ -31,20 +33,21 @@ class Swapped:
             raise ValueError("swapped: expected a model with a hypernetwork, got one without")
         self.model = model
         self._updates: dict[str, Parameters] = {}
-        with torch.no_grad():
+        with torch.no_grad(), in_use(model):
             for support in objects:
-                self._updates[_digest(support)] = model.eval().update(model.prepare(support, carved=False))
+                self._updates[_digest(support)] = model.update(model.prepare(support, carved=False))
         if len(self._updates) < 2:
             raise ValueError(f"swapped: expected at least 2 objects to swap updates of, got {len(self._updates)}")
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The field of theta plus the update of the object after this one."""
+        """The field of theta plus the update of the object after this one, attenuated as with its own update."""
         prepared = self.model.prepare(support)
         known = list(self._updates)
         own = _digest(support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]
-        return self.model.rendering_field(prepared, self.model.theta + self._updates[other])
+        weights = attenuated_weights(self.model, prepared, self.model.theta + self._updates[other])
+        return self.model.rendering_field(prepared, weights)
 
 
 def _digest(support: Views) -> str:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 from hyperplanes.utilities.interrupts import keep_handlers
 
-__all__ = ["is_installed", "require"]
+__all__ = ["is_installed", "require", "stated_threads"]
 
 
 def is_installed(name: str) -> bool:
     """Whether a package can be imported; it is not imported."""
     return find_spec(name) is not None
+
+
+def stated_threads() -> int:
+    """How many threads OMP_NUM_THREADS allows, the first of its numbers; 0 where it says nothing."""
+    stated = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    return int(stated) if stated.isdigit() else 0
 
 
 def require(name: str, purpose: str) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from PIL import Image
@@ -29,6 +30,7 @@ from hyperplanes.capture.video import VIDEO_SUFFIXES, take_frames
 from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import Pixels, read_image
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.writing import write_whole
@@ -53,21 +55,22 @@ ADVICE = (
 )
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Settings:
     """How a capture is made.
 
     Attributes:
-        max_size: pixels along the longer side, in which poses are found and pictures written.
+        max_size: pixels along the longer side, in which poses are found and pictures written; at least 64.
         mask: auto, given, colour, network, grabcut, none, or a command with {image} and {mask} in it.
-        frames: taken out of a video.
+        frames: taken out of a video; at least 3.
         order: "auto", "sequence" (neighbours are matched) or "any" (all pairs are).
     """
 
-    max_size: int = 1000
+    max_size: Annotated[int, range(64, 1 << 16)] = 1000
     mask: str = "auto"
-    frames: int = 60
-    order: str = "auto"
+    frames: Annotated[int, range(3, 1 << 16)] = 60
+    order: Literal["auto", "sequence", "any"] = "auto"
 
 
 @dataclass
@@ -87,7 +90,8 @@ def capture(
 
     Args:
         source: a folder of photographs, in which masks/ may lie, or a video.
-        out: the folder of the scene. What the stages made lies in its folder capture/; the same call goes on there.
+        out: the folder of the scene. What the stages made lies in its folder capture/; the same call goes on there. No
+            photograph may lie in its folders images/, masks/ and capture/, in which files are replaced.
         settings: how.
         progress: called as it goes on.
 
@@ -98,8 +102,11 @@ def capture(
     """
     source, out, settings = Path(source), Path(out), settings or Settings()
     check_mask(settings.mask)
+    _refuse_inside(out, source)
     work = _Work(Stages(out / WORK), settings, progress or (lambda stage, done, total, text: None))
     photographs, is_video = _photographs(source, work)
+    if not is_video:
+        _refuse_inside(out, *(path for one in photographs for path in (one.path, one.mask) if path is not None))
     photographs, pictures, opacities = _pictures(photographs, work)
     model = _poses(pictures, is_video, work)
     kept = [photographs[index] for index in model.pictures]
@@ -110,6 +117,20 @@ def capture(
     masks, how = _masks(model, straight, [one.name for one in kept], work)
     placement, masks = _placed(model, kept, straight, masks, work, trusted=how == "given")
     return _written(out, model, kept, straight, masks, how, placement, work)
+
+
+def _refuse_inside(out: Path, *sources: Path) -> None:
+    """Refuse to write where photographs lie: pictures of a scene take the place of what is there.
+
+    Raises:
+        DataError: the scene's own folder, or something in one that is written to.
+    """
+    home = out.resolve()
+    written = [home / name for name in ("images", "masks", WORK)]
+    for source in sources:
+        place = source.resolve()
+        if place == home or any(place == folder or folder in place.parents for folder in written):
+            raise DataError(source, "photographs outside of the scene", f"{out} as --out", "give another --out")
 
 
 def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:

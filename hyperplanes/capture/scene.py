@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.pictures.images import Pixels
 from hyperplanes.data.pictures.undistort import undistort
+from hyperplanes.utilities.files import DataError, read_json
 from hyperplanes.utilities.writing import write_json, write_whole
 
 __all__ = ["Captured", "encode_points", "straightened", "write_scene"]
@@ -69,7 +71,7 @@ def write_scene(
     """Write the files of a scene, transforms.json last.
 
     Args:
-        folder: of the scene; pictures of an earlier one in its images/ and masks/ are deleted.
+        folder: of the scene; the pictures and masks that an earlier transforms.json in it lists are deleted.
         model: in a world with z up, in which the unit sphere holds the object.
         names: of the pictures, one a camera.
         sizes: (height, width) of each.
@@ -78,11 +80,10 @@ def write_scene(
     Returns:
         What was written.
     """
+    former = _listed(folder / "transforms.json") - set(files)
     (folder / "transforms.json").unlink(missing_ok=True)
-    for kind in ("images", "masks"):
-        for old in (folder / kind).glob("*"):
-            if f"{kind}/{old.name}" not in files:
-                old.unlink()
+    for name in former:
+        (folder / name).unlink(missing_ok=True)
     for name, data in files.items():
         write_whole(folder / name, data, durable=False)
     write_whole(folder / POINTS, encode_points(model), durable=False)
@@ -98,6 +99,17 @@ def write_scene(
             frame["mask_path"] = f"masks/{name}.png"
     write_json(folder / "transforms.json", document | {"up": "z", "ply_file_path": POINTS})
     return Captured(folder, len(names), len(model.points), model.reprojection_error)
+
+
+def _listed(document: Path) -> set[str]:
+    """The pictures and masks of a scene that was written before: images/NAME and masks/NAME."""
+    try:
+        frames = read_json(document).get("frames")
+    except DataError:
+        return set()
+    entries = [each for each in frames if isinstance(each, dict)] if isinstance(frames, list) else []
+    names = [str(each[key]) for each in entries for key in ("file_path", "mask_path") if key in each]
+    return {name for name in names if re.fullmatch(r"(images|masks)/[^/\\]+", name) and ".." not in name}
 
 
 def encode_points(model: SparseModel) -> bytes:

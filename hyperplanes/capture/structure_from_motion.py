@@ -6,7 +6,6 @@ that are missing.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hyperplanes.capture.packages import require
+from hyperplanes.capture.packages import require, stated_threads
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.utilities.writing import write_whole
 
@@ -278,5 +277,4 @@ def _quiet(pycolmap: Any) -> Generator[None]:
 
 def _threads() -> int:
     """Threads for COLMAP: as many as OMP_NUM_THREADS allows, else all cores."""
-    stated = os.environ.get("OMP_NUM_THREADS", "")
-    return int(stated) if stated.isdigit() and int(stated) > 0 else -1
+    return stated_threads() or -1

@@ -59,8 +59,6 @@ def run(arguments: Arguments) -> int:
         raise ValueError(f"--size: expected at least 64 pixels, got {arguments.size}")
     if arguments.frames < 3:
         raise ValueError(f"--frames: expected at least 3, got {arguments.frames}")
-    if arguments.out.resolve() == arguments.photographs.resolve():
-        raise ValueError(f"--out: expected another folder than that of the photographs, got {arguments.out}")
     from hyperplanes.capture import Settings, capture
 
     console, started = Console(), time.perf_counter()

@@ -51,8 +51,8 @@ class BakedScene:
     @checked
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Pictures:
-        """The pictures of the cameras, by a kernel on a CPU and by `RayMarching` elsewhere."""
-        bounds = self.field.bounds
+        """The pictures of cameras on any device, by a kernel where the voxels are on a CPU, else by `RayMarching`."""
+        bounds, cameras = self.field.bounds, camera.to(cameras, self.field.index.device)
         if self.field.index.device.type != "cpu":
             return self.adapted.render(cameras, self.adapted.sampling)
         step = 2 * bounds.radius / self.steps
@@ -202,7 +202,7 @@ def _resampled(occupancy: Occupancy, side: int) -> Occupancy:
 
 
 def _density_at(adapted: AdaptedField, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-    return torch.cat([adapted.density(part) for part in points.split(CHUNK)] or [points.new_zeros(0)])
+    return torch.cat([adapted.density(part) for part in points.split(CHUNK)])
 
 
 def _harmonics(

@@ -98,7 +98,7 @@ def _video(frames: npt.NDArray[np.uint8], kind: str, rate: float) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"video.{kind}"
         size = (even.shape[2], even.shape[1])
-        writer = write_frames(str(path), size, fps=round(rate), codec=CODECS[kind], quality=8, macro_block_size=2)
+        writer = write_frames(str(path), size, fps=rate, codec=CODECS[kind], quality=8, macro_block_size=2)
         writer.send(None)
         for frame in even:
             writer.send(np.ascontiguousarray(frame))

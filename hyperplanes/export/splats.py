@@ -18,6 +18,7 @@ from torch import Tensor
 
 from hyperplanes.fields.baked import HARMONICS, BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.rendering.splats import render_splats
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.files import format_of
@@ -109,7 +110,13 @@ def fit_splats(
 
     Returns:
         At most as many splats; as they are where there is no step.
+
+    Raises:
+        ValueError: no views, or cameras with lens distortion.
     """
+    if not len(views) or isinstance(views.cameras, DistortedCamera):
+        found = "some with it" if len(views) else "none"
+        raise ValueError(f"views: expected at least one without lens distortion, got {found}")
     if not steps:
         return splats
     views = views.to("cpu", torch.float32)

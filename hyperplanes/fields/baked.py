@@ -110,7 +110,12 @@ class BakedField:
         """Write one compact file: a bit a voxel, and a row of half precision density and a byte a coefficient.
 
         Bytes divide the range of each coefficient, so that pictures change by less than a grey level of 255.
+
+        Raises:
+            ValueError: an odd number of voxels an axis.
         """
+        if self.side % 2:
+            raise ValueError(f"side: expected an even number of voxels an axis, got {self.side}")
         bits = (self.index >= 0).flatten().reshape(-1, 8).to(torch.uint8)
         packed = (bits * (2 ** torch.arange(8, device=bits.device)).to(torch.uint8)).sum(1, dtype=torch.uint8)
         order = self.index.flatten()

@@ -22,7 +22,7 @@ from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.encoding import encode, encoded_size
 from hyperplanes.fields.rig import Rig, camera_directions
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility import ANGLE, ChosenViews, Described, Reading, Visibility, VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
@@ -150,9 +150,7 @@ class ImageBasedNeRF(Target):
         count, device = min(count, len(views)), views.images.device
         if choice == "first":
             return torch.arange(count, device=device)
-        standing = camera_directions(views).cpu()
-        first = int((standing @ standing.mean(0)).argmin())
-        return torch.tensor(farthest_first(standing, first, count), dtype=torch.long, device=device)
+        return torch.tensor(outermost_first(camera_directions(views).cpu(), count), dtype=torch.long, device=device)
 
     def hull_resolution(self, configured: int, support: Views) -> int:
         """More than configured where masks are larger, so that the hull is as fine as they are."""

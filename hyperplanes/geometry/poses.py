@@ -110,6 +110,16 @@ def fibonacci_sphere(views: Count, distance: float, lowest: float = -1.0, highes
     return look_at(distance * torch.stack([flat * azimuth.sin(), height, flat * azimuth.cos()], -1))
 
 
+def outermost_first(directions: Float[Tensor, "direction 3"], count: int) -> list[int]:
+    """As `farthest_first`, from the direction on that is farthest from their mean.
+
+    Args:
+        directions: unit vectors.
+        count: how many, at most all.
+    """
+    return farthest_first(directions, int((directions @ directions.mean(0)).argmin()), count)
+
+
 def farthest_first(directions: Float[Tensor, "direction 3"], first: int, count: int) -> list[int]:
     """Directions as far apart as they can be, one after the other (Gonzalez 1985).
 

@@ -20,6 +20,7 @@ __all__ = ["footprint", "pixels_across"]
 
 def pixels_across(cameras: PinholeCamera, bounds: Sphere) -> float:
     """How many pixels the diameter of a sphere takes where it is seen largest; from within, as from its surface."""
+    camera.image_size(cameras)  # refuses no cameras at all
     distance = (camera.centres(cameras) - camera.centres(cameras).new_tensor(bounds.centre)).norm(dim=1)
     focal = camera.intrinsics(cameras)[:, 0, 0]
     return float((2 * bounds.radius * focal / distance.clamp_min(bounds.radius)).max())

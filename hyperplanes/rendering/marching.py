@@ -25,6 +25,7 @@ __all__ = ["RayMarching", "march"]
 CANDIDATES = 1 << 21  # samples tested against the grid at once; 12 bytes each
 RAYS = 512  # that one call of the kernel works on
 PIXELS, MOST_PIXELS = 100, 4.0  # across the scene for which 5 samples for 3 in training do; times that are followed
+MOST_STEPS = 1 << 14
 STOP_FACTOR, HIGHEST_STOP = 4.0, 0.1  # of `stop` for pictures, where what lies behind has the colour in front
 
 
@@ -38,7 +39,7 @@ class RayMarching:
         stop: transmittance below which a ray is finished (only where no gradient is wanted); 0 never stops.
     """
 
-    steps: Annotated[int, range(1, 16385)] = 96
+    steps: Annotated[int, range(1, MOST_STEPS + 1)] = 96
     stop: float = 5e-3
 
     @property
@@ -62,7 +63,7 @@ class RayMarching:
         """
         finer = math.sqrt(min(max(pixels / PIXELS, 1 / MOST_PIXELS), MOST_PIXELS))
         stop = max(self.stop, min(HIGHEST_STOP, STOP_FACTOR * self.stop))
-        return RayMarching(round(self.steps * finer * 5 / 3), stop)
+        return RayMarching(min(MOST_STEPS, round(self.steps * finer * 5 / 3)), stop)
 
     @property
     def summary(self) -> str:

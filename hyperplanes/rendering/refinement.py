@@ -96,7 +96,7 @@ def refine(
         near = Occupancy(kept, bounds).dilated().occupied if large else occupancy.occupied
         asked = near & occupancy.occupied & ~kept & ~divided
         divided |= asked
-        found = _filled(occupancy, asked, density, threshold, 2)
+        found = _filled(occupancy, asked, density, threshold)
         if not found.any():
             break
         filled = filled | found
@@ -153,12 +153,10 @@ def _densities(points: Tensor, density: Callable[[Tensor], Tensor]) -> Tensor:
     return torch.cat([density(part) for part in points.split(CHUNK)])
 
 
-def _filled(
-    grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor], threshold: float, parts: int
-) -> Tensor:
-    """Which of the asked voxels have density above a threshold at the centre of one of parts^3 equal parts."""
+def _filled(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor], threshold: float) -> Tensor:
+    """Which of the asked voxels have density above a threshold at the centre of one of their eight equal parts."""
     points = Occupancy(asked, grid.bounds).centres()
-    steps = ((torch.arange(parts, device=points.device) + 0.5) / parts - 0.5) * grid.voxel
+    steps = torch.tensor([-0.25, 0.25], device=points.device) * grid.voxel
     offsets = torch.cartesian_prod(steps, steps, steps).reshape(-1, 3)
     found = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     chunk = CHUNK // len(offsets)

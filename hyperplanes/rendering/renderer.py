@@ -73,13 +73,14 @@ def render(
         sampling: where along the rays the field is evaluated. Where absent, `RayMarching` with the samples of images
             for cameras; for rays `RayMarching` if there are bounds or an occupancy, else `Hierarchical`, which needs
             neither.
-        bounds: the sphere of the scene, outside of which nothing is rendered. That of the occupancy where absent, and
-            for cameras the unit sphere where there is none.
+        bounds: the sphere of the scene. Cameras see what lies in it; rays have their own near and far, and between them
+            `RayMarching` takes samples in the cube around the sphere. That of the occupancy where absent, and for
+            cameras the unit sphere where there is none.
         occupancy: voxels where the field can be anything but empty, for `RayMarching`; all within the bounds where
             absent.
         proposal: the field of the coarse pass of `Hierarchical`; `field` where absent. `RayMarching` evaluates it only
             for gradients, so that it learns.
-        generator: jitters the samples; without one they are the same each time.
+        generator: jitters the samples; on the CPU. Without one they are the same each time.
         background: grey value behind everything.
         differentiable: keep gradients to whatever the field and the rays depend on; by default for rays, not for
             cameras. Without gradients rays are rendered in chunks, so that memory does not grow with their number, and

@@ -65,7 +65,6 @@ class Trainer:
         objective: Objective | None = None,
     ) -> None:
         self.model, self.processes = model, Processes.current()
-        self.curve: list[dict[str, float]] = []
         self.diagnostics: Diagnostics | None = None
         self.samples: Samples | None = None
         self.stopping = False  # set by whoever wants `run` to end after the step at hand
@@ -84,6 +83,7 @@ class Trainer:
         self.data = self.objective.tasks(data)
         self.loader = EpisodeLoader(model, self.data, config, self.processes)
         self.validator = Validator(model, self.data, config, self.objective.adapt)
+        self.curve: list[dict[str, float]]
         self.step, self.curve = self.checkpointing.resume(self.loader)
         with other_processes():
             self.processes.agree(model, self.step)

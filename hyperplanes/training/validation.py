@@ -11,6 +11,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.diagnostics import Diagnostics, diagnose, swap_gap
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.network import in_use
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes.episode import Episode, prepare_episode
 from hyperplanes.training.episodes.loader import reads_hull
@@ -65,9 +66,7 @@ class Validator:
         model, episodes = self.model, self._held_out()
         if not episodes:
             return None
-        training = model.training
-        model.eval()
-        try:
+        with in_use(model):
             # adapt to each object and render its query views
             fields = [self.adapt(each.prepared) for each in episodes]
             queries = [each.query for each in episodes]
@@ -78,10 +77,9 @@ class Validator:
             diagnostics = None
             if model.hypernetwork is not None and len(episodes) > 1:
                 prepared = [each.prepared for each in episodes]
-                _, gap = swap_gap(model, prepared, queries, quality)
+                # attenuated fields are no measure of what an update that is not attenuated loses
+                _, gap = swap_gap(model, prepared, queries, None if model.config.judged else quality)
                 diagnostics = replace(diagnose(model, prepared), swap_gap=gap)
-        finally:
-            model.train(training)
         return Validation(quality, samples.ssim, samples, diagnostics)
 
     def _held_out(self) -> list[Episode]:

@@ -118,3 +118,11 @@ def test_what_has_masks_stays_as_it_is(scene):
     views, outlines = scene
     given = Views(views.images, views.cameras, outlines.float())
     assert cut_out_task(Task(given, given), Console()).support is given
+
+
+def test_views_in_double_precision_are_cut_out(scene):
+    photographs, outlines = scene
+    views = photographs.to("cpu", torch.float64)
+    found = separate_background(views).cut_out(views)
+    assert found.masks.dtype == torch.float64
+    assert overlap(found, outlines) > 0.5

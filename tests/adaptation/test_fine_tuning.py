@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from hyperplanes.adaptation import fine_tuning
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
@@ -200,3 +201,14 @@ def test_from_scratch_nothing_that_was_trained_is_used(support):
 def test_settings_that_cannot_be_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         FineTuning(**settings)
+
+
+def test_auto_tries_the_start_that_it_goes_on_from(monkeypatch):
+    shares, made = [], fine_tuning.make_descent
+    monkeypatch.setattr(fine_tuning, "make_descent", lambda *given: shares.append(given[2].fresh) or made(*given))
+    for count in (9, 10, 12):
+        shares.clear()
+        awaken(small_model()).fine_tune(
+            ball_views(ring(count)), "auto", replace(WEIGHTS, max_steps=4, learning_rate=1e-4)
+        )
+        assert set(shares) == {0.5 if count >= 10 else 0.0}

@@ -7,9 +7,10 @@ import pytest
 import torch
 from torch.nn.functional import softplus
 
-from hyperplanes.adaptation import HyperPlanes, ModelConfig, judging
+from hyperplanes.adaptation import AdaptedField, HyperPlanes, ModelConfig, judging
 from hyperplanes.adaptation.fine_tuned import random_model
 from hyperplanes.adaptation.judging import FEWEST, STRENGTHS, judge_strength
+from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.image_based import EMPTY, SOLID
 from hyperplanes.geometry.cameras import centres
@@ -81,7 +82,7 @@ def test_less_is_taken_of_what_was_learned_only_where_it_is_better_by_a_quarter(
     remaining = iter(errors)
     monkeypatch.setattr(Views, "sample_rays", lambda *_, **__: (None, torch.zeros(8, 3)))
     monkeypatch.setattr(
-        judging, "render", lambda *_, **__: SimpleNamespace(colour=torch.full((8, 3), next(remaining) ** 0.5))
+        AdaptedField, "trace", lambda *_, **__: SimpleNamespace(colour=torch.full((8, 3), next(remaining) ** 0.5))
     )
     assert judge_strength(model(), ball_views(ring(6, (24, 24)))) == expected
 
@@ -126,3 +127,12 @@ def test_the_weights_of_one_object_are_not_judged_again():
     cameras = ring(2, (10, 13), shift=1)
     torch.testing.assert_close(again.render(cameras).images, adapted.render(cameras).images, atol=1e-6, rtol=0)
     assert not random_model(adapter.config, 0).config.judged
+
+
+def test_the_control_of_another_objects_update_is_attenuated_as_the_object_is(monkeypatch):
+    adapter, supports = model(), [ball_views(ring(6, (24, 24)), radius=radius) for radius in (0.4, 0.7)]
+    swapped, cameras = Swapped(adapter, supports), ring(1, (24, 24), shift=1)
+    for strength in STRENGTHS:
+        monkeypatch.setattr(judging, "judge_strength", lambda network, support, strength=strength: strength)
+        own, other = (each.adapt(supports[0]).render(cameras).images for each in (adapter, swapped))
+        assert torch.equal(own, other) == (strength == 0.0)  # nothing of what was learned: the same plain hull

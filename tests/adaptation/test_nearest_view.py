@@ -1,12 +1,13 @@
 """Source of truth: the support images themselves, copied; angles between camera directions by hand."""
 
+import pytest
 import torch
 
 from hyperplanes.adaptation import NearestView
 from hyperplanes.geometry.cameras import concatenate, select
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Views
-from tests.reference_rendering import camera_at, ring
+from tests.reference_rendering import ball_views, camera_at, ring
 
 
 def support(count=5, size=(12, 16), bounds=None):
@@ -59,3 +60,8 @@ def test_the_opacity_is_the_mask_of_the_copied_view_and_one_without_masks():
     assert torch.equal(pictures.opacity, masked.masks[order])
     assert torch.equal(pictures.images, plain.images[order])
     assert (NearestView().adapt(plain).render(select(plain.cameras, order)).opacity == 1).all()
+
+
+def test_no_views_are_refused():
+    with pytest.raises(ValueError, match="support: expected at least one view, got none"):
+        NearestView().adapt(ball_views(ring(2))[:0])

@@ -7,8 +7,11 @@ import pytest
 from PIL import Image
 
 from hyperplanes.capture import Settings, capture
+from hyperplanes.capture.packages import stated_threads
 from hyperplanes.capture.photographs import find_photographs, list_photographs, read_upright, without_copies
+from hyperplanes.capture.scene import write_scene
 from hyperplanes.utilities.files import DataError
+from tests.fuzz.published import Published
 
 ORIENTATION, MODEL, EXIF, FOCAL_35 = 0x0112, 0x0110, 0x8769, 0xA405
 
@@ -123,3 +126,41 @@ def test_copies_of_a_file_are_left_out(upright, tmp_path):
 def test_masks_that_nothing_finds_are_refused_before_poses_are_searched_for(tmp_path, mask, said):
     with pytest.raises(ValueError, match=said):
         capture(tmp_path / "nothing", tmp_path / "scene", Settings(mask=mask))
+
+
+@pytest.mark.parametrize(("given", "out"), [("scene", "scene"), ("scene/images", "scene"), ("capture/pictures", ".")])
+def test_a_scene_is_not_written_over_the_photographs_that_it_is_made_of(given, out, upright, tmp_path):
+    for index in range(3):
+        (tmp_path / given).mkdir(parents=True, exist_ok=True)
+        save(upright if index else upright[::-1], tmp_path / given / f"{index}.png")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    with pytest.raises(DataError, match="expected photographs outside of the scene"):
+        capture(tmp_path / given, tmp_path / out)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+
+
+def test_what_lies_beside_the_pictures_of_a_former_scene_stays(tmp_path):
+    model = Published([np.zeros((10, 12, 4), np.uint8)] * 4, np.stack([np.eye(4)] * 4)).sparse_model()
+    names, size = ["0", "1", "2", "3"], [(10, 12)] * 4
+    first = {f"{kind}/{name}.{end}": b"1" for kind, end in (("images", "jpg"), ("masks", "png")) for name in names}
+    write_scene(tmp_path, model, names, size, first)
+    (tmp_path / "images" / "thumbs").mkdir()
+    (tmp_path / "masks" / "notes.txt").write_text("mine")
+    second = {f"images/{name}.jpg": b"2" for name in ["0", "1", "2", "other"]}
+    write_scene(tmp_path, model, ["0", "1", "2", "other"], size, second)
+    left = sorted(
+        str(path.relative_to(tmp_path)) for kind in ("images", "masks") for path in (tmp_path / kind).iterdir()
+    )
+    assert left == sorted([*second, "images/thumbs", "masks/notes.txt"])
+
+
+@pytest.mark.parametrize("wrong", [{"order": "sequnce"}, {"max_size": 0}, {"frames": 2}])
+def test_settings_that_cannot_be_are_refused(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected"):
+        Settings(**wrong)
+
+
+@pytest.mark.parametrize(("stated", "threads"), [("4", 4), ("4,2", 4), ("", 0), ("many", 0)])
+def test_threads_are_those_of_the_environment(stated, threads, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", stated)
+    assert stated_threads() == threads

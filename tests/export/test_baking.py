@@ -140,6 +140,8 @@ def test_wrong_arguments_are_refused(adapted):
         bake(adapted, side=16, directions=4)
     with pytest.raises(ValueError, match="side: expected a multiple of 2 from 8 to 512, got 15"):
         bake(adapted, side=15)
+    with pytest.raises(ValueError, match="side: expected an even number of voxels an axis, got 3"):
+        BakedField(torch.full((3, 3, 3), -1, dtype=torch.int32), torch.zeros(0, 28), Sphere()).save("never")
     empty = AdaptedField(lambda p, d: (torch.zeros_like(p), p.new_zeros(len(p))), full(Sphere(), 16), RayMarching())
     with pytest.raises(ValueError, match="empty everywhere"):
         bake(empty, side=16)

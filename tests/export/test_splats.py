@@ -14,6 +14,7 @@ import trimesh
 from hyperplanes.export.splats import fit_splats, save_splats, splats_of
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.rays import Sphere, pixel_grid
 from hyperplanes.rendering.splats import render_splats, rotations_of
 from hyperplanes.utilities.metrics import psnr
@@ -149,3 +150,11 @@ def test_fitting_brings_back_what_was_taken_away(splats):
     assert float(psnr(fitted.render(CAMERAS), truth).mean()) > before + 5
     assert len(splats.means) / 2 < len(fitted.means) < len(splats.means)
     assert fit_splats(spoilt, Views(truth.clamp(0, 1), CAMERAS), steps=0) is spoilt
+
+
+def test_views_that_cannot_be_fitted_are_refused(splats):
+    views = Views(torch.zeros(6, 3, SIZE, SIZE), CAMERAS)
+    distorted = Views(views.images, DistortedCamera(CAMERAS, torch.zeros(6, 5)))
+    for wrong in (views[:0], distorted):
+        with pytest.raises(ValueError, match="views: expected at least one without lens distortion"):
+            fit_splats(splats, wrong, steps=1)

@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from hyperplanes.geometry.cameras import look_at, pinhole, to
+from hyperplanes.geometry.cameras import look_at, pinhole, select, to
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering import march
-from hyperplanes.rendering.footprint import footprint
+from hyperplanes.rendering.footprint import footprint, pixels_across
 from tests.reference_rendering import camera_at, ring
 
 OFF_CENTRE = Sphere((0.4, -0.3, 0.2), 1.5)
@@ -88,3 +88,8 @@ def test_everything_occupied_is_seen_where_the_cube_is():
 def test_cameras_in_double_precision():
     grid, cameras = blobs(4, 0.3, Sphere()), ring(1)
     assert torch.equal(footprint(grid, cameras), footprint(grid, to(cameras, dtype=torch.float64)))
+
+
+def test_no_cameras_are_refused():
+    with pytest.raises(ValueError, match="cameras"):
+        pixels_across(select(ring(2), []), Sphere())

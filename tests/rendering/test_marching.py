@@ -5,7 +5,7 @@ import torch
 
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
-from hyperplanes.rendering import march
+from hyperplanes.rendering import RayMarching, march
 from hyperplanes.rendering.marching import _walk_compiled, _walk_torch
 from tests.reference_rendering import camera_at, march_ray, some_rays, voxel_is_occupied
 
@@ -106,3 +106,7 @@ def test_only_part_of_a_sphere_is_walked_beyond_it_nothing():
     found = march(rays, full(Sphere(), 4), 0.1)
     points = rays.origins[found.ray] + found.distances[:, None] * rays.directions[found.ray]
     assert (points.abs() <= 1).all()
+
+
+def test_denser_samples_of_pictures_stay_within_what_a_sampler_takes():
+    assert RayMarching(6000).for_rendering(400).steps == 1 << 14

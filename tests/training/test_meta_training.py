@@ -254,3 +254,12 @@ def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not
     plain = replace(given.config, hypernetwork=None)
     with pytest.raises(ValueError, match=expected.format("hypernetwork", "--config .*given/config.yaml")):
         start_training(plain, FAST, Balls(), tmp_path / "other", reference=tmp_path / "given")
+
+
+def test_a_validation_whose_steps_lower_nothing_does_not_end_the_training():
+    model = model_of("mv_meta")
+    with torch.no_grad():
+        model.networks["fine"].density.weight.zero_()
+        model.networks["fine"].density.bias.fill_(-60.0)  # empty, and without a gradient
+    trainer = initialisation_trainer(model, Balls(), replace(FAST, steps=1), None)
+    assert [row.psnr for row in trainer.run()][-1] is not None

@@ -660,3 +660,13 @@ def test_weights_that_are_not_finite_are_not_saved(tmp_path):
     with pytest.raises(ValueError, match=r"training-00000002.*expected finite numbers to save, found NaN .* model\."):
         trainer.save()
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_views_in_double_precision_are_trained_on_as_in_single(tmp_path):
+    class Double(Balls):
+        def task(self, name):
+            task = super().task(name)
+            return replace(task, support=task.support.to(dtype=torch.float64), query=task.query.to(dtype=torch.float64))
+
+    losses = [Trainer(awaken(small_model()), data, replace(FAST, steps=1)).take_step() for data in (Balls(), Double())]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)

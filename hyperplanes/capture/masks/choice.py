@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -11,7 +10,7 @@ from hyperplanes.capture.masks.colour import PlainBackground, is_plain
 from hyperplanes.capture.masks.command import Command
 from hyperplanes.capture.masks.grabcut import GrabCut
 from hyperplanes.capture.masks.network import SalientObject, weights
-from hyperplanes.capture.packages import is_installed
+from hyperplanes.capture.packages import is_installed, stated_threads
 from hyperplanes.capture.sparse_model import SparseModel
 
 __all__ = ["MASKS", "Masker", "check_mask", "choose_masker"]
@@ -73,7 +72,7 @@ def choose_masker(name: str, model: SparseModel, pictures: Sequence[np.ndarray])
         plain = PlainBackground()
         return lambda picture, camera: plain(picture), "colour of the background"
     if name == "network":
-        network = SalientObject(int(os.environ.get("OMP_NUM_THREADS") or 0))
+        network = SalientObject(stated_threads())
         return lambda picture, camera: network(picture), "network"
     if name == "grabcut":
         return GrabCut(model), "GrabCut"

@@ -37,7 +37,7 @@ def refuse_unposed(path: Path) -> None:
             path,
             "camera poses beside the photographs (transforms.json, or a COLMAP model in sparse/0)",
             f"{count} photograph{'s' if count > 1 else ''} and no poses",
-            f"find them: hyperplanes capture {home} --out scene, then give scene",
+            f"find them: hyperplanes capture {home} --out NEW, then give NEW",
         )
 
 

@@ -10,11 +10,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hyperplanes.adaptation.context import SupportContext
+from hyperplanes.adaptation.context import SupportContext, live_pixels
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.compatibility import VOLUME_CHANNELS
 from hyperplanes.geometry.visibility import VisibilityPlanes
-from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.views import Task, Views, join_views
 
@@ -44,7 +43,7 @@ class Episode:
         """Flat indices of the pixels of the planes that look into the hull; None where all are drawn from."""
         if self.live is None:
             return None
-        return footprint(self.prepared.occupancy, self.prepared.views.cameras).flatten().nonzero()[:, 0]
+        return live_pixels(self.prepared.occupancy, self.prepared.views)
 
     @property
     def nbytes(self) -> int:
@@ -73,10 +72,10 @@ def prepare_episode(model: HyperPlanes, task: Task, *, carved: bool = True) -> E
     """
     with prefix_errors(task.name):
         prepared = model.prepare(task.support, carved=carved)
-        query = task.query.to(model.rig.device)
+        query = model.to_own(task.query)
         live = None
         if model.config.sampling.needs_occupancy:
-            live = footprint(prepared.occupancy, query.cameras).flatten().nonzero()[:, 0]
+            live = live_pixels(prepared.occupancy, query)
     return Episode(prepared, query, live)
 
 
