@@ -66,11 +66,9 @@ def fill(text: str, results: Path = RESULTS, page: Path | str = "page") -> str:
         origins: dict[str, list[str]] = {}  # what rows depend on: in which files those are that do
         for source, result in made.items():
             origins.setdefault(_measured(result), []).append(f"{source}.json")
-        if len(origins) > 1:
-            origins = {f"{origin} ({', '.join(files)})": [] for origin, files in origins.items()}
-        measured = "; ".join(origins)
-        measured = f"*{measured[0].upper()}{measured[1:]}.*"
-        return f"{found[1]}{TABLES[name](*made.values()).rstrip()}\n\n{measured}\n{found[3]}"
+        whose = [origin + f" ({', '.join(files)})" * (len(origins) > 1) for origin, files in origins.items()]
+        measured = "; ".join(whose)
+        return f"{found[1]}{TABLES[name](*made.values()).rstrip()}\n\n*{measured}.*\n{found[3]}"
 
     return MARKED.sub(replaced, text)
 
@@ -85,7 +83,7 @@ def _measured(result: Result) -> str:
     """What the rows depend on beside the command: those of quality on the commit alone."""
     if result["benchmark"] in OF_QUALITY:
         commits = dict.fromkeys([result["commit"], *(row["commit"] for row in result["rows"] if "commit" in row)])
-        return f"commit {', '.join(commits)}"
+        return f"Commit {', '.join(commits)}"
     load = result.get("load")
     threads, beside = result["threads"], "not recorded" if load is None else f"{load:.2f} cores"
     machine = f"{result['processor']}, {result['cores']} cores, {threads} thread{'s' if threads > 1 else ''}"
@@ -321,7 +319,7 @@ def _captures(result: Result) -> str:
 WAYS = {
     "damaged": "masks damaged on purpose, as they are",
     "damaged_one_word": "the same, corrected by a hull from which one mask removes a point",
-    "damaged_vote": "the same, corrected by a hull from which several have to, as `capture` does",
+    "damaged_vote": "the same, corrected by a hull from which several masks have to, as `capture` does",
     "learned_background": "no masks, learned background",
     "no_masks": "no masks",
 }

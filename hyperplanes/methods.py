@@ -18,7 +18,7 @@ import torch
 
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Renderable
 from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromScratch, random_model, shuffled
-from hyperplanes.adaptation.fine_tuning import NoProgressError
+from hyperplanes.adaptation.fine_tuning import made_anyway
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
@@ -354,9 +354,4 @@ class Unchecked:
 
     def adapt(self, support: Views) -> Renderable:
         """What the method makes of one object."""
-        try:
-            return self.adapter.adapt(support)
-        except NoProgressError as error:
-            if error.field is None:
-                raise
-            return error.field
+        return made_anyway(lambda: self.adapter.adapt(support))

@@ -113,14 +113,14 @@ def test_a_table_has_the_numbers_of_its_rows_and_the_load_they_were_measured_wit
         {"name": "lookup", "load": load, "policy": "passive", "threads": threads, "seconds": 0.5, "speedup": speedup}
         for load, threads, speedup in (("idle", 1, 1), ("idle", 2, 1.75), ("busy", 1, 1), ("busy", 2, 0.9))
     ]
-    machine = {"benchmark": "busy", "processor": "Processor", "cores": 4, "threads": 2, "load": 0.25}
+    machine = {"benchmark": "busy", "processor": "a processor", "cores": 4, "threads": 2, "load": 0.25}
     machine["commit"] = "abc1234"
     (tmp_path / "busy.json").write_text(json.dumps({**machine, "rows": rows}))
     found = tables.fill("before\n<!-- benchmarks busy -->\nold\n<!-- end -->\nafter", tmp_path)
     assert found.startswith("before\n<!-- benchmarks busy -->\n")
     assert found.endswith("<!-- end -->\nafter")
     assert "| lookup (0.50 s by one thread) | 1.75 | 0.90 |" in found
-    assert "*Processor, 4 cores, 2 threads; commit abc1234; load of other processes: 0.25 cores.*" in found
+    assert "*a processor, 4 cores, 2 threads; commit abc1234; load of other processes: 0.25 cores.*" in found
     assert "old" not in found
     for name, message in (("lookup", "run python -m benchmarks lookup"), ("walking", "correct its marker")):
         with pytest.raises(DataError, match=message):
@@ -147,6 +147,10 @@ def test_tables_of_views_take_the_rows_of_all_suites(tmp_path):
     assert "| cars | +2.50 (+2.0 to +3.0) | +2.50 (+2.0 to +3.0) | - | +2.50 (+2.0 to +3.0) |" in found["views_over"]
     assert "| CC0 cars | 25.5 (23.0) | 27.5 (25.0) | 47.5 (45.0) |" in found["views_summary"]
     assert found["views"].count("*Commit abc1234.*") == 1
+    (tmp_path / "views_posed.json").write_text(json.dumps({**machine, "commit": "def5678", "rows": []}))
+    files = "views_procedural.json, views_cc0.json, views_random.json"
+    found = tables.fill("<!-- benchmarks views -->\n<!-- end -->", tmp_path)
+    assert f"*Commit abc1234 ({files}); Commit def5678 (views_posed.json).*" in found
 
 
 def test_a_process_that_spins_is_a_load():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -19,7 +20,9 @@ from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "make_descent"]
+__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "made_anyway", "make_descent"]
+
+Made = TypeVar("Made")
 
 NEARLY = 0.99  # of the error of an empty picture, which a field that has lost everything may miss by rounding
 
@@ -34,6 +37,23 @@ class NoProgressError(ValueError):
     def __init__(self, message: str, field: AdaptedField | None = None) -> None:
         super().__init__(message)
         self.field = field
+
+
+def made_anyway(make: Callable[[], Made]) -> Made | AdaptedField:
+    """What gradient steps made, even where they lowered nothing.
+
+    Args:
+        make: takes them.
+
+    Raises:
+        NoProgressError: they ended in no numbers.
+    """
+    try:
+        return make()
+    except NoProgressError as error:
+        if error.field is None:
+            raise
+        return error.field
 
 
 def fine_tune(

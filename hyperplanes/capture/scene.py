@@ -83,7 +83,8 @@ def write_scene(
     former = _listed(folder / "transforms.json") - set(files)
     (folder / "transforms.json").unlink(missing_ok=True)
     for name in former:
-        (folder / name).unlink(missing_ok=True)
+        if (folder / name).is_file():
+            (folder / name).unlink()
     for name, data in files.items():
         write_whole(folder / name, data, durable=False)
     write_whole(folder / POINTS, encode_points(model), durable=False)
@@ -109,7 +110,7 @@ def _listed(document: Path) -> set[str]:
         return set()
     entries = [each for each in frames if isinstance(each, dict)] if isinstance(frames, list) else []
     names = [str(each[key]) for each in entries for key in ("file_path", "mask_path") if key in each]
-    return {name for name in names if re.fullmatch(r"(images|masks)/[^/\\]+", name) and ".." not in name}
+    return {name for name in names if re.fullmatch(r"(images|masks)/[^/\\]+", name)}
 
 
 def encode_points(model: SparseModel) -> bytes:

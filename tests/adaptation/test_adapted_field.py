@@ -214,3 +214,13 @@ def test_masks_that_leave_nothing_are_named():
     apart[0, 0, 0, 0] = apart[1, 0, -1, -1] = apart[2, 0, 0, -1] = 1.0
     with pytest.raises(ValueError, match="got 3 of 3 with a pixel set, and no point that all of them may show; check"):
         hull(replace(views, masks=apart, bounds=Sphere(radius=0.3)), 32)
+
+
+@pytest.mark.parametrize("sampling", [RayMarching(60), Hierarchical(24, 24)])
+def test_rays_without_gradients_show_the_same(sampling):
+    field = adapted(sampling)
+    rays, _ = ball_views(ring(2)).sample_rays(300, generator=torch.Generator().manual_seed(0))
+    whole, ended = field.trace(rays), field.trace(rays, differentiable=False)
+    assert ended.samples <= whole.samples
+    assert (ended.samples < whole.samples) == (sampling.stop > 0)
+    torch.testing.assert_close(ended.colour, whole.colour, atol=max(1e-6, sampling.stop), rtol=0)

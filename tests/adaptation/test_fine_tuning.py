@@ -7,12 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import fine_tuning
+from hyperplanes.adaptation import AdaptedField, fine_tuning
+from hyperplanes.adaptation.descent import split_holdout
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning
-from hyperplanes.rendering import Hierarchical
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring, small_model
 
@@ -212,3 +214,17 @@ def test_auto_tries_the_start_that_it_goes_on_from(monkeypatch):
             ball_views(ring(count)), "auto", replace(WEIGHTS, max_steps=4, learning_rate=1e-4)
         )
         assert set(shares) == {0.5 if count >= 10 else 0.0}
+
+
+def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
+    model, support = awaken(small_model()), ball_views(ring(9))
+    shown, holdout = split_holdout(support, WEIGHTS)
+    context = model.prepare(shown)
+    bounds = support.bounds
+    blank = AdaptedField(lambda p, d: (torch.ones_like(p), p.new_zeros(len(p))), full(bounds, 4), RayMarching(24))
+    best = fine_tuning.fine_tune_to(model, context, 60, WEIGHTS)  # better than a few steps
+    stops = [
+        make_descent(model, context, replace(WEIGHTS, max_steps=10), shown)[0].best_stop(holdout, unchanged=unchanged)
+        for unchanged in (blank, best)
+    ]
+    assert stops[0] > stops[1] == 0

@@ -8,16 +8,21 @@ import torch
 from torch.nn.functional import softplus
 
 from hyperplanes.adaptation import AdaptedField, HyperPlanes, ModelConfig, judging
+from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.fine_tuned import random_model
+from hyperplanes.adaptation.fine_tuning import fine_tune
 from hyperplanes.adaptation.judging import FEWEST, STRENGTHS, judge_strength
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.image_based import EMPTY, SOLID
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.rendering import RayMarching
+from hyperplanes.training import TrainingConfig
+from hyperplanes.training.validation import Validator
 from hyperplanes.views import Views
-from tests.reference_rendering import awaken, ball_views, ring
+from tests.reference_rendering import Balls, awaken, ball_views, ring
 
 NETWORK = ImageBasedConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1)
 CONFIG = ModelConfig(
@@ -136,3 +141,32 @@ def test_the_control_of_another_objects_update_is_attenuated_as_the_object_is(mo
         monkeypatch.setattr(judging, "judge_strength", lambda network, support, strength=strength: strength)
         own, other = (each.adapt(supports[0]).render(cameras).images for each in (adapter, swapped))
         assert torch.equal(own, other) == (strength == 0.0)  # nothing of what was learned: the same plain hull
+
+
+def test_the_swap_gap_of_a_validation_compares_fields_that_are_not_attenuated(monkeypatch):
+    adapter, data = model(), Balls(test=2)
+    settings = TrainingConfig(steps=1, tasks=1, rays=8, held_out=2)
+    validator = Validator(adapter, data, settings, adapter.adapt_to)
+    whole = validator.run()
+    monkeypatch.setattr(judging, "judge_strength", lambda network, support: 0.0)
+    attenuated = validator.run()
+    assert attenuated.psnr != whole.psnr
+    assert attenuated.diagnostics.swap_gap == whole.diagnostics.swap_gap
+
+
+def test_auto_compares_steps_with_the_field_that_no_step_returns(monkeypatch):
+    seen, adapter, support = [], model(), ball_views(ring(12, (16, 16)))
+
+    def best_stop(self, holdout, *, unchanged, **given):
+        seen.append((unchanged.render(holdout.cameras).images, self.field(None).render(holdout.cameras).images))
+        return 0
+
+    prepare, shown = adapter.prepare, []
+    monkeypatch.setattr(adapter, "prepare", lambda views, **given: shown.append(views) or prepare(views, **given))
+    monkeypatch.setattr(Descent, "best_stop", best_stop)
+    monkeypatch.setattr(judging, "judge_strength", lambda network, support: 0.5)
+    fine_tune(adapter, support, "auto", FineTuning(rays=8, max_steps=3))
+    ((unchanged, begun),) = seen
+    cameras = split_holdout(support, FineTuning())[1].cameras
+    torch.testing.assert_close(adapter.adapt(shown[0]).render(cameras).images, unchanged, atol=1e-4, rtol=0)
+    assert (begun - unchanged).abs().max() > 0.01  # half of the weights that steps begin with are random
