@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.export import voxel_fitting
 from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.export.voxel_fitting import fit_voxels, render_guide
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
@@ -196,6 +197,19 @@ def test_fitting_brings_back_colours_and_densities(adapted, seen):
     assert after > before + 5
     assert steps == list(range(1, 31))
     assert torch.equal(fitted.index, whole.index)
+
+
+def test_fitting_begins_with_voxels_that_rays_pass_through(adapted, seen, monkeypatch):
+    """Voxels of a ball that is too large: without the bound of depths, what is opaque hides what is behind it."""
+    whole = bake(adapted, side=32)
+    opaque = replace(whole, values=torch.cat([whole.values[:, :1].clamp_min(300.0), whole.values[:, 1:]], 1))
+    others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
+    truth, found = adapted.render(others).images, []
+    for bound in (voxel_fitting.LARGEST_DEPTH, math.inf):
+        monkeypatch.setattr(voxel_fitting, "LARGEST_DEPTH", bound)
+        fitted = fit_voxels(opaque, Views(seen.images, CAMERAS), steps=30, rays=1024)
+        found.append(float(psnr(BakedScene(fitted).render(others).images, truth).mean()))
+    assert found[0] > found[1] + 1
 
 
 def test_a_guide_keeps_what_few_views_do_not_show(adapted, seen):
