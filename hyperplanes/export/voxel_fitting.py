@@ -33,8 +33,8 @@ ENOUGH = 16  # views by which voxels are fitted without a guide
 def render_guide(adapted: AdaptedField, views: Views) -> Views | None:
     """Views of a field from all around the object, as the second source of `fit_voxels` where few views are shown.
 
-    Fitted to a few views alone, voxels show them and little else. Two chairs have 20.6 dB as baked from three views, 18.7
-    fitted, 20.5 with the guide (`python -m benchmarks baked --data data/chairs --counts 3 --objects 2 --query 4`).
+    Fitted to a few views alone, voxels show them and little else. Two chairs have 20.6 dB as baked from three views,
+    18.7 fitted, 20.5 with the guide (`python -m benchmarks baked --data data/chairs --counts 3 --objects 2 --query 4`).
 
     Args:
         adapted: the field that the voxels were baked from.
