@@ -16,8 +16,10 @@ from jaxtyping import Int
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.optimisers import make_optimisers
 from hyperplanes.configuration.fine_tuning import RATES, FineTuning
+from hyperplanes.geometry.rays import Rays
 from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
@@ -26,6 +28,7 @@ from hyperplanes.views import Views
 __all__ = ["Descent", "Variables", "ray_loss", "split_holdout"]
 
 HOLDOUT_RAYS = 4096  # of held-out views that "auto" compares
+PART = 512  # rays of a step whose gradients one thread finds, at most
 CHECKS = 10  # times that it compares them
 
 
@@ -120,15 +123,33 @@ class Descent:
                 rays, truth = views.sample_rays(
                     settings.rays, generator=generator, among=among, near_far=field.sampling.near_far
                 )
-                loss = ray_loss(field.trace(rays, generator), truth)
+                gradients = self._gradients(field, rays, truth, generator)
                 # one step of every optimiser, at the rate of the schedule
-                for tensor in self.tensors:
-                    tensor.grad = None
-                loss.backward()
+                for tensor, gradient in zip(self.tensors, gradients, strict=True):
+                    tensor.grad = gradient
                 for optimiser, rate in zip(optimisers, rates, strict=True):
                     optimiser.param_groups[0]["lr"] = rate * settings.schedule(step, steps)
                     optimiser.step()
             yield step + 1
+
+    def _gradients(
+        self, field: AdaptedField, rays: Rays, truth: Tensor, generator: torch.Generator
+    ) -> Sequence[Tensor | None]:
+        """The gradients of the mean loss of rays, parts of which have a thread and a generator each."""
+        # the graph of a hypernetwork is one for all rays
+        size = PART if self.settings.trainable == "weights" and truth.device.type == "cpu" else len(rays)
+        starts = range(0, len(rays), size)
+        generators = [generator]
+        if len(starts) > 1:
+            seeds = torch.randint(2**62, (len(starts),), generator=generator)
+            generators = [torch.Generator().manual_seed(seed) for seed in seeds.tolist()]
+
+        def loss(index: int) -> Tensor:
+            part = slice(starts[index], starts[index] + size)
+            share = len(truth[part]) / len(truth)
+            return share * ray_loss(field.trace(rays[part], generators[index]), truth[part])
+
+        return summed_gradients(loss, len(starts), self.tensors)[1]
 
     @torch.no_grad()
     def errors(self) -> tuple[float, float]:

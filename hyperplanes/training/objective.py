@@ -6,10 +6,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 from torch.profiler import record_function
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
+from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.parameters import Parameters
@@ -68,18 +70,30 @@ class RenderingObjective(Objective):
 
     def gradients(self, batch: Batch) -> float:
         """Backpropagate the mean over the rendered objects of the sum of the losses."""
-        total, count = torch.zeros(()), len(batch.rendered)
         # the HyperPlanes of all objects in one batch, which batch statistics are taken over (Eq. 7)
         with record_function("step:update"):
             updates = self.model.updates([each.episode.prepared for each in (*batch.rendered, *batch.reference)])
-        for draw, update in zip(batch.rendered, updates[:count], strict=True):
-            output = forward(self.model, draw, update, self.config)
-            for loss in self.losses:
-                total = total + loss(output)
-        with record_function("step:gradients"):
-            (total / count).backward()
         self.updates = [update.detach() for update in updates]
-        return float(total.detach()) / count
+        weights = [value for value in self.model.parameters() if value.requires_grad]
+        leaves = [Parameters((name, value.requires_grad_()) for name, value in each.items()) for each in self.updates]
+
+        def loss(place: int) -> Tensor:
+            output = forward(self.model, batch.rendered[place], leaves[place], self.config)
+            return sum((each(output) for each in self.losses), torch.zeros(())) / len(batch.rendered)
+
+        # back from the rays of each object to theta and to its update, and from all updates through the hypernetwork
+        with record_function("step:objects"):
+            variables = [*weights, *(value for update in leaves for value in update.values())]
+            total, found = summed_gradients(loss, len(batch.rendered), variables)
+        of_weights, of_updates = found[: len(weights)], found[len(weights) :]
+        for value, gradient in zip(weights, of_weights, strict=True):
+            value.grad = gradient
+        with record_function("step:hypernetwork"):
+            written = zip((value for update in updates for value in update.values()), of_updates, strict=True)
+            ends = [(value, gradient) for value, gradient in written if gradient is not None]
+            if ends:  # a hypernetwork wrote something
+                torch.autograd.backward([value for value, _ in ends], [gradient for _, gradient in ends])
+        return float(total)
 
     def adapt(self, prepared: SupportContext) -> AdaptedField:
         """The field of a held-out object, in a single step."""

@@ -237,7 +237,7 @@ def test_rays_come_from_hidden_views_only(among):
     assert len(set.union(*(hidden for hidden, _ in recorder.notes))) > 6  # others in every step
 
 
-@pytest.mark.parametrize(("count", "settings"), [(1, FineTuning()), (12, FineTuning(mask_views=False))])
+@pytest.mark.parametrize(("count", "settings"), [(1, FineTuning(rays=16)), (12, FineTuning(rays=16, mask_views=False))])
 def test_a_single_view_and_who_does_not_want_it_hide_none(count, settings):
     recorder = Recorder(views(count))
     list(recorder.descent(views(count), settings).run(3))

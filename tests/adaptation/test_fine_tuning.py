@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import AdaptedField, fine_tuning
+from hyperplanes.adaptation import descent as descent_module
 from hyperplanes.adaptation.descent import split_holdout
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
@@ -228,3 +229,25 @@ def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
         for unchanged in (blank, best)
     ]
     assert stops[0] > stops[1] == 0
+
+
+def test_parts_of_the_rays_of_a_step_have_the_gradients_of_all_whatever_the_threads(model, support, monkeypatch):
+    monkeypatch.setattr(descent_module, "PART", 12)
+    descent, _ = make_descent(model, model.prepare(support), WEIGHTS)
+    field, (rays, truth) = descent.field(None), support.sample_rays(30, generator=torch.Generator().manual_seed(1))
+    # one loss of the same rays, each part of which takes its samples from a generator of its own
+    seeds = torch.randint(2**62, (3,), generator=torch.Generator().manual_seed(2)).tolist()
+    parts = [(slice(12 * place, 12 * place + 12), seed) for place, seed in enumerate(seeds)]
+    seen = [field.trace(rays[part], torch.Generator().manual_seed(seed)).colour for part, seed in parts]
+    loss = (torch.cat(seen) - truth).square().mean()
+    expected = torch.autograd.grad(loss, descent.tensors, allow_unused=True)
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(descent._gradients(field, rays, truth, torch.Generator().manual_seed(2)))
+    finally:
+        torch.set_num_threads(before)
+    for one, two, whole in zip(*found, expected, strict=True):
+        assert one is two is None if whole is None else torch.equal(one, two)
+        torch.testing.assert_close(one, whole)

@@ -22,6 +22,8 @@ from hyperplanes.geometry import cameras, occupancy
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.training import Trainer, TrainingConfig, train
+from hyperplanes.training.forward import forward
+from hyperplanes.training.losses import losses_of
 from hyperplanes.training.monitoring import TensorBoard
 from hyperplanes.utilities import checkpoints, writing
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
@@ -69,6 +71,32 @@ def trained(trained_once, tmp_path):
 def test_the_loss_falls(parts):
     found = losses(small_model(**parts), with_(steps=24, learning_rate=5e-3, hypernetwork_learning_rate=2e-3))
     assert sum(found[-5:]) < 0.5 * sum(found[:5])
+
+
+@pytest.mark.parametrize("parts", [{}, {"hypernetwork": None}], ids=["hypernetwork", "target alone"])
+def test_gradients_object_by_object_are_those_of_one_loss_of_all(parts):
+    config, found = with_(tasks=3, empty_points=50), []
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            trainer = Trainer(awaken(small_model(**parts)) if not parts else small_model(**parts), Balls(), config)
+            trainer.model.train()
+            loss = trainer.objective.gradients(trainer.loader.batch(0))
+            found.append((loss, {name: value.grad for name, value in trainer.model.named_parameters()}))
+    finally:
+        torch.set_num_threads(before)
+    # the mean over the objects of the sums of their losses, backpropagated at once
+    trainer = Trainer(awaken(small_model(**parts)) if not parts else small_model(**parts), Balls(), config)
+    model, batch = trainer.model.train(), trainer.loader.batch(0)
+    updates = model.updates([each.episode.prepared for each in (*batch.rendered, *batch.reference)])
+    outputs = [forward(model, draw, update, config) for draw, update in zip(batch.rendered, updates, strict=False)]
+    expected = torch.stack([each(output) for output in outputs for each in losses_of(config)]).sum() / 3
+    expected.backward()
+    for loss, gradients in found:
+        assert loss == pytest.approx(float(expected.detach()))
+        for name, value in model.named_parameters():
+            torch.testing.assert_close(gradients[name], value.grad)
 
 
 def test_the_same_seed_makes_the_same_curve_and_the_same_weights():

@@ -1,0 +1,51 @@
+"""Gradients of a loss that is a sum over parts, each part forward and backward by one thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from hyperplanes.geometry.kernels.threads import parallel_map
+
+__all__ = ["summed_gradients"]
+
+
+def summed_gradients(
+    loss: Callable[[int], Tensor], parts: int, variables: Sequence[Tensor]
+) -> tuple[Tensor, list[Tensor | None]]:
+    """The sum of the losses of some parts, and its gradients.
+
+    On the CPU each part runs on one thread, forward and backward: threads that share an operation wait for each other
+    after each, which takes longer than the operation where other processes keep a core busy. The parts are added in
+    their order, so that the result does not depend on the number of threads.
+
+    Args:
+        loss: of one part, by its index; called by several threads at once. No two parts share a graph that begins
+            before this call, since each is freed after its backward pass.
+        parts: how many there are.
+        variables: leaves of the graphs.
+
+    Returns:
+        The sum, without its history, and a gradient for every variable; None where no part depends on it.
+
+    >>> x = torch.tensor([1.0, 2.0], requires_grad=True)
+    >>> summed_gradients(lambda part: x[part] ** 2, 2, [x])
+    (tensor(5.), [tensor([2., 4.])])
+    """
+
+    @torch.enable_grad()
+    def of_part(part: int) -> tuple[Tensor, Sequence[Tensor | None]]:
+        value = loss(part)
+        return value.detach(), torch.autograd.grad(value, variables, allow_unused=True)
+
+    run = parallel_map if all(value.device.type == "cpu" for value in variables) else map
+    values, gradients = zip(*run(of_part, range(parts)), strict=True)
+    return torch.stack(values).sum(), [_sum(found) for found in zip(*gradients, strict=True)]
+
+
+def _sum(gradients: Sequence[Tensor | None]) -> Tensor | None:
+    """The sum of those that there are."""
+    found = [each for each in gradients if each is not None]
+    return sum(found[1:], found[0]) if found else None
