@@ -43,6 +43,7 @@ MORE = {"baked": ["--objects", "2", "--query", "4", "--counts", "25", "3"]}
 """Options of those beside --data."""
 
 _TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", "--methods", "nearest_view", "hull_blend"]
+_TUNED = ["--query", "2", "--steps", "100", "--methods", "hull_blend"]
 OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_procedural": (["procedural"], _TEN),
     "views_cc0": (["cc0"], _TEN),
@@ -53,10 +54,8 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     ),
     "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "5"]),
     "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "5"]),
-    "views_tuned": (
-        ["cc0", "random", "posed", "procedural"],
-        ["--objects", "1", "--query", "2", "--counts", "25", "--steps", "100", "--methods", "hull_blend"],
-    ),
+    "views_tuned_3": (["procedural", "cc0", "random", "posed"], ["--objects", "5", "--counts", "3", *_TUNED]),
+    "views_tuned": (["procedural", "cc0", "random", "posed"], ["--objects", "3", "--counts", "25", *_TUNED]),
 }
 """Results of `views` by suites below --root, and its options, in place of `views` by --data."""
 

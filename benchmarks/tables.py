@@ -226,6 +226,7 @@ NAMES = {
     "cars": "cars",
     "chairs": "chairs",
     "planes": "planes",
+    "spacecraft": "spacecraft",
     "lamps": "lamps",
     "random-unseen": "compositions of random shapes",
     "chair": "the Blender chair",
@@ -294,8 +295,8 @@ def _views_summary(*results: Result) -> str:
     return _table_of_views(list(SUMMARY), lines)
 
 
-def _views_tuned(result: Result) -> str:
-    found, counts = _of_views((result,))
+def _views_tuned(*results: Result) -> str:
+    found, counts = _of_views(results)
     lines = []
     for name, rows in found.items():
         for count in counts:
@@ -343,6 +344,7 @@ SOURCES = {
     "views": OF_VIEWS,
     "views_over": OF_VIEWS,
     "views_srn": ("views_srn", "views_srn_2"),
+    "views_tuned": ("views_tuned_3", "views_tuned"),
     "views_summary": OF_VIEWS,
 }
 """Files of rows of tables that are not made of the file of their name."""
