@@ -149,7 +149,7 @@ class Descent:
             share = len(truth[part]) / len(truth)
             return share * ray_loss(field.trace(rays[part], generators[index]), truth[part])
 
-        return summed_gradients(loss, len(starts), self.tensors)[1]
+        return summed_gradients(loss, len(starts), self.tensors, thread_safe=field.thread_safe)[1]
 
     @torch.no_grad()
     def errors(self) -> tuple[float, float]:

@@ -13,7 +13,7 @@ __all__ = ["summed_gradients"]
 
 
 def summed_gradients(
-    loss: Callable[[int], Tensor], parts: int, variables: Sequence[Tensor]
+    loss: Callable[[int], Tensor], parts: int, variables: Sequence[Tensor], *, thread_safe: bool = True
 ) -> tuple[Tensor, list[Tensor | None]]:
     """The sum of the losses of some parts, and its gradients.
 
@@ -22,10 +22,11 @@ def summed_gradients(
     their order, so that the result does not depend on the number of threads.
 
     Args:
-        loss: of one part, by its index; called by several threads at once. No two parts share a graph that begins
-            before this call, since each is freed after its backward pass.
+        loss: of one part, by its index. No two parts share a graph that begins before this call, since each is freed
+            after its backward pass.
         parts: how many there are.
         variables: leaves of the graphs.
+        thread_safe: several threads may call `loss` at once.
 
     Returns:
         The sum, without its history, and a gradient for every variable; None where no part depends on it.
@@ -40,7 +41,7 @@ def summed_gradients(
         value = loss(part)
         return value.detach(), torch.autograd.grad(value, variables, allow_unused=True)
 
-    run = parallel_map if all(value.device.type == "cpu" for value in variables) else map
+    run = parallel_map if thread_safe and all(value.device.type == "cpu" for value in variables) else map
     values, gradients = zip(*run(of_part, range(parts)), strict=True)
     return torch.stack(values).sum(), [_sum(found) for found in zip(*gradients, strict=True)]
 

@@ -84,7 +84,8 @@ class RenderingObjective(Objective):
         # back from the rays of each object to theta and to its update, and from all updates through the hypernetwork
         with record_function("step:objects"):
             variables = [*weights, *(value for update in leaves for value in update.values())]
-            total, found = summed_gradients(loss, len(batch.rendered), variables)
+            shared = self.model.field(batch.rendered[0].episode.prepared, self.model.theta).thread_safe
+            total, found = summed_gradients(loss, len(batch.rendered), variables, thread_safe=shared)
         of_weights, of_updates = found[: len(weights)], found[len(weights) :]
         for value, gradient in zip(weights, of_weights, strict=True):
             value.grad = gradient

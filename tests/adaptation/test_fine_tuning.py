@@ -2,6 +2,7 @@
 a loss that falls on the support views.
 """
 
+import threading
 from dataclasses import replace
 
 import pytest
@@ -9,11 +10,12 @@ import torch
 
 from hyperplanes.adaptation import AdaptedField, fine_tuning
 from hyperplanes.adaptation import descent as descent_module
-from hyperplanes.adaptation.descent import split_holdout
+from hyperplanes.adaptation.descent import ray_loss, split_holdout
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.fields.base import Field
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.utilities.metrics import psnr
@@ -251,3 +253,25 @@ def test_parts_of_the_rays_of_a_step_have_the_gradients_of_all_whatever_the_thre
     for one, two, whole in zip(*found, expected, strict=True):
         assert one is two is None if whole is None else torch.equal(one, two)
         torch.testing.assert_close(one, whole)
+
+
+def test_a_field_that_is_not_thread_safe_is_called_by_one_thread(model, support, monkeypatch):
+    monkeypatch.setattr(descent_module, "PART", 16)
+    descent, _ = make_descent(model, model.prepare(support), WEIGHTS)
+    rays, truth = support.sample_rays(64, generator=torch.Generator().manual_seed(1))
+    before, found = torch.get_num_threads(), {True: set(), False: set()}
+    try:
+        torch.set_num_threads(2)
+        for safe, callers in found.items():
+
+            def noting(seen, truth, callers=callers):
+                callers.add(threading.get_ident())
+                return ray_loss(seen, truth)
+
+            monkeypatch.setattr(Field, "thread_safe", safe)
+            monkeypatch.setattr(descent_module, "ray_loss", noting)
+            descent._gradients(descent.field(None), rays, truth, torch.Generator())
+    finally:
+        torch.set_num_threads(before)
+    assert found[False] == {threading.get_ident()}
+    assert threading.get_ident() not in found[True]
