@@ -104,9 +104,14 @@ def compare(name: str, chosen: Preset, objects: Objects, steps: int) -> list[Row
 
 
 def step_parts(name: str, trained: Trainer) -> list[Row]:
-    """Seconds of the parts of one step."""
-    with torch.profiler.profile(record_shapes=False) as profiler:
-        trained.take_step()
+    """Seconds of the parts of one step, by one thread: the profiler sees no other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.profiler.profile(record_shapes=False) as profiler:
+            trained.take_step()
+    finally:
+        torch.set_num_threads(threads)
     return [
         {
             "name": f"part of a step, {name}: {event.key.removeprefix('step:')}",

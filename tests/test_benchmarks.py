@@ -17,8 +17,9 @@ from small_demo import demo_folder
 from benchmarks import __main__ as benchmarks_main
 from benchmarks import all as all_benchmarks
 from benchmarks import image_based, tables, views
+from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.training import Trainer
+from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.utilities.files import DataError
 from tests.reference_rendering import Balls
 from tests.training.test_volume_loss import MODEL
@@ -63,6 +64,20 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     assert views.main([*options, "--json", str(tmp_path / "rows.json")]) == 0
     rows = [(row["views"], row["name"]) for row in json.loads((tmp_path / "rows.json").read_text())["rows"]]
     assert rows == [(1, "one_step"), (2, "one_step"), (2, "1_steps"), (2, "scratch_1")]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_parts_of_a_step_are_those_that_its_table_names(threads):
+    trainer = Trainer(HyperPlanes(MODEL), Balls(), TrainingConfig(tasks=2, rays=16, views=(1, 3)))
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        found = {row["name"].removeprefix("part of a step, ours: "): row for row in step_parts("ours", trainer)}
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert found.keys() >= tables.PARTS.keys()
+    assert all(found[part]["seconds"] > 0 for part in tables.PARTS)
 
 
 @pytest.mark.parametrize("name", benchmarks_main.OF_SPEED)

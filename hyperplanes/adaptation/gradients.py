@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.profiler import record_function
 
 from hyperplanes.geometry.kernels.threads import parallel_map
 
@@ -17,9 +18,9 @@ def summed_gradients(
 ) -> tuple[Tensor, list[Tensor | None]]:
     """The sum of the losses of some parts, and its gradients.
 
-    On the CPU each part runs on one thread, forward and backward: threads that share an operation wait for each other
-    after each, which takes longer than the operation where other processes keep a core busy. The parts are added in
-    their order, so that the result does not depend on the number of threads.
+    On the CPU each part runs on one thread, forward and backward. Two threads that share every operation are slower
+    than one where other processes keep the cores busy; with a part each they are not (`python -m benchmarks busy`). The
+    parts are added in their order, so that the result does not depend on the number of threads.
 
     Args:
         loss: of one part, by its index. No two parts share a graph that begins before this call, since each is freed
@@ -39,7 +40,8 @@ def summed_gradients(
     @torch.enable_grad()
     def of_part(part: int) -> tuple[Tensor, Sequence[Tensor | None]]:
         value = loss(part)
-        return value.detach(), torch.autograd.grad(value, variables, allow_unused=True)
+        with record_function("step:gradients"):
+            return value.detach(), torch.autograd.grad(value, variables, allow_unused=True)
 
     run = parallel_map if thread_safe and all(value.device.type == "cpu" for value in variables) else map
     values, gradients = zip(*run(of_part, range(parts)), strict=True)

@@ -76,23 +76,23 @@ class RenderingObjective(Objective):
         self.updates = [update.detach() for update in updates]
         weights = [value for value in self.model.parameters() if value.requires_grad]
         leaves = [Parameters((name, value.requires_grad_()) for name, value in each.items()) for each in self.updates]
+        thread_safe = self.model.field(batch.rendered[0].episode.prepared, self.model.theta).thread_safe
 
         def loss(place: int) -> Tensor:
             output = forward(self.model, batch.rendered[place], leaves[place], self.config)
             return sum((each(output) for each in self.losses), torch.zeros(())) / len(batch.rendered)
 
-        # back from the rays of each object to theta and to its update, and from all updates through the hypernetwork
-        with record_function("step:objects"):
-            variables = [*weights, *(value for update in leaves for value in update.values())]
-            shared = self.model.field(batch.rendered[0].episode.prepared, self.model.theta).thread_safe
-            total, found = summed_gradients(loss, len(batch.rendered), variables, thread_safe=shared)
+        # back from the rays of each object to theta and to its update
+        variables = [*weights, *(value for update in leaves for value in update.values())]
+        total, found = summed_gradients(loss, len(batch.rendered), variables, thread_safe=thread_safe)
         of_weights, of_updates = found[: len(weights)], found[len(weights) :]
         for value, gradient in zip(weights, of_weights, strict=True):
             value.grad = gradient
-        with record_function("step:hypernetwork"):
-            written = zip((value for update in updates for value in update.values()), of_updates, strict=True)
-            ends = [(value, gradient) for value, gradient in written if gradient is not None]
-            if ends:  # a hypernetwork wrote something
+        # and from all updates, if a hypernetwork wrote any, through it
+        written = zip((value for update in updates for value in update.values()), of_updates, strict=True)
+        ends = [(value, gradient) for value, gradient in written if gradient is not None]
+        if ends:
+            with record_function("step:gradients"):
                 torch.autograd.backward([value for value, _ in ends], [gradient for _, gradient in ends])
         return float(total)
 

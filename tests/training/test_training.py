@@ -18,10 +18,11 @@ from PIL import Image
 from hyperplanes.adaptation import Diagnostics, HyperPlanes, base, diagnose
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.train import follow
+from hyperplanes.fields.base import Field
 from hyperplanes.geometry import cameras, occupancy
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical, RayMarching
-from hyperplanes.training import Trainer, TrainingConfig, train
+from hyperplanes.training import Trainer, TrainingConfig, objective, train
 from hyperplanes.training.forward import forward
 from hyperplanes.training.losses import losses_of
 from hyperplanes.training.monitoring import TensorBoard
@@ -30,6 +31,7 @@ from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.interrupts import HungUp, Terminated
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, awaken, small_model
+from tests.training.test_volume_loss import MODEL
 
 FAST = TrainingConfig(steps=6, tasks=2, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
 
@@ -73,21 +75,34 @@ def test_the_loss_falls(parts):
     assert sum(found[-5:]) < 0.5 * sum(found[:5])
 
 
-@pytest.mark.parametrize("parts", [{}, {"hypernetwork": None}], ids=["hypernetwork", "target alone"])
-def test_gradients_object_by_object_are_those_of_one_loss_of_all(parts):
-    config, found = with_(tasks=3, empty_points=50), []
-    before = torch.get_num_threads()
+@pytest.mark.parametrize(
+    ("make", "training"),
+    [
+        (lambda: awaken(small_model()), {}),
+        (lambda: small_model(hypernetwork=None), {}),
+        (lambda: awaken(HyperPlanes(MODEL)), {"views": (1, 3), "volume_loss": 0.1}),
+    ],
+    ids=["hypernetwork", "target alone", "volumes"],
+)
+def test_gradients_object_by_object_are_those_of_one_loss_of_all(make, training):
+    config = with_(tasks=3, empty_points=50, **training)
+
+    def begun():
+        torch.manual_seed(0)  # of what lets the hypernetwork say something
+        return Trainer(make(), Balls(), config)
+
+    before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            trainer = Trainer(awaken(small_model(**parts)) if not parts else small_model(**parts), Balls(), config)
+            trainer = begun()
             trainer.model.train()
             loss = trainer.objective.gradients(trainer.loader.batch(0))
             found.append((loss, {name: value.grad for name, value in trainer.model.named_parameters()}))
     finally:
         torch.set_num_threads(before)
     # the mean over the objects of the sums of their losses, backpropagated at once
-    trainer = Trainer(awaken(small_model(**parts)) if not parts else small_model(**parts), Balls(), config)
+    trainer = begun()
     model, batch = trainer.model.train(), trainer.loader.batch(0)
     updates = model.updates([each.episode.prepared for each in (*batch.rendered, *batch.reference)])
     outputs = [forward(model, draw, update, config) for draw, update in zip(batch.rendered, updates, strict=False)]
@@ -97,6 +112,26 @@ def test_gradients_object_by_object_are_those_of_one_loss_of_all(parts):
         assert loss == pytest.approx(float(expected.detach()))
         for name, value in model.named_parameters():
             torch.testing.assert_close(gradients[name], value.grad)
+
+
+@pytest.mark.parametrize("safe", [True, False])
+def test_objects_have_threads_of_their_own_where_the_field_is_thread_safe(safe, monkeypatch):
+    trainer, callers = Trainer(small_model(), Balls(), with_(tasks=2)), set()
+
+    def noting(*given):
+        callers.add(threading.get_ident())
+        return forward(*given)
+
+    monkeypatch.setattr(Field, "thread_safe", safe)
+    monkeypatch.setattr(objective, "forward", noting)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        trainer.take_step()
+    finally:
+        torch.set_num_threads(before)
+    here = threading.get_ident()
+    assert here not in callers if safe else callers == {here}
 
 
 def test_the_same_seed_makes_the_same_curve_and_the_same_weights():
