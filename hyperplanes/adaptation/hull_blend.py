@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -10,9 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, hull
-from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
@@ -20,7 +19,6 @@ from hyperplanes.views import Views
 __all__ = ["HullBlend"]
 
 OPAQUE = 1e4  # density within the hull, per radius of the scene
-WHOLE = 0.98  # opacity of a mask from which on no background is mixed into the colour
 STOP = 2e-3  # transmittance; so low that every sample is evaluated: by every second one wings lose 0.05 to 0.5 dB
 SOLID = 0.5  # opacity of a mask from which on a pixel shows the object
 
@@ -30,14 +28,13 @@ class HullBlend:
     """The visual hull of the support masks is the surface, and its colour that of the support views that see it.
 
     A point lies in the hull where no view that shows it has background there. Its colour is a mean of the `nearest` of
-    the support views that see it, by the angle between the direction of view and theirs: one at angle a weighs
-    1 / a - 1 / a_max, a_max being the angle of the next one (Buehler et al. 2001, "Unstructured Lumigraph Rendering").
-    A view sees a point in front of which no part of the hull lies and where its mask is whole, so that no background is
-    mixed into the colour. Where fewer views see the point, the nearest of the others serve.
+    the support views that see it, by the weights of the unstructured lumigraph (`VisibilityPlanes.blended`). A view
+    sees a point in front of which no part of the hull lies and where its mask is whole, so that no background is mixed
+    into the colour. Where fewer views see the point, the nearest of the others serve.
 
     Attributes:
         nearest: number of views that a colour is made of.
-        side: voxels an axis of the hull in which rays march.
+        side: voxels an axis of the hull in which rays march, and by which views are said to see a point.
         steps: samples along a diameter of the scene.
     """
 
@@ -48,82 +45,66 @@ class HullBlend:
     @checked
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The hull and its colours; the distance of the hull is rendered once for every support view.
+        """The hull and its colours.
 
         Raises:
             ValueError: views without masks, or masks that leave nothing.
         """
         if support.masks is None:
             raise ValueError("hull_blend: expected support views with masks, got none; images with alpha have them")
-        support, alpha = support.to(dtype=torch.float32), support.masks.float()
-        masks = ImagePlanes(alpha.expand(-1, 3, -1, -1), support.cameras, background=1.0)
-        region, sampling = hull(support, self.side), RayMarching(self.steps, STOP)
-        shape = _Hull(masks, support.bounds)
-        solid = AdaptedField(shape, region, sampling, densities=(shape.density,))
-        distance = solid.render(support.cameras, antialias=False).depth
-        distance = torch.where(distance > 0, distance, torch.inf).expand(-1, 3, -1, -1)
-        eyes = camera.centres(support.cameras)
-        far = 2 * float((eyes - eyes.new_tensor(support.bounds.centre)).norm(dim=1).max() + support.bounds.radius)
-        depths = ImagePlanes(distance.clamp_max(far).contiguous(), support.cameras, background=far, exact=True)
-        colours = ImagePlanes(support.images, support.cameras)
-        tolerance = 2 * region.voxel
-        field = _Blend(masks, support.bounds, colours, depths, min(self.nearest, len(support)), tolerance)
-        return AdaptedField(field, region, sampling, densities=(shape.density,))
+        support = support.to(dtype=torch.float32)
+        region = hull(support, self.side)
+        field = _Blend(
+            VisibilityPlanes(support.images, support.cameras, support.masks, region), support.bounds, self.nearest
+        )
+        # the voxels of which masks were carved away hold no part of the hull at their centre: what is left is its
+        # surface as views see it, without bias towards them
+        carved = AdaptedField(field, region, RayMarching(self.steps, STOP), densities=(field.density,))
+        voxels = carved.refined_occupancy
+        field = replace(field, planes=field.planes.with_surface(voxels.solid()))
+        return replace(carved, field=field, densities=(field.density,), refined=voxels)
 
 
 @dataclass(frozen=True)
-class _Hull:
-    """The visual hull as an opaque grey field."""
+class _HullPoints:
+    """Points, and their density."""
 
-    masks: ImagePlanes
+    points: Float[Tensor, "point 3"]
+    density: Float[Tensor, " point"]
+
+    def __getitem__(self, index: slice | Tensor) -> _HullPoints:
+        return _HullPoints(self.points[index], self.density[index])
+
+
+@dataclass(frozen=True)
+class _Blend:
+    """The visual hull as an opaque field, in the colours of the support views."""
+
+    planes: VisibilityPlanes
     bounds: Sphere
+    nearest: int
 
     thread_safe: ClassVar[bool] = True
 
+    def __call__(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
+        """The blended colours, and the density."""
+        return self.planes.blended(points, directions, self.nearest), self.density(points)
+
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """High where every view that shows a point shows the object there, else 0."""
-        found = self.masks.lookup(points)
-        background = (found.colours[..., 0] < SOLID) & found.valid
-        return torch.where(background.any(1), 0.0, OPAQUE / self.bounds.radius)
+        coverage = self.planes.choose(points, best=1).coverage
+        return torch.where(coverage < SOLID, 0.0, OPAQUE / self.bounds.radius)
 
-    def __call__(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
-        """Grey, and the density."""
-        return torch.full_like(points, 0.5), self.density(points)
+    def hidden(self, points: Float[Tensor, "point 3"]) -> _HullPoints:
+        """All that is expensive about the density of a point."""
+        return _HullPoints(points, self.density(points))
 
+    def density_of(self, hidden: _HullPoints) -> Float[Tensor, " point"]:
+        """The density."""
+        return hidden.density
 
-@dataclass(frozen=True)
-class _Blend(_Hull):
-    """The hull in the colours of the support views."""
-
-    colours: ImagePlanes
-    depths: ImagePlanes
-    nearest: int
-    tolerance: float
-
-    def __call__(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
-        """The blended colours, computed where there is density, and the density."""
-        density = self.density(points)
-        inside = density > 0
-        colour = torch.ones_like(points)
-        colour[inside] = self._blended(points[inside], directions[inside])
-        return colour, density
-
-    def _blended(self, points: Tensor, directions: Tensor) -> Tensor:
-        seen = self.colours.lookup(points, return_directions=True)
-        assert seen.directions is not None
-        assert seen.distances is not None
-        angle = torch.acos((seen.directions * directions[:, None]).sum(-1).clamp(-1, 1)).clamp_min(1e-3)
-        depth = self.depths.lookup(points).colours[..., 0]
-        covered = self.masks.lookup(points).colours[..., 0]
-        hidden = (seen.distances > depth + self.tolerance) | (covered < WHOLE) | ~seen.valid
-        penalty = angle + 10 * hidden  # views that see the point go first
-        chosen, index = penalty.topk(min(self.nearest + 1, penalty.shape[1]), largest=False)
-        limit = chosen[:, -1:] if chosen.shape[1] > self.nearest else chosen[:, -1:] * 2
-        chosen, index = chosen[:, : self.nearest], index[:, : self.nearest]
-        weights = (1 / chosen - 1 / limit).clamp_min(1e-6)
-        weights = weights / weights.sum(1, keepdim=True)
-        return (weights[..., None] * seen.colours.gather(1, index[..., None].expand(-1, -1, 3))).sum(1)
+    def colour_of(self, hidden: _HullPoints, directions: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """The blended colours."""
+        return self.planes.blended(hidden.points, directions, self.nearest)

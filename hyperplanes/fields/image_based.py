@@ -7,7 +7,6 @@ number nor their order is built into its weights. The colour is a blend of what 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +23,7 @@ from hyperplanes.fields.rig import Rig, camera_directions
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.visibility import ANGLE, ChosenViews, Described, Reading, Visibility, VisibilityPlanes
+from hyperplanes.geometry.visibility import ChosenViews, Described, Reading, Visibility, VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
@@ -32,7 +31,6 @@ from hyperplanes.views import Views
 
 __all__ = ["ImageBasedConfig", "ImageBasedField", "ImageBasedNeRF", "FeatureGrid"]
 
-SMALLEST_ANGLE = 1e-2
 FALLOFF = 8.0  # of depths behind the hull, in 1 / radii, where tanh makes them inputs
 VOXELS_PER_PIXEL = 3 / 4  # of a side of the pictures: 96 voxels for 128 pixels, as the preset "small" is trained
 FINEST_HULL = 192
@@ -260,10 +258,7 @@ class ImageBasedField(Field):
     @property
     def _reading(self) -> Reading:
         config = self.target.config
-        return Reading(
-            config.planes, config.blended, config.point_frequencies, config.direction_frequencies, FALLOFF,
-            SMALLEST_ANGLE,
-        )  # fmt: skip
+        return Reading(config.planes, config.blended, config.point_frequencies, config.direction_frequencies, FALLOFF)
 
     def _is_described(self, points: Tensor) -> bool:
         """Whether one kernel writes what the network reads; not of fields that read something else."""
@@ -342,23 +337,18 @@ class ImageBasedField(Field):
     ) -> Float[Tensor, "point 3"]:
         """A blend of the colours of the views nearest to the direction that see the point, and a shift of it.
 
-        As in the unstructured lumigraph a view at angle a has the weight 1 / a - 1 / a_max, a_max being the angle of
-        the next view; the network multiplies these weights and shifts the logit of the result.
+        The network multiplies the weights of the unstructured lumigraph (`ChosenViews.lumigraph_weights`), and shifts
+        the logit of the result.
         """
         config, near = self.target.config, visibility.nearest
         assert near is not None
-        # the angle between the direction and each view's ray, more where the view does not see the point: (point, view)
-        angle = torch.acos((near.directions * directions[:, None]).sum(-1).clamp(-1 + 1e-6, 1 - 1e-6))
-        score = (angle + ANGLE * near.penalty.clamp_min(0)).clamp_min(SMALLEST_ANGLE)
-        # weights that fall to zero at the next view, so that the blend is continuous where it changes
-        count = min(config.blended, len(self.planes))
-        farthest = score[:, count:] if len(self.planes) > count else 2 * score[:, count - 1 :]
-        weights = (1 / score[:, :count] - 1 / (1.01 * farthest)).clamp_min(1e-6)
-        seen = ChosenViews(*(getattr(near, each.name)[:, :count] for each in dataclasses.fields(near)))
+        count, angles = min(config.blended, len(self.planes)), near.angles(directions)
+        weights = near.lumigraph_weights(angles, count)
+        seen = near.first(count)
         colours, valid = _of(shown, seen.views), seen.valid[..., None]  # (point, blended, 3), (point, blended, 1)
 
         # what the head reads: the trunk's features, the encoded direction, what each of these views shows
-        slots = torch.cat([(2 * colours - 1) * valid, angle[:, :count, None] * valid, _described(seen)], -1)
+        slots = torch.cat([(2 * colours - 1) * valid, angles[:, :count, None] * valid, _described(seen)], -1)
         along = encode(directions, config.direction_frequencies)
         value = self.viewed(hidden, torch.cat([along, _padded(slots, config.blended).flatten(1)], 1))
         return self._blend(value, weights.log(), colours)

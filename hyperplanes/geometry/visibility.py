@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -40,6 +40,7 @@ WHOLE = 0.98  # opacity of a mask from which on it counts as whole
 UNSEEN = 8.0  # penalty of a view that does not show the point
 FADING = 10.0  # of the weights of views, with their penalty
 ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
+SMALLEST_ANGLE = 1e-2  # between a view and a direction, in radians: nearer ones count as that far
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,33 @@ class ChosenViews:
         weights = torch.exp(-FADING * self.penalty.clamp_min(0)) * self.valid
         return weights / weights.sum(1, keepdim=True).clamp_min(1e-6)
 
+    def first(self, count: int) -> ChosenViews:
+        """The first of the views.
+
+        Args:
+            count: how many; all where there are fewer.
+        """
+        return ChosenViews(*(getattr(self, each.name)[:, :count] for each in fields(self)))
+
+    def angles(self, directions: Float[Tensor, "point 3"]) -> Float[Tensor, "point chosen"]:
+        """Between a direction at each point and the ray of each view, in radians."""
+        return torch.acos((self.directions * directions[:, None]).sum(-1).clamp(-1 + 1e-6, 1 - 1e-6))
+
+    def lumigraph_weights(self, angles: Float[Tensor, "point chosen"], count: int) -> Float[Tensor, "point blended"]:
+        """Weights of the first views in a blend of their colours; not normalised.
+
+        A view at angle a has the weight 1 / a - 1 / a_max, a_max being the angle of the next view, so that the blend
+        changes continuously with the direction (Buehler et al. 2001, "Unstructured Lumigraph Rendering"). A view that
+        does not see the point counts as one at a greater angle.
+
+        Args:
+            angles: of `angles`.
+            count: how many views are blended.
+        """
+        score = (angles + ANGLE * self.penalty.clamp_min(0)).clamp_min(SMALLEST_ANGLE)
+        farthest = score[:, count : count + 1] if score.shape[1] > count else 2 * score[:, -1:]
+        return (1 / score[:, :count] - 1 / (1.01 * farthest)).clamp_min(1e-6)
+
 
 @dataclass(frozen=True)
 class Visibility:
@@ -100,7 +128,6 @@ class Reading:
         point_frequencies: of the encoded point.
         direction_frequencies: of the encoded direction.
         falloff: of depths behind the hull, in 1 / radii, where tanh makes them inputs.
-        smallest_angle: between a view and a direction, in radians: nearer ones count as that far.
     """
 
     best: int
@@ -108,7 +135,6 @@ class Reading:
     point_frequencies: int
     direction_frequencies: int
     falloff: float
-    smallest_angle: float
 
     @property
     def row_size(self) -> int:
@@ -266,6 +292,28 @@ class VisibilityPlanes:
         chosen = [ChosenViews(each, *_split(value)) for each, value in zip(views, values, strict=True)]
         return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
 
+    def blended(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], nearest: int
+    ) -> Float[Tensor, "point 3"]:
+        """The mean of the colours of the views nearest to a direction that see the point (`lumigraph_weights`).
+
+        Args:
+            points: in the world.
+            directions: unit vectors along which the points are seen.
+            nearest: how many views, at most all.
+        """
+        if self.can_describe(points):
+            near = self.describe(points, directions, Reading(0, nearest, 0, 0, 0.0), self.occupancy.bounds)
+            weights, colours = near.near_weights.softmax(1), near.near_colours
+        else:
+            seen = self.choose(points, directions, best=1, nearest=nearest).nearest
+            assert seen is not None
+            weights = seen.lumigraph_weights(seen.angles(directions), min(nearest, len(self)))
+            weights = weights / weights.sum(1, keepdim=True)
+            colours = self.colours.lookup(points).colours
+            colours = colours.gather(1, seen.first(nearest).views[..., None].expand(-1, -1, 3))
+        return (weights[..., None] * colours).sum(1)
+
     def can_describe(self, points: Float[Tensor, "point 3"]) -> bool:
         """Whether `describe` takes these points: those that the kernels take, where no gradient goes through them."""
         given = (points, *(getattr(self.colours.cameras, name) for name in ("intrinsics", "extrinsics")))
@@ -307,7 +355,7 @@ class VisibilityPlanes:
         kept = min(reading.nearest, len(self))
         weights, colours = torch.empty(len(along), kept), torch.empty(len(along), kept, 3)
         surface = points.new_zeros(0) if self._surface is None else self._surface
-        numbers = [*self._limits(), FADING, reading.falloff, reading.smallest_angle]
+        numbers = [*self._limits(), FADING, reading.falloff, SMALLEST_ANGLE]
         frequencies = reading.point_frequencies, reading.direction_frequencies
         maps = [each.contiguous().flatten().numpy() for each in (self._shown_cameras(), self.depth_opacity, surface)]
         fixed = (

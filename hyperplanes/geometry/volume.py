@@ -15,7 +15,7 @@ __all__ = ["CHANNELS", "SIDE", "interpolate_grid", "volume_of"]
 SIDE = 32  # cells an axis
 CHANNELS = 5  # of a cell: occupied share, mean colour, number of views
 BEST = 8  # views of a cell that count
-_READING = Reading(BEST, nearest=0, point_frequencies=0, direction_frequencies=0, falloff=0.0, smallest_angle=0.0)
+_READING = Reading(BEST, nearest=0, point_frequencies=0, direction_frequencies=0, falloff=0.0)
 
 
 @torch.no_grad()
