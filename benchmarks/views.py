@@ -295,7 +295,7 @@ METHODS = {
     "random_weights": lambda model, *_: FromScratch(model, 0),
     "theta": lambda model, *_: _Partly(model, lambda name: False),
     "swapped": _swapped,
-    "unjudged": lambda model, *_: _Partly(model),
+    "unstacked": lambda model, *_: _Partly(model),
     "one_ray": lambda model, *_: _OneRay(model),
 }
 

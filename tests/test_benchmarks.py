@@ -52,7 +52,7 @@ def test_pooling_reads_the_views_of_a_point_in_no_order():
 
 def test_a_whole_update_as_parts_of_it_is_that_of_the_model():
     model, task = HyperPlanes(MODEL), Balls(views=6, size=(24, 24)).task("train0")
-    found = views.METHODS["unjudged"](model).adapt(task.support)  # outputs start at zero: nothing to leave out
+    found = views.METHODS["unstacked"](model).adapt(task.support)  # outputs start at zero: nothing to leave out
     expected, cameras = model.adapt(task.support), task.query.cameras
     assert torch.equal(found.render(cameras).images, expected.render(cameras).images)
 

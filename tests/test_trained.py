@@ -240,7 +240,7 @@ def test_views_that_are_held_out_find_out_what_is_wrong_for_an_object():
     foreign = model.update(model.prepare(lamp().support[::2]))
     model.update = lambda context: foreign
     found = {}
-    for judged in (False, True):
-        model.config = replace(model.config, judged=judged)
-        found[judged] = mean_psnr(model, cars()[0], 12)
+    for stacked in (False, True):
+        model.config = replace(model.config, stacked=stacked)
+        found[stacked] = mean_psnr(model, cars()[0], 12)
     assert found[True] > found[False] + 3

@@ -101,7 +101,7 @@ class FieldFromScratch:
 def random_model(config: ModelConfig, seed: int) -> HyperPlanes:
     """The target network of a model with random weights, without what finds better ones."""
     return HyperPlanes(
-        replace(config, hypernetwork=None, autoencoder=None, initialisation=None, judged=False), seed=seed
+        replace(config, hypernetwork=None, autoencoder=None, initialisation=None, stacked=False), seed=seed
     )
 
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext, observe
 from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
-from hyperplanes.adaptation.judging import judged_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
+from hyperplanes.adaptation.stacking import stacked_field
 from hyperplanes.configuration.compatibility import check_fine_tuning
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.parameters import Parameters
@@ -87,7 +87,7 @@ def fine_tune(
     trial, _ = make_descent(network, context, settings, shown)
     pixels = network.live_pixels_of(context, holdout)
     with torch.no_grad():
-        unchanged = network.field(context, judged_weights(network, context))
+        unchanged = network.field(context, network.adapted_weights(context))
     stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
@@ -124,7 +124,7 @@ def fine_tune_to(
         if on_step is not None:
             on_step(0)
         with torch.no_grad():
-            return network.rendering_field(context, judged_weights(network, context))
+            return stacked_field(network, context, network.adapted_weights(context))
     descent, variables = make_descent(network, context, settings, views)
     before, _ = descent.errors()
     for done in descent.run(steps if schedule is None else schedule):
@@ -189,6 +189,6 @@ def _refreshed(network: HyperPlanesNetwork, weights: Parameters, settings: FineT
     share = settings.fresh_share(views)
     if not share or not network.reads_volume:
         return weights
-    made = HyperPlanesNetwork(replace(network.config, hypernetwork=None, judged=False), settings.seed)
+    made = HyperPlanesNetwork(replace(network.config, hypernetwork=None, stacked=False), settings.seed)
     random = made.to(network.rig.device, network.rig.dtype).theta.detach()
     return Parameters((name, torch.lerp(value, random[name], share)) for name, value in weights.items())

@@ -12,6 +12,7 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
@@ -54,15 +55,23 @@ class HullBlend:
             raise ValueError("hull_blend: expected support views with masks, got none; images with alpha have them")
         support = support.to(dtype=torch.float32)
         region = hull(support, self.side)
-        field = _Blend(
-            VisibilityPlanes(support.images, support.cameras, support.masks, region), support.bounds, self.nearest
-        )
-        # the voxels of which masks were carved away hold no part of the hull at their centre: what is left is its
-        # surface as views see it, without bias towards them
-        carved = AdaptedField(field, region, RayMarching(self.steps, STOP), densities=(field.density,))
-        voxels = carved.refined_occupancy
-        field = replace(field, planes=field.planes.with_surface(voxels.solid()))
-        return replace(carved, field=field, densities=(field.density,), refined=voxels)
+        return self.adapt_to(VisibilityPlanes(support.images, support.cameras, support.masks, region))
+
+    @torch.no_grad()
+    def adapt_to(self, planes: VisibilityPlanes) -> AdaptedField:
+        """As `adapt`, of views whose hull is carved.
+
+        Args:
+            planes: the views; the side of their hull counts.
+        """
+        region, field = planes.occupancy, _Blend(planes, planes.occupancy.bounds, self.nearest)
+        # voxels whose centre lies in the hull: by all that it enters views would see its surface too near
+        depth = torch.zeros_like(region.occupied, dtype=torch.float32)
+        depth[region.occupied] = field.density(region.centres().to(planes.depth_opacity)).float() * region.voxel
+        voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
+        field = replace(field, planes=planes.with_surface(voxels.solid()))
+        sampling = RayMarching(self.steps, STOP)
+        return AdaptedField(field, region, sampling, densities=(field.density,), refined=voxels)
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,11 @@ from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.descent import Descent, Variables
 from hyperplanes.adaptation.fine_tuning import fine_tune, fine_tune_to, make_descent
 from hyperplanes.adaptation.hub import upload_checkpoint
-from hyperplanes.adaptation.judging import judged_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
+from hyperplanes.adaptation.stacking import StackedField, stacked_field
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.fields.base import Field
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
@@ -44,14 +45,14 @@ class HyperPlanes(HyperPlanesNetwork):
     def adapt(self, support: Views) -> AdaptedField:
         """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6).
 
-        Where `config.judged` says so, two of the views decide how much of what was learned counts.
+        Where `config.stacked` says so, its pictures are means with those of the visual hull (`adaptation.stacking`).
         """
         return self.adapt_to(self.prepare(support))
 
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:
         """As `adapt`, of an object that is prepared."""
-        return self.rendering_field(context, judged_weights(self, context))
+        return stacked_field(self, context, self.adapted_weights(context))
 
     @checked
     def fine_tune(
@@ -99,11 +100,13 @@ class HyperPlanes(HyperPlanesNetwork):
             adapted: what this model made of the object.
 
         Returns:
-            A model that makes the same field of the same views, without looking at them twice. A field that is
-            no network of this model is a ValueError.
+            A model that makes the same field of the same views, without looking at them twice; of a stacked field,
+            the part that is a network. A field that is no network of this model is a ValueError.
         """
+        if isinstance(adapted, StackedField) and not isinstance(adapted.field, Field):
+            adapted = adapted.other
         result = HyperPlanes(
-            replace(self.config, hypernetwork=None, autoencoder=None, initialisation=None, judged=False)
+            replace(self.config, hypernetwork=None, autoencoder=None, initialisation=None, stacked=False)
         )
         result.rig.copy_(self.rig)
         found = {"fine": adapted.field, "coarse": adapted.proposal}

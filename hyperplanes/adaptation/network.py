@@ -135,16 +135,6 @@ class HyperPlanesNetwork(nn.Module):
         densities = tuple(field.density for field in bound.values())
         return AdaptedField(bound["fine"], context.occupancy, self.config.sampling, bound.get("coarse"), densities)
 
-    def attenuated(self, parameters: Parameters, strength: float) -> Parameters:
-        """Weights of a field between that of given ones and one of which nothing is learned (`Target.attenuated`).
-
-        Args:
-            parameters: theta + delta.
-            strength: 1 leaves them as they are.
-        """
-        parts = {name: network.attenuated(parameters.under(name), strength) for name, network in self.targets.items()}
-        return Parameters((f"{name}.{key}", value) for name, part in parts.items() for key, value in part.items())
-
     def rendering_field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
         """As `field`; one that judges what views see takes colours from those that see the surface of its density.
 

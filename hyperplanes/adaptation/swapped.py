@@ -9,8 +9,8 @@ import torch
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.judging import attenuated_weights
 from hyperplanes.adaptation.network import in_use
+from hyperplanes.adaptation.stacking import stacked_field
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
@@ -41,13 +41,12 @@ class Swapped:
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The field of theta plus the update of the object after this one, attenuated as with its own update."""
+        """The field of theta plus the update of the object after this one, stacked as with its own update."""
         prepared = self.model.prepare(support)
         known = list(self._updates)
         own = _digest(support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]
-        weights = attenuated_weights(self.model, prepared, self.model.theta + self._updates[other])
-        return self.model.rendering_field(prepared, weights)
+        return stacked_field(self.model, prepared, self.model.theta + self._updates[other])
 
 
 def _digest(support: Views) -> str:

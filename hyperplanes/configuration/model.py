@@ -48,9 +48,9 @@ class ModelConfig:
         plane_dropout: how likely a step of training hides a plane of an object, for a field that knows planes by their
             places. It learns to do without any of them, and where there are fewer views than planes, each stands at one
             plane and the others are hidden, not filled with views that stand elsewhere.
-        judged: of five or more views of an object, two that are held out decide whether a field of any number of views
-            is used as it was learned, halfway to the plain visual hull in blended colours, or not at all
-            (`adaptation.judging`). Training does without.
+        stacked: pictures of a field of any number of views are means with those of `hull_blend`, by a share that two of
+            five or more views decide, which are held out for the purpose (`adaptation.stacking`). Training does
+            without.
     """
 
     target: str = "point_multiplane"
@@ -63,7 +63,7 @@ class ModelConfig:
     hull_resolution: Annotated[int, range(1, 513)] = 64
     order: str = "matched"
     plane_dropout: float = 0.0
-    judged: bool = False
+    stacked: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.plane_dropout < 1:

@@ -11,7 +11,7 @@ from hyperplanes.utilities.settings import SettingsError
 
 __all__ = ["TARGETS", "upgrade_model", "upgrade_training"]
 
-MODEL = {"hull_side": "hull_resolution"}
+MODEL = {"hull_side": "hull_resolution", "judged": "stacked"}
 NETWORK = {"point_octaves": "point_frequencies", "direction_octaves": "direction_frequencies"}
 TRAINING = {"final": "final_rate_factor", "completion": "volume_loss"}
 """Entries by their former names."""

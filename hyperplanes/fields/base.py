@@ -145,18 +145,6 @@ class Target(nn.Module):
         """
         return planes
 
-    def attenuated(self, parameters: Parameters, strength: float) -> Parameters:
-        """Weights of which what was learned counts less, where a field has outputs to begin with; here none has.
-
-        Args:
-            parameters: theta or theta + delta.
-            strength: 1 leaves them as they are, 0 makes a field of which nothing is learned.
-
-        Raises:
-            TypeError: a field that has none.
-        """
-        raise TypeError(f"{type(self).__name__} does not say what it is without what it learned")
-
     def bind(self, parameters: Parameters, planes: Any, bounds: Sphere | None = None) -> Field:
         """The field that these parameters and planes make.
 

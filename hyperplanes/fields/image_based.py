@@ -106,23 +106,6 @@ class ImageBasedNeRF(Target):
             self.density.bias.fill_(EMPTY)
             self.colour.weight *= 0.1
 
-    def attenuated(self, parameters: Parameters, strength: float) -> Parameters:
-        """Weights of a field between that of given ones and the plain hull that training began with.
-
-        The heads are linear, so that interpolating their weights interpolates their outputs: the density before
-        softplus, and what the network changes of the blended colour. What was learned is scaled by `strength`.
-
-        Args:
-            parameters: theta + delta.
-            strength: 0 is a density of the masks alone and the plain blend, 1 leaves both as they are.
-        """
-        changed = Parameters(parameters)
-        for name in (f"{head}.{part}" for head in ("density", "colour") for part in ("weight", "bias")):
-            changed[name] = strength * parameters[name]
-        changed["density.weight"][:, -1] += (1 - strength) * (SOLID - EMPTY)
-        changed["density.bias"] += (1 - strength) * EMPTY
-        return changed
-
     @property
     def input_size(self) -> int:
         """The encoded point, what the best views show, and what all of them have in common."""

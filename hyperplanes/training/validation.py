@@ -77,8 +77,8 @@ class Validator:
             diagnostics = None
             if model.hypernetwork is not None and len(episodes) > 1:
                 prepared = [each.prepared for each in episodes]
-                # attenuated fields are no measure of what an update that is not attenuated loses
-                _, gap = swap_gap(model, prepared, queries, None if model.config.judged else quality)
+                # stacked pictures are no measure of what an update alone loses
+                _, gap = swap_gap(model, prepared, queries, None if model.config.stacked else quality)
                 diagnostics = replace(diagnose(model, prepared), swap_gap=gap)
         return Validation(quality, samples.ssim, samples, diagnostics)
 

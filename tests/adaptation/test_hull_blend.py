@@ -9,7 +9,6 @@ from torch.nn.functional import max_pool2d
 from hyperplanes.adaptation import HullBlend
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
-from hyperplanes.rendering import images
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 from tests.reference_rendering import ball_views, camera_at, ring
@@ -78,10 +77,3 @@ def test_the_order_of_the_views_does_not_matter():
 def test_views_without_masks_are_refused():
     with pytest.raises(ValueError, match="hull_blend: expected support views with masks, got none"):
         SMALL.adapt(ball_views(ring(4), masks=False))
-
-
-def test_distances_of_the_hull_are_of_one_ray_a_pixel(monkeypatch):
-    monkeypatch.setattr(images, "_edges", lambda values: pytest.fail("rays of edges"))
-    adapted = SMALL.adapt(ball_views(ring(3, (24, 24))))
-    with pytest.raises(pytest.fail.Exception, match="rays of edges"):
-        adapted.render(ring(1, (24, 24)))

@@ -1,0 +1,177 @@
+"""Pictures of a field averaged with those of the visual hull, by a share that held-out support views decide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from hyperplanes.adaptation.base import AdaptedField, Pictures
+from hyperplanes.adaptation.context import SupportContext, live_pixels
+from hyperplanes.adaptation.hull_blend import HullBlend
+from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
+from hyperplanes.fields.rig import camera_directions
+from hyperplanes.geometry.poses import outermost_first
+from hyperplanes.geometry.rays import SUBPIXELS, Rays
+from hyperplanes.parameters import Parameters
+from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.rendering.footprint import pixels_across
+from hyperplanes.rendering.renderer import Sampler, render
+from hyperplanes.utilities.arguments import checked
+from hyperplanes.views import Views
+
+__all__ = ["FEWEST", "StackedField", "best_share", "hull_share", "stack", "stacked_field"]
+
+FEWEST = 5  # views, of which some can be held out
+HELD_OUT = 2
+PIXELS = 2048  # of the views that are held out, at whose edges pictures differ most
+SIZE = 256  # of all of them, along the longer side, at most: photographs have no more to say here
+CAUTION = 1.5  # power of the share that shows held-out views best: two views overestimate small shares
+MARGIN = 0.02  # of the squared error, by which it has to be lower to be worth a second picture
+
+Pixels = TypeVar("Pixels", Rendered, Pictures)
+
+
+@dataclass(frozen=True, repr=False)
+class StackedField(AdaptedField):
+    """A field whose pictures are means of its own and of those of another one (Wolpert 1992, "Stacked generalization").
+
+    Densities, colours and meshes are those of the field alone.
+
+    Attributes:
+        other: the other field.
+        share: of the pictures of the other field in the mean.
+    """
+
+    other: AdaptedField = field(kw_only=True)
+    share: float = field(kw_only=True)
+
+    def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
+        """The mean of the pixels of both, as `AdaptedField.trace`."""
+        own = super().trace(rays, generator, differentiable=differentiable)
+        return _mean(own, self.other.trace(rays, generator, differentiable=differentiable), self.share, "colour")
+
+    @checked
+    @torch.no_grad()
+    def render(
+        self, cameras: PinholeCamera, sampling: Sampler | None = None, antialias: bool | None = None
+    ) -> Pictures:
+        """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the field's alone."""
+        own = super().render(cameras, sampling, antialias)
+        return _mean(own, self.other.render(cameras, antialias=antialias), self.share, "images")
+
+
+def _mean(one: Pixels, other: Pixels, share: float, colour: str) -> Pixels:
+    """The mean of colours and opacities, and the expected distance of what both show."""
+    opacity = torch.lerp(one.opacity, other.opacity, share)
+    depth = torch.lerp(one.opacity * one.depth, other.opacity * other.depth, share) / opacity.clamp_min(1e-10)
+    colours = torch.lerp(getattr(one, colour), getattr(other, colour), share)
+    return replace(one, **{colour: colours}, opacity=opacity, depth=depth, samples=one.samples + other.samples)
+
+
+def stack(learned: AdaptedField, hull: AdaptedField, share: float) -> AdaptedField:
+    """Two fields as one: it has the densities of the one that counts more, and the mean of the pictures of both.
+
+    Args:
+        learned: a field.
+        hull: another one.
+        share: of the second one in the pictures, in [0, 1].
+
+    Returns:
+        One of the two alone where the share is 0 or 1.
+    """
+    if share > 0.5:
+        learned, hull, share = hull, learned, 1 - share
+    if share == 0:
+        return learned
+    own = {each.name: getattr(learned, each.name) for each in fields(learned)}
+    return StackedField(**own, other=hull, share=share)
+
+
+@torch.no_grad()
+def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
+    """The field of given weights, stacked with the visual hull where the model is configured so.
+
+    The share of the hull is that of the object's own update (`hull_share`), whatever the weights are.
+
+    Args:
+        network: the model.
+        context: the object.
+        weights: of the field.
+    """
+    learned = network.rendering_field(context, weights)
+    if not network.config.stacked:
+        return learned
+    with in_use(network):
+        share = hull_share(network, context.views)
+    return stack(learned, HullBlend().adapt_to(context.planes), share) if share else learned
+
+
+@torch.no_grad()
+def hull_share(network: HyperPlanesNetwork, support: Views) -> float:
+    """The share of `HullBlend` in the pictures of an object, by which views that are held out are shown best.
+
+    What was learned may not fit an object of another kind, and where it does fit, the errors of both are different
+    ones, so that a mean has less of them. Held out are the HELD_OUT views that the others stand closest around, and the
+    squared error of PIXELS of their pixels within the hull decides.
+
+    Args:
+        network: of a field that takes any number of views.
+        support: the views of an object, where the model is.
+
+    Returns:
+        The share, in [0, 1]: the best one (`best_share`) to the power of CAUTION; 0 where that lowers the squared error
+        by less than MARGIN, with fewer than FEWEST views, and without masks.
+    """
+    if len(support) < FEWEST or support.masks is None:
+        return 0.0
+    support = support.resized(SIZE)
+    order = outermost_first(camera_directions(support).cpu(), len(support))
+    shown, held_out = support[sorted(order[:-HELD_OUT])], support[order[-HELD_OUT:]]
+    context = network.prepare(shown)
+    learned = network.rendering_field(context, network.theta + network.update(context))
+    rays, truth, _ = held_out.sample_masked_rays(
+        PIXELS,
+        generator=torch.Generator().manual_seed(0),
+        among=live_pixels(context.occupancy, held_out),
+        near_far=learned.sampling.near_far,
+        subpixels=SUBPIXELS,
+    )
+    across = pixels_across(held_out.cameras, support.bounds)
+    errors = [_pixels(each, rays, across) - truth for each in (learned, HullBlend().adapt_to(context.planes))]
+    share = best_share(*errors) ** CAUTION
+    without, mixed = (float(torch.lerp(*errors, each).square().mean()) for each in (0.0, share))
+    return share if mixed < (1 - MARGIN) * without else 0.0
+
+
+def _pixels(adapted: AdaptedField, rays: Rays, across: float) -> Float[Tensor, "pixel 3"]:
+    """The colours of pixels, each the mean of its rays."""
+    found = render(
+        adapted.field,
+        rays,
+        adapted.sampling.for_rendering(across),
+        occupancy=adapted.occupancy,
+        differentiable=False,
+    )
+    return found.pooled(len(SUBPIXELS)).colour
+
+
+def best_share(one: Float[Tensor, "pixel 3"], other: Float[Tensor, "pixel 3"]) -> float:
+    """The share of the other in the mean of two predictions by which its squared error is least.
+
+    >>> best_share(torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]]))
+    0.5
+
+    Args:
+        one: errors of a prediction.
+        other: errors of another one.
+
+    Returns:
+        The minimum of a quadratic function, in [0, 1]; 0 where both predictions are the same.
+    """
+    between = other - one
+    return float((-(one * between).sum() / between.square().sum().clamp_min(1e-12)).clamp(0, 1))

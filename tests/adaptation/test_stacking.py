@@ -1,0 +1,194 @@
+"""Source of truth: the minimum of a quadratic function by a grid, means of pictures, and which views may decide."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, stacking
+from hyperplanes.adaptation.descent import Descent, split_holdout
+from hyperplanes.adaptation.fine_tuned import random_model
+from hyperplanes.adaptation.fine_tuning import fine_tune
+from hyperplanes.adaptation.kept import keep_field
+from hyperplanes.adaptation.stacking import CAUTION, FEWEST, MARGIN, StackedField, best_share, hull_share, stack
+from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.fields import ImageBasedConfig
+from hyperplanes.geometry.cameras import centres
+from hyperplanes.geometry.rays import cast
+from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
+from hyperplanes.rendering import RayMarching
+from hyperplanes.training import TrainingConfig
+from hyperplanes.training.validation import Validator
+from hyperplanes.utilities.metrics import psnr
+from tests.reference_rendering import Balls, awaken, ball_views, ring
+
+NETWORK = ImageBasedConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1)
+CONFIG = ModelConfig(
+    "image_based", NETWORK, VolumeHyperNetworkConfig(), sampling=RayMarching(24), hull_resolution=16, stacked=True
+)
+
+
+def model(seed=0, *, empty=False):
+    torch.manual_seed(seed)
+    made = awaken(HyperPlanes(CONFIG, seed)).eval()
+    with torch.no_grad():
+        made.networks["fine"].density.weight *= 5
+        made.networks["fine"].colour.weight *= 5
+        if empty:  # what was learned is that there is nothing
+            made.theta["fine.density.bias"].fill_(-50)
+    return made
+
+
+def both(support):
+    """A learned field and the hull of the same views."""
+    adapter = model()
+    context = adapter.prepare(support)
+    return adapter.rendering_field(context, adapter.adapted_weights(context)), HullBlend().adapt_to(context.planes)
+
+
+def test_the_best_share_has_the_least_squared_error_of_a_grid():
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        one, other = torch.randn(2, 40, 3, generator=generator) + torch.randn(2, 1, 3, generator=generator)
+        grid = torch.linspace(0, 1, 1001)
+        errors = torch.stack([torch.lerp(one, other, float(share)).square().mean() for share in grid])
+        assert best_share(one, other) == pytest.approx(float(grid[errors.argmin()]), abs=1e-3)
+
+
+def test_the_share_of_a_prediction_that_is_right_is_one_and_of_one_that_brings_nothing_zero():
+    error = torch.rand(7, 3) + 0.1
+    assert best_share(error, torch.zeros(7, 3)) == 1
+    assert best_share(torch.zeros(7, 3), error) == 0
+    assert best_share(error, 2 * error) == 0
+    assert best_share(error, error) == 0
+
+
+@pytest.mark.parametrize("share", [0.3, 0.8])
+def test_pictures_and_pixels_are_the_mean_of_both_fields(share):
+    learned, hull = both(ball_views(ring(6, (24, 24))))
+    stacked, cameras = stack(learned, hull, share), ring(2, (10, 13), shift=1)
+    one, other, mixed = (each.render(cameras) for each in (learned, hull, stacked))
+    torch.testing.assert_close(mixed.images, torch.lerp(one.images, other.images, share))
+    torch.testing.assert_close(mixed.opacity, torch.lerp(one.opacity, other.opacity, share))
+    moments = (each.opacity * each.depth for each in (one, other))
+    torch.testing.assert_close(mixed.opacity * mixed.depth, torch.lerp(*moments, share))
+    assert mixed.samples == one.samples + other.samples
+    view, pixels = torch.zeros(5, dtype=torch.long), torch.rand(5, 2) * 4 + 4
+    rays = cast(cameras, view, pixels, learned.occupancy.bounds)
+    one, other, mixed = (each.trace(rays, differentiable=False) for each in (learned, hull, stacked))
+    torch.testing.assert_close(mixed.colour, torch.lerp(one.colour, other.colour, share))
+
+
+def test_densities_are_those_of_the_field_that_counts_more():
+    learned, hull = both(ball_views(ring(6, (24, 24))))
+    points = torch.rand(50, 3) - 0.5
+    for share, heavier in ((0.2, learned), (0.8, hull)):
+        assert torch.equal(stack(learned, hull, share).density(points), heavier.density(points))
+    assert stack(learned, hull, 0.0) is learned
+    assert stack(learned, hull, 1.0) is hull
+
+
+def test_the_views_that_decide_are_not_shown(monkeypatch):
+    adapter, support, shown = model(), ball_views(ring(7, (24, 24))), []
+    prepare = adapter.prepare
+    monkeypatch.setattr(adapter, "prepare", lambda views, **given: shown.append(views) or prepare(views, **given))
+    assert 0 <= hull_share(adapter, support) <= 1
+    (rest,) = shown
+    assert len(rest) == 5
+    apart = torch.cdist(centres(support.cameras), centres(rest.cameras)).amin(1)
+    assert int((apart > 1e-3).sum()) == 2
+
+
+def test_where_nothing_was_learned_the_hull_is_shown():
+    adapter, support, cameras = model(empty=True), ball_views(ring(8, (24, 24))), ring(3, (24, 24), shift=1)
+    adapted = adapter.adapt(support)
+    assert isinstance(adapted, StackedField)
+    assert 1 - adapted.share > 0.8
+    truth = ball_views(cameras).images
+    alone = replace(adapter.config, stacked=False)
+    without = HyperPlanes(alone)
+    without.load_state_dict(adapter.state_dict())
+    gained = psnr(adapted.render(cameras).images, truth) - psnr(without.adapt(support).render(cameras).images, truth)
+    assert (gained > 6).all()
+
+
+@pytest.mark.parametrize("other", [1.0, 2.0, 7.0])
+def test_a_second_picture_is_made_only_where_it_is_worth_it(monkeypatch, other):
+    """Uncorrelated errors 1 and e: by a share s the squared error is (1 - s)^2 + s^2 e^2, least by 1 / (1 + e^2)."""
+    pixels = iter([torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.0, other, 0.0]])])
+    support = ball_views(ring(6, (24, 24)))
+    rays, _, opacity = support.sample_masked_rays(1)
+    monkeypatch.setattr(type(support), "sample_masked_rays", lambda *_, **__: (rays, torch.zeros(1, 3), opacity))
+    monkeypatch.setattr(stacking, "_pixels", lambda *_: next(pixels))
+    share = (1 / (1 + other**2)) ** CAUTION
+    worth_it = (1 - share) ** 2 + share**2 * other**2 < 1 - MARGIN
+    assert hull_share(model(), support) == pytest.approx(share if worth_it else 0.0)
+    assert worth_it == (other < 5)
+
+
+def test_few_views_or_none_with_masks_decide_nothing():
+    adapter = model()
+    for count in (1, FEWEST - 1):
+        assert hull_share(adapter, ball_views(ring(count, (24, 24)))) == 0
+    assert hull_share(adapter, ball_views(ring(6, (24, 24)), masks=False)) == 0
+
+
+def test_a_field_that_knows_views_by_their_places_is_not_stacked():
+    with pytest.raises(ValueError, match="stacked: .* got point_multiplane"):
+        HyperPlanes(replace(ModelConfig(), stacked=True))
+
+
+def test_the_weights_of_one_object_are_those_of_the_network_in_the_stack(tmp_path):
+    support, cameras = ball_views(ring(7, (24, 24))), ring(2, (10, 13), shift=1)
+    for empty in (False, True):
+        adapter = model(empty=empty)
+        context = adapter.prepare(support)
+        learned = adapter.rendering_field(context, adapter.adapted_weights(context))
+        for share in (0.2, 0.8):
+            stacked = stack(learned, HullBlend().adapt_to(context.planes), share)
+            again = adapter.with_weights_of(stacked).adapt(support)
+            expected = learned.render(cameras).images
+            torch.testing.assert_close(again.render(cameras).images, expected, atol=1e-6, rtol=0)
+            keep_field(adapter, stacked, tmp_path / "kept")
+            assert not (tmp_path / "kept").exists()
+    assert not random_model(adapter.config, 0).config.stacked
+
+
+def test_the_control_of_another_objects_update_is_stacked_as_the_object_is(monkeypatch):
+    adapter, supports = model(), [ball_views(ring(6, (24, 24)), radius=radius) for radius in (0.4, 0.7)]
+    swapped, cameras = Swapped(adapter, supports), ring(1, (24, 24), shift=1)
+    for share in (0.0, 0.5, 1.0):
+        monkeypatch.setattr(stacking, "hull_share", lambda network, support, share=share: share)
+        own, other = (each.adapt(supports[0]).render(cameras).images for each in (adapter, swapped))
+        assert torch.equal(own, other) == (share == 1.0)  # the hull alone
+
+
+def test_the_swap_gap_of_a_validation_compares_fields_that_are_not_stacked(monkeypatch):
+    adapter, data = model(), Balls(test=2)
+    settings = TrainingConfig(steps=1, tasks=1, rays=8, held_out=2)
+    validator = Validator(adapter, data, settings, adapter.adapt_to)
+    monkeypatch.setattr(stacking, "hull_share", lambda network, support: 0.0)
+    alone = validator.run()
+    monkeypatch.setattr(stacking, "hull_share", lambda network, support: 0.6)
+    stacked = validator.run()
+    assert stacked.psnr != alone.psnr
+    assert stacked.diagnostics.swap_gap == alone.diagnostics.swap_gap
+
+
+def test_auto_compares_steps_with_the_field_that_they_begin_at(monkeypatch):
+    seen, adapter, support = [], model(), ball_views(ring(12, (16, 16)))
+
+    def best_stop(self, holdout, *, unchanged, **given):
+        seen.append((unchanged.render(holdout.cameras).images, self.field(None).render(holdout.cameras).images))
+        return 0
+
+    prepare, shown = adapter.prepare, []
+    monkeypatch.setattr(adapter, "prepare", lambda views, **given: shown.append(views) or prepare(views, **given))
+    monkeypatch.setattr(Descent, "best_stop", best_stop)
+    monkeypatch.setattr(stacking, "hull_share", lambda network, support: 0.0)
+    fine_tune(adapter, support, "auto", FineTuning(rays=8, max_steps=3))
+    ((unchanged, begun),) = seen
+    cameras = split_holdout(support, FineTuning())[1].cameras
+    torch.testing.assert_close(adapter.adapt(shown[0]).render(cameras).images, unchanged, atol=1e-4, rtol=0)
+    assert (begun - unchanged).abs().max() > 0.01  # half of the weights that steps begin with are random
