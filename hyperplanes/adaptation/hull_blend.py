@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
@@ -10,10 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, hull
-from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.rendering.renderer import RayMarching
+from hyperplanes.rendering.samplers import PackedSamples
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
@@ -22,6 +24,7 @@ __all__ = ["HullBlend"]
 OPAQUE = 1e4  # density within the hull, per radius of the scene
 STOP = 2e-3  # transmittance; so low that every sample is evaluated: by every second one wings lose 0.05 to 0.5 dB
 SOLID = 0.5  # opacity of a mask from which on a pixel shows the object
+ROUNDING = 1e-4  # of an opacity: what one kernel finds in the hull the other one does
 
 
 @dataclass(frozen=True)
@@ -64,14 +67,39 @@ class HullBlend:
         Args:
             planes: the views; the side of their hull counts.
         """
-        region, field = planes.occupancy, _Blend(planes, planes.occupancy.bounds, self.nearest)
+        region, blend = planes.occupancy, _Blend(planes, planes.occupancy.bounds, self.nearest)
         # voxels whose centre lies in the hull: by all that it enters views would see its surface too near
         depth = torch.zeros_like(region.occupied, dtype=torch.float32)
-        depth[region.occupied] = field.density(region.centres().to(planes.depth_opacity)).float() * region.voxel
+        depth[region.occupied] = blend.density(region.centres().to(planes.depth_opacity)).float() * region.voxel
         voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
-        field = replace(field, planes=planes.with_surface(voxels.solid()))
-        sampling = RayMarching(self.steps, STOP)
-        return AdaptedField(field, region, sampling, densities=(field.density,), refined=voxels)
+        blend = replace(blend, planes=planes.with_surface(voxels.solid()))
+        sampling = _FirstInHull(self.steps, STOP, planes=planes)
+        return AdaptedField(blend, region, sampling, densities=(blend.density,), refined=voxels)
+
+
+@dataclass(frozen=True)
+class _FirstInHull(RayMarching):
+    """Of the samples of ray marching, the first of each ray that lies in the hull: all that is seen of an opaque field.
+
+    Attributes:
+        planes: the views whose masks are the hull.
+    """
+
+    planes: VisibilityPlanes = field(kw_only=True, repr=False)
+
+    def for_rendering(self, pixels: float) -> _FirstInHull:
+        """As `RayMarching.for_rendering`."""
+        finer = super().for_rendering(pixels)
+        return replace(self, steps=finer.steps, stop=finer.stop)
+
+    def place(self, rays: Rays, occupancy: Occupancy | None, generator: torch.Generator | None = None) -> PackedSamples:
+        """As `RayMarching.place`; where no kernel takes the rays, or the samples are random, all samples."""
+        if occupancy is None or generator is not None or not self.planes.has_kernels(rays.origins):
+            return super().place(rays, occupancy, generator)
+        step = 2 * occupancy.bounds.radius / self.steps
+        distances = self.planes.hull_hits(rays, rays.near + step / 2, step, occupancy, SOLID)
+        ray = distances.isfinite().nonzero()[:, 0]
+        return PackedSamples(ray, distances[ray], step)
 
 
 @dataclass(frozen=True)
@@ -104,7 +132,7 @@ class _Blend:
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """High where every view that shows a point shows the object there, else 0."""
         coverage = self.planes.choose(points, best=1).coverage
-        return torch.where(coverage < SOLID, 0.0, OPAQUE / self.bounds.radius)
+        return torch.where(coverage < SOLID - ROUNDING, 0.0, OPAQUE / self.bounds.radius)
 
     def hidden(self, points: Float[Tensor, "point 3"]) -> _HullPoints:
         """All that is expensive about the density of a point."""

@@ -17,6 +17,7 @@ from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import pixels_across
@@ -108,7 +109,7 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
         return learned
     with in_use(network):
         share = hull_share(network, context.views)
-    return stack(learned, HullBlend().adapt_to(context.planes), share) if share else learned
+    return stack(learned, _hull(context), share) if share else learned
 
 
 @torch.no_grad()
@@ -142,10 +143,15 @@ def hull_share(network: HyperPlanesNetwork, support: Views) -> float:
         subpixels=SUBPIXELS,
     )
     across = pixels_across(held_out.cameras, support.bounds)
-    errors = [_pixels(each, rays, across) - truth for each in (learned, HullBlend().adapt_to(context.planes))]
-    share = best_share(*errors) ** CAUTION
-    without, mixed = (float(torch.lerp(*errors, each).square().mean()) for each in (0.0, share))
-    return share if mixed < (1 - MARGIN) * without else 0.0
+    without, hull = (_pixels(each, rays, across) - truth for each in (learned, _hull(context)))
+    share = best_share(without, hull) ** CAUTION
+    mixed = torch.lerp(without, hull, share)
+    return share if float(mixed.square().sum()) < (1 - MARGIN) * float(without.square().sum()) else 0.0
+
+
+def _hull(context: SupportContext) -> AdaptedField:
+    assert isinstance(context.planes, VisibilityPlanes)
+    return HullBlend().adapt_to(context.planes)
 
 
 def _pixels(adapted: AdaptedField, rays: Rays, across: float) -> Float[Tensor, "pixel 3"]:

@@ -20,7 +20,7 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.lookup_torch import transform_of
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.rays import Rays, Sphere
 
 __all__ = [
     "ANGLE",
@@ -33,6 +33,7 @@ __all__ = [
 ]
 
 POINTS = 512  # that one call of the kernel works on
+RAYS = 512  # likewise
 
 DEEPEST = 2.0  # radii
 PARTLY = 2.0  # penalty of a mask that is not whole
@@ -253,13 +254,13 @@ class VisibilityPlanes:
             The views. All of them are looked at; colours are looked up by who wants them.
         """
         best, nearest = min(best, len(self)), min(nearest + 1, len(self)) if directions is not None else 0
-        choose = self._choose_compiled if self._has_kernels(points) else self._choose_torch
+        choose = self._choose_compiled if self.has_kernels(points) else self._choose_torch
         if self._surface is None or directions is None:
             return choose(points, directions, best, nearest, self.depth_opacity)
         near = choose(points, directions, 1, nearest, self._surface).nearest
         return replace(choose(points, None, best, 0, self.depth_opacity), nearest=near)
 
-    def _has_kernels(self, points: Tensor) -> bool:
+    def has_kernels(self, points: Tensor) -> bool:
         """Whether the kernels take these points: single precision, on the CPU, pinhole cameras."""
         pinholes = not isinstance(self.colours.cameras, DistortedCamera)
         compiled = find_spec("numba") and points.device.type == "cpu" and self.depth_opacity.numel() < 2**31
@@ -292,6 +293,36 @@ class VisibilityPlanes:
         chosen = [ChosenViews(each, *_split(value)) for each, value in zip(views, values, strict=True)]
         return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
 
+    @torch.no_grad()
+    def hull_hits(
+        self, rays: Rays, first: Float[Tensor, " ray"], step: float, voxels: Occupancy, opacity: float
+    ) -> Float[Tensor, " ray"]:
+        """The first samples of rays in the visual hull, by one kernel; `has_kernels` says of which points.
+
+        Args:
+            rays: with far.
+            first: distance of the first sample of each.
+            step: from one sample to the next.
+            voxels: a sample lies in the hull only where these are occupied.
+            opacity: that every view which shows a sample has there at least.
+
+        Returns:
+            Their distances along the rays; infinite where there is none.
+        """
+        cameras, bounds = self._shown_cameras(), voxels.bounds
+        arrays = [each.contiguous().numpy() for each in (rays.origins, rays.directions, first, rays.far)]
+        fixed = (
+            *arrays, np.float32(step), np.array([*bounds.centre, bounds.radius], np.float32),
+            voxels.occupied.contiguous().numpy().view(np.uint8),
+            *(each.contiguous().flatten().numpy() for each in (cameras, self.depth_opacity)),
+            (*self.depth_opacity.shape[:3], cameras.shape[1]),
+            np.array([self.colours.nearest, opacity], np.float32),
+        )  # fmt: skip
+        nearest = torch.empty(len(rays))
+        kernel = compile_kernel("hull_hits.hull_hits", torch.float32)
+        parallel_for(lambda a, b: kernel(*fixed, nearest.numpy(), a, b), len(rays), RAYS)
+        return nearest
+
     def blended(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], nearest: int
     ) -> Float[Tensor, "point 3"]:
@@ -321,7 +352,7 @@ class VisibilityPlanes:
             return False
         if torch.is_grad_enabled() and any(each.requires_grad for each in given):
             return False
-        if not self._has_kernels(points) or self.colours.background != 1.0:
+        if not self.has_kernels(points) or self.colours.background != 1.0:
             return False
         return self.colours.packed_images(points) is not None
 

@@ -7,8 +7,11 @@ import torch
 from torch.nn.functional import max_pool2d
 
 from hyperplanes.adaptation import HullBlend
+from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
+from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.rendering import RayMarching
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 from tests.reference_rendering import ball_views, camera_at, ring
@@ -77,3 +80,28 @@ def test_the_order_of_the_views_does_not_matter():
 def test_views_without_masks_are_refused():
     with pytest.raises(ValueError, match="hull_blend: expected support views with masks, got none"):
         SMALL.adapt(ball_views(ring(4), masks=False))
+
+
+def test_the_first_sample_in_the_hull_is_all_that_is_seen():
+    """By the kernel, and by compositing all samples of an opaque field: the same samples, so the same pictures."""
+    blend = SMALL.adapt(ball_views(ring(7, (24, 24)), colour=(0.9, 0.5, 0.2)))
+    cameras = ring(3, (40, 30), shift=1)
+    marching = blend.sampling.for_rendering(50)
+    first = blend.render(cameras, marching)
+    every = blend.render(cameras, RayMarching(marching.steps, marching.stop))
+    torch.testing.assert_close(first.images, every.images, atol=1e-4, rtol=0)
+    torch.testing.assert_close(first.depth, every.depth, atol=1e-4, rtol=0)
+    assert first.samples < every.samples / 4
+
+
+def test_a_view_that_is_hidden_cuts_nothing_away(monkeypatch):
+    views = ball_views(ring(6, (24, 24)))
+    nothing = Views(views.images, views.cameras, views.masks.index_fill(0, torch.tensor([4]), 0.0), views.bounds)
+    planes = VisibilityPlanes(nothing.images, nothing.cameras, nothing.masks, hull(views, 20))
+    cameras = ring(1, (24, 24), shift=1)
+    assert SMALL.adapt_to(planes).render(cameras).opacity.max() == 0
+    hidden = planes.mask_views(torch.tensor([4]))
+    opacity = SMALL.adapt_to(hidden).render(cameras).opacity
+    monkeypatch.setattr(VisibilityPlanes, "has_kernels", lambda self, points: False)
+    torch.testing.assert_close(opacity, SMALL.adapt_to(hidden).render(cameras).opacity, atol=1e-4, rtol=0)
+    assert opacity.max() == 1
