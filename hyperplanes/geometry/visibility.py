@@ -200,6 +200,7 @@ class VisibilityPlanes:
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
         self._masked = torch.zeros(len(images), dtype=torch.bool, device=images.device)
+        self._deepest, self._partly = DEEPEST, PARTLY
 
     def __len__(self) -> int:
         return len(self.colours)
@@ -218,6 +219,17 @@ class VisibilityPlanes:
         result = copy.copy(self)
         result.colours = self.colours.mask_views(views)
         result._masked = self._masked.index_fill(0, views.to(self._masked.device), True)
+        return result
+
+    def with_penalties(self, deepest: float, partly: float) -> VisibilityPlanes:
+        """The same planes with other limits of what counts against a view.
+
+        Args:
+            deepest: the largest penalty of a point that lies behind the surface, in radii.
+            partly: that of a mask that is not whole.
+        """
+        result = copy.copy(self)
+        result._deepest, result._partly = deepest, partly
         return result
 
     def with_surface(self, voxels: Occupancy) -> VisibilityPlanes:
@@ -269,7 +281,7 @@ class VisibilityPlanes:
     def _limits(self) -> list[float]:
         """The numbers by which the kernels judge."""
         per_radius = 1 / self.occupancy.bounds.radius
-        return [self.colours.nearest, per_radius, self.tolerance, DEEPEST, PARTLY, WHOLE, UNSEEN, ANGLE]
+        return [self.colours.nearest, per_radius, self.tolerance, self._deepest, self._partly, WHOLE, UNSEEN, ANGLE]
 
     def _shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, and 0 where it is hidden."""
@@ -414,7 +426,7 @@ class VisibilityPlanes:
         coverage = torch.where(valid, coverage, 1.0)
         # how far behind the surface, in radii, and what that and a broken mask cost
         behind = torch.where(valid, (found.distances - depth) / self.occupancy.bounds.radius, 0.0)
-        penalty = (behind - self.tolerance).clamp(-DEEPEST, DEEPEST) + PARTLY * (coverage < WHOLE)
+        penalty = (behind - self.tolerance).clamp(-self._deepest, self._deepest) + self._partly * (coverage < WHOLE)
         penalty = torch.where(valid, penalty, UNSEEN)
         values = torch.cat([found.directions, torch.stack([behind, coverage, penalty], -1)], -1)
 

@@ -10,6 +10,7 @@ from hyperplanes.adaptation import HullBlend, hull_blend
 from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
+from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering import RayMarching
 from hyperplanes.utilities.metrics import psnr
@@ -44,18 +45,38 @@ def test_seen_from_a_support_camera_it_is_nearly_that_image():
     assert psnr(found, views.images[:2]).mean() > 25
 
 
-def test_a_view_from_behind_gives_no_colour():
-    red, blue, green = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
-    eyes = [(3.0, 0.0, 0.0), (-3.0, 0.0, 0.0), (0.0, 0.2, 3.0), (0.0, 0.2, -3.0), (0.3, 3.0, 0.3)]
-    support = painted(concatenate([camera_at(eye, (32, 32)) for eye in eyes]), [red, blue, green, green, green])
-    blend = HullBlend(nearest=5, side=20, steps=64).adapt(support)
-    east, west = (
-        blend.render(camera_at((side, 0.2, 0.1), (32, 32))).images[0, :, 14:18, 14:18] for side in (3.0, -3.0)
-    )
-    assert east[0].min() > 0.8
-    assert west[2].min() > 0.8
-    assert east[2].max() < 0.02
-    assert west[0].max() < 0.02
+def balls_at(cameras, centre, radius):
+    """Masks of a ball somewhere."""
+    moved = camera_from_world(cameras).clone()
+    moved[:, :3, 3] += moved[:, :3, :3] @ torch.tensor(centre)
+    return ball_views(with_poses(cameras, moved), radius=radius).masks
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_view_from_which_a_ball_is_hidden_gives_it_no_colour(monkeypatch, compiled):
+    """Two balls in a row: the nearest view sees one of them alone, and shows red, all others blue."""
+    if not compiled:
+        monkeypatch.setattr(VisibilityPlanes, "has_kernels", lambda self, points: False)
+    near, far = ((0.6, 0.0, 0.0), 0.3), ((-0.5, 0.0, 0.0), 0.25)
+    turns = torch.arange(1, 8) * (torch.pi / 4)
+    eyes = [(3.0, 0.0, 0.0), *torch.stack([3 * turns.cos(), 0 * turns, 3 * turns.sin()], 1).tolist(), (0.3, 3.0, 0.0)]
+    cameras = concatenate([camera_at(tuple(eye), (48, 48)) for eye in eyes])
+    masks = torch.maximum(balls_at(cameras, *near), balls_at(cameras, *far))
+    colours = torch.tensor([[1.0, 0.0, 0.0]] + [[0.0, 0.0, 1.0]] * 8)[:, :, None, None]
+    support = Views(torch.where(masks > 0, colours, torch.ones(())), cameras, masks, Sphere())
+    above = camera_at((2.85, 0.9, 0.0), (48, 48))
+    only_far = (balls_at(above, *far) == 1) & (max_pool2d(balls_at(above, *near), 5, 1, 2) == 0)
+    assert only_far.sum() > 5
+
+    def redness():
+        red, _, blue = HullBlend(side=48, steps=96).adapt(support).render(above).images[0][:, only_far[0, 0]].mean(1)
+        return float(red / (red + blue))
+
+    assert redness() < 0.15
+    nothing = lambda self, voxels: with_surface(self, Occupancy(torch.zeros_like(voxels.occupied), voxels.bounds))  # noqa: E731
+    with_surface = VisibilityPlanes.with_surface
+    monkeypatch.setattr(VisibilityPlanes, "with_surface", nothing)
+    assert redness() > 0.5  # where nothing hides it
 
 
 def test_where_the_world_has_its_origin_does_not_matter():
