@@ -51,6 +51,9 @@ class StackedField(AdaptedField):
     other: AdaptedField = field(kw_only=True)
     share: float = field(kw_only=True)
 
+    def __repr__(self) -> str:
+        return f"StackedField({super().__repr__()}, {self.share:.0%} of {self.other!r})"
+
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
         """The mean of the pixels of both, as `AdaptedField.trace`."""
         own = super().trace(rays, generator, differentiable=differentiable)
