@@ -12,7 +12,7 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays, Sphere
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility import Penalties, VisibilityPlanes
 from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.rendering.samplers import PackedSamples
@@ -24,7 +24,6 @@ __all__ = ["HullBlend"]
 OPAQUE = 1e4  # density within the hull, per radius of the scene
 STOP = 2e-3  # transmittance; so low that every sample is evaluated: by every second one wings lose 0.05 to 0.5 dB
 SOLID = 0.5  # opacity of a mask from which on a pixel shows the object
-DEEPEST, PARTLY = 0.2, 0.4  # penalties of a view: by more, views from behind go before near ones at edges
 ROUNDING = 1e-4  # of an opacity: what one kernel finds in the hull the other one does
 
 
@@ -73,7 +72,7 @@ class HullBlend:
         depth = torch.zeros_like(region.occupied, dtype=torch.float32)
         depth[region.occupied] = blend.density(region.centres().to(planes.depth_opacity)).float() * region.voxel
         voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
-        blend = replace(blend, planes=planes.with_penalties(DEEPEST, PARTLY).with_surface(voxels.solid()))
+        blend = replace(blend, planes=planes.with_penalties(Penalties.alike()).with_surface(voxels.solid()))
         sampling = _FirstInHull(self.steps, STOP, planes=planes)
         return AdaptedField(blend, region, sampling, densities=(blend.density,), refined=voxels)
 

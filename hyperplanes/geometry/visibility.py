@@ -26,6 +26,7 @@ __all__ = [
     "ANGLE",
     "UNSEEN",
     "ChosenViews",
+    "Penalties",
     "Described",
     "Reading",
     "Visibility",
@@ -42,6 +43,28 @@ UNSEEN = 8.0  # penalty of a view that does not show the point
 FADING = 10.0  # of the weights of views, with their penalty
 ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
 SMALLEST_ANGLE = 1e-2  # between a view and a direction, in radians: nearer ones count as that far
+
+
+@dataclass(frozen=True)
+class Penalties:
+    """What counts against a view that does not see a point well; ANGLE radians of angle each.
+
+    Attributes:
+        deepest: the most that a point behind the first surface costs.
+        partly: what a mask costs that is not whole.
+        steep: cost of a radius behind the surface.
+        highest: of both together.
+    """
+
+    deepest: float = DEEPEST
+    partly: float = PARTLY
+    steep: float = 1.0
+    highest: float = DEEPEST + PARTLY
+
+    @classmethod
+    def alike(cls) -> Penalties:
+        """A view sees a point or does not: whatever hides it costs 1."""
+        return cls(deepest=1e3, partly=1e6, steep=1e6, highest=1.0)
 
 
 @dataclass(frozen=True)
@@ -200,7 +223,7 @@ class VisibilityPlanes:
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
         self._masked = torch.zeros(len(images), dtype=torch.bool, device=images.device)
-        self._deepest, self._partly = DEEPEST, PARTLY
+        self._penalties = Penalties()
 
     def __len__(self) -> int:
         return len(self.colours)
@@ -221,15 +244,14 @@ class VisibilityPlanes:
         result._masked = self._masked.index_fill(0, views.to(self._masked.device), True)
         return result
 
-    def with_penalties(self, deepest: float, partly: float) -> VisibilityPlanes:
-        """The same planes with other limits of what counts against a view.
+    def with_penalties(self, penalties: Penalties) -> VisibilityPlanes:
+        """The same planes with other penalties of the views.
 
         Args:
-            deepest: the largest penalty of a point that lies behind the surface, in radii.
-            partly: that of a mask that is not whole.
+            penalties: what counts against a view, and how much.
         """
         result = copy.copy(self)
-        result._deepest, result._partly = deepest, partly
+        result._penalties = penalties
         return result
 
     def with_surface(self, voxels: Occupancy) -> VisibilityPlanes:
@@ -280,8 +302,9 @@ class VisibilityPlanes:
 
     def _limits(self) -> list[float]:
         """The numbers by which the kernels judge."""
-        per_radius = 1 / self.occupancy.bounds.radius
-        return [self.colours.nearest, per_radius, self.tolerance, self._deepest, self._partly, WHOLE, UNSEEN, ANGLE]
+        per_radius, own = 1 / self.occupancy.bounds.radius, self._penalties
+        limits = [self.colours.nearest, per_radius, self.tolerance, own.deepest, own.partly, WHOLE, UNSEEN, ANGLE]
+        return [*limits, own.steep, own.highest]
 
     def _shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, and 0 where it is hidden."""
@@ -426,7 +449,9 @@ class VisibilityPlanes:
         coverage = torch.where(valid, coverage, 1.0)
         # how far behind the surface, in radii, and what that and a broken mask cost
         behind = torch.where(valid, (found.distances - depth) / self.occupancy.bounds.radius, 0.0)
-        penalty = (behind - self.tolerance).clamp(-self._deepest, self._deepest) + self._partly * (coverage < WHOLE)
+        own = self._penalties
+        penalty = (own.steep * (behind - self.tolerance)).clamp(-own.deepest, own.deepest)
+        penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest)
         penalty = torch.where(valid, penalty, UNSEEN)
         values = torch.cat([found.directions, torch.stack([behind, coverage, penalty], -1)], -1)
 

@@ -74,7 +74,7 @@ def judge(s, pitch, total, maps, shape, limits):
     zero, one = number(0), number(1)
     across_next, down_next = np.int32(2 * min(shape[2] - 1, 1)), np.int32(2 * shape[2] * min(shape[1] - 1, 1))
     per_unit, tolerance, deepest = limits[1], limits[2], limits[3]
-    partly, whole, unseen = limits[4], limits[5], limits[6]
+    partly, whole, unseen, steep, highest = limits[4], limits[5], limits[6], limits[8], limits[9]
     for k in range(total):
         at, across, down = load_int(s, AT * pitch, k), load(s, ACROSS * pitch + k), load(s, DOWN * pitch + k)
         right, below = np.int32(at + across_next), np.int32(at + down_next)
@@ -90,7 +90,8 @@ def judge(s, pitch, total, maps, shape, limits):
         # how far behind the surface the point lies, in radii, and what that costs
         shown = load(s, SHOWN * pitch + k) > zero
         behind = (load(s, DISTANCE * pitch + k) - depth) * per_unit
-        penalty = min(max(behind - tolerance, -deepest), deepest) + (partly if opacity < whole else zero)
+        penalty = min(max(steep * (behind - tolerance), -deepest), deepest)
+        penalty = min(penalty + (partly if opacity < whole else zero), highest)
         store(s, BEHIND * pitch + k, behind if shown else zero)
         store(s, OPACITY * pitch + k, opacity if shown else one)
         store(s, PENALTY * pitch + k, penalty if shown else unseen)
@@ -163,10 +164,11 @@ def choose(
 
     `cameras` holds 16 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
     matrix, and 0 where it is hidden. `maps` (view, row, column, 2) hold depth and opacity. `shape` is the number of
-    views, height, width, the numbers of chosen views, and the pitch; `limits` min_z, 1 / radius, the tolerance,
-    DEEPEST, PARTLY, WHOLE, UNSEEN and ANGLE. `best` and `near` (point, chosen) get indices of views, their values
-    (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each, and `overall` (point, 2) the least
-    opacity and the number of the views that show the point. Where there are no directions nothing is written to `near`.
+    views, height, width, the numbers of chosen views, and the pitch; `limits` min_z, 1 / radius, the tolerance, deepest
+    and partly of `visibility.Penalties`, WHOLE, UNSEEN, ANGLE, steep and highest. `best` and `near` (point, chosen) get
+    indices of views, their values (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each, and
+    `overall` (point, 2) the least opacity and the number of the views that show the point. Where there are no
+    directions nothing is written to `near`.
     """
     number = limits.dtype.type
     total, best_count, near_count, pitch = shape[0], shape[3], shape[4], shape[5]
