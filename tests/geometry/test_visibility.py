@@ -11,7 +11,7 @@ from hyperplanes.geometry.cameras import centres, projection_matrices
 from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import pixel_grid
-from hyperplanes.geometry.visibility import ANGLE, DEEPEST, PARTLY, UNSEEN, WHOLE, VisibilityPlanes
+from hyperplanes.geometry.visibility import ANGLE, DEEPEST, PARTLY, UNSEEN, WHOLE, Penalties, VisibilityPlanes
 from tests.reference_rendering import ball_views, camera_at, ring
 
 SIZE = (20, 24)
@@ -116,6 +116,34 @@ def test_the_chosen_views_are_those_of_the_definition(monkeypatch, compiled):
     torch.testing.assert_close(found.coverage, every[..., 4].amin(1), atol=1e-5, rtol=0)
     assert torch.equal(found.number, (~unseen).sum(1).float())
     assert torch.equal(found.best.valid, ~unseen.gather(1, found.best.views))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_what_hides_a_point_costs_alike_where_penalties_are_alike(monkeypatch, compiled):
+    shown, (points, directions) = planes(), queries(200)
+    if not compiled:
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    points = points.mul(0.4)
+    seen = shown.with_penalties(Penalties.alike()).choose(points, directions, best=len(shown), nearest=1).best
+    hidden = (seen.behind > shown.tolerance) | (seen.coverage < WHOLE)
+    unseen = seen.penalty == UNSEEN
+    assert 0.1 < hidden[~unseen].float().mean() < 0.9  # of both kinds
+    torch.testing.assert_close(seen.penalty[hidden & ~unseen], torch.ones(int((hidden & ~unseen).sum())))
+    assert (seen.penalty[~hidden & ~unseen] <= 0).all()
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_blended_colours_are_those_of_the_unstructured_lumigraph(monkeypatch, compiled):
+    shown, (points, directions) = planes(), queries(40)
+    if not compiled:
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    every = slow_penalties(shown, points)
+    angle = torch.acos((every[..., :3] * directions[:, None]).sum(-1).clamp(-1, 1))
+    score, order = (angle + ANGLE * every[..., 5].clamp_min(0)).clamp_min(1e-2).sort(1)
+    weights = (1 / score[:, :2] - 1 / (1.01 * score[:, 2:3])).clamp_min(1e-6)
+    colours = shown.colours.lookup(points).colours.gather(1, order[:, :2, None].expand(-1, -1, 3))
+    expected = (weights[..., None] * colours).sum(1) / weights.sum(1, keepdim=True)
+    torch.testing.assert_close(shown.blended(points, directions, 2), expected, atol=2e-3, rtol=0)
 
 
 def test_a_point_on_a_ball_is_seen_from_its_side_and_lies_behind_it_from_the_other():
