@@ -123,6 +123,11 @@ class _Blend:
 
     thread_safe: ClassVar[bool] = True
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """That of the views, in which points are expected."""
+        return self.planes.depth_opacity.dtype
+
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:

@@ -298,7 +298,7 @@ class VisibilityPlanes:
         """Whether the kernels take these points: single precision, on the CPU, pinhole cameras."""
         pinholes = not isinstance(self.colours.cameras, DistortedCamera)
         compiled = find_spec("numba") and points.device.type == "cpu" and self.depth_opacity.numel() < 2**31
-        return bool(compiled) and points.dtype == torch.float32 and pinholes
+        return bool(compiled) and points.dtype == torch.float32 == self.depth_opacity.dtype and pinholes
 
     def _limits(self) -> list[float]:
         """The numbers by which the kernels judge."""

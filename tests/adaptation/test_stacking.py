@@ -80,6 +80,18 @@ def test_pictures_and_pixels_are_the_mean_of_both_fields(share):
     torch.testing.assert_close(mixed.colour, torch.lerp(one.colour, other.colour, share))
 
 
+def test_a_model_in_double_precision_is_stacked_too():
+    support, cameras = ball_views(ring(6, (24, 24))), ring(1, (10, 13), shift=1)
+    adapter = model()
+    context = adapter.prepare(support)
+    double = adapter.double().prepare(support)
+    one, other = (HullBlend().adapt_to(each.planes).render(cameras) for each in (context, double))
+    torch.testing.assert_close(one.images, other.images, atol=2e-2, rtol=0)
+    learned = adapter.rendering_field(double, adapter.adapted_weights(double))
+    assert stack(learned, HullBlend().adapt_to(double.planes), 0.3).render(cameras).images.dtype == torch.float32
+    assert hull_share(adapter, support.to(dtype=torch.float64)) >= 0
+
+
 def test_densities_are_those_of_the_field_that_counts_more():
     learned, hull = both(ball_views(ring(6, (24, 24))))
     points = torch.rand(50, 3) - 0.5
