@@ -1,6 +1,6 @@
 """Baked voxels against the field that they were baked from: PSNR on views that neither was shown, and time.
 
-    python -m benchmarks baked --data data/cars data/chairs --json FILE
+    python -m benchmarks baked --data data/cars data/chairs data/chair --json FILE
     python -m benchmarks baked --suite cc0 --counts 5 25 --json FILE
 
 Of every held-out object so many views are shown to the model, and some others are rendered by its field, by the voxels
@@ -56,7 +56,8 @@ def main(arguments: list[str]) -> int:
         for count in chosen.counts:
             shown = Shown(data, count, chosen.query)
             found = [measure(model, shown.task(name), chosen.side, chosen.fit) for name in names]
-            row: Row = {"name": path.resolve().name, "views": count, "objects": len(names)}
+            height, width = shown.task(names[0]).support.size
+            row: Row = {"name": path.resolve().name, "views": count, "objects": len(names), "size": f"{width}x{height}"}
             row |= {key: statistics.fmean(each[key] for each in found) for key in found[0]}
             row["worst"] = min(each["fitted"] - each["field"] for each in found)
             print(row, flush=True)

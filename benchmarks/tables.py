@@ -108,7 +108,8 @@ def _baked(result: Result) -> str:
     for row in result["rows"]:
         quality = [f"{row[name]:.2f} dB" for name in ("field", "baked", "fitted")]
         times = [_seconds(row[name] / 1000) for name in ("field_ms", "voxels_ms")]
-        name = f"{row['name']} ({row['objects']}), {row['views']} views"
+        size = f", {row['size']}" if "size" in row else ""
+        name = f"{NAMES[row['name']]} ({row['objects']}){size}, {row['views']} views"
         lines.append([name, *quality, *times, _seconds(row["bake_seconds"] + row["fit_seconds"])])
     headings = ["field, one step", "voxels as baked", "fitted", "a view by the field", "by voxels", "made in"]
     return markdown_table(["", *headings], lines)

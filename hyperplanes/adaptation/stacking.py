@@ -129,7 +129,7 @@ def hull_share(network: HyperPlanesNetwork, support: Views) -> float:
 
     Returns:
         The share, in [0, 1]: the best one (`best_share`) to the power of CAUTION; 0 where that lowers the squared error
-        by less than MARGIN, with fewer than FEWEST views, and without masks.
+        by less than MARGIN, with fewer than FEWEST views, without masks, and where held-out views look past the object.
     """
     if len(support) < FEWEST or support.masks is None:
         return 0.0
@@ -137,11 +137,14 @@ def hull_share(network: HyperPlanesNetwork, support: Views) -> float:
     order = outermost_first(camera_directions(support).cpu(), len(support))
     shown, held_out = support[sorted(order[:-HELD_OUT])], support[order[-HELD_OUT:]]
     context = network.prepare(shown)
+    among = live_pixels(context.occupancy, held_out)
+    if not len(among):  # they look past the object
+        return 0.0
     learned = network.rendering_field(context, network.theta + network.update(context))
     rays, truth, _ = held_out.sample_masked_rays(
         PIXELS,
         generator=torch.Generator().manual_seed(0),
-        among=live_pixels(context.occupancy, held_out),
+        among=among,
         near_far=learned.sampling.near_far,
         subpixels=SUBPIXELS,
     )

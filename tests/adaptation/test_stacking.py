@@ -146,6 +146,13 @@ def test_few_views_or_none_with_masks_decide_nothing():
     assert hull_share(adapter, ball_views(ring(6, (24, 24)), masks=False)) == 0
 
 
+def test_views_that_look_past_the_object_decide_nothing(monkeypatch):
+    support = ball_views(ring(6, (24, 24)))
+    assert hull_share(model(empty=True), support) > 0
+    monkeypatch.setattr(stacking, "live_pixels", lambda *_: torch.arange(0))
+    assert hull_share(model(empty=True), support) == 0
+
+
 def test_a_field_that_knows_views_by_their_places_is_not_stacked():
     with pytest.raises(ValueError, match="stacked: .* got point_multiplane"):
         HyperPlanes(replace(ModelConfig(), stacked=True))
