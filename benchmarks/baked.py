@@ -1,6 +1,6 @@
 """Baked voxels against the field that they were baked from: PSNR on views that neither was shown, and time.
 
-    python -m benchmarks baked --data data/cars data/chairs data/chair --json FILE
+    python -m benchmarks baked --data data/cars data/chairs --json FILE
     python -m benchmarks baked --suite cc0 --counts 5 25 --json FILE
 
 Of every held-out object so many views are shown to the model, and some others are rendered by its field, by the voxels

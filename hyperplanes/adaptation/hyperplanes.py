@@ -15,10 +15,9 @@ from hyperplanes.adaptation.descent import Descent, Variables
 from hyperplanes.adaptation.fine_tuning import fine_tune, fine_tune_to, make_descent
 from hyperplanes.adaptation.hub import upload_checkpoint
 from hyperplanes.adaptation.network import HyperPlanesNetwork
-from hyperplanes.adaptation.stacking import StackedField, stacked_field
+from hyperplanes.adaptation.stacking import learned_part, stacked_field
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
-from hyperplanes.fields.base import Field
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
@@ -100,13 +99,14 @@ class HyperPlanes(HyperPlanesNetwork):
             adapted: what this model made of the object.
 
         Returns:
-            A model that makes the same field of the same views, without looking at them twice; of a stacked field,
-            the part that is a network. A field that is no network of this model is a ValueError.
+            A model that makes the same field of the same views, without looking at them twice. A field that is
+            no network of this model is a ValueError.
         """
-        if isinstance(adapted, StackedField) and not isinstance(adapted.field, Field):
-            adapted = adapted.other
+        adapted, share = learned_part(adapted)
         result = HyperPlanes(
-            replace(self.config, hypernetwork=None, autoencoder=None, initialisation=None, stacked=False)
+            replace(
+                self.config, hypernetwork=None, autoencoder=None, initialisation=None, stacked=False, hull_share=share
+            )
         )
         result.rig.copy_(self.rig)
         found = {"fine": adapted.field, "coarse": adapted.proposal}

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
 from hyperplanes.utilities.environment import cache_folder
@@ -122,17 +121,13 @@ def _code() -> str:
 
 
 def keep_field(model: HyperPlanes, field: AdaptedField, folder: Path) -> None:
-    """Keep a field that is one network; of more than ten the oldest are deleted.
-
-    Stacked fields are not kept: one forward pass makes them again.
+    """Keep a field; of more than ten the oldest are deleted.
 
     Args:
         model: what made it.
         field: of `model`.
         folder: of `kept_folder`.
     """
-    if isinstance(field, StackedField):
-        return
     model.with_weights_of(field).save(folder)
     _delete_oldest(folder.parent)
 

@@ -14,6 +14,7 @@ from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.adaptation.context import SupportContext, live_pixels
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
+from hyperplanes.fields.base import Field
 from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
@@ -25,7 +26,7 @@ from hyperplanes.rendering.renderer import Sampler, render
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
-__all__ = ["FEWEST", "StackedField", "best_share", "hull_share", "stack", "stacked_field"]
+__all__ = ["FEWEST", "StackedField", "best_share", "hull_share", "learned_part", "stack", "stacked_field"]
 
 FEWEST = 5  # views, of which some can be held out
 HELD_OUT = 2
@@ -57,6 +58,8 @@ class StackedField(AdaptedField):
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
         """The mean of the pixels of both, as `AdaptedField.trace`."""
         own = super().trace(rays, generator, differentiable=differentiable)
+        if not self.share:
+            return own
         return _mean(own, self.other.trace(rays, generator, differentiable=differentiable), self.share, "colour")
 
     @checked
@@ -66,6 +69,8 @@ class StackedField(AdaptedField):
     ) -> Pictures:
         """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the field's alone."""
         own = super().render(cameras, sampling, antialias)
+        if not self.share:
+            return own
         return _mean(own, self.other.render(cameras, antialias=antialias), self.share, "images")
 
 
@@ -77,6 +82,19 @@ def _mean(one: Pixels, other: Pixels, share: float, colour: str) -> Pixels:
     return replace(one, **{colour: colours}, opacity=opacity, depth=depth, samples=one.samples + other.samples)
 
 
+def learned_part(adapted: AdaptedField) -> tuple[AdaptedField, float]:
+    """The part of a field that is a network, and the share of the hull beside it.
+
+    Args:
+        adapted: a field, stacked or not.
+    """
+    if not isinstance(adapted, StackedField):
+        return adapted, 0.0
+    if isinstance(adapted.field, Field):
+        return adapted, adapted.share
+    return adapted.other, 1 - adapted.share
+
+
 def stack(learned: AdaptedField, hull: AdaptedField, share: float) -> AdaptedField:
     """Two fields as one: it has the densities of the one that counts more, and the mean of the pictures of both.
 
@@ -86,12 +104,12 @@ def stack(learned: AdaptedField, hull: AdaptedField, share: float) -> AdaptedFie
         share: of the second one in the pictures, in [0, 1].
 
     Returns:
-        One of the two alone where the share is 0 or 1.
+        The first one alone where the share is 0.
     """
-    if share > 0.5:
-        learned, hull, share = hull, learned, 1 - share
     if share == 0:
         return learned
+    if share > 0.5:
+        learned, hull, share = hull, learned, 1 - share
     own = {each.name: getattr(learned, each.name) for each in fields(learned)}
     return StackedField(**own, other=hull, share=share)
 
@@ -100,7 +118,8 @@ def stack(learned: AdaptedField, hull: AdaptedField, share: float) -> AdaptedFie
 def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
     """The field of given weights, stacked with the visual hull where the model is configured so.
 
-    The share of the hull is that of the object's own update (`hull_share`), whatever the weights are.
+    The share of the hull is that of the object's own update (`hull_share`), whatever the weights are, or the one that
+    the model is configured with.
 
     Args:
         network: the model.
@@ -108,10 +127,10 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
         weights: of the field.
     """
     learned = network.rendering_field(context, weights)
-    if not network.config.stacked:
-        return learned
-    with in_use(network):
-        share = hull_share(network, context.views)
+    share = network.config.hull_share
+    if network.config.stacked:
+        with in_use(network):
+            share = hull_share(network, context.views)
     return stack(learned, _hull(context), share) if share else learned
 
 

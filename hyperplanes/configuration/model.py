@@ -51,6 +51,7 @@ class ModelConfig:
         stacked: pictures of a field of any number of views are means with those of `hull_blend`, by a share that two of
             five or more views decide, which are held out for the purpose (`adaptation.stacking`). Training does
             without.
+        hull_share: of `hull_blend` in the pictures of a model that is not `stacked`: what was decided for one object.
     """
 
     target: str = "point_multiplane"
@@ -64,10 +65,13 @@ class ModelConfig:
     order: str = "matched"
     plane_dropout: float = 0.0
     stacked: bool = False
+    hull_share: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.plane_dropout < 1:
             raise ValueError(f"plane_dropout: expected a probability from 0 to below 1, got {self.plane_dropout}")
+        if not 0 <= self.hull_share <= 1:
+            raise ValueError(f"hull_share: expected a share from 0 to 1, got {self.hull_share}")
         if self.order not in ORDERS:
             raise ValueError(f"order: expected one of {', '.join(map(repr, ORDERS))}, got {self.order!r}")
         chosen = [name for name in ("hypernetwork", "autoencoder", "initialisation") if getattr(self, name) is not None]

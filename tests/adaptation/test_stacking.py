@@ -9,7 +9,7 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, stacking
 from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.fine_tuned import random_model
 from hyperplanes.adaptation.fine_tuning import fine_tune
-from hyperplanes.adaptation.kept import keep_field
+from hyperplanes.adaptation.kept import keep_field, recall_field
 from hyperplanes.adaptation.stacking import CAUTION, FEWEST, MARGIN, StackedField, best_share, hull_share, stack
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FineTuning
@@ -98,7 +98,8 @@ def test_densities_are_those_of_the_field_that_counts_more():
     for share, heavier in ((0.2, learned), (0.8, hull)):
         assert torch.equal(stack(learned, hull, share).density(points), heavier.density(points))
     assert stack(learned, hull, 0.0) is learned
-    assert stack(learned, hull, 1.0) is hull
+    cameras = ring(1, (10, 13), shift=1)
+    assert torch.equal(stack(learned, hull, 1.0).render(cameras).images, hull.render(cameras).images)
 
 
 def test_the_views_that_decide_are_not_shown(monkeypatch):
@@ -158,19 +159,19 @@ def test_a_field_that_knows_views_by_their_places_is_not_stacked():
         HyperPlanes(replace(ModelConfig(), stacked=True))
 
 
-def test_the_weights_of_one_object_are_those_of_the_network_in_the_stack(tmp_path):
-    support, cameras = ball_views(ring(7, (24, 24))), ring(2, (10, 13), shift=1)
-    for empty in (False, True):
-        adapter = model(empty=empty)
-        context = adapter.prepare(support)
-        learned = adapter.rendering_field(context, adapter.adapted_weights(context))
-        for share in (0.2, 0.8):
-            stacked = stack(learned, HullBlend().adapt_to(context.planes), share)
-            again = adapter.with_weights_of(stacked).adapt(support)
-            expected = learned.render(cameras).images
-            torch.testing.assert_close(again.render(cameras).images, expected, atol=1e-6, rtol=0)
-            keep_field(adapter, stacked, tmp_path / "kept")
-            assert not (tmp_path / "kept").exists()
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.8, 1.0])
+def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share):
+    adapter, support, cameras = model(), ball_views(ring(7, (24, 24))), ring(2, (10, 13), shift=1)
+    context = adapter.prepare(support)
+    learned = adapter.rendering_field(context, adapter.adapted_weights(context))
+    stacked = stack(learned, HullBlend().adapt_to(context.planes), share)
+    keep_field(adapter, stacked, tmp_path / "adapted" / "kept")
+    expected = stacked.render(cameras).images
+    for again in (
+        adapter.with_weights_of(stacked).adapt(support),
+        recall_field(tmp_path / "adapted" / "kept", support),
+    ):
+        torch.testing.assert_close(again.render(cameras).images, expected, atol=1e-6, rtol=0)
     assert not random_model(adapter.config, 0).config.stacked
 
 
