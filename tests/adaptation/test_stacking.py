@@ -10,10 +10,20 @@ from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.fine_tuned import random_model
 from hyperplanes.adaptation.fine_tuning import fine_tune
 from hyperplanes.adaptation.kept import keep_field, recall_field
-from hyperplanes.adaptation.stacking import CAUTION, FEWEST, MARGIN, StackedField, best_share, hull_share, stack
+from hyperplanes.adaptation.stacking import (
+    CAUTION,
+    FEWEST,
+    MARGIN,
+    StackedField,
+    best_share,
+    hull_share,
+    learned_part,
+    stack,
+)
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import ImageBasedConfig
+from hyperplanes.fields.base import Field
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.geometry.rays import cast
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
@@ -92,10 +102,10 @@ def test_a_model_in_double_precision_is_stacked_too():
     assert hull_share(adapter, support.to(dtype=torch.float64)) >= 0
 
 
-def test_densities_are_those_of_the_field_that_counts_more():
+def test_densities_are_those_of_the_learned_field_unless_the_hull_overrules_it():
     learned, hull = both(ball_views(ring(6, (24, 24))))
     points = torch.rand(50, 3) - 0.5
-    for share, heavier in ((0.2, learned), (0.8, hull)):
+    for share, heavier in ((0.2, learned), (0.8, learned), (0.95, hull)):
         assert torch.equal(stack(learned, hull, share).density(points), heavier.density(points))
     assert stack(learned, hull, 0.0) is learned
     cameras = ring(1, (10, 13), shift=1)
@@ -117,7 +127,8 @@ def test_where_nothing_was_learned_the_hull_is_shown():
     adapter, support, cameras = model(empty=True), ball_views(ring(8, (24, 24))), ring(3, (24, 24), shift=1)
     adapted = adapter.adapt(support)
     assert isinstance(adapted, StackedField)
-    assert 1 - adapted.share > 0.8
+    assert learned_part(adapted)[1] > 0.8
+    assert isinstance(adapted.other.field, Field)  # nothing is left of it, so densities are those of the hull
     truth = ball_views(cameras).images
     alone = replace(adapter.config, stacked=False)
     without = HyperPlanes(alone)
