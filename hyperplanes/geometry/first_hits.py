@@ -47,10 +47,9 @@ def first_hits(
     result = far[:, None, None].repeat(1, height, width)
     masks = torch.ones_like(result) if masks is None else torch.as_tensor(masks, device=device)[:, 0]
     compiled = result.device.type == "cpu" and result.dtype == torch.float32 and find_spec("numba")
-    for view, (hits, mask) in enumerate(zip(result, masks, strict=True)):
-        for pixels in (mask > 0).nonzero().split(RAYS_AT_ONCE):
-            rays = cast(cameras, torch.full_like(pixels[:, 0], view), pixels.flip(1).to(result), occupancy.bounds)
-            hits[pixels.unbind(1)] = (_hits_compiled if compiled else _hits_torch)(occupancy, rays)
+    for pixels in (masks > 0).nonzero().split(RAYS_AT_ONCE):  # view, row, column
+        rays = cast(cameras, pixels[:, 0], pixels[:, 1:].flip(1).to(result), occupancy.bounds)
+        result[pixels.unbind(1)] = (_hits_compiled if compiled else _hits_torch)(occupancy, rays)
     return result
 
 
