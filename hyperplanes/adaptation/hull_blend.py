@@ -24,6 +24,7 @@ __all__ = ["HullBlend"]
 OPAQUE = 1e4  # density within the hull, per radius of the scene
 STOP = 2e-3  # transmittance; so low that every sample is evaluated: by every second one wings lose 0.05 to 0.5 dB
 SOLID = 0.5  # opacity of a mask from which on a pixel shows the object
+POINTS = 1 << 14  # in one call of the density
 ROUNDING = 1e-4  # of an opacity: what one kernel finds in the hull the other one does
 
 
@@ -65,12 +66,13 @@ class HullBlend:
         """As `adapt`, of views whose hull is carved.
 
         Args:
-            planes: the views; the side of their hull counts.
+            planes: the views, with masks; the side of their hull counts, not `side`.
         """
         region, blend = planes.occupancy, _Blend(planes, planes.occupancy.bounds, self.nearest)
         # voxels whose centre lies in the hull: by all that it enters views would see its surface too near
         depth = torch.zeros_like(region.occupied, dtype=torch.float32)
-        depth[region.occupied] = blend.density(region.centres().to(planes.depth_opacity)).float() * region.voxel
+        centres = region.centres().to(planes.depth_opacity).split(POINTS)
+        depth[region.occupied] = torch.cat([blend.density(each) for each in centres]).float() * region.voxel
         voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
         blend = replace(blend, planes=planes.with_penalties(Penalties.alike()).with_surface(voxels.solid()))
         sampling = _FirstInHull(self.steps, STOP, planes=planes)

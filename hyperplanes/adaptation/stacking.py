@@ -103,13 +103,19 @@ def stack(learned: AdaptedField, hull: AdaptedField, share: float) -> AdaptedFie
     of it in the pictures.
 
     Args:
-        learned: a field.
+        learned: a field that is not stacked.
         hull: another one.
         share: of the second one in the pictures, in [0, 1].
 
     Returns:
-        The first one alone where the share is 0.
+        The first one alone where the share is 0; with more than OVERRULED the `other` of the result is the first one
+        (`learned_part`).
+
+    Raises:
+        ValueError: a field that is stacked already.
     """
+    if isinstance(learned, StackedField) or isinstance(hull, StackedField):
+        raise ValueError("stack: expected fields that are not stacked, got one that is")
     if share == 0:
         return learned
     if share > OVERRULED:
@@ -131,7 +137,7 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
         weights: of the field.
     """
     learned = network.rendering_field(context, weights)
-    share = network.config.hull_share
+    share = 0.0 if context.views.masks is None else network.config.hull_share
     if network.config.stacked:
         with in_use(network):
             share = hull_share(network, context.views)
@@ -151,17 +157,21 @@ def hull_share(network: HyperPlanesNetwork, support: Views) -> float:
         support: the views of an object, where the model is.
 
     Returns:
-        The share, in [0, 1]: the best one (`best_share`) to the power of CAUTION; 0 where that lowers the squared error
-        by less than MARGIN, with fewer than FEWEST views, without masks, and where held-out views look past the object.
+        The share, in [0, 1]: the best one (`best_share`) to the power of CAUTION. It is 0 where that lowers the squared
+        error by less than MARGIN, with fewer than FEWEST views, without masks, and where the object is seen by the
+        held-out views alone, or not by them.
     """
     if len(support) < FEWEST or support.masks is None:
         return 0.0
     support = support.resized(SIZE)
     order = outermost_first(camera_directions(support).cpu(), len(support))
     shown, held_out = support[sorted(order[:-HELD_OUT])], support[order[-HELD_OUT:]]
+    assert shown.masks is not None
+    if not shown.masks.any():
+        return 0.0
     context = network.prepare(shown)
     among = live_pixels(context.occupancy, held_out)
-    if not len(among):  # they look past the object
+    if not len(among):
         return 0.0
     learned = network.rendering_field(context, network.theta + network.update(context))
     rays, truth, _ = held_out.sample_masked_rays(
@@ -190,6 +200,7 @@ def _pixels(adapted: AdaptedField, rays: Rays, across: float) -> Float[Tensor, "
         rays,
         adapted.sampling.for_rendering(across),
         occupancy=adapted.occupancy,
+        proposal=adapted.proposal,
         differentiable=False,
     )
     return found.pooled(len(SUBPIXELS)).colour

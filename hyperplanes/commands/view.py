@@ -156,7 +156,7 @@ def _adapt(
         if done % EVERY == 0 or done == steps:
             with torch.no_grad():
                 weights = variables.weights().detach()
-            field = model.rendering_field(context, weights)
+            field = model.rendering_field(context, weights) if steps else model.adapt_to(context)
             viewer.show(field, f"{len(shown)} support views, {done} of {steps} fine-tuning steps")
         if not wanted.empty():
             return

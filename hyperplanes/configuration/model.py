@@ -72,6 +72,8 @@ class ModelConfig:
             raise ValueError(f"plane_dropout: expected a probability from 0 to below 1, got {self.plane_dropout}")
         if not 0 <= self.hull_share <= 1:
             raise ValueError(f"hull_share: expected a share from 0 to 1, got {self.hull_share}")
+        if self.stacked and self.hull_share:
+            raise ValueError(f"hull_share: expected 0 where views decide it (stacked), got {self.hull_share}")
         if self.order not in ORDERS:
             raise ValueError(f"order: expected one of {', '.join(map(repr, ORDERS))}, got {self.order!r}")
         chosen = [name for name in ("hypernetwork", "autoencoder", "initialisation") if getattr(self, name) is not None]

@@ -47,9 +47,12 @@ def first_hits(
     result = far[:, None, None].repeat(1, height, width)
     masks = torch.ones_like(result) if masks is None else torch.as_tensor(masks, device=device)[:, 0]
     compiled = result.device.type == "cpu" and result.dtype == torch.float32 and find_spec("numba")
-    for pixels in (masks > 0).nonzero().split(RAYS_AT_ONCE):  # view, row, column
-        rays = cast(cameras, pixels[:, 0], pixels[:, 1:].flip(1).to(result), occupancy.bounds)
-        result[pixels.unbind(1)] = (_hits_compiled if compiled else _hits_torch)(occupancy, rays)
+    together = max(1, RAYS_AT_ONCE // (height * width))
+    for first in range(0, len(masks), together):
+        found = (masks[first : first + together] > 0).nonzero()  # view, row, column
+        for pixels in (found + found.new_tensor([first, 0, 0])).split(RAYS_AT_ONCE):
+            rays = cast(cameras, pixels[:, 0], pixels[:, 1:].flip(1).to(result), occupancy.bounds)
+            result[pixels.unbind(1)] = (_hits_compiled if compiled else _hits_torch)(occupancy, rays)
     return result
 
 

@@ -24,7 +24,9 @@ from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.base import Field
+from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.cameras import centres
+from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import cast
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.rendering import RayMarching
@@ -99,7 +101,8 @@ def test_a_model_in_double_precision_is_stacked_too():
     torch.testing.assert_close(one.images, other.images, atol=2e-2, rtol=0)
     learned = adapter.rendering_field(double, adapter.adapted_weights(double))
     assert stack(learned, HullBlend().adapt_to(double.planes), 0.3).render(cameras).images.dtype == torch.float32
-    assert hull_share(adapter, support.to(dtype=torch.float64)) >= 0
+    expected = hull_share(model(empty=True), support)
+    assert hull_share(model(empty=True).double(), support.to(dtype=torch.float64)) == pytest.approx(expected, abs=1e-3)
 
 
 def test_densities_are_those_of_the_learned_field_unless_the_hull_overrules_it():
@@ -119,6 +122,8 @@ def test_the_views_that_decide_are_not_shown(monkeypatch):
     assert 0 <= hull_share(adapter, support) <= 1
     (rest,) = shown
     assert len(rest) == 5
+    kept = sorted(outermost_first(camera_directions(support), 7)[:-2])  # without those that the others stand around
+    torch.testing.assert_close(centres(rest.cameras), centres(support.cameras)[kept])
     apart = torch.cdist(centres(support.cameras), centres(rest.cameras)).amin(1)
     assert int((apart > 1e-3).sum()) == 2
 
@@ -155,7 +160,14 @@ def test_few_views_or_none_with_masks_decide_nothing():
     adapter = model()
     for count in (1, FEWEST - 1):
         assert hull_share(adapter, ball_views(ring(count, (24, 24)))) == 0
-    assert hull_share(adapter, ball_views(ring(6, (24, 24)), masks=False)) == 0
+    support = ball_views(ring(6, (24, 24)))
+    assert hull_share(model(empty=True), replace(support, masks=None)) == 0
+    few = support.masks.clone()
+    few[sorted(outermost_first(camera_directions(support), 6)[:-2])] = 0
+    assert hull_share(model(empty=True), replace(support, masks=few)) == 0  # of which none is shown
+    saved = HyperPlanes(replace(CONFIG, stacked=False, hull_share=0.5))
+    assert not isinstance(saved.adapt(replace(support, masks=None)), StackedField)
+    assert isinstance(saved.adapt(support), StackedField)
 
 
 def test_views_that_look_past_the_object_decide_nothing(monkeypatch):
@@ -168,6 +180,15 @@ def test_views_that_look_past_the_object_decide_nothing(monkeypatch):
 def test_a_field_that_knows_views_by_their_places_is_not_stacked():
     with pytest.raises(ValueError, match="stacked: .* got point_multiplane"):
         HyperPlanes(replace(ModelConfig(), stacked=True))
+    with pytest.raises(ValueError, match="hull_share: .* got point_multiplane"):
+        HyperPlanes(replace(ModelConfig(), hull_share=0.5))
+    with pytest.raises(ValueError, match=r"hull_share: expected 0 where views decide it"):
+        replace(CONFIG, hull_share=0.5)
+    with pytest.raises(ValueError, match="hull_share: expected a share"):
+        replace(CONFIG, stacked=False, hull_share=1.5)
+    learned, hull = both(ball_views(ring(5, (24, 24))))
+    with pytest.raises(ValueError, match="stack: expected fields that are not stacked"):
+        stack(stack(learned, hull, 0.3), hull, 0.3)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.8, 1.0])
