@@ -11,7 +11,7 @@ from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility import ANGLE, VisibilityPlanes
 from hyperplanes.rendering import RayMarching
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
@@ -127,3 +127,17 @@ def test_a_view_that_is_hidden_cuts_nothing_away(monkeypatch):
     monkeypatch.setattr(VisibilityPlanes, "has_kernels", lambda self, points: False)
     torch.testing.assert_close(opacity, SMALL.adapt_to(hidden).render(cameras).opacity, atol=1e-4, rtol=0)
     assert opacity.max() == 1
+
+
+def test_where_no_view_sees_a_point_the_nearest_serve_whatever_hides_it():
+    """Within a ball every view is behind its surface, by more or less; the blend weighs them by angle alone."""
+    colours = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 0.0), (0.0, 1.0, 1.0)]
+    eyes = torch.nn.functional.normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(1)), dim=1) * 3
+    support = painted(concatenate([camera_at(tuple(eye.tolist()), (32, 32)) for eye in eyes]), colours)
+    point, direction = torch.tensor([[0.2, 0.1, 0.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+    found, _ = HullBlend(nearest=2, side=32).adapt(support).field(point, direction)
+    rays = torch.nn.functional.normalize(point - eyes, dim=1)
+    score, order = (1 * ANGLE + torch.acos((rays * direction).sum(1))).sort()
+    weights = 1 / score[:2] - 1 / (1.01 * score[2])
+    expected = (weights[:, None] * torch.tensor(colours)[order[:2]]).sum(0) / weights.sum()
+    torch.testing.assert_close(found[0], expected, atol=1e-2, rtol=0)
