@@ -30,8 +30,9 @@ from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TARGETS, ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.fields.image_based import READ, ImageBasedField
 from hyperplanes.geometry import ImagePlanes
+from hyperplanes.geometry.chosen_views import ChosenViews, Visibility
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.visibility import ChosenViews, Visibility, VisibilityPlanes
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.training import Trainer
 from hyperplanes.views import Views
 

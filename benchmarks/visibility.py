@@ -17,7 +17,8 @@ from benchmarks._timing import interleaved, ratio
 from benchmarks.objects import held_out
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.base import hull
-from hyperplanes.geometry.visibility import Visibility, VisibilityPlanes
+from hyperplanes.geometry.chosen_views import Visibility
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.geometry.volume import volume_of
 from hyperplanes.views import join_views
 

@@ -10,9 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, hull
+from hyperplanes.geometry.chosen_views import Penalties
+from hyperplanes.geometry.hull_hits import hull_hits
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays, Sphere
-from hyperplanes.geometry.visibility import Penalties, VisibilityPlanes
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.rendering.samplers import PackedSamples
@@ -25,7 +27,7 @@ OPAQUE = 1e4  # density within the hull, per radius of the scene
 STOP = 2e-3  # transmittance; so low that every sample is evaluated: by every second one wings lose 0.05 to 0.5 dB
 SOLID = 0.5  # opacity of a mask from which on a pixel shows the object
 POINTS = 1 << 14  # in one call of the density
-ROUNDING = 1e-4  # of an opacity: what one kernel finds in the hull the other one does
+ROUNDING = 1e-4  # of an opacity, by which kernels differ: without it 5 of 424,000 samples in the hull were holes
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ class _FirstInHull(RayMarching):
         if occupancy is None or generator is not None or not self.planes.has_kernels(rays.origins):
             return super().place(rays, occupancy, generator)
         step = 2 * occupancy.bounds.radius / self.steps
-        distances = self.planes.hull_hits(rays, rays.near + step / 2, step, occupancy, SOLID)
+        distances = hull_hits(self.planes, rays, rays.near + step / 2, step, occupancy, SOLID)
         ray = distances.isfinite().nonzero()[:, 0]
         return PackedSamples(ray, distances[ray], step)
 

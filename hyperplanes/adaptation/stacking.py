@@ -32,7 +32,7 @@ FEWEST = 5  # views, of which some can be held out
 HELD_OUT = 2
 PIXELS = 2048  # of the views that are held out, at whose edges pictures differ most
 SIZE = 128  # of all of them, along the longer side, at most: 256 pixels find no better shares, in three times the time
-CAUTION = 1.5  # power of the share that shows held-out views best: two views overestimate small shares
+CAUTION = 1.5  # power of the share that shows held-out views best: few views, so less than that (docs/small.md)
 OVERRULED = 0.8  # share of the hull from which on it is its surface that counts
 MARGIN = 0.02  # of the squared error, by which it has to be lower to be worth a second picture
 

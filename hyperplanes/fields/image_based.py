@@ -20,10 +20,11 @@ from torch.nn.functional import pad, relu, softplus
 from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.encoding import encode, encoded_size
 from hyperplanes.fields.rig import Rig, camera_directions
+from hyperplanes.geometry.chosen_views import ChosenViews, Described, Reading, Visibility
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.visibility import ChosenViews, Described, Reading, Visibility, VisibilityPlanes
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields

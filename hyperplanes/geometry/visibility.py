@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.chosen_views import (
+    ANGLE,
+    FADING,
+    SMALLEST_ANGLE,
+    UNSEEN,
+    WHOLE,
+    ChosenViews,
+    Described,
+    Penalties,
+    Reading,
+    Visibility,
+)
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.image_planes import ImagePlanes
@@ -20,176 +32,11 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.lookup_torch import transform_of
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.rays import Rays, Sphere
+from hyperplanes.geometry.rays import Sphere
 
-__all__ = [
-    "ANGLE",
-    "UNSEEN",
-    "ChosenViews",
-    "Penalties",
-    "Described",
-    "Reading",
-    "Visibility",
-    "VisibilityPlanes",
-]
+__all__ = ["VisibilityPlanes"]
 
 POINTS = 512  # that one call of the kernel works on
-RAYS = 512  # likewise
-
-DEEPEST = 2.0  # radii
-PARTLY = 2.0  # penalty of a mask that is not whole
-WHOLE = 0.98  # opacity of a mask from which on it counts as whole
-UNSEEN = 8.0  # penalty of a view that does not show the point
-FADING = 10.0  # of the weights of views, with their penalty
-ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
-SMALLEST_ANGLE = 1e-2  # between a view and a direction, in radians: nearer ones count as that far
-
-
-@dataclass(frozen=True)
-class Penalties:
-    """What counts against a view that does not see a point well; ANGLE radians of angle each.
-
-    Attributes:
-        deepest: the most that a point behind the first surface costs.
-        partly: what a mask costs that is not whole.
-        steep: cost of a radius behind the surface.
-        highest: of both together.
-    """
-
-    deepest: float = DEEPEST
-    partly: float = PARTLY
-    steep: float = 1.0
-    highest: float = DEEPEST + PARTLY
-
-    @classmethod
-    def alike(cls) -> Penalties:
-        """A view sees a point or does not: whatever hides it costs 1."""
-        return cls(deepest=1e3, partly=1e6, steep=1e6, highest=1.0)
-
-
-@dataclass(frozen=True)
-class ChosenViews:
-    """Some views of each point, best first.
-
-    Attributes:
-        views: their indices.
-        directions: unit vectors from each camera's centre to the point, in the world.
-        behind: how far the point lies behind the first surface of the hull along the ray of each camera, in radii of
-            the scene; negative before it.
-        coverage: opacity of the mask where the point falls.
-        penalty: how badly the view sees the point; UNSEEN where it does not show it at all.
-    """
-
-    views: Int[Tensor, "point chosen"]
-    directions: Float[Tensor, "point chosen 3"]
-    behind: Float[Tensor, "point chosen"]
-    coverage: Float[Tensor, "point chosen"]
-    penalty: Float[Tensor, "point chosen"]
-
-    @property
-    def valid(self) -> Bool[Tensor, "point chosen"]:
-        """Whether each view shows the point: it falls into the image, and the view is not hidden."""
-        return self.penalty < UNSEEN
-
-    @property
-    def weights(self) -> Float[Tensor, "point chosen"]:
-        """Weights that fall with the penalty and sum to one; all zero where no view shows the point."""
-        weights = torch.exp(-FADING * self.penalty.clamp_min(0)) * self.valid
-        return weights / weights.sum(1, keepdim=True).clamp_min(1e-6)
-
-    def first(self, count: int) -> ChosenViews:
-        """The first of the views.
-
-        Args:
-            count: how many; all where there are fewer.
-        """
-        return ChosenViews(*(getattr(self, each.name)[:, :count] for each in fields(self)))
-
-    def angles(self, directions: Float[Tensor, "point 3"]) -> Float[Tensor, "point chosen"]:
-        """Between a direction at each point and the ray of each view, in radians."""
-        return torch.acos((self.directions * directions[:, None]).sum(-1).clamp(-1 + 1e-6, 1 - 1e-6))
-
-    def lumigraph_weights(self, angles: Float[Tensor, "point chosen"], count: int) -> Float[Tensor, "point blended"]:
-        """Weights of the first views in a blend of their colours; not normalised.
-
-        A view at angle a has the weight 1 / a - 1 / a_max, a_max being the angle of the next view, so that the blend
-        changes continuously with the direction (Buehler et al. 2001, "Unstructured Lumigraph Rendering"). A view that
-        does not see the point counts as one at a greater angle.
-
-        Args:
-            angles: of `angles`.
-            count: how many views are blended.
-        """
-        score = (angles + ANGLE * self.penalty.clamp_min(0)).clamp_min(SMALLEST_ANGLE)
-        farthest = score[:, count : count + 1] if score.shape[1] > count else 2 * score[:, -1:]
-        return (1 / score[:, :count] - 1 / (1.01 * farthest)).clamp_min(1e-6)
-
-
-@dataclass(frozen=True)
-class Visibility:
-    """How the planes see points.
-
-    Attributes:
-        best: the views that see each point best.
-        nearest: those of similar viewing direction, which see it, one more than was asked for where there are so many.
-        coverage: the least opacity over the views that show the point; 1 where none does.
-        number: of the views that show the point.
-    """
-
-    best: ChosenViews
-    nearest: ChosenViews | None
-    coverage: Float[Tensor, " point"]
-    number: Float[Tensor, " point"]
-
-
-@dataclass(frozen=True)
-class Reading:
-    """How a network reads views.
-
-    Attributes:
-        best: views of the least penalty; 0 reads none of them.
-        nearest: views nearest to a direction.
-        point_frequencies: of the encoded point.
-        direction_frequencies: of the encoded direction.
-        falloff: of depths behind the hull, in 1 / radii, where tanh makes them inputs.
-    """
-
-    best: int
-    nearest: int
-    point_frequencies: int
-    direction_frequencies: int
-    falloff: float
-
-    @property
-    def row_size(self) -> int:
-        """The encoded point, nine numbers of each of the best views, eleven of all of them."""
-        return 3 + 6 * self.point_frequencies + 9 * self.best + 11
-
-    @property
-    def near_size(self) -> int:
-        """The encoded direction, and seven numbers of each of the nearest views."""
-        return 3 + 6 * self.direction_frequencies + 7 * self.nearest
-
-
-@dataclass(frozen=True)
-class Described:
-    """What a network reads of points, in rows.
-
-    Attributes:
-        rows: the encoded point; colour in [-1, 1], depth behind the hull, coverage, validity and direction of each of
-            the best views; mean, variance and difference to the best of their colours, least coverage, logarithm of the
-            number of views; features of a grid.
-        coverage: the least opacity over the views that show the point.
-        near_rows: the encoded direction; colour, angle, depth, coverage and validity of each of the nearest views.
-        near_weights: logarithms of the weights of the blend (`fields.image_based`).
-        near_colours: in [0, 1], white where a view does not show the point.
-    """
-
-    rows: Float[Tensor, "point number"]
-    coverage: Float[Tensor, " covered"]
-    near_rows: Float[Tensor, "point near_number"]
-    near_weights: Float[Tensor, "seen near"]
-    near_colours: Float[Tensor, "seen near 3"]
 
 
 class VisibilityPlanes:
@@ -306,7 +153,7 @@ class VisibilityPlanes:
         limits = [self.colours.nearest, per_radius, self.tolerance, own.deepest, own.partly, WHOLE, UNSEEN, ANGLE]
         return [*limits, own.steep, own.highest]
 
-    def _shown_cameras(self) -> Tensor:
+    def shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, and 0 where it is hidden."""
         return torch.cat([self._cameras, (~self._masked).to(self._cameras)[None]])
 
@@ -319,7 +166,7 @@ class VisibilityPlanes:
         values = torch.empty(count, best, 6), torch.empty(count, nearest, 6)
         overall = torch.empty(count, 2)
         along = points[:0] if directions is None else directions
-        fixed = [each.contiguous().flatten().numpy() for each in (points, along, self._shown_cameras(), depth_opacity)]
+        fixed = [each.contiguous().flatten().numpy() for each in (points, along, self.shown_cameras(), depth_opacity)]
         shape = (*depth_opacity.shape[:3], best, nearest, len(self))
         numbers = np.array(self._limits(), np.float32)
         outputs = [each.flatten().numpy() for each in (views[0], values[0], views[1], values[1], overall)]
@@ -327,36 +174,6 @@ class VisibilityPlanes:
         parallel_for(lambda a, b: kernel(*fixed, shape, numbers, *outputs, a, b), count, POINTS)
         chosen = [ChosenViews(each, *_split(value)) for each, value in zip(views, values, strict=True)]
         return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
-
-    @torch.no_grad()
-    def hull_hits(
-        self, rays: Rays, first: Float[Tensor, " ray"], step: float, voxels: Occupancy, opacity: float
-    ) -> Float[Tensor, " ray"]:
-        """The first samples of rays in the visual hull, by one kernel; `has_kernels` says of which points.
-
-        Args:
-            rays: with far.
-            first: distance of the first sample of each.
-            step: from one sample to the next.
-            voxels: a sample lies in the hull only where these are occupied.
-            opacity: that every view which shows a sample has there at least.
-
-        Returns:
-            Their distances along the rays; infinite where there is none.
-        """
-        cameras, bounds = self._shown_cameras(), voxels.bounds
-        arrays = [each.contiguous().numpy() for each in (rays.origins, rays.directions, first, rays.far)]
-        fixed = (
-            *arrays, np.float32(step), np.array([*bounds.centre, bounds.radius], np.float32),
-            voxels.occupied.contiguous().numpy().view(np.uint8),
-            *(each.contiguous().flatten().numpy() for each in (cameras, self.depth_opacity)),
-            (*self.depth_opacity.shape[:3], cameras.shape[1]),
-            np.array([self.colours.nearest, opacity], np.float32),
-        )  # fmt: skip
-        nearest = torch.empty(len(rays))
-        kernel = compile_kernel("hull_hits.hull_hits", torch.float32)
-        parallel_for(lambda a, b: kernel(*fixed, nearest.numpy(), a, b), len(rays), RAYS)
-        return nearest
 
     def blended(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], nearest: int
@@ -423,7 +240,7 @@ class VisibilityPlanes:
         surface = points.new_zeros(0) if self._surface is None else self._surface
         numbers = [*self._limits(), FADING, reading.falloff, SMALLEST_ANGLE]
         frequencies = reading.point_frequencies, reading.direction_frequencies
-        maps = [each.contiguous().flatten().numpy() for each in (self._shown_cameras(), self.depth_opacity, surface)]
+        maps = [each.contiguous().flatten().numpy() for each in (self.shown_cameras(), self.depth_opacity, surface)]
         fixed = (
             points.contiguous().numpy(), along.contiguous().numpy(), *maps,
             packed.words.flatten().numpy().view(np.uint32), features.numpy(),

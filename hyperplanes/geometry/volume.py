@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, grid_sample
 
+from hyperplanes.geometry.chosen_views import Reading
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.visibility import Reading, VisibilityPlanes
+from hyperplanes.geometry.visibility import VisibilityPlanes
 
 __all__ = ["CHANNELS", "SIDE", "interpolate_grid", "volume_of"]
 

@@ -10,8 +10,9 @@ from hyperplanes.adaptation import HullBlend, hull_blend
 from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
+from hyperplanes.geometry.chosen_views import ANGLE
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.visibility import ANGLE, VisibilityPlanes
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering import RayMarching
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views

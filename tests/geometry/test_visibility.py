@@ -8,10 +8,11 @@ import torch
 from hyperplanes.geometry import Sphere, carve, cast
 from hyperplanes.geometry import visibility as module
 from hyperplanes.geometry.cameras import centres, projection_matrices
+from hyperplanes.geometry.chosen_views import ANGLE, DEEPEST, PARTLY, UNSEEN, WHOLE, Penalties
 from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import pixel_grid
-from hyperplanes.geometry.visibility import ANGLE, DEEPEST, PARTLY, UNSEEN, WHOLE, Penalties, VisibilityPlanes
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from tests.reference_rendering import ball_views, camera_at, ring
 
 SIZE = (20, 24)

@@ -1,4 +1,4 @@
-"""The CPU kernel of `visibility.VisibilityPlanes.hull_hits`: every ray steps on until no mask cuts its sample away."""
+"""The CPU kernel of `geometry.hull_hits`: every ray steps on until no mask cuts its sample away."""
 
 from __future__ import annotations
 

@@ -165,9 +165,9 @@ def choose(
     `cameras` holds 16 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
     matrix, and 0 where it is hidden. `maps` (view, row, column, 2) hold depth and opacity. `shape` is the number of
     views, height, width, the numbers of chosen views, and the pitch; `limits` min_z, 1 / radius, the tolerance, deepest
-    and partly of `visibility.Penalties`, WHOLE, UNSEEN, ANGLE, steep and highest. `best` and `near` (point, chosen) get
-    indices of views, their values (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each, and
-    `overall` (point, 2) the least opacity and the number of the views that show the point. Where there are no
+    and partly of `chosen_views.Penalties`, WHOLE, UNSEEN, ANGLE, steep and highest. `best` and `near` (point, chosen)
+    get indices of views, their values (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each,
+    and `overall` (point, 2) the least opacity and the number of the views that show the point. Where there are no
     directions nothing is written to `near`.
     """
     number = limits.dtype.type

@@ -1,0 +1,179 @@
+"""Which views see points, and how well: what `visibility.VisibilityPlanes` answers, and by what it judges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+__all__ = [
+    "ANGLE",
+    "DEEPEST",
+    "FADING",
+    "PARTLY",
+    "SMALLEST_ANGLE",
+    "UNSEEN",
+    "WHOLE",
+    "ChosenViews",
+    "Described",
+    "Penalties",
+    "Reading",
+    "Visibility",
+]
+
+DEEPEST = 2.0  # radii
+PARTLY = 2.0  # penalty of a mask that is not whole
+WHOLE = 0.98  # opacity of a mask from which on it counts as whole
+UNSEEN = 8.0  # penalty of a view that does not show the point
+FADING = 10.0  # of the weights of views, with their penalty
+ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
+SMALLEST_ANGLE = 1e-2  # between a view and a direction, in radians: nearer ones count as that far
+
+
+@dataclass(frozen=True)
+class Penalties:
+    """What counts against a view that does not see a point well; ANGLE radians of angle each.
+
+    Attributes:
+        deepest: the most that a point behind the first surface costs.
+        partly: what a mask costs that is not whole.
+        steep: cost of a radius behind the surface.
+        highest: of both together.
+    """
+
+    deepest: float = DEEPEST
+    partly: float = PARTLY
+    steep: float = 1.0
+    highest: float = DEEPEST + PARTLY
+
+    @classmethod
+    def alike(cls) -> Penalties:
+        """A view sees a point or does not: whatever hides it costs 1."""
+        return cls(deepest=1e3, partly=1e6, steep=1e6, highest=1.0)
+
+
+@dataclass(frozen=True)
+class ChosenViews:
+    """Some views of each point, best first.
+
+    Attributes:
+        views: their indices.
+        directions: unit vectors from each camera's centre to the point, in the world.
+        behind: how far the point lies behind the first surface of the hull along the ray of each camera, in radii of
+            the scene; negative before it.
+        coverage: opacity of the mask where the point falls.
+        penalty: how badly the view sees the point; UNSEEN where it does not show it at all.
+    """
+
+    views: Int[Tensor, "point chosen"]
+    directions: Float[Tensor, "point chosen 3"]
+    behind: Float[Tensor, "point chosen"]
+    coverage: Float[Tensor, "point chosen"]
+    penalty: Float[Tensor, "point chosen"]
+
+    @property
+    def valid(self) -> Bool[Tensor, "point chosen"]:
+        """Whether each view shows the point: it falls into the image, and the view is not hidden."""
+        return self.penalty < UNSEEN
+
+    @property
+    def weights(self) -> Float[Tensor, "point chosen"]:
+        """Weights that fall with the penalty and sum to one; all zero where no view shows the point."""
+        weights = torch.exp(-FADING * self.penalty.clamp_min(0)) * self.valid
+        return weights / weights.sum(1, keepdim=True).clamp_min(1e-6)
+
+    def first(self, count: int) -> ChosenViews:
+        """The first of the views.
+
+        Args:
+            count: how many; all where there are fewer.
+        """
+        return ChosenViews(*(getattr(self, each.name)[:, :count] for each in fields(self)))
+
+    def angles(self, directions: Float[Tensor, "point 3"]) -> Float[Tensor, "point chosen"]:
+        """Between a direction at each point and the ray of each view, in radians."""
+        return torch.acos((self.directions * directions[:, None]).sum(-1).clamp(-1 + 1e-6, 1 - 1e-6))
+
+    def lumigraph_weights(self, angles: Float[Tensor, "point chosen"], count: int) -> Float[Tensor, "point blended"]:
+        """Weights of the first views in a blend of their colours; not normalised.
+
+        A view at angle a has the weight 1 / a - 1 / a_max, a_max being the angle of the next view, so that the blend
+        changes continuously with the direction (Buehler et al. 2001, "Unstructured Lumigraph Rendering"). A view that
+        does not see the point counts as one at a greater angle.
+
+        Args:
+            angles: of `angles`.
+            count: how many views are blended.
+        """
+        score = (angles + ANGLE * self.penalty.clamp_min(0)).clamp_min(SMALLEST_ANGLE)
+        farthest = score[:, count : count + 1] if score.shape[1] > count else 2 * score[:, -1:]
+        return (1 / score[:, :count] - 1 / (1.01 * farthest)).clamp_min(1e-6)
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """How the planes see points.
+
+    Attributes:
+        best: the views that see each point best.
+        nearest: those of similar viewing direction, which see it, one more than was asked for where there are so many.
+        coverage: the least opacity over the views that show the point; 1 where none does.
+        number: of the views that show the point.
+    """
+
+    best: ChosenViews
+    nearest: ChosenViews | None
+    coverage: Float[Tensor, " point"]
+    number: Float[Tensor, " point"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a network reads views.
+
+    Attributes:
+        best: views of the least penalty; 0 reads none of them.
+        nearest: views nearest to a direction.
+        point_frequencies: of the encoded point.
+        direction_frequencies: of the encoded direction.
+        falloff: of depths behind the hull, in 1 / radii, where tanh makes them inputs.
+    """
+
+    best: int
+    nearest: int
+    point_frequencies: int
+    direction_frequencies: int
+    falloff: float
+
+    @property
+    def row_size(self) -> int:
+        """The encoded point, nine numbers of each of the best views, eleven of all of them."""
+        return 3 + 6 * self.point_frequencies + 9 * self.best + 11
+
+    @property
+    def near_size(self) -> int:
+        """The encoded direction, and seven numbers of each of the nearest views."""
+        return 3 + 6 * self.direction_frequencies + 7 * self.nearest
+
+
+@dataclass(frozen=True)
+class Described:
+    """What a network reads of points, in rows.
+
+    Attributes:
+        rows: the encoded point; colour in [-1, 1], depth behind the hull, coverage, validity and direction of each of
+            the best views; mean, variance and difference to the best of their colours, least coverage, logarithm of the
+            number of views; features of a grid.
+        coverage: the least opacity over the views that show the point.
+        near_rows: the encoded direction; colour, angle, depth, coverage and validity of each of the nearest views.
+        near_weights: logarithms of the weights of the blend (`fields.image_based`).
+        near_colours: in [0, 1], white where a view does not show the point.
+    """
+
+    rows: Float[Tensor, "point number"]
+    coverage: Float[Tensor, " covered"]
+    near_rows: Float[Tensor, "point near_number"]
+    near_weights: Float[Tensor, "seen near"]
+    near_colours: Float[Tensor, "seen near 3"]

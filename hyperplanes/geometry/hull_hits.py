@@ -1,0 +1,54 @@
+"""Where rays first meet the visual hull of masks, and not only a voxel that it enters."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.threads import parallel_for
+from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.rays import Rays
+from hyperplanes.geometry.visibility import VisibilityPlanes
+
+__all__ = ["hull_hits"]
+
+RAYS = 512  # that one call of the kernel works on
+
+
+@torch.no_grad()
+def hull_hits(
+    planes: VisibilityPlanes,
+    rays: Rays,
+    first: Float[Tensor, " ray"],
+    step: float,
+    voxels: Occupancy,
+    opacity: float,
+) -> Float[Tensor, " ray"]:
+    """The first samples of rays in the visual hull, by one kernel; `planes.has_kernels` says of which points.
+
+    Args:
+        planes: the views whose masks are the hull.
+        rays: with far.
+        first: distance of the first sample of each.
+        step: from one sample to the next.
+        voxels: a sample lies in the hull only where these are occupied.
+        opacity: that every view which shows a sample has there at least.
+
+    Returns:
+        Their distances along the rays; infinite where there is none.
+    """
+    cameras, bounds, shape = planes.shown_cameras(), voxels.bounds, planes.depth_opacity.shape
+    arrays = [each.contiguous().numpy() for each in (rays.origins, rays.directions, first, rays.far)]
+    fixed = (
+        *arrays, np.float32(step), np.array([*bounds.centre, bounds.radius], np.float32),
+        voxels.occupied.contiguous().numpy().view(np.uint8),
+        *(each.contiguous().flatten().numpy() for each in (cameras, planes.depth_opacity)),
+        (*shape[:3], cameras.shape[1]), np.array([planes.colours.nearest, opacity], np.float32),
+    )  # fmt: skip
+    nearest = torch.empty(len(rays))
+    kernel = compile_kernel("hull_hits.hull_hits", torch.float32)
+    parallel_for(lambda a, b: kernel(*fixed, nearest.numpy(), a, b), len(rays), RAYS)
+    return nearest
