@@ -152,10 +152,9 @@ def render_views(
         console: where the progress is shown.
         sampling: another sampler than the field's own, for one that was adapted.
     """
-    import torch
-
-    from hyperplanes.adaptation.base import AdaptedField, Pictures
+    from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.geometry import cameras as camera
+    from hyperplanes.rendering.images import join_pictures
 
     parts = []
     with console.bar("rendering") as bar:
@@ -163,12 +162,7 @@ def render_views(
             one = camera.select(cameras, [view])
             parts.append(field.render(one, sampling) if isinstance(field, AdaptedField) else field.render(one))
             bar.show(view + 1, cameras.batch_size, "views")
-    return Pictures(
-        torch.cat([part.images for part in parts]),
-        torch.cat([part.opacity for part in parts]),
-        torch.cat([part.depth for part in parts]),
-        sum(part.samples for part in parts),
-    )
+    return join_pictures(parts)
 
 
 def bake_field(field: AdaptedField, shown: Views, side: int, *, fit: int, console: Console) -> BakedField:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -20,11 +20,11 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
-from hyperplanes.rendering.images import render_images
+from hyperplanes.rendering.images import join_pictures, render_images
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.rendering.scene import SplitField
 from hyperplanes.rendering.transmittance import transmittance
-from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
+from hyperplanes.rendering.voxels import STOP, VoxelGrid, render_voxels, shade_voxels
 from hyperplanes.utilities.arguments import checked
 
 __all__ = ["BakedScene", "bake", "coarsening", "default_side"]
@@ -57,23 +57,31 @@ class BakedScene:
             return self.adapted.render(cameras, self.adapted.sampling)
         step = 2 * bounds.radius / self.steps
 
-        def render_rays(rays: Rays) -> Rendered:
-            basis = spherical_harmonics(rays.directions)
-            return render_voxels(
-                self.field.index, self.field.values, bounds, rays, basis, step=step, empty=self.distances
-            )
+        def view(place: int) -> Pictures:
+            one = camera.select(cameras, [place])
+            shaded = shade_voxels(self.field.values, self._centres, camera.centres(one)[0])
 
-        return render_images(cameras, bounds, render_rays, occupancy=self._coarse_occupancy, antialias=True)
+            def render_rays(rays: Rays) -> Rendered:
+                return render_voxels(self.grid, shaded, rays, step=step)
+
+            return render_images(one, bounds, render_rays, occupancy=self._coarse_occupancy, antialias=True)
+
+        return join_pictures([view(place) for place in range(cameras.batch_size)])
 
     @cached_property
     def adapted(self) -> AdaptedField:
         """The voxels as any other field of one object."""
-        return AdaptedField(self.field, self.field.occupancy, RayMarching(self.steps, 1e-3))
+        return AdaptedField(self.field, self.field.occupancy, RayMarching(self.steps, STOP))
 
     @cached_property
-    def distances(self) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
-        """From every cell to the nearest that is not empty, for empty-space skipping; see `distance_to_filled`."""
-        return distance_to_filled(self.field.index)
+    def grid(self) -> VoxelGrid:
+        """The voxels as rays are cast through them."""
+        return VoxelGrid.of(self.field.index, self.field.bounds)
+
+    @cached_property
+    def _centres(self) -> Float[Tensor, "row 3"]:
+        """Where the voxel of each row stands."""
+        return self.field.centres()
 
     def footprint(self, cameras: PinholeCamera) -> Bool[Tensor, "view height width"]:
         """The pixels whose rays may meet a voxel."""

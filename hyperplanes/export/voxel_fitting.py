@@ -104,10 +104,7 @@ def fit_voxels(
         # squared error of some rays, and its gradient by the kernel
         drawn, truth = _draw(sources, generator)
         values[:, :1], values[:, 1:], basis = depth / voxel, colour, spherical_harmonics(drawn.directions)
-        _, gradient = voxel_gradients(
-            baked.index, values, baked.bounds, drawn, basis, truth, step=voxel, empty=scene.distances,
-            out=gradients, stop=STOP,
-        )  # fmt: skip
+        _, gradient = voxel_gradients(scene.grid, values, drawn, basis, truth, step=voxel, out=gradients, stop=STOP)
         depth.grad.copy_(gradient[:, :1] / voxel)
         colour.grad.copy_(gradient[:, 1:])
         descent.step()

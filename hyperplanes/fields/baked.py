@@ -73,6 +73,11 @@ class BakedField:
         """Where interpolation may find a row: the voxels that have one and their neighbours."""
         return Occupancy(self.index >= 0, self.bounds).dilated()
 
+    def centres(self) -> Float[Tensor, "row 3"]:
+        """World positions of the centres of the voxels, in the order of their rows."""
+        filled = Occupancy(self.index >= 0, self.bounds)
+        return torch.empty_like(self.values[:, :3]).index_copy_(0, self.index[filled.occupied].long(), filled.centres())
+
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.util import find_spec
 
 import numpy as np
@@ -68,6 +69,11 @@ class Occupancy:
             for start in (0, 2):
                 inner &= padded.narrow(axis, start, len(inner))[_middle(axis)]
         return Occupancy(self.occupied & ~inner, self.bounds)
+
+    @cached_property
+    def surface_centres(self) -> Float[Tensor, "voxel 3"]:
+        """World positions of the centres of the voxels of `surface`, computed once."""
+        return self.surface().centres()
 
     def dilated(self, voxels: int = 1) -> Occupancy:
         """The grid grown by some voxels in every direction."""

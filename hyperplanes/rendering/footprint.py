@@ -38,7 +38,7 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
     if isinstance(cameras, DistortedCamera) and occupancy.occupied.any():
         return torch.ones(cameras.batch_size, height, width, dtype=torch.bool, device=cameras.intrinsics.device)
     matrices, calibration = camera.projection_matrices(cameras), camera.intrinsics(cameras)
-    points = occupancy.surface().centres().to(matrices)
+    points = occupancy.surface_centres.to(matrices)
     result = torch.zeros(len(matrices), height, width, dtype=torch.bool, device=points.device)
     if not len(points):
         return result

@@ -18,7 +18,7 @@ from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.memory import require_memory
 
-__all__ = ["Pictures", "render_images"]
+__all__ = ["Pictures", "join_pictures", "render_images"]
 
 BYTES_OF_VIEW, BYTES_KEPT = 200, 32
 """That a pixel takes: of rays, while its view is rendered, and of the pictures of all views."""
@@ -48,6 +48,20 @@ class Pictures:
     opacity: Float[Tensor, "view 1 height width"]
     depth: Float[Tensor, "view 1 height width"]
     samples: int
+
+
+def join_pictures(parts: Sequence[Pictures]) -> Pictures:
+    """The views of several pictures, one after the other.
+
+    Args:
+        parts: at least one, of one image size.
+    """
+    return Pictures(
+        torch.cat([part.images for part in parts]),
+        torch.cat([part.opacity for part in parts]),
+        torch.cat([part.depth for part in parts]),
+        sum(part.samples for part in parts),
+    )
 
 
 def render_images(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
+from torch.nn.functional import pad
 
 from hyperplanes.geometry.kernels import voxel_rays
 from hyperplanes.geometry.kernels.compiling import compile_function
@@ -17,11 +18,49 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered
 
-__all__ = ["distance_to_filled", "render_voxels", "voxel_gradients"]
+__all__ = ["STOP", "VoxelGrid", "distance_to_filled", "render_voxels", "shade_voxels", "voxel_gradients"]
 
 MAX_DISTANCE = 255  # of the distance transform, which is stored in a byte
 STOP = 1e-3  # transmittance below which a ray is finished
-RAYS = 1 << 10  # in one call of the kernel
+RAYS, ROWS = 1 << 10, 1 << 14  # in one call of the kernels
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """The box of a sparse voxel grid that holds its voxels, as rays are cast through it.
+
+    Cell (i, j, k) lies between the centres of voxels (i, j, k) and (i + 1, j + 1, k + 1).
+
+    Attributes:
+        rows: row of every voxel, or -1; the outermost voxels have none.
+        distances: chessboard distance from every cell to the nearest one that is not empty.
+        first: world position of the centre of voxel (0, 0, 0).
+        voxel: side of a voxel in world units.
+    """
+
+    rows: Int[Tensor, "x y z"]
+    distances: UInt8[Tensor, "cell_x cell_y cell_z"]
+    first: Float[Tensor, " 3"]
+    voxel: float
+
+    @classmethod
+    def of(cls, index: Int[Tensor, "x y z"], bounds: Sphere) -> VoxelGrid:
+        """The box of these voxels.
+
+        Args:
+            index: row of every voxel of a cube, or -1.
+            bounds: the sphere inside the cube.
+        """
+        low, high = [0, 0, 0], [1, 1, 1]
+        filled = index >= 0
+        if filled.any():
+            along = [filled.flatten(1).any(1), filled.any(2).any(0), filled.flatten(0, 1).any(0)]
+            places = [each.nonzero()[:, 0] for each in along]
+            low, high = [int(each[0]) for each in places], [int(each[-1]) + 1 for each in places]
+        box = index[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
+        voxel = 2 * bounds.radius / len(index)
+        first = torch.tensor(bounds.centre) - bounds.radius + voxel * (torch.tensor(low) - 0.5)
+        return cls(pad(box, (1,) * 6, value=-1), distance_to_filled(box), first, voxel)
 
 
 def distance_to_filled(index: Int[Tensor, "x y z"]) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
@@ -48,27 +87,36 @@ def distance_to_filled(index: Int[Tensor, "x y z"]) -> UInt8[Tensor, "cell_x cel
     return torch.from_numpy(away.clip(max=MAX_DISTANCE).astype(np.uint8))
 
 
+def shade_voxels(
+    values: Float[Tensor, "row 28"], centres: Float[Tensor, "row 3"], eye: Float[Tensor, " 3"]
+) -> Float[Tensor, "padded_row 4"]:
+    """Voxels as one camera sees them: density, and red, green and blue times density; zeros in a row after the last.
+
+    A picture then interpolates four numbers a voxel and not 28. The direction is that of the ray through the centre of
+    the voxel.
+
+    Args:
+        values: density and 3 x 9 coefficients of every row.
+        centres: of the voxels, in world units.
+        eye: the centre of the camera.
+    """
+    kernel, out = compile_function(voxel_rays.shade), torch.empty(len(values) + 1, 4)
+    out[-1] = 0
+    arrays = values.numpy(), centres.float().numpy(), eye.float().numpy(), out.numpy()
+    parallel_for(lambda first, last: kernel(*arrays, first, last), len(values), ROWS)
+    return out
+
+
 def render_voxels(
-    index: Int[Tensor, "x y z"],
-    values: Float[Tensor, "row 28"],
-    bounds: Sphere,
-    rays: Rays,
-    basis: Float[Tensor, "ray 9"],
-    *,
-    step: float,
-    empty: UInt8[Tensor, "cell_x cell_y cell_z"] | None = None,
-    stop: float = STOP,
+    grid: VoxelGrid, shaded: Float[Tensor, "padded_row 4"], rays: Rays, *, step: float, stop: float = STOP
 ) -> Rendered:
     """The pixels of rays through a baked field: the same sums as `RayMarching` computes, in one compiled loop a ray.
 
     Args:
-        index: row of every voxel or -1.
-        values: density and 3 x 9 coefficients of every row.
-        bounds: the sphere inside the cube of voxels.
+        grid: where the voxels are.
+        shaded: the result of `shade_voxels` for the camera that the rays come from.
         rays: with near and far.
-        basis: spherical harmonics of every ray's direction.
         step: distance between samples in world units.
-        empty: the result of `distance_to_filled`, by which empty space is skipped; computed here where absent.
         stop: transmittance below which a ray is finished.
 
     Returns:
@@ -76,7 +124,7 @@ def render_voxels(
     """
     kernel = compile_function(voxel_rays.render)
     out = np.empty((len(rays), 5), np.float32)
-    arrays = _arrays(index, values, bounds, rays, basis, distance_to_filled(index) if empty is None else empty)
+    arrays = _arrays(grid, shaded, rays)
     numbers = _numbers(step, stop)
     samples = sum(parallel_for(lambda first, last: kernel(*arrays, *numbers, out, first, last), len(rays), RAYS))
     found = torch.from_numpy(out)
@@ -84,29 +132,25 @@ def render_voxels(
 
 
 def voxel_gradients(
-    index: Int[Tensor, "x y z"],
+    grid: VoxelGrid,
     values: Float[Tensor, "row 28"],
-    bounds: Sphere,
     rays: Rays,
     basis: Float[Tensor, "ray 9"],
     truth: Float[Tensor, "ray 3"],
     *,
     step: float,
-    empty: UInt8[Tensor, "cell_x cell_y cell_z"],
     out: Float[Tensor, "thread row 28"] | None = None,
     stop: float = STOP,
 ) -> tuple[float, Float[Tensor, "row 28"]]:
     """The mean squared error of the pixels of `render_voxels`, and its gradient with respect to `values`.
 
     Args:
-        index: as there.
-        values: as there.
-        bounds: as there.
+        grid: as there.
+        values: density and 3 x 9 coefficients of every row.
         rays: as there.
-        basis: as there.
+        basis: spherical harmonics of every ray's direction.
         truth: what the pixels should be.
         step: as there.
-        empty: the result of `distance_to_filled`.
         out: a gradient for each thread of PyTorch, to be written over; the first becomes the result.
         stop: as there.
 
@@ -117,7 +161,7 @@ def voxel_gradients(
     chunk = max(1, -(-len(rays) // threads))  # one a thread, each with a gradient of its own
     found = torch.empty(threads, *values.shape) if out is None else out
     found.zero_()
-    arrays = _arrays(index, values, bounds, rays, basis, empty)
+    arrays = (*_arrays(grid, values, rays), basis.contiguous().numpy())
     numbers, colours = _numbers(step, stop), truth.float().contiguous().numpy()
 
     def work(first: int, last: int) -> float:
@@ -129,24 +173,19 @@ def voxel_gradients(
     return error / (3 * len(rays)), found[0].div_(3 * len(rays))
 
 
-def _arrays(
-    index: Tensor, values: Tensor, bounds: Sphere, rays: Rays, basis: Tensor, empty: Tensor
-) -> tuple[npt.NDArray[Any], ...]:
+def _arrays(grid: VoxelGrid, values: Tensor, rays: Rays) -> tuple[npt.NDArray[Any], ...]:
     """What both kernels read, rays in units of cells."""
-    scale = index.shape[0] / (2 * bounds.radius)
-    corner = torch.tensor(bounds.centre) - bounds.radius
     return (
-        index.numpy(),
+        grid.rows.numpy(),
         values.numpy(),
-        empty.numpy(),
-        ((rays.origins.float() - corner) * scale + 0.5).contiguous().numpy(),
-        (rays.directions.float() * scale).contiguous().numpy(),
+        grid.distances.numpy(),
+        ((rays.origins.float() - grid.first) / grid.voxel).contiguous().numpy(),
+        (rays.directions.float() / grid.voxel).contiguous().numpy(),
         rays.near.float().numpy(),
         rays.far.float().numpy(),
-        basis.contiguous().numpy(),
     )
 
 
 def _numbers(step: float, stop: float) -> tuple[np.float32, ...]:
-    """The step, the optical depth at which a ray is finished, and a white background."""
-    return np.float32(step), np.float32(-math.log(stop) if stop > 0 else math.inf), np.float32(1.0)
+    """The step, the transmittance at which a ray is finished, and a white background."""
+    return np.float32(step), np.float32(stop), np.float32(1.0)

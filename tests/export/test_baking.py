@@ -14,11 +14,11 @@ from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
-from hyperplanes.geometry.rays import Rays
+from hyperplanes.geometry.rays import Rays, cast
 from hyperplanes.rendering import images
 from hyperplanes.rendering.renderer import RayMarching, render
 from hyperplanes.rendering.transmittance import transmittance, transmittance_torch
-from hyperplanes.rendering.voxels import distance_to_filled, render_voxels
+from hyperplanes.rendering.voxels import STOP, VoxelGrid, distance_to_filled, render_voxels, shade_voxels
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
@@ -78,11 +78,41 @@ def test_baked_pictures_are_those_of_the_field(seen, baked):
 def test_the_compiled_caster_agrees_with_packed_torch(baked):
     # Source of truth: the same voxels as a callable through the generic renderer, at the same steps.
     scene = BakedScene(baked)
-    sampling = RayMarching(scene.steps, 1e-3)
+    sampling = RayMarching(scene.steps, STOP)
     generic = render(baked, CAMERAS, sampling, bounds=baked.occupancy.bounds, occupancy=baked.occupancy)
     compiled = scene.render(CAMERAS)
     assert float((generic.images - compiled.images).abs().max()) < 5e-3
     assert float((generic.images - compiled.images).abs().mean()) < 1e-4
+
+
+def test_shaded_voxels_have_the_colours_of_rays_through_their_centres(baked):
+    # Source of truth: the harmonics of each direction, by the field's own function.
+    eye = torch.tensor([0.5, -2.0, 1.0])
+    found = shade_voxels(baked.values, baked.centres(), eye)
+    basis = spherical_harmonics(torch.nn.functional.normalize(baked.centres() - eye, dim=-1))
+    density, coefficients = baked.values[:, :1], baked.values[:, 1:].unflatten(1, (3, 9))
+    expected = torch.cat([density, density * (coefficients * basis[:, None]).sum(-1)], 1)
+    torch.testing.assert_close(found[:-1], expected, rtol=1e-4, atol=1e-4)
+    assert not found[-1].any()  # what a voxel without a row reads
+
+
+def test_a_grid_is_the_box_of_its_voxels_with_a_border_of_none(baked):
+    grid = VoxelGrid.of(baked.index, baked.bounds)
+    places = (grid.rows >= 0).nonzero()
+    assert places.amin(0).tolist() == [1, 1, 1]
+    assert (places.amax(0) + 2).tolist() == list(grid.rows.shape)
+    centres = torch.empty_like(baked.centres())
+    centres[grid.rows[grid.rows >= 0].long()] = grid.first + places * grid.voxel
+    torch.testing.assert_close(centres, baked.centres(), rtol=0, atol=1e-5)
+
+
+def test_a_grid_without_voxels_is_background():
+    index = torch.full((8, 8, 8), -1, dtype=torch.int32)
+    rays = cast(CAMERAS, torch.zeros(1, dtype=torch.long), torch.tensor([[9.0, 9.0]]))
+    shaded = shade_voxels(torch.zeros(0, 28), torch.zeros(0, 3), rays.origins[0])
+    seen = render_voxels(VoxelGrid.of(index, Sphere()), shaded, rays, step=0.01)
+    assert seen.samples == 0
+    assert seen.colour.tolist() == [[1.0, 1.0, 1.0]]
 
 
 def test_a_constant_slab_is_beer_lambert():
@@ -93,7 +123,9 @@ def test_a_constant_slab_is_beer_lambert():
     rays = Rays(
         torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([2.1]), torch.tensor([3.9])
     )
-    seen = render_voxels(index, values, Sphere(), rays, spherical_harmonics(rays.directions), step=1.8 / 512, stop=1e-9)
+    field = BakedField(index, values, Sphere())
+    shaded = shade_voxels(values, field.centres(), rays.origins[0])
+    seen = render_voxels(VoxelGrid.of(index, Sphere()), shaded, rays, step=1.8 / 512, stop=1e-9)
     assert float(seen.opacity) == pytest.approx(1 - math.exp(-2 * 1.8), abs=1e-3)
     assert torch.allclose(seen.colour, (1 - seen.opacity)[:, None].expand(1, 3), atol=1e-5)  # black over white
 

@@ -7,7 +7,7 @@ from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering.renderer import RayMarching, render
-from hyperplanes.rendering.voxels import distance_to_filled, voxel_gradients
+from hyperplanes.rendering.voxels import VoxelGrid, voxel_gradients
 
 
 def test_the_compiled_gradient_is_that_of_autograd():
@@ -23,14 +23,12 @@ def test_the_compiled_gradient_is_that_of_autograd():
     rays = cast(cameras, torch.arange(2).repeat_interleave(64), pixels.repeat(2, 1))
     truth = torch.rand(128, 3, generator=generator)
     error, found = voxel_gradients(
-        index,
+        VoxelGrid.of(index, Sphere()),
         values,
-        Sphere(),
         rays,
         spherical_harmonics(rays.directions),
         truth,
         step=2 / 24,
-        empty=distance_to_filled(index),
     )
     wanted = values.clone().requires_grad_()
     field = BakedField(index, wanted, Sphere())

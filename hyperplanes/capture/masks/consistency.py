@@ -186,7 +186,7 @@ def _votes(judged: _Judged, pairs: Sequence[tuple[np.ndarray, PinholeCamera]]) -
 
 def _ball(hull: Occupancy) -> Sphere | None:
     """The sphere around the voxels of a hull that lie within its bounds, None where there are none."""
-    points = hull.surface().centres()
+    points = hull.surface_centres
     points = points[hull.bounds.normalise(points).norm(dim=-1) <= 1]
     if not len(points):
         return None

@@ -1,7 +1,9 @@
 """Loops over rays through a sparse voxel grid (numba only): their pixels, and the gradient of a squared error of these.
 
-Positions are in cells: cell (i, j, k) lies between the centres of voxels i - 1 and i, and so on; the whole part of a
-position is the index of its cell, the fraction the place between the voxel centres.
+Positions are in cells: cell (i, j, k) lies between the centres of voxels i and i + 1, and so on; the whole part of a
+position is the index of its cell, the fraction the place between the voxel centres. `index` has the row of each voxel,
+-1 where there is none, and none in its outermost voxels; `empty` has the chessboard distance from each cell to the
+nearest that is not empty (`rendering.voxels.VoxelGrid`).
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import numpy as np
 
 from hyperplanes.geometry.kernels.blocks import inlined
 
-__all__ = ["add_gradients", "render"]
+__all__ = ["add_gradients", "render", "shade"]
 
 MAX_SAMPLES = 1024  # of positive density on a ray whose gradient is computed
 HARMONICS = 9
@@ -29,11 +31,49 @@ def _corner(index, cell_x, cell_y, cell_z, x, y, z, corner):
     """
     one = np.float32(1.0)
     right, up, behind = corner >> 2, corner >> 1 & 1, corner & 1
-    at_x, at_y, at_z = cell_x + right - 1, cell_y + up - 1, cell_z + behind - 1
-    if min(at_x, at_y, at_z) < 0 or max(at_x, at_y, at_z) >= index.shape[0]:
-        return -1, np.float32(0.0)
     weight = (x if right else one - x) * (y if up else one - y) * (z if behind else one - z)
-    return index[at_x, at_y, at_z], weight
+    return index[cell_x + right, cell_y + up, cell_z + behind], weight
+
+
+@inlined
+@no_type_check
+def _inside(empty, origin, along, first, last, step):
+    """The first sample of a ray in the box of all cells, and the t at which the ray leaves the box."""
+    enter, zero = first, np.float32(0.0)
+    for axis in range(3):
+        if along[axis] != zero:
+            near, far = -origin[axis] / along[axis], (np.float32(empty.shape[axis]) - origin[axis]) / along[axis]
+            enter, last = max(enter, min(near, far)), min(last, max(near, far))
+        elif origin[axis] < zero or origin[axis] > np.float32(empty.shape[axis]):
+            last = enter
+    return int(math.ceil((enter - first) / step)), last
+
+
+@inlined
+@no_type_check
+def _next_cell(empty, origin, along, first, last, step, per_cell, sample):
+    """The first sample from `sample` on in a cell that is not empty.
+
+    Returns:
+        The sample after it, its t, and its position; no t is below `last` where the ray ends first.
+    """
+    while True:
+        t = first + np.float32(sample) * step
+        x, y, z = origin[0] + t * along[0], origin[1] + t * along[1], origin[2] + t * along[2]
+        if t >= last:
+            return sample, t, x, y, z
+        cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+        if min(cell_x, cell_y, cell_z) < 0:  # by rounding, as the box is entered or left
+            sample += 1
+            continue
+        if cell_x >= empty.shape[0] or cell_y >= empty.shape[1] or cell_z >= empty.shape[2]:
+            sample += 1
+            continue
+        # Empty-space skipping: all samples within the distance to the nearest filled cell.
+        distance = empty[cell_x, cell_y, cell_z]
+        if distance == 0:
+            return sample + 1, t, x, y, z
+        sample += 1 + int(np.float32(distance - 1) * per_cell)
 
 
 @inlined
@@ -42,27 +82,16 @@ def _next_sample(index, values, empty, origin, along, first, last, step, per_cel
     """The first sample from `sample` on whose density is positive.
 
     Returns:
-        The sample after it; its t, position and density, which is zero where the ray ends first. `mixed` receives the
+        The sample after it; its position and density, which is zero where the ray ends first. `mixed` receives the
         interpolated coefficients, weighted by density.
     """
-    side, zero = empty.shape[0], np.float32(0.0)
+    zero = np.float32(0.0)
     while True:
-        t = first + np.float32(sample) * step
+        sample, t, x, y, z = _next_cell(empty, origin, along, first, last, step, per_cell, sample)
         if t >= last:
-            return sample, t, zero, zero, zero, zero
-        x, y, z = origin[0] + t * along[0], origin[1] + t * along[1], origin[2] + t * along[2]
-        # The cell that the sample lies in.
-        cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
-        if min(cell_x, cell_y, cell_z) < 0 or max(cell_x, cell_y, cell_z) >= side:
-            sample += 1
-            continue
-        # Empty-space skipping: all samples within the distance to the nearest filled cell.
-        distance = empty[cell_x, cell_y, cell_z]
-        if distance > 0:
-            sample += 1 + int(np.float32(distance - 1) * per_cell)
-            continue
-        sample += 1
+            return sample, x, y, z, zero
         # Trilinear interpolation of density, and of coefficients weighted by density.
+        cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
         a, b, c = x - np.float32(cell_x), y - np.float32(cell_y), z - np.float32(cell_z)
         density = zero
         mixed[:] = zero
@@ -75,7 +104,7 @@ def _next_sample(index, values, empty, origin, along, first, last, step, per_cel
             for number in range(NUMBERS):
                 mixed[number] += weight * values[row, number]
         if density > zero:
-            return sample, t, x, y, z, density
+            return sample, x, y, z, density
 
 
 @inlined
@@ -92,44 +121,92 @@ def _colour(basis, ray, mixed, density):
 
 @inlined
 @no_type_check
-def _composite(optical_depth, added, r, g, b, red, green, blue, opacity):  # noqa: PLR0913
-    """The weight of a sample in its pixel, and the sums up to it (NeRF, Eq. 3)."""
+def _composite(transmittance, added, r, g, b, red, green, blue, opacity):  # noqa: PLR0913
+    """The weight of a sample in its pixel, the transmittance behind it, and the sums up to it (NeRF, Eq. 3)."""
     one, zero = np.float32(1.0), np.float32(0.0)
-    weight = math.exp(-optical_depth) * (one - math.exp(-added))
+    behind = transmittance * math.exp(-added)
+    weight = transmittance - behind
     red += weight * min(max(r, zero), one)
     green += weight * min(max(g, zero), one)
     blue += weight * min(max(b, zero), one)
-    return weight, optical_depth + added, red, green, blue, opacity + weight
+    return weight, behind, red, green, blue, opacity + weight
 
 
 @no_type_check
-def render(index, values, empty, origins, directions, near, far, basis, step, limit, background, out, start, stop):  # noqa: PLR0913
-    """The pixels of rays start..stop: (colour, opacity, depth) into `out`.
+def shade(values, centres, eye, out, start, stop):
+    """Density, and the colour times density towards an eye, of voxels start..stop into `out`.
+
+    The spherical harmonics are those of `fields.baked.spherical_harmonics`.
+    """
+    for row in range(start, stop):
+        x, y, z = centres[row, 0] - eye[0], centres[row, 1] - eye[1], centres[row, 2] - eye[2]
+        scale = np.float32(1.0) / np.float32(math.sqrt(max(x * x + y * y + z * z, np.float32(1e-30))))
+        x, y, z = x * scale, y * scale, z * scale
+        basis = (
+            np.float32(0.28209479),
+            np.float32(-0.48860251) * y,
+            np.float32(0.48860251) * z,
+            np.float32(-0.48860251) * x,
+            np.float32(1.09254843) * x * y,
+            np.float32(-1.09254843) * y * z,
+            np.float32(0.31539157) * (np.float32(3.0) * z * z - np.float32(1.0)),
+            np.float32(-1.09254843) * x * z,
+            np.float32(0.54627422) * (x * x - y * y),
+        )
+        density = values[row, 0]
+        out[row, 0] = density
+        for channel in range(3):
+            colour = np.float32(0.0)
+            for number in range(HARMONICS):
+                colour += basis[number] * values[row, 1 + channel * HARMONICS + number]
+            out[row, 1 + channel] = density * colour
+
+
+@inlined
+@no_type_check
+def _interpolated(index, shaded, x, y, z):
+    """Density at a position, and red, green and blue times density, trilinearly."""
+    cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+    x, y, z = x - np.float32(cell_x), y - np.float32(cell_y), z - np.float32(cell_z)
+    density = r = g = b = np.float32(0.0)
+    for corner in range(8):
+        # Without a branch for voxels that have no row: -1 is the last one, of zeros.
+        row, weight = _corner(index, cell_x, cell_y, cell_z, x, y, z, corner)
+        density += weight * shaded[row, 0]
+        r += weight * shaded[row, 1]
+        g += weight * shaded[row, 2]
+        b += weight * shaded[row, 3]
+    return density, r, g, b
+
+
+@no_type_check
+def render(index, shaded, empty, origins, directions, near, far, step, stopped, background, out, start, stop):  # noqa: PLR0913
+    """The pixels of rays start..stop through voxels that `shade` made ready: (colour, opacity, depth) into `out`.
 
     Returns:
         The samples of positive density.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
-    mixed = np.empty(NUMBERS, np.float32)
     total = 0
     for ray in range(start, stop):
         origin = origins[ray, 0], origins[ray, 1], origins[ray, 2]
         along = directions[ray, 0], directions[ray, 1], directions[ray, 2]
         first, last = near[ray] + half * step, far[ray]
         per_cell = one / (max(abs(along[0]), abs(along[1]), abs(along[2])) * step)  # least number of samples in a cell
-        optical_depth, opacity, depth = zero, zero, zero
+        transmittance, opacity, depth = one, zero, zero
         red, green, blue = zero, zero, zero
-        sample = 0
-        while optical_depth < limit:  # early ray termination
-            sample, t, _, _, _, density = _next_sample(
-                index, values, empty, origin, along, first, last, step, per_cell, sample, mixed
-            )
-            if density <= zero:
+        sample, last = _inside(empty, origin, along, first, last, step)
+        while transmittance > stopped:  # early ray termination
+            sample, t, x, y, z = _next_cell(empty, origin, along, first, last, step, per_cell, sample)
+            if t >= last:
                 break
+            density, r, g, b = _interpolated(index, shaded, x, y, z)
+            if density <= zero:
+                continue
             total += 1
-            r, g, b = _colour(basis, ray, mixed, density)
-            weight, optical_depth, red, green, blue, opacity = _composite(
-                optical_depth, density * step, r, g, b, red, green, blue, opacity
+            scale = one / density
+            weight, transmittance, red, green, blue, opacity = _composite(
+                transmittance, density * step, r * scale, g * scale, b * scale, red, green, blue, opacity
             )
             depth += weight * t
         out[ray, 0] = red + (one - opacity) * background
@@ -142,14 +219,14 @@ def render(index, values, empty, origins, directions, near, far, basis, step, li
 
 @no_type_check
 def add_gradients(  # noqa: PLR0913
-    index, values, empty, origins, directions, near, far, basis, step, limit, background, truth, gradient, start, stop
+    index, values, empty, origins, directions, near, far, basis, step, stopped, background, truth, gradient, start, stop
 ):
     """Adds the gradient of the squared errors of rays start..stop to `gradient`; returns the sum of the errors."""
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     mixed = np.empty(NUMBERS, np.float32)
     by_number = np.zeros(NUMBERS, np.float32)  # of a sample, by its interpolated numbers; density has its own way
     places = np.empty((MAX_SAMPLES, 3), np.float32)
-    densities = np.empty(MAX_SAMPLES, np.float32)
+    densities, before = np.empty(MAX_SAMPLES, np.float32), np.empty(MAX_SAMPLES, np.float32)
     colours = np.empty((MAX_SAMPLES, 3), np.float32)  # before they are clamped
     total = 0.0
     for ray in range(start, stop):
@@ -157,12 +234,13 @@ def add_gradients(  # noqa: PLR0913
         along = directions[ray, 0], directions[ray, 1], directions[ray, 2]
         first, last = near[ray] + half * step, far[ray]
         per_cell = one / (max(abs(along[0]), abs(along[1]), abs(along[2])) * step)
-        optical_depth, opacity = zero, zero
+        transmittance, opacity = one, zero
         red, green, blue = zero, zero, zero
-        sample, count = 0, 0
+        sample, last = _inside(empty, origin, along, first, last, step)
+        count = 0
         # Forward, as `render`; the samples are kept.
-        while optical_depth < limit and count < MAX_SAMPLES:
-            sample, _, x, y, z, density = _next_sample(
+        while transmittance > stopped and count < MAX_SAMPLES:
+            sample, x, y, z, density = _next_sample(
                 index, values, empty, origin, along, first, last, step, per_cell, sample, mixed
             )
             if density <= zero:
@@ -171,8 +249,9 @@ def add_gradients(  # noqa: PLR0913
             places[count, 0], places[count, 1], places[count, 2] = x, y, z
             colours[count, 0], colours[count, 1], colours[count, 2] = r, g, b
             densities[count] = density
-            _, optical_depth, red, green, blue, opacity = _composite(
-                optical_depth, density * step, r, g, b, red, green, blue, opacity
+            before[count] = transmittance
+            _, transmittance, red, green, blue, opacity = _composite(
+                transmittance, density * step, r, g, b, red, green, blue, opacity
             )
             count += 1
         # Twice the difference from the truth.
@@ -184,18 +263,15 @@ def add_gradients(  # noqa: PLR0913
         behind_it = zero
         for kept in range(count - 1, -1, -1):
             density = densities[kept]
-            added = density * step
-            optical_depth -= added
-            before = math.exp(-optical_depth)
-            after = before * math.exp(-added)
-            weight = before - after
+            weight = before[kept] - transmittance
             r, g, b = colours[kept, 0], colours[kept, 1], colours[kept, 2]
             shown = (
                 wrong_r * (min(max(r, zero), one) - background)
                 + wrong_g * (min(max(g, zero), one) - background)
                 + wrong_b * (min(max(b, zero), one) - background)
             )
-            by_density = step * (after * shown - behind_it)
+            by_density = step * (transmittance * shown - behind_it)
+            transmittance = before[kept]
             behind_it += weight * shown
             by_red = weight * wrong_r if zero < r < one else zero
             by_green = weight * wrong_g if zero < g < one else zero
