@@ -114,7 +114,7 @@ def compile_kernels(device: torch.device) -> None:
     """Have everything compiled and loaded that the packaged model renders with, by one small view of an example."""
     example = read_task(EXAMPLES / "example-car")
     model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(device)
-    model.adapt(example.support[:3]).render(resized(example.query[:1].cameras, 32, 32))
+    model.adapt(example.support).render(resized(example.query[:1].cameras, 32, 32))  # of so many that it stacks
 
 
 def describe_count(row: str, most: int) -> str:
