@@ -7,8 +7,8 @@
 Of every held-out object some query views are kept back to be judged by; of all others, support and query alike, so many
 are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
 (where there are masks); the same field from random weights; the model without its hypernetwork, with the update of
-another object of the data set, with its own where no left-out views may decide otherwise, with one ray a pixel, and as
-it is used; and fine-tuned. Beside each mean stands how far it lies above
+another object of the data set, with its own alone, averaged with the visual hull by one share an object, with one ray
+a pixel, and as it is used; and fine-tuned. Beside each mean stands how far it lies above
 `hull_blend`, with the 95 % interval of that difference over the objects (paired, Student's t).
 
 With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
@@ -35,12 +35,14 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Renderable
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.stacking import hull_share, stack
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Inputs, Shown
 from hyperplanes.evaluation import Score, evaluate
 from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.episodes.augmentation import Rotation
@@ -263,6 +265,21 @@ class _Partly:
 
 
 @dataclass(frozen=True)
+class _Ungated:
+    """A model whose pictures are means with those of the visual hull by one share an object."""
+
+    model: HyperPlanes
+
+    @torch.no_grad()
+    def adapt(self, support: Views) -> AdaptedField:
+        """The field of the object's own update, and the hull."""
+        model, context = self.model.eval(), self.model.prepare(support)
+        assert isinstance(context.planes, VisibilityPlanes)
+        learned = model.rendering_field(context, model.adapted_weights(context))
+        return stack(learned, HullBlend().adapt_to(context.planes), hull_share(model, context.views))
+
+
+@dataclass(frozen=True)
 class _OneRay:
     """A model whose pictures are one ray a pixel, at edges too.
 
@@ -296,6 +313,7 @@ METHODS = {
     "theta": lambda model, *_: _Partly(model, lambda name: False),
     "swapped": _swapped,
     "unstacked": lambda model, *_: _Partly(model),
+    "ungated": lambda model, *_: _Ungated(model),
     "one_ray": lambda model, *_: _OneRay(model),
 }
 

@@ -18,7 +18,7 @@ from benchmarks import __main__ as benchmarks_main
 from benchmarks import all as all_benchmarks
 from benchmarks import image_based, tables, views
 from benchmarks.training import step_parts
-from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation import HyperPlanes, stacking
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.utilities.files import DataError
 from tests.reference_rendering import Balls
@@ -55,6 +55,16 @@ def test_a_whole_update_as_parts_of_it_is_that_of_the_model():
     found = views.METHODS["unstacked"](model).adapt(task.support)  # outputs start at zero: nothing to leave out
     expected, cameras = model.adapt(task.support), task.query.cameras
     assert torch.equal(found.render(cameras).images, expected.render(cameras).images)
+
+
+def test_a_model_without_its_gate_is_stacked_by_one_share(monkeypatch):
+    model, task = HyperPlanes(replace(MODEL, stacked=True, gated=True)), Balls(views=6, size=(24, 24)).task("train0")
+    monkeypatch.setattr(stacking, "hull_share", lambda *_: 0.4)
+    monkeypatch.setattr(views, "hull_share", lambda *_: 0.4)
+    found = views.METHODS["ungated"](model).adapt(task.support).render(task.query.cameras).images
+    assert not torch.equal(found, model.adapt(task.support).render(task.query.cameras).images)
+    model.gate = None
+    assert torch.equal(found, model.adapt(task.support).render(task.query.cameras).images)
 
 
 def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):

@@ -101,7 +101,9 @@ class FieldFromScratch:
 def random_model(config: ModelConfig, seed: int) -> HyperPlanes:
     """The target network of a model with random weights, without what finds better ones."""
     return HyperPlanes(
-        replace(config, hypernetwork=None, autoencoder=None, initialisation=None, stacked=False, hull_share=0.0),
+        replace(
+            config, hypernetwork=None, autoencoder=None, initialisation=None, stacked=False, hull_share=0.0, gated=False
+        ),
         seed=seed,
     )
 

@@ -189,6 +189,8 @@ def _refreshed(network: HyperPlanesNetwork, weights: Parameters, settings: FineT
     share = settings.fresh_share(views)
     if not share or not network.reads_volume:
         return weights
-    made = HyperPlanesNetwork(replace(network.config, hypernetwork=None, stacked=False, hull_share=0.0), settings.seed)
+    made = HyperPlanesNetwork(
+        replace(network.config, hypernetwork=None, stacked=False, hull_share=0.0, gated=False), settings.seed
+    )
     random = made.to(network.rig.device, network.rig.dtype).theta.detach()
     return Parameters((name, torch.lerp(value, random[name], share)) for name, value in weights.items())

@@ -102,14 +102,13 @@ class HyperPlanes(HyperPlanesNetwork):
             A model that makes the same field of the same views, without looking at them twice. A field that is
             no network of this model is a ValueError.
         """
-        adapted, share = learned_part(adapted)
-        result = HyperPlanes(
-            replace(
-                self.config, hypernetwork=None, autoencoder=None, initialisation=None, stacked=False, hull_share=share
-            )
-        )
+        learned = learned_part(adapted)
+        beside = {"stacked": False, "hull_share": learned.share, "gated": learned.gate is not None}
+        result = HyperPlanes(replace(self.config, hypernetwork=None, autoencoder=None, initialisation=None, **beside))
+        if result.gate is not None and learned.gate is not None:
+            result.gate.load_state_dict(learned.gate.state_dict())
         result.rig.copy_(self.rig)
-        found = {"fine": adapted.field, "coarse": adapted.proposal}
+        found = {"fine": learned.field.field, "coarse": learned.field.proposal}
         for name, network in result.targets.items():
             network.load_state_dict(network.parameters_of(found[name]))
         return result.eval()

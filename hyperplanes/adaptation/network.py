@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext, arrange, live_pixels, observe, prepare_context
+from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
@@ -52,6 +53,7 @@ class HyperPlanesNetwork(nn.Module):
                 shapes = {name: value.shape for name, value in self.networks.named_parameters()}
                 reading, volume = self.target.reading_layers, self.target.volume_size
                 self.hypernetwork = make_hypernetwork(shape, shapes, reading, volume)
+            self.gate = GatingNetwork() if config.gated else None
         self.register_buffer("rig", torch.zeros(self.target.rig_size, 3))
 
     @property

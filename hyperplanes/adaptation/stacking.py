@@ -1,4 +1,4 @@
-"""Pictures of a field averaged with those of the visual hull, by a share that held-out support views decide."""
+"""Pictures of a field averaged with those of the visual hull, by shares that held-out views and each pixel decide."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.adaptation.context import SupportContext, live_pixels
+from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.fields.base import Field
@@ -26,7 +27,7 @@ from hyperplanes.rendering.renderer import Sampler, render
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
-__all__ = ["FEWEST", "StackedField", "best_share", "hull_share", "learned_part", "stack", "stacked_field"]
+__all__ = ["FEWEST", "Learned", "StackedField", "best_share", "hull_share", "learned_part", "stack", "stacked_field"]
 
 FEWEST = 5  # views, of which some can be held out
 HELD_OUT = 2
@@ -48,10 +49,14 @@ class StackedField(AdaptedField):
     Attributes:
         other: the other field.
         share: of the pictures of the other field in the mean.
+        gate: what makes a share of every pixel of that; None leaves all alike.
+        views: how many are shown.
     """
 
     other: AdaptedField = field(kw_only=True)
     share: float = field(kw_only=True)
+    gate: GatingNetwork | None = field(default=None, kw_only=True)
+    views: int = field(default=FEWEST, kw_only=True)
 
     def __repr__(self) -> str:
         return f"StackedField({super().__repr__()}, {self.share:.0%} of {self.other!r})"
@@ -59,9 +64,9 @@ class StackedField(AdaptedField):
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
         """The mean of the pixels of both, as `AdaptedField.trace`."""
         own = super().trace(rays, generator, differentiable=differentiable)
-        if not self.share:
+        if not (self.share or self.gate):
             return own
-        return _mean(own, self.other.trace(rays, generator, differentiable=differentiable), self.share, "colour")
+        return self._mean(own, self.other.trace(rays, generator, differentiable=differentiable), "colour")
 
     @checked
     @torch.no_grad()
@@ -70,33 +75,60 @@ class StackedField(AdaptedField):
     ) -> Pictures:
         """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the field's alone."""
         own = super().render(cameras, sampling, antialias)
-        if not self.share:
+        if not (self.share or self.gate):
             return own
-        return _mean(own, self.other.render(cameras, antialias=antialias), self.share, "images")
+        return self._mean(own, self.other.render(cameras, antialias=antialias), "images")
+
+    def _mean(self, own: Pixels, other: Pixels, colour: str) -> Pixels:
+        """The mean of colours and opacities, and the expected distance of what both show."""
+        share = self._shares(own, other)
+        opacity = torch.lerp(own.opacity, other.opacity, share)
+        depth = torch.lerp(own.opacity * own.depth, other.opacity * other.depth, share) / opacity.clamp_min(1e-10)
+        colours = torch.lerp(
+            getattr(own, colour), getattr(other, colour), share if colour == "images" else share[:, None]
+        )
+        return replace(own, **{colour: colours}, opacity=opacity, depth=depth, samples=own.samples + other.samples)
+
+    def _shares(self, own: Pixels, other: Pixels) -> Tensor:
+        """Of the other field in each pixel."""
+        if self.gate is None:
+            return torch.full_like(own.opacity, self.share)
+        if isinstance(self.field, Field):
+            return self.gate.shares(own, other, self.share, self.views)
+        return 1 - self.gate.shares(other, own, 1 - self.share, self.views)
 
 
-def _mean(one: Pixels, other: Pixels, share: float, colour: str) -> Pixels:
-    """The mean of colours and opacities, and the expected distance of what both show."""
-    opacity = torch.lerp(one.opacity, other.opacity, share)
-    depth = torch.lerp(one.opacity * one.depth, other.opacity * other.depth, share) / opacity.clamp_min(1e-10)
-    colours = torch.lerp(getattr(one, colour), getattr(other, colour), share)
-    return replace(one, **{colour: colours}, opacity=opacity, depth=depth, samples=one.samples + other.samples)
+@dataclass(frozen=True)
+class Learned:
+    """The part of a field that is a network.
+
+    Attributes:
+        field: with what renders it.
+        share: of the hull beside it, over all pixels.
+        gate: what makes a share of every pixel of that, if anything does.
+    """
+
+    field: AdaptedField
+    share: float = 0.0
+    gate: GatingNetwork | None = None
 
 
-def learned_part(adapted: AdaptedField) -> tuple[AdaptedField, float]:
-    """The part of a field that is a network, and the share of the hull beside it.
+def learned_part(adapted: AdaptedField) -> Learned:
+    """The part of a field that is a network, and what is beside it.
 
     Args:
         adapted: a field, stacked or not.
     """
     if not isinstance(adapted, StackedField):
-        return adapted, 0.0
+        return Learned(adapted)
     if isinstance(adapted.field, Field):
-        return adapted, adapted.share
-    return adapted.other, 1 - adapted.share
+        return Learned(adapted, adapted.share, adapted.gate)
+    return Learned(adapted.other, 1 - adapted.share, adapted.gate)
 
 
-def stack(learned: AdaptedField, hull: AdaptedField, share: float) -> AdaptedField:
+def stack(
+    learned: AdaptedField, hull: AdaptedField, share: float, gate: GatingNetwork | None = None, views: int = FEWEST
+) -> AdaptedField:
     """Two fields as one: it has the mean of the pictures of both.
 
     Densities are those of the first one, from which voxels and meshes come out better, unless next to nothing is left
@@ -106,22 +138,24 @@ def stack(learned: AdaptedField, hull: AdaptedField, share: float) -> AdaptedFie
         learned: a field that is not stacked.
         hull: another one.
         share: of the second one in the pictures, in [0, 1].
+        gate: what makes a share of every pixel of that; without it all pixels are alike.
+        views: how many are shown, for the gate.
 
     Returns:
-        The first one alone where the share is 0; with more than OVERRULED the `other` of the result is the first one
-        (`learned_part`).
+        The first one alone where the share is 0 and there is no gate; with more than OVERRULED the `other` of the
+        result is the first one (`learned_part`).
 
     Raises:
         ValueError: a field that is stacked already.
     """
     if isinstance(learned, StackedField) or isinstance(hull, StackedField):
         raise ValueError("stack: expected fields that are not stacked, got one that is")
-    if share == 0:
+    if share == 0 and gate is None:
         return learned
     if share > OVERRULED:
         learned, hull, share = hull, learned, 1 - share
     own = {each.name: getattr(learned, each.name) for each in fields(learned)}
-    return StackedField(**own, other=hull, share=share)
+    return StackedField(**own, other=hull, share=share, gate=gate, views=views)
 
 
 @torch.no_grad()
@@ -129,7 +163,8 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
     """The field of given weights, stacked with the visual hull where the model is configured so.
 
     The share of the hull is that of the object's own update (`hull_share`), whatever the weights are, or the one that
-    the model is configured with.
+    the model is configured with. From FEWEST views on the model's gating network, where it has one, makes a share of
+    every pixel of that.
 
     Args:
         network: the model.
@@ -137,11 +172,14 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
         weights: of the field.
     """
     learned = network.rendering_field(context, weights)
-    share = 0.0 if context.views.masks is None else network.config.hull_share
+    if context.views.masks is None:
+        return learned
+    share = network.config.hull_share
     if network.config.stacked:
         with in_use(network):
             share = hull_share(network, context.views)
-    return stack(learned, _hull(context), share) if share else learned
+    gate = network.gate if len(context.views) >= FEWEST else None
+    return stack(learned, _hull(context), share, gate, len(context.views)) if share or gate else learned
 
 
 @torch.no_grad()

@@ -95,7 +95,7 @@ def adapt_to(
         ValueError: fine-tuning steps of a baked scene.
     """
     from hyperplanes.adaptation.kept import keep_field, kept_folder, recall_field
-    from hyperplanes.adaptation.stacking import learned_part
+    from hyperplanes.adaptation.stacking import StackedField
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.evaluation.suitability import suitability_warnings
     from hyperplanes.export.baking import BakedScene
@@ -135,7 +135,7 @@ def adapt_to(
         except OSError as error:  # the field is there, and what is asked of it can be done
             console.warn(f"{folder}: not kept for another time: {error}")
     how = f", {taken[-1]} fine-tuning steps" if any(taken) else ""
-    how += f", averaged with the visual hull ({share:.0%})" if (share := learned_part(field)[1]) else ""
+    how += ", averaged with the visual hull" if isinstance(field, StackedField) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")
     return field, warned

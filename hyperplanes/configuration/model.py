@@ -52,6 +52,8 @@ class ModelConfig:
             five or more views decide, which are held out for the purpose (`adaptation.stacking`). Training does
             without.
         hull_share: of `hull_blend` in the pictures of a model that is not `stacked`: what was decided for one object.
+        gated: a gating network makes a share of every pixel of that one (`adaptation.gating`); `training.gating` trains
+            it after the model.
     """
 
     target: str = "point_multiplane"
@@ -66,6 +68,7 @@ class ModelConfig:
     plane_dropout: float = 0.0
     stacked: bool = False
     hull_share: float = 0.0
+    gated: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.plane_dropout < 1:

@@ -9,6 +9,7 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, stacking
 from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.fine_tuned import random_model
 from hyperplanes.adaptation.fine_tuning import fine_tune
+from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.kept import keep_field, recall_field
 from hyperplanes.adaptation.stacking import (
     CAUTION,
@@ -132,7 +133,7 @@ def test_where_nothing_was_learned_the_hull_is_shown():
     adapter, support, cameras = model(empty=True), ball_views(ring(8, (24, 24))), ring(3, (24, 24), shift=1)
     adapted = adapter.adapt(support)
     assert isinstance(adapted, StackedField)
-    assert learned_part(adapted)[1] > 0.8
+    assert learned_part(adapted).share > 0.8
     assert isinstance(adapted.other.field, Field)  # nothing is left of it, so densities are those of the hull
     truth = ball_views(cameras).images
     alone = replace(adapter.config, stacked=False)
@@ -180,6 +181,8 @@ def test_views_that_look_past_the_object_decide_nothing(monkeypatch):
 def test_a_field_that_knows_views_by_their_places_is_not_stacked():
     with pytest.raises(ValueError, match="stacked: .* got point_multiplane"):
         HyperPlanes(replace(ModelConfig(), stacked=True))
+    with pytest.raises(ValueError, match="gated: .* got point_multiplane"):
+        HyperPlanes(replace(ModelConfig(), gated=True))
     with pytest.raises(ValueError, match="hull_share: .* got point_multiplane"):
         HyperPlanes(replace(ModelConfig(), hull_share=0.5))
     with pytest.raises(ValueError, match=r"hull_share: expected 0 where views decide it"):
@@ -191,12 +194,13 @@ def test_a_field_that_knows_views_by_their_places_is_not_stacked():
         stack(stack(learned, hull, 0.3), hull, 0.3)
 
 
+@pytest.mark.parametrize("gated", [False, True])
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.8, 1.0])
-def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share):
+def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share, gated):
     adapter, support, cameras = model(), ball_views(ring(7, (24, 24))), ring(2, (10, 13), shift=1)
     context = adapter.prepare(support)
     learned = adapter.rendering_field(context, adapter.adapted_weights(context))
-    stacked = stack(learned, HullBlend().adapt_to(context.planes), share)
+    stacked = stack(learned, HullBlend().adapt_to(context.planes), share, GatingNetwork() if gated else None, 7)
     keep_field(adapter, stacked, tmp_path / "adapted" / "kept")
     expected = stacked.render(cameras).images
     for again in (
@@ -204,7 +208,9 @@ def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share):
         recall_field(tmp_path / "adapted" / "kept", support),
     ):
         torch.testing.assert_close(again.render(cameras).images, expected, atol=1e-6, rtol=0)
-    assert not random_model(adapter.config, 0).config.stacked
+    fresh = random_model(replace(adapter.config, gated=gated), 0).config
+    assert not fresh.stacked
+    assert not fresh.gated
 
 
 def test_the_control_of_another_objects_update_is_stacked_as_the_object_is(monkeypatch):

@@ -1,0 +1,58 @@
+"""Training of the gating network of a model whose pictures are means with those of the visual hull.
+
+    python -m benchmarks gating --data data/cars data/random --objects 24 --out FOLDER
+
+Each held-out object is shown by a random number of views, upright and in a random orientation. The objects must be none
+that the model was trained on, nor those of any table. A copy of the model with the gating network is written, and what
+it is worth is measured by `python -m benchmarks views --methods ungated unstacked`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from benchmarks.views import add_data_options, suite_folders
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.checkpoints import find_checkpoint
+from hyperplanes.data import open_dataset
+from hyperplanes.data.support import Shown
+from hyperplanes.training.gating import GatingExample, example_of, fit_gate, turned
+
+__all__ = ["main"]
+
+COUNTS = (3, 5, 7, 10, 15, 25, 40)  # of the views that an object is shown by
+QUERY = 2
+
+
+def main(arguments: list[str]) -> int:
+    """Train, and write the model.
+
+    Args:
+        arguments: see --help.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks gating", description=__doc__)
+    add_data_options(parser)
+    parser.add_argument("--objects", type=int, default=24, help="held-out ones of each data set")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", required=True, help="where the model goes")
+    parser.add_argument("--quick", action="store_true", help="one object: to see that it runs")
+    chosen = parser.parse_args(arguments)
+    model = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint)))
+    draws, generator, examples = random.Random(0), torch.Generator().manual_seed(0), list[GatingExample]()
+    for _, path in suite_folders(parser, chosen):
+        data = open_dataset(path)
+        for name in sorted(data.names("test"))[: 1 if chosen.quick else chosen.objects]:
+            for upright in (True, False):
+                task = Shown(data, draws.choice(COUNTS), QUERY).task(name)
+                examples.append(example_of(model, task if upright else turned(task, generator)))
+        print(f"{path}: {len(examples)} examples", flush=True)
+    result = HyperPlanes(replace(model.config, gated=True))
+    gate = {f"gate.{name}": value for name, value in fit_gate(examples).state_dict().items()}
+    result.load_state_dict({**model.state_dict(), **gate})
+    result.save(chosen.out, torch.float16)
+    print(f"{chosen.out}: the model, with a gating network trained on {len(examples)} examples")
+    return 0

@@ -1,0 +1,105 @@
+"""Source of truth: shares that are set by hand, means of pictures, and which picture is right by construction."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HullBlend, HyperPlanes
+from hyperplanes.adaptation.gating import GatingNetwork, readings
+from hyperplanes.adaptation.stacking import FEWEST, StackedField, stack
+from hyperplanes.geometry.rays import cast
+from hyperplanes.training.gating import GatingExample, example_of, fit_gate, turned
+from hyperplanes.utilities.metrics import psnr
+from hyperplanes.views import Task
+from tests.adaptation.test_stacking import CONFIG, both, model
+from tests.reference_rendering import ball_views, ring
+
+
+def constant(share):
+    """A gate that gives every pixel the same share."""
+    gate = GatingNetwork()
+    gate.layers[-1].weight.zero_()
+    gate.layers[-1].bias.fill_(torch.logit(torch.tensor(share)))
+    return gate
+
+
+@pytest.mark.parametrize("by_object", [0.1, 0.95])  # of which the second makes the hull the field that has densities
+def test_a_gate_that_gives_all_pixels_one_share_is_a_mean_by_that_share(by_object):
+    learned, hull = both(ball_views(ring(6, (24, 24))))
+    stacked, cameras = stack(learned, hull, by_object, constant(0.3), 6), ring(2, (10, 13), shift=1)
+    one, other, mixed = (each.render(cameras) for each in (learned, hull, stacked))
+    torch.testing.assert_close(mixed.images, torch.lerp(one.images, other.images, 0.3))
+    torch.testing.assert_close(mixed.opacity, torch.lerp(one.opacity, other.opacity, 0.3))
+    rays = cast(cameras, torch.zeros(5, dtype=torch.long), torch.rand(5, 2) * 4 + 4, learned.occupancy.bounds)
+    one, other, mixed = (each.trace(rays, differentiable=False) for each in (learned, hull, stacked))
+    torch.testing.assert_close(mixed.colour, torch.lerp(one.colour, other.colour, 0.3))
+    torch.testing.assert_close(mixed.opacity, torch.lerp(one.opacity, other.opacity, 0.3))
+
+
+def test_shares_of_pictures_are_those_of_their_pixels():
+    learned, hull = both(ball_views(ring(6, (24, 24))))
+    cameras, gate = ring(2, (10, 13), shift=1), GatingNetwork()
+    one, other = (each.render(cameras) for each in (learned, hull))
+    found = gate.shares(one, other, 0.4, 6)
+    assert found.shape == one.opacity.shape
+    view, row, column = 1, 4, 6
+    pixel = [each.images[view, :, row, column] for each in (one, other)]
+    opacity = [each.opacity[view, 0, row, column] for each in (one, other)]
+    expected = gate(readings(*pixel, *opacity, 0.4, 6))
+    torch.testing.assert_close(found[view, 0, row, column], expected)
+    assert found.std() > 0
+
+
+def test_pixels_are_gated_from_five_views_with_masks_on():
+    adapter = HyperPlanes(replace(CONFIG, gated=True))
+    for count in (FEWEST - 1, FEWEST):
+        support = ball_views(ring(count, (24, 24)))
+        assert isinstance(adapter.adapt(support), StackedField) == (count == FEWEST)
+        assert not isinstance(adapter.adapt(replace(support, masks=None)), StackedField)
+
+
+def test_a_fitted_gate_takes_the_picture_that_is_right():
+    # Two pictures of noise, of which the first is right where opacity is 1 and the second where it is below a half.
+    generator = torch.Generator().manual_seed(0)
+    examples = []
+    for _ in range(4):
+        truth, wrong = torch.rand(2, 4000, 3, generator=generator)
+        opacity = torch.where(torch.rand(4000, generator=generator) < 0.5, 1.0, 0.4)
+        first = torch.where(opacity[:, None] == 1, truth, wrong)
+        second = torch.where(opacity[:, None] == 1, wrong, truth)
+        read = readings(first, second, opacity, torch.ones(4000), 0.2, 10)
+        examples.append(GatingExample(read, first, second, truth, float((first - truth).square().sum())))
+    gate = fit_gate(examples, steps=300)
+    shares = gate(examples[0].read)
+    assert float(shares[opacity_of(examples[0]) == 1].mean()) < 0.05
+    assert float(shares[opacity_of(examples[0]) < 1].mean()) > 0.95
+    assert not any(each.requires_grad for each in gate.parameters())
+    again = fit_gate(examples, steps=300)
+    assert all(torch.equal(a, b) for a, b in zip(gate.state_dict().values(), again.state_dict().values(), strict=True))
+    with pytest.raises(ValueError, match="examples: expected at least one"):
+        fit_gate([])
+
+
+def opacity_of(example):
+    return example.read[:, 1]
+
+
+def test_an_example_holds_what_both_pictures_show():
+    adapter, task = model(), Task(ball_views(ring(6, (24, 24))), ball_views(ring(2, (10, 13), shift=1)), "ball")
+    found = example_of(adapter, task)
+    context = adapter.prepare(task.support)
+    learned = adapter.rendering_field(context, adapter.adapted_weights(context)).render(task.query.cameras)
+    hull = HullBlend().adapt_to(context.planes).render(task.query.cameras)
+    some = ((learned.opacity > 0) | (hull.opacity > 0))[:, 0]
+    torch.testing.assert_close(found.truth, task.query.images.movedim(1, -1)[some])
+    torch.testing.assert_close(found.hull, hull.images.movedim(1, -1)[some])
+    assert found.error == pytest.approx(float((learned.images - task.query.images).square().sum()), rel=1e-4)
+
+
+def test_a_turned_object_is_the_same_object():
+    task = Task(ball_views(ring(6, (24, 24))), ball_views(ring(2, (24, 24), shift=1)), "ball")
+    moved = turned(task, torch.Generator().manual_seed(0))
+    one, other = (HullBlend().adapt(each.support).render(each.query.cameras).images for each in (task, moved))
+    assert not torch.equal(moved.support.cameras.extrinsics, task.support.cameras.extrinsics)
+    assert float(psnr(other, one).min()) > 25  # but for the voxels of the hull, which do not turn
