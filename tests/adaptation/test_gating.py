@@ -51,6 +51,14 @@ def test_shares_of_pictures_are_those_of_their_pixels():
     assert found.std() > 0
 
 
+def test_a_gate_in_double_precision_gives_the_same_shares():
+    learned, hull = both(ball_views(ring(6, (24, 24))))
+    cameras, gate = ring(2, (10, 13), shift=1), GatingNetwork()
+    pictures = [each.render(cameras) for each in (learned, hull)]
+    expected = gate.shares(*pictures, 0.4, 6)
+    torch.testing.assert_close(gate.double().shares(*pictures, 0.4, 6), expected)
+
+
 def test_pixels_are_gated_from_five_views_with_masks_on():
     adapter = HyperPlanes(replace(CONFIG, gated=True))
     for count in (FEWEST - 1, FEWEST):
