@@ -15,7 +15,6 @@ from hyperplanes.adaptation.context import SupportContext, live_pixels
 from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
-from hyperplanes.fields.base import Field
 from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
@@ -49,12 +48,14 @@ class StackedField(AdaptedField):
     Attributes:
         other: the other field.
         share: of the pictures of the other field in the mean.
+        overruled: whether the other field is the learned one, and the field itself the visual hull.
         gate: what makes a share of every pixel of that; None leaves all alike.
         views: how many are shown.
     """
 
     other: AdaptedField = field(kw_only=True)
     share: float = field(kw_only=True)
+    overruled: bool = field(default=False, kw_only=True)
     gate: GatingNetwork | None = field(default=None, kw_only=True)
     views: int = field(default=FEWEST, kw_only=True)
 
@@ -93,9 +94,9 @@ class StackedField(AdaptedField):
         """Of the other field in each pixel."""
         if self.gate is None:
             return torch.full_like(own.opacity, self.share)
-        if isinstance(self.field, Field):
-            return self.gate.shares(own, other, self.share, self.views)
-        return 1 - self.gate.shares(other, own, 1 - self.share, self.views)
+        if self.overruled:
+            return 1 - self.gate.shares(other, own, 1 - self.share, self.views)
+        return self.gate.shares(own, other, self.share, self.views)
 
 
 @dataclass(frozen=True)
@@ -121,9 +122,9 @@ def learned_part(adapted: AdaptedField) -> Learned:
     """
     if not isinstance(adapted, StackedField):
         return Learned(adapted)
-    if isinstance(adapted.field, Field):
-        return Learned(adapted, adapted.share, adapted.gate)
-    return Learned(adapted.other, 1 - adapted.share, adapted.gate)
+    if adapted.overruled:
+        return Learned(adapted.other, 1 - adapted.share, adapted.gate)
+    return Learned(adapted, adapted.share, adapted.gate)
 
 
 def stack(
@@ -152,10 +153,11 @@ def stack(
         raise ValueError("stack: expected fields that are not stacked, got one that is")
     if share == 0 and gate is None:
         return learned
-    if share > OVERRULED:
+    overruled = share > OVERRULED
+    if overruled:
         learned, hull, share = hull, learned, 1 - share
     own = {each.name: getattr(learned, each.name) for each in fields(learned)}
-    return StackedField(**own, other=hull, share=share, gate=gate, views=views)
+    return StackedField(**own, other=hull, share=share, overruled=overruled, gate=gate, views=views)
 
 
 @torch.no_grad()
