@@ -71,7 +71,7 @@ def test_a_fitted_gate_takes_the_picture_that_is_right():
     # Two pictures of noise, of which the first is right where opacity is 1 and the second where it is below a half.
     generator = torch.Generator().manual_seed(0)
     examples = []
-    for _ in range(4):
+    for _ in range(2):
         truth, wrong = torch.rand(2, 4000, 3, generator=generator)
         opacity = torch.where(torch.rand(4000, generator=generator) < 0.5, 1.0, 0.4)
         first = torch.where(opacity[:, None] == 1, truth, wrong)
@@ -83,8 +83,8 @@ def test_a_fitted_gate_takes_the_picture_that_is_right():
     assert float(shares[opacity_of(examples[0]) == 1].mean()) < 0.05
     assert float(shares[opacity_of(examples[0]) < 1].mean()) > 0.95
     assert not any(each.requires_grad for each in gate.parameters())
-    again = fit_gate(examples, steps=300)
-    assert all(torch.equal(a, b) for a, b in zip(gate.state_dict().values(), again.state_dict().values(), strict=True))
+    one, other = (fit_gate(examples, steps=2).state_dict() for _ in range(2))
+    assert all(torch.equal(one[name], other[name]) for name in one)
     with pytest.raises(ValueError, match="examples: expected at least one"):
         fit_gate([])
 
