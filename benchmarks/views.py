@@ -35,14 +35,13 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Renderable
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
-from hyperplanes.adaptation.stacking import hull_share, stack
+from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Inputs, Shown
 from hyperplanes.evaluation import Score, evaluate
 from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
-from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.episodes.augmentation import Rotation
@@ -270,13 +269,10 @@ class _Ungated:
 
     model: HyperPlanes
 
-    @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The field of the object's own update, and the hull."""
-        model, context = self.model.eval(), self.model.prepare(support)
-        assert isinstance(context.planes, VisibilityPlanes)
-        learned = model.rendering_field(context, model.adapted_weights(context))
-        return stack(learned, HullBlend().adapt_to(context.planes), hull_share(model, context.views))
+        """The model's own field without its gating network."""
+        found = self.model.adapt(support)
+        return replace(found, gate=None) if isinstance(found, StackedField) else found
 
 
 @dataclass(frozen=True)

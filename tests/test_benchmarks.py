@@ -60,7 +60,6 @@ def test_a_whole_update_as_parts_of_it_is_that_of_the_model():
 def test_a_model_without_its_gate_is_stacked_by_one_share(monkeypatch):
     model, task = HyperPlanes(replace(MODEL, stacked=True, gated=True)), Balls(views=6, size=(24, 24)).task("train0")
     monkeypatch.setattr(stacking, "hull_share", lambda *_: 0.4)
-    monkeypatch.setattr(views, "hull_share", lambda *_: 0.4)
     found = views.METHODS["ungated"](model).adapt(task.support).render(task.query.cameras).images
     assert not torch.equal(found, model.adapt(task.support).render(task.query.cameras).images)
     model.gate = None

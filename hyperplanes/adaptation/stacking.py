@@ -26,7 +26,17 @@ from hyperplanes.rendering.renderer import Sampler, render
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
-__all__ = ["FEWEST", "Learned", "StackedField", "best_share", "hull_share", "learned_part", "stack", "stacked_field"]
+__all__ = [
+    "FEWEST",
+    "Learned",
+    "StackedField",
+    "best_share",
+    "hull_field",
+    "hull_share",
+    "learned_part",
+    "stack",
+    "stacked_field",
+]
 
 FEWEST = 5  # views, of which some can be held out
 HELD_OUT = 2
@@ -65,9 +75,9 @@ class StackedField(AdaptedField):
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
         """The mean of the pixels of both, as `AdaptedField.trace`."""
         own = super().trace(rays, generator, differentiable=differentiable)
-        if not (self.share or self.gate):
+        if not self.share and self.gate is None:
             return own
-        return self._mean(own, self.other.trace(rays, generator, differentiable=differentiable), "colour")
+        return self._mean(own, self.other.trace(rays, generator, differentiable=differentiable))
 
     @checked
     @torch.no_grad()
@@ -76,18 +86,17 @@ class StackedField(AdaptedField):
     ) -> Pictures:
         """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the field's alone."""
         own = super().render(cameras, sampling, antialias)
-        if not (self.share or self.gate):
+        if not self.share and self.gate is None:
             return own
-        return self._mean(own, self.other.render(cameras, antialias=antialias), "images")
+        return self._mean(own, self.other.render(cameras, antialias=antialias))
 
-    def _mean(self, own: Pixels, other: Pixels, colour: str) -> Pixels:
+    def _mean(self, own: Pixels, other: Pixels) -> Pixels:
         """The mean of colours and opacities, and the expected distance of what both show."""
         share = self._shares(own, other)
         opacity = torch.lerp(own.opacity, other.opacity, share)
         depth = torch.lerp(own.opacity * own.depth, other.opacity * other.depth, share) / opacity.clamp_min(1e-10)
-        colours = torch.lerp(
-            getattr(own, colour), getattr(other, colour), share if colour == "images" else share[:, None]
-        )
+        colour, of_colours = ("images", share) if isinstance(own, Pictures) else ("colour", share[:, None])
+        colours = torch.lerp(getattr(own, colour), getattr(other, colour), of_colours)
         return replace(own, **{colour: colours}, opacity=opacity, depth=depth, samples=own.samples + other.samples)
 
     def _shares(self, own: Pixels, other: Pixels) -> Tensor:
@@ -181,7 +190,9 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
         with in_use(network):
             share = hull_share(network, context.views)
     gate = network.gate if len(context.views) >= FEWEST else None
-    return stack(learned, _hull(context), share, gate, len(context.views)) if share or gate else learned
+    if not share and gate is None:
+        return learned
+    return stack(learned, hull_field(context), share, gate, len(context.views))
 
 
 @torch.no_grad()
@@ -222,13 +233,18 @@ def hull_share(network: HyperPlanesNetwork, support: Views) -> float:
         subpixels=SUBPIXELS,
     )
     across = pixels_across(held_out.cameras, support.bounds)
-    without, hull = (_pixels(each, rays, across) - truth for each in (learned, _hull(context)))
+    without, hull = (_pixels(each, rays, across) - truth for each in (learned, hull_field(context)))
     share = best_share(without, hull) ** CAUTION
     mixed = torch.lerp(without, hull, share)
     return share if float(mixed.square().sum()) < (1 - MARGIN) * float(without.square().sum()) else 0.0
 
 
-def _hull(context: SupportContext) -> AdaptedField:
+def hull_field(context: SupportContext) -> AdaptedField:
+    """What `HullBlend` makes of an object.
+
+    Args:
+        context: of a field that takes any number of views.
+    """
     assert isinstance(context.planes, VisibilityPlanes)
     return HullBlend().adapt_to(context.planes)
 

@@ -11,12 +11,10 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
 from hyperplanes.adaptation.gating import GatingNetwork, readings
-from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.stacking import hull_share
-from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.visibility import VisibilityPlanes
-from hyperplanes.views import Task, Views
+from hyperplanes.adaptation.stacking import hull_field, hull_share
+from hyperplanes.training.episodes.augmentation import moved
+from hyperplanes.views import Task
 
 __all__ = ["GatingExample", "example_of", "fit_gate", "turned"]
 
@@ -53,9 +51,8 @@ def example_of(model: HyperPlanes, task: Task) -> GatingExample:
         task: an object that the model was not trained on, with masks.
     """
     context = model.prepare(task.support)
-    assert isinstance(context.planes, VisibilityPlanes)
     learned = model.rendering_field(context, model.adapted_weights(context)).render(task.query.cameras)
-    hull = HullBlend().adapt_to(context.planes).render(task.query.cameras)
+    hull = hull_field(context).render(task.query.cameras)
     share, truth = hull_share(model, context.views), _flat(task.query.images)
     one, other = _flat(learned.images), _flat(hull.images)
     opacity, of_hull = learned.opacity.flatten(), hull.opacity.flatten()
@@ -78,11 +75,7 @@ def turned(task: Task, generator: torch.Generator) -> Task:
     centre = torch.tensor(task.support.bounds.centre, dtype=torch.float64)
     motion[:3, 3] = centre - motion[:3, :3] @ centre
 
-    def moved(views: Views) -> Views:
-        pose = camera.camera_from_world(views.cameras)
-        return replace(views, cameras=camera.with_poses(views.cameras, pose @ torch.linalg.inv(motion).to(pose)))
-
-    return replace(task, support=moved(task.support), query=moved(task.query))
+    return replace(task, support=moved(task.support, motion), query=moved(task.query, motion))
 
 
 def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS, seed: int = 0) -> GatingNetwork:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
@@ -17,7 +16,7 @@ from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
 
-__all__ = ["Rotation", "draw_rotation", "drop_planes", "over_random_colour"]
+__all__ = ["Rotation", "draw_rotation", "drop_planes", "moved", "over_random_colour"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class Rotation:
 
     def views(self, views: Views) -> Views:
         """The views of the rotated object: the same pictures, whose cameras are rotated with it."""
-        return replace(views, cameras=_rotated(views, self.angle)) if self.angle else views
+        return moved(views, _rotation(self.angle, views.bounds)) if self.angle else views
 
     def volume(self, volume: Float[Tensor, "4 x y z"]) -> Float[Tensor, "4 x y z"]:
         """The first channels of a volume (`geometry.volume.volume_of`) of the rotated object.
@@ -42,6 +41,17 @@ class Rotation:
                 the result is smoother than the volume of the rotated views.
         """
         return _resampled(volume, self.angle) if self.angle else volume
+
+
+def moved(views: Views, motion: Float[Tensor, "4 4"]) -> Views:
+    """The views of an object after a rigid motion: the same pictures, whose cameras move with it.
+
+    Args:
+        views: of the object.
+        motion: in world coordinates, in float64.
+    """
+    pose = camera.camera_from_world(views.cameras)
+    return replace(views, cameras=camera.with_poses(views.cameras, pose @ torch.linalg.inv(motion).to(pose)))
 
 
 def draw_rotation(share: float, generator: torch.Generator) -> Rotation:
@@ -82,12 +92,6 @@ def over_random_colour(
     """
     colour = torch.rand(3, generator=generator).to(truth)
     return rendered.over(colour), truth + (1 - opacity) * (colour - 1)
-
-
-def _rotated(views: Views, angle: float) -> PinholeCamera:
-    """The cameras of the views, rotated with the object."""
-    pose = camera.camera_from_world(views.cameras)
-    return camera.with_poses(views.cameras, pose @ torch.linalg.inv(_rotation(angle, views.bounds)).to(pose))
 
 
 def _rotation(angle: float, bounds: Sphere) -> Float[Tensor, "4 4"]:
