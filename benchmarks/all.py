@@ -42,7 +42,8 @@ OF_DATA = ("views", "baked", "image_based", "hypernetwork")
 MORE = {"baked": ["--objects", "2", "--query", "4", "--counts", "25", "3"]}
 """Options of those beside --data."""
 
-_TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", "--methods", "nearest_view", "hull_blend"]
+_METHODS = ["--methods", "nearest_view", "hull_blend", "hull_blend_reflected", "unreflected"]
+_TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", *_METHODS]
 _TUNED = ["--query", "2", "--steps", "100", "--methods", "hull_blend"]
 OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_procedural": (["procedural"], _TEN),
@@ -50,10 +51,10 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_random": (["random"], [*_TEN, "swapped"]),
     "views_posed": (
         ["posed"],
-        ["--query", "5", "--counts", "1", "3", "5", "25", "50", "--methods", "nearest_view", "hull_blend"],
+        ["--query", "5", "--counts", "1", "3", "5", "25", "50", *_METHODS],
     ),
-    "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "5"]),
-    "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "5"]),
+    "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "5", *_METHODS]),
+    "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "5", *_METHODS]),
     "views_tuned_3": (["procedural", "cc0", "random", "posed"], ["--objects", "5", "--counts", "3", *_TUNED]),
     "views_tuned": (["procedural", "cc0", "random", "posed"], ["--objects", "3", "--counts", "25", *_TUNED]),
 }

@@ -236,7 +236,9 @@ NAMES = {
 METHODS = {
     "nearest_view": "the nearest view",
     "hull_blend": "`hull_blend`",
+    "hull_blend_reflected": "`hull_blend` with reflections",
     "swapped": "the update of another object",
+    "unreflected": "`small` without reflections",
     "one_step": "**`small`**",
 }
 """Rows of the table of views, in its order."""

@@ -6,9 +6,10 @@
 
 Of every held-out object some query views are kept back to be judged by; of all others, support and query alike, so many
 are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
-(where there are masks); the same field from random weights; the model without its hypernetwork, with the update of
-another object of the data set, with its own alone, averaged with the visual hull by one share an object, with one ray
-a pixel, and as it is used; and fine-tuned. Beside each mean stands how far it lies above
+(where there are masks), of views alone and with their reflections; the same field from random weights; the model
+without its hypernetwork, with the update of another object of the data set, with its own alone, averaged with the
+visual hull by one share an object, without reflections of views, with one ray a pixel, and as it is used; and
+fine-tuned. Beside each mean stands how far it lies above
 `hull_blend`, with the 95 % interval of that difference over the objects (paired, Student's t).
 
 With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
@@ -37,6 +38,7 @@ from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.adaptation.symmetry import Reflecting
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Inputs, Shown
 from hyperplanes.evaluation import Score, evaluate
@@ -228,7 +230,7 @@ def adapters(
     found: dict[str, Adapter] = {}
     for name in wanted:
         needs_others = name == "swapped" and (model.hypernetwork is None or len(names) < 2)
-        if not (needs_others or (name == "hull_blend" and shown.task(names[0]).support.masks is None)):
+        if not (needs_others or (name.startswith("hull_blend") and shown.task(names[0]).support.masks is None)):
             found[name] = (METHODS | PARTS)[name](model, shown, names)
     found["one_step"] = model
     for each in steps:
@@ -254,7 +256,8 @@ class _Partly:
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The field of theta and what is left of the update."""
-        model, prepared = self.model.eval(), self.model.prepare(support)
+        model = self.model.eval()
+        prepared = model.prepare(support, symmetry=model.find_symmetry(support))
         if prepared.volume is not None:
             kept = [float(channel not in self.masked) for channel in range(CHANNELS)]
             volume = prepared.volume * prepared.volume.new_tensor(kept)[:, None, None, None]
@@ -273,6 +276,17 @@ class _Ungated:
         """The model's own field without its gating network."""
         found = self.model.adapt(support)
         return replace(found, gate=None) if isinstance(found, StackedField) else found
+
+
+@dataclass(frozen=True)
+class _Unreflected:
+    """A model that is shown no reflections of views."""
+
+    model: HyperPlanes
+
+    def adapt(self, support: Views) -> AdaptedField:
+        """The model's own field of the views alone."""
+        return self.model.adapt_to(self.model.prepare(support))
 
 
 @dataclass(frozen=True)
@@ -305,11 +319,13 @@ def _swapped(model: HyperPlanes, shown: Tasks, names: list[str]) -> Adapter:
 METHODS = {
     "nearest_view": lambda *_: NearestView(),
     "hull_blend": lambda *_: HullBlend(),
+    "hull_blend_reflected": lambda *_: Reflecting(HullBlend()),
     "random_weights": lambda model, *_: FromScratch(model, 0),
     "theta": lambda model, *_: _Partly(model, lambda name: False),
     "swapped": _swapped,
     "unstacked": lambda model, *_: _Partly(model),
     "ungated": lambda model, *_: _Ungated(model),
+    "unreflected": lambda model, *_: _Unreflected(model),
     "one_ray": lambda model, *_: _OneRay(model),
 }
 

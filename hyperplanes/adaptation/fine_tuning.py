@@ -78,21 +78,28 @@ def fine_tune(
     support, settings = network.to_own(support), settings or FineTuning()
     check_fine_tuning(settings, steps, len(support), network.config, network.target)
     if steps != "auto":
-        return fine_tune_to(network, network.prepare(support), steps, settings, views=support, on_step=on_step)
+        context = network.prepare(support, symmetry=network.find_symmetry(support))
+        return fine_tune_to(network, context, steps, settings, views=_trained_on(context, support), on_step=on_step)
 
     # how many steps show some of the views best that the others were fine-tuned without, from as many random weights
     settings = replace(settings, fresh=settings.fresh_share(len(support)))
     shown, holdout = split_holdout(support, settings)
-    context = network.prepare(shown)
-    trial, _ = make_descent(network, context, settings, shown)
+    context = network.prepare(shown, symmetry=network.find_symmetry(shown))
+    trial, _ = make_descent(network, context, settings, _trained_on(context, shown))
     pixels = network.live_pixels_of(context, holdout)
     with torch.no_grad():
         unchanged = network.field(context, network.adapted_weights(context))
     stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
-    context, schedule = network.prepare(support), settings.max_steps
-    return fine_tune_to(network, context, stop, settings, views=support, schedule=schedule, on_step=on_step)
+    context, schedule = network.prepare(support, symmetry=network.find_symmetry(support)), settings.max_steps
+    views = _trained_on(context, support)
+    return fine_tune_to(network, context, stop, settings, views=views, schedule=schedule, on_step=on_step)
+
+
+def _trained_on(context: SupportContext, support: Views) -> Views:
+    """Where rays come from: the support views, in their order, or these and their reflections."""
+    return support if context.symmetry is None else context.views
 
 
 def fine_tune_to(
@@ -180,7 +187,7 @@ def _variables(
         observed, theta = observe([context], network.hypernetwork.resolution), network.theta.detach()
         return Variables.of_hypernetwork(network.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
     if start is None:
-        start = _refreshed(network, network.adapted_weights(context), settings, len(context.views))
+        start = _refreshed(network, network.adapted_weights(context), settings, len(context.given))
     return Variables.of_weights(start)
 
 

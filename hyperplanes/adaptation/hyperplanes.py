@@ -46,7 +46,7 @@ class HyperPlanes(HyperPlanesNetwork):
 
         Where `config.stacked` says so, its pictures are means with those of the visual hull (`adaptation.stacking`).
         """
-        return self.adapt_to(self.prepare(support))
+        return self.adapt_to(self.prepare(support, symmetry=self.find_symmetry(support)))
 
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:
@@ -104,6 +104,7 @@ class HyperPlanes(HyperPlanesNetwork):
         """
         learned = learned_part(adapted)
         beside = {"stacked": False, "hull_share": learned.share, "gated": learned.gate is not None}
+        beside |= {"symmetric": False, "symmetry": adapted.symmetry}
         result = HyperPlanes(replace(self.config, hypernetwork=None, autoencoder=None, initialisation=None, **beside))
         if result.gate is not None and learned.gate is not None:
             result.gate.load_state_dict(learned.gate.state_dict())

@@ -12,10 +12,12 @@ from torch import Tensor, nn
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext, arrange, live_pixels, observe, prepare_context
 from hyperplanes.adaptation.gating import GatingNetwork
+from hyperplanes.adaptation.symmetry import UNKNOWN, symmetry_plane, vertical_planes
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
 from hyperplanes.fields.rig import Rig, camera_directions
+from hyperplanes.geometry.reflections import Plane
 from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
@@ -23,6 +25,8 @@ from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanesNetwork", "in_use"]
+
+SIZE_OF_ONE = 128  # pixels of a single view, along the longer side, at most, by which its plane is chosen
 
 
 class HyperPlanesNetwork(nn.Module):
@@ -96,11 +100,12 @@ class HyperPlanesNetwork(nn.Module):
         return arrange(support, self.target, self.known_rig)
 
     @checked
-    def prepare(self, support: Views, *, carved: bool = True) -> SupportContext:
+    def prepare(self, support: Views, *, carved: bool = True, symmetry: Plane | None = None) -> SupportContext:
         """All that depends on the support views and not on weights.
 
         Args:
             support: the views of one object, on any device and in any precision.
+            symmetry: a plane about which the object is symmetric: reflections of the views count as views, too.
             carved: without, one voxel that may hold anything stands for the hull, for who never asks it. A hypernetwork
                 that reads the hull has it carved in any case.
         """
@@ -112,7 +117,35 @@ class HyperPlanesNetwork(nn.Module):
             self.config.hull_resolution,
             carved=carved,
             masks_repeated=self.config.plane_dropout > 0,
+            symmetry=symmetry,
         )
+
+    @checked
+    @torch.no_grad()
+    def find_symmetry(self, support: Views) -> Plane | None:
+        """The plane about which the views of an object are to be reflected, where `config.symmetric` says so.
+
+        Args:
+            support: the views of one object.
+
+        Returns:
+            `config.symmetry` where that is known. Else the plane about which the object looks symmetric
+            (`symmetry.symmetry_plane`), or None. A single view is reflected about one of the vertical planes if it is
+            shown better so than without its reflection.
+        """
+        if self.config.symmetry is not None or not self.config.symmetric:
+            return self.config.symmetry
+        views = self.to_own(support)
+        if len(views) != 1 or views.masks is None or not views.masks.any():
+            return symmetry_plane(views)
+        view = views.resized(SIZE_OF_ONE)
+
+        def error(plane: Plane | None) -> float:
+            context = self.prepare(view, symmetry=plane)
+            found = self.rendering_field(context, self.adapted_weights(context)).render(view.cameras)
+            return float((found.images - view.images).square().sum())
+
+        return min((None, *vertical_planes(view.bounds)), key=error)
 
     def to_own(self, support: Views) -> Views:
         """The views where the weights are, in their precision or at least single."""
@@ -135,7 +168,14 @@ class HyperPlanesNetwork(nn.Module):
             for name, network in self.targets.items()
         }
         densities = tuple(field.density for field in bound.values())
-        return AdaptedField(bound["fine"], context.occupancy, self.config.sampling, bound.get("coarse"), densities)
+        return AdaptedField(
+            bound["fine"],
+            context.occupancy,
+            self.config.sampling,
+            bound.get("coarse"),
+            densities,
+            symmetry=context.symmetry,
+        )
 
     def rendering_field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
         """As `field`; one that judges what views see takes colours from those that see the surface of its density.
@@ -158,8 +198,16 @@ class HyperPlanesNetwork(nn.Module):
             return self.theta + self.update(context)
 
     def live_pixels_of(self, context: SupportContext, views: Views) -> Tensor | None:
-        """Flat indices of the pixels of views that look into the hull; None where all are drawn from."""
-        return live_pixels(context.occupancy, views) if self.config.sampling.needs_occupancy else None
+        """Flat indices of the pixels of views that look into the hull; None where all are drawn from.
+
+        Pixels at which a reflection is known to be wrong are none of them.
+        """
+        if not self.config.sampling.needs_occupancy:
+            return None
+        pixels = live_pixels(context.occupancy, views)
+        if context.symmetry is None or views.masks is None:
+            return pixels
+        return pixels[views.masks.flatten()[pixels] != views.masks.new_tensor(UNKNOWN)]
 
 
 @contextmanager

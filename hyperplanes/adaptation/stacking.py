@@ -18,6 +18,7 @@ from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
+from hyperplanes.geometry.reflections import Plane
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
@@ -188,7 +189,7 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
     share = network.config.hull_share
     if network.config.stacked:
         with in_use(network):
-            share = hull_share(network, context.views)
+            share = hull_share(network, context.given, context.symmetry)
     gate = network.gate if len(context.views) >= FEWEST else None
     if not share and gate is None:
         return learned
@@ -196,7 +197,7 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
 
 
 @torch.no_grad()
-def hull_share(network: HyperPlanesNetwork, support: Views) -> float:
+def hull_share(network: HyperPlanesNetwork, support: Views, symmetry: Plane | None = None) -> float:
     """The share of `HullBlend` in the pictures of an object, by which views that are held out are shown best.
 
     What was learned may not fit an object of another kind, and where it does fit, the errors of both are different
@@ -206,6 +207,7 @@ def hull_share(network: HyperPlanesNetwork, support: Views) -> float:
     Args:
         network: of a field that takes any number of views.
         support: the views of an object, where the model is.
+        symmetry: the plane about which they are reflected.
 
     Returns:
         The share, in [0, 1]: the best one (`best_share`) to the power of CAUTION. It is 0 where that lowers the squared
@@ -220,7 +222,7 @@ def hull_share(network: HyperPlanesNetwork, support: Views) -> float:
     assert shown.masks is not None
     if not shown.masks.any():
         return 0.0
-    context = network.prepare(shown)
+    context = network.prepare(shown, symmetry=symmetry)
     among = live_pixels(context.occupancy, held_out)
     if not len(among):
         return 0.0

@@ -35,14 +35,16 @@ class Swapped:
         self._updates: dict[str, Parameters] = {}
         with torch.no_grad(), in_use(model):
             for support in objects:
-                self._updates[_digest(support)] = model.update(model.prepare(support, carved=False))
+                self._updates[_digest(support)] = model.update(
+                    model.prepare(support, carved=False, symmetry=model.find_symmetry(support))
+                )
         if len(self._updates) < 2:
             raise ValueError(f"swapped: expected at least 2 objects to swap updates of, got {len(self._updates)}")
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The field of theta plus the update of the object after this one, stacked as with its own update."""
-        prepared = self.model.prepare(support)
+        prepared = self.model.prepare(support, symmetry=self.model.find_symmetry(support))
         known = list(self._updates)
         own = _digest(support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]

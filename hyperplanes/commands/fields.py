@@ -135,6 +135,7 @@ def adapt_to(
         except OSError as error:  # the field is there, and what is asked of it can be done
             console.warn(f"{folder}: not kept for another time: {error}")
     how = f", {taken[-1]} fine-tuning steps" if any(taken) else ""
+    how += ", together with their reflections" if field.symmetry is not None else ""
     how += ", averaged with the visual hull" if isinstance(field, StackedField) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")

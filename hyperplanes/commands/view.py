@@ -149,8 +149,8 @@ def _adapt(
     from hyperplanes.export.baking import BakedScene, default_side
 
     console.say(f"adapting to {len(shown)} views")
-    context, steps = model.prepare(shown), arguments.steps if len(shown) > 1 else 0
-    descent, variables = make_descent(model, context, FineTuning(), shown)
+    context, steps = model.prepare(shown, symmetry=model.find_symmetry(shown)), arguments.steps if len(shown) > 1 else 0
+    descent, variables = make_descent(model, context, FineTuning())
     field = None
     for done in descent.run(steps):
         if done % EVERY == 0 or done == steps:

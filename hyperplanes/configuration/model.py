@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from hyperplanes.configuration.initialisation import InitialisationConfig
 from hyperplanes.configuration.upgrade import upgrade_model
 from hyperplanes.fields import TargetConfig, find_targets
+from hyperplanes.geometry.reflections import Plane
 from hyperplanes.hypernetwork import KINDS, AutoencoderConfig, HyperNetworkConfig, ImageHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.utilities.arguments import checked_fields
@@ -54,6 +55,9 @@ class ModelConfig:
         hull_share: of `hull_blend` in the pictures of a model that is not `stacked`: what was decided for one object.
         gated: a gating network makes a share of every pixel of that one (`adaptation.gating`); `training.gating` trains
             it after the model.
+        symmetric: views of an object that looks symmetric are shown to the model together with their reflections
+            (`adaptation.symmetry`). Training does without.
+        symmetry: the plane of these, where it is known: what was found for one object.
     """
 
     target: str = "point_multiplane"
@@ -69,6 +73,8 @@ class ModelConfig:
     stacked: bool = False
     hull_share: float = 0.0
     gated: bool = False
+    symmetric: bool = False
+    symmetry: Plane | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.plane_dropout < 1:

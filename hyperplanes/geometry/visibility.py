@@ -70,6 +70,7 @@ class VisibilityPlanes:
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
         self._masked = torch.zeros(len(images), dtype=torch.bool, device=images.device)
+        self._handicaps = images.new_zeros(len(images))
         self._penalties = Penalties()
 
     def __len__(self) -> int:
@@ -99,6 +100,16 @@ class VisibilityPlanes:
         """
         result = copy.copy(self)
         result._penalties = penalties
+        return result
+
+    def with_handicaps(self, handicaps: Float[Tensor, " view"]) -> VisibilityPlanes:
+        """The same planes, whose views have other penalties beside those of points.
+
+        Args:
+            handicaps: added to the penalty of each view wherever it shows a point.
+        """
+        result = copy.copy(self)
+        result._handicaps = handicaps.to(self._handicaps)
         return result
 
     def with_surface(self, voxels: Occupancy) -> VisibilityPlanes:
@@ -154,8 +165,8 @@ class VisibilityPlanes:
         return [*limits, own.steep, own.highest]
 
     def shown_cameras(self) -> Tensor:
-        """What the kernels read of each view: centre, projection matrix, and 0 where it is hidden."""
-        return torch.cat([self._cameras, (~self._masked).to(self._cameras)[None]])
+        """What the kernels read of each view: centre, projection matrix, 0 where it is hidden, and its handicap."""
+        return torch.cat([self._cameras, torch.stack([(~self._masked).to(self._cameras), self._handicaps])])
 
     def _choose_compiled(
         self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
@@ -268,7 +279,7 @@ class VisibilityPlanes:
         behind = torch.where(valid, (found.distances - depth) / self.occupancy.bounds.radius, 0.0)
         own = self._penalties
         penalty = (own.steep * (behind - self.tolerance)).clamp(-own.deepest, own.deepest)
-        penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest)
+        penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self._handicaps
         penalty = torch.where(valid, penalty, UNSEEN)
         values = torch.cat([found.directions, torch.stack([behind, coverage, penalty], -1)], -1)
 

@@ -50,10 +50,10 @@ def example_of(model: HyperPlanes, task: Task) -> GatingExample:
         model: whose pictures are mixed with those of the hull.
         task: an object that the model was not trained on, with masks.
     """
-    context = model.prepare(task.support)
+    context = model.prepare(task.support, symmetry=model.find_symmetry(task.support))
     learned = model.rendering_field(context, model.adapted_weights(context)).render(task.query.cameras)
     hull = hull_field(context).render(task.query.cameras)
-    share, truth = hull_share(model, context.views), _flat(task.query.images)
+    share, truth = hull_share(model, context.given, context.symmetry), _flat(task.query.images)
     one, other = _flat(learned.images), _flat(hull.images)
     opacity, of_hull = learned.opacity.flatten(), hull.opacity.flatten()
     some = (opacity > 0) | (of_hull > 0)

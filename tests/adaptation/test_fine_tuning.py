@@ -157,7 +157,9 @@ def test_auto_goes_on_where_steps_show_left_out_views_better():
 def test_left_out_views_are_neither_planes_nor_rays_while_the_number_of_steps_is_chosen(model, monkeypatch):
     support, prepared, drawn = ball_views(ring(9)), [], []
     prepare, sample = HyperPlanes.prepare, type(support).sample_rays
-    monkeypatch.setattr(HyperPlanes, "prepare", lambda self, views: prepared.append(views) or prepare(self, views))
+    monkeypatch.setattr(
+        HyperPlanes, "prepare", lambda self, views, **given: prepared.append(views) or prepare(self, views, **given)
+    )
 
     def sampled(self, count, **given):
         drawn.append((len(self), count))

@@ -217,7 +217,7 @@ def test_the_control_of_another_objects_update_is_stacked_as_the_object_is(monke
     adapter, supports = model(), [ball_views(ring(6, (24, 24)), radius=radius) for radius in (0.4, 0.7)]
     swapped, cameras = Swapped(adapter, supports), ring(1, (24, 24), shift=1)
     for share in (0.0, 0.5, 1.0):
-        monkeypatch.setattr(stacking, "hull_share", lambda network, support, share=share: share)
+        monkeypatch.setattr(stacking, "hull_share", lambda *_, share=share: share)
         own, other = (each.adapt(supports[0]).render(cameras).images for each in (adapter, swapped))
         assert torch.equal(own, other) == (share == 1.0)  # the hull alone
 
@@ -226,9 +226,9 @@ def test_the_swap_gap_of_a_validation_compares_fields_that_are_not_stacked(monke
     adapter, data = model(), Balls(test=2)
     settings = TrainingConfig(steps=1, tasks=1, rays=8, held_out=2)
     validator = Validator(adapter, data, settings, adapter.adapt_to)
-    monkeypatch.setattr(stacking, "hull_share", lambda network, support: 0.0)
+    monkeypatch.setattr(stacking, "hull_share", lambda *_: 0.0)
     alone = validator.run()
-    monkeypatch.setattr(stacking, "hull_share", lambda network, support: 0.6)
+    monkeypatch.setattr(stacking, "hull_share", lambda *_: 0.6)
     stacked = validator.run()
     assert stacked.psnr != alone.psnr
     assert stacked.diagnostics.swap_gap == alone.diagnostics.swap_gap
@@ -244,7 +244,7 @@ def test_auto_compares_steps_with_the_field_that_they_begin_at(monkeypatch):
     prepare, shown = adapter.prepare, []
     monkeypatch.setattr(adapter, "prepare", lambda views, **given: shown.append(views) or prepare(views, **given))
     monkeypatch.setattr(Descent, "best_stop", best_stop)
-    monkeypatch.setattr(stacking, "hull_share", lambda network, support: 0.0)
+    monkeypatch.setattr(stacking, "hull_share", lambda *_: 0.0)
     fine_tune(adapter, support, "auto", FineTuning(rays=8, max_steps=3))
     ((unchanged, begun),) = seen
     cameras = split_holdout(support, FineTuning())[1].cameras

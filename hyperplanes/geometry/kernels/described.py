@@ -230,7 +230,7 @@ def describe(
         place(s, pitch, total, x, y, z, cameras, shape, numbers[0])
         if rows.shape[1]:  # what the trunk reads of the best views
             row = rows[point]
-            judge(s, pitch, total, maps, shape, numbers)
+            judge(s, pitch, total, cameras, maps, shape, numbers)
             least(s, pitch, total, PENALTY, best, chosen, scores, 0)
             covered, seen = one, zero
             for view in range(total):
@@ -247,9 +247,9 @@ def describe(
         if near_rows.shape[1]:  # what the colour head reads of the nearest ones
             row = near_rows[point]
             if len(surface):
-                judge(s, pitch, total, surface, shape, numbers)
+                judge(s, pitch, total, cameras, surface, shape, numbers)
             elif not rows.shape[1]:
-                judge(s, pitch, total, maps, shape, numbers)
+                judge(s, pitch, total, cameras, maps, shape, numbers)
             x, y, z = directions[point, 0], directions[point, 1], directions[point, 2]
             rank(s, pitch, total, x, y, z, numbers[7])
             least(s, pitch, total, SCORE, ranked, chosen, scores, 0)

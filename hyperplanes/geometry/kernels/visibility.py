@@ -68,7 +68,7 @@ def place(s, pitch, total, x, y, z, cameras, shape, min_z):
 
 @inlined
 @no_type_check
-def judge(s, pitch, total, maps, shape, limits):
+def judge(s, pitch, total, cameras, maps, shape, limits):
     """Reads depth and opacity where a point falls into each view, and computes the penalties."""
     number = s.dtype.type
     zero, one = number(0), number(1)
@@ -91,7 +91,7 @@ def judge(s, pitch, total, maps, shape, limits):
         shown = load(s, SHOWN * pitch + k) > zero
         behind = (load(s, DISTANCE * pitch + k) - depth) * per_unit
         penalty = min(max(steep * (behind - tolerance), -deepest), deepest)
-        penalty = min(penalty + (partly if opacity < whole else zero), highest)
+        penalty = min(penalty + (partly if opacity < whole else zero), highest) + read(cameras, 16 * pitch, k)
         store(s, BEHIND * pitch + k, behind if shown else zero)
         store(s, OPACITY * pitch + k, opacity if shown else one)
         store(s, PENALTY * pitch + k, penalty if shown else unseen)
@@ -162,13 +162,13 @@ def choose(
 ):
     """Writes the chosen views of points start..stop. All arrays are flat.
 
-    `cameras` holds 16 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
-    matrix, and 0 where it is hidden. `maps` (view, row, column, 2) hold depth and opacity. `shape` is the number of
-    views, height, width, the numbers of chosen views, and the pitch; `limits` min_z, 1 / radius, the tolerance, deepest
-    and partly of `chosen_views.Penalties`, WHOLE, UNSEEN, ANGLE, steep and highest. `best` and `near` (point, chosen)
-    get indices of views, their values (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each,
-    and `overall` (point, 2) the least opacity and the number of the views that show the point. Where there are no
-    directions nothing is written to `near`.
+    `cameras` holds 17 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
+    matrix, 0 where it is hidden, and its handicap. `maps` (view, row, column, 2) hold depth and opacity. `shape` is the
+    number of views, height, width, the numbers of chosen views, and the pitch; `limits` min_z, 1 / radius, the
+    tolerance, deepest and partly of `chosen_views.Penalties`, WHOLE, UNSEEN, ANGLE, steep and highest. `best` and
+    `near` (point, chosen) get indices of views, their values (point, chosen, 6) direction, depth behind the hull,
+    opacity and penalty of each, and `overall` (point, 2) the least opacity and the number of the views that show the
+    point. Where there are no directions nothing is written to `near`.
     """
     number = limits.dtype.type
     total, best_count, near_count, pitch = shape[0], shape[3], shape[4], shape[5]
@@ -177,7 +177,7 @@ def choose(
         at = 3 * point
         # what each view shows of the point
         place(s, pitch, total, points[at], points[at + 1], points[at + 2], cameras, shape, limits[0])
-        judge(s, pitch, total, maps, shape, limits)
+        judge(s, pitch, total, cameras, maps, shape, limits)
         # over all views: least opacity, and how many show it
         covered, seen = number(1), number(0)
         for k in range(total):

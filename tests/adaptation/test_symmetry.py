@@ -1,0 +1,225 @@
+"""Source of truth: balls in known places, seen by cameras and by the reflections of these."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HullBlend, HyperPlanes
+from hyperplanes.adaptation.base import hull
+from hyperplanes.adaptation.symmetry import (
+    HANDICAP,
+    UNKNOWN,
+    Reflecting,
+    reflected,
+    symmetry_plane,
+    with_reflections,
+)
+from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.geometry import Sphere, cast
+from hyperplanes.geometry.cameras import camera_from_world
+from hyperplanes.geometry.rays import pixel_grid
+from hyperplanes.geometry.reflections import Plane, reflected_cameras
+from hyperplanes.utilities.metrics import psnr
+from hyperplanes.views import Views, join_views
+from tests.adaptation.test_stacking import CONFIG
+from tests.reference_rendering import ball_views, ring
+
+RED, GREEN, BLUE = (0.9, 0.1, 0.1), (0.1, 0.9, 0.1), (0.1, 0.1, 0.9)
+ACROSS = Plane((1.0, 0.0, 0.0))
+BODY = [((-0.3, 0.0, 0.0), 0.35, RED), ((0.3, 0.0, 0.0), 0.35, RED), ((0.0, 0.35, 0.3), 0.25, BLUE)]
+ANTENNA = ((0.3, 0.6, -0.3), 0.08, GREEN)
+SIZE = (64, 64)
+
+
+def balls(cameras, placed, bounds=None):
+    """Pictures of opaque balls (centre, radius, colour) of flat colours, the nearest one first."""
+    height, width = SIZE
+    view = torch.arange(cameras.batch_size).repeat_interleave(height * width)
+    rays = cast(cameras, view, pixel_grid(height, width).repeat(cameras.batch_size, 1), Sphere(radius=2.0))
+    colours, nearest = torch.ones(len(view), 3), torch.full((len(view),), torch.inf)
+    for centre, radius, colour in placed:
+        offset = rays.origins - torch.tensor(centre)
+        along = -(offset * rays.directions).sum(1)
+        inside = radius**2 - (offset.square().sum(1) - along.square())
+        distance = torch.where(inside > 0, along - inside.clamp_min(0).sqrt(), torch.inf)
+        colours = torch.where((distance < nearest)[:, None], torch.tensor(colour), colours)
+        nearest = torch.minimum(nearest, distance)
+    shape = (cameras.batch_size, height, width)
+    images = colours.reshape(*shape, 3).permute(0, 3, 1, 2).contiguous()
+    return Views(images, cameras, nearest.isfinite().float().reshape(shape)[:, None], bounds or Sphere())
+
+
+def cameras(count=4):
+    """Cameras of no symmetric arrangement."""
+    return ring(count, SIZE, shift=2)
+
+
+def model(**changes):
+    return HyperPlanes(replace(CONFIG, symmetric=True, **changes)).eval()
+
+
+def test_the_reflection_of_a_view_is_the_view_of_the_reflected_camera():
+    found = reflected(balls(cameras(), BODY), ACROSS)
+    truth = balls(reflected_cameras(cameras(), ACROSS), BODY)
+    torch.testing.assert_close(camera_from_world(found.cameras), camera_from_world(truth.cameras))
+    same = (found.images - truth.images).abs().amax(1) < 1e-5
+    assert same.float().mean() > 0.999  # rays that graze a ball fall either way
+    assert (found.masks == truth.masks).float().mean() > 0.999
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 12])
+def test_the_plane_of_a_symmetric_object_is_found(count):
+    assert symmetry_plane(balls(cameras(count), BODY)) == ACROSS
+
+
+def test_the_plane_goes_through_the_middle_of_the_scene():
+    placed = [((x + 0.4, y, z), radius, colour) for (x, y, z), radius, colour in BODY]
+    found = symmetry_plane(balls(cameras(), placed, Sphere((0.4, 0.0, 0.0))))
+    assert found == Plane((1.0, 0.0, 0.0), 0.4)
+    assert symmetry_plane(balls(cameras(), placed, Sphere((0.3, 0.0, 0.0)))) is None
+
+
+def test_an_object_of_two_colours_or_of_one_sided_shape_has_none():
+    assert symmetry_plane(balls(cameras(), BODY)) is not None
+    assert symmetry_plane(balls(cameras(), [BODY[0], (*BODY[1][:2], GREEN), BODY[2]])) is None
+    assert symmetry_plane(balls(cameras(), [BODY[0], BODY[2]])) is None
+
+
+def test_neither_a_single_view_nor_views_without_masks_or_object_tell_a_plane():
+    views = balls(cameras(), BODY)
+    for given in (views[:1], replace(views, masks=None), replace(views, masks=torch.zeros_like(views.masks))):
+        assert symmetry_plane(given) is None
+
+
+def test_where_no_plane_is_found_the_views_are_as_they_were():
+    views = balls(cameras(), BODY)
+    assert with_reflections(views, None) is views
+    plain = join_views(replace(views, masks=None), reflected(replace(views, masks=None), ACROSS))
+    assert torch.equal(with_reflections(replace(views, masks=None), ACROSS).images, plain.images)
+
+
+def test_a_part_that_is_not_symmetric_stays_in_the_hull_and_leaves_nothing_on_the_other_side():
+    views = balls(cameras(8), [*BODY, ANTENNA])
+    assert symmetry_plane(views) == ACROSS
+    own, mirrored = torch.tensor([ANTENNA[0]]), torch.tensor([[-0.3, 0.6, -0.3]])
+    carelessly = hull(join_views(views, reflected(views, ACROSS)), 64)
+    carefully = hull(with_reflections(views, ACROSS), 64)
+    assert not carelessly.contains(own)
+    assert carefully.contains(own)
+    assert not carefully.contains(mirrored)
+
+
+def test_of_a_symmetric_object_every_pixel_of_a_reflection_is_known():
+    views = balls(cameras(8), BODY)
+    found = with_reflections(views, ACROSS)
+    assert not (found.masks == UNKNOWN).any()
+    torch.testing.assert_close(found.images, torch.cat([views.images, views.images.flip(3)]))
+
+
+def test_the_hull_of_views_and_reflections_shows_sides_that_no_view_sees():
+    from_left = [index for index, direction in enumerate(cameras(16).extrinsics) if float(direction[2, 0]) > 0.3][:3]
+    views, others = balls(cameras(16), BODY)[from_left], balls(cameras(16), BODY)
+    alone, both = (each.adapt(views).render(others.cameras).images for each in (HullBlend(), Reflecting(HullBlend())))
+    assert psnr(both, others.images).mean() > psnr(alone, others.images).mean() + 1
+
+
+def test_a_model_counts_reflections_as_views_and_gives_the_nearer_ones_a_handicap():
+    views = balls(cameras(), BODY)
+    symmetric, plain = model(), model()
+    plain.config = replace(plain.config, symmetric=False)
+    assert plain.find_symmetry(views) is None
+    context = symmetric.prepare(views, symmetry=symmetric.find_symmetry(views))
+    assert context.symmetry == ACROSS
+    assert len(context.planes) == 8
+    assert torch.equal(context.given.images, views.images)
+    assert len(plain.prepare(views).planes) == 4
+    points = torch.tensor([[0.0, 0.0, 0.4], [0.3, 0.35, 0.0]])
+    found = context.planes.choose(points, best=8).best
+    without = context.planes.with_handicaps(torch.zeros(8)).choose(points, best=8).best
+    for row in range(2):
+        costs = dict(zip(found.views[row].tolist(), found.penalty[row].tolist(), strict=True))
+        plainly = dict(zip(without.views[row].tolist(), without.penalty[row].tolist(), strict=True))
+        for view in range(8):
+            assert costs[view] == pytest.approx(plainly[view] + (HANDICAP if view >= 4 else 0), abs=1e-5)
+
+
+def test_adapting_shows_the_model_reflections_and_another_plane_or_none_can_be_given():
+    views = balls(cameras(), BODY)
+    adapter = model()
+    with torch.no_grad():
+        adapter.theta["fine.density.bias"].fill_(1.0)
+    found = adapter.adapt(views).render(views.cameras).images
+    same = adapter.adapt_to(adapter.prepare(views, symmetry=ACROSS)).render(views.cameras).images
+    other = adapter.adapt_to(adapter.prepare(views)).render(views.cameras).images
+    assert torch.equal(found, same)
+    assert not torch.allclose(found, other, atol=1e-3)
+
+
+def test_gradient_steps_draw_rays_of_reflections_but_none_where_they_are_wrong(monkeypatch):
+    views, drawn = balls(cameras(8), [*BODY, ANTENNA]), []
+    sample = Views.sample_rays
+
+    def sampled(self, count, *, among=None, **given):
+        drawn.append((len(self), self.masks.flatten()[among]))
+        return sample(self, count, among=among, **given)
+
+    monkeypatch.setattr(Views, "sample_rays", sampled)
+    model().fine_tune(views, 2, FineTuning(rays=64, learning_rate=1e-3, muon_learning_rate=1e-3))
+    assert [count for count, _ in drawn].count(16) >= 2
+    assert not any((opacity == UNKNOWN).any() for _, opacity in drawn)
+
+
+def test_views_of_a_ball_are_reflected_by_kernels_and_plain_pytorch_alike(monkeypatch):
+    from hyperplanes.geometry import visibility as module
+
+    views = ball_views(ring(3, (20, 24)))
+    planes = HullBlend().adapt(views).field.planes.with_handicaps(torch.tensor([0.0, 0.3, 0.1]))
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    along = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    compiled = planes.choose(points, along, best=3, nearest=2)
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    plain = planes.choose(points, along, best=3, nearest=2)
+    for one, other in ((compiled.best, plain.best), (compiled.nearest, plain.nearest)):
+        torch.testing.assert_close(one.penalty, other.penalty, atol=2e-5, rtol=0)
+        assert torch.equal(one.views, other.views)
+
+
+def test_the_field_of_an_object_keeps_the_plane_that_was_found():
+    views = balls(cameras(), BODY)
+    adapter = model()
+    with torch.no_grad():
+        adapter.theta["fine.density.bias"].fill_(1.0)
+    made = adapter.adapt(views)
+    assert made.symmetry == ACROSS
+    alone = adapter.with_weights_of(made)
+    assert (alone.config.symmetric, alone.config.symmetry) == (False, ACROSS)
+    again = type(alone.config).of_json(json.loads(json.dumps(alone.config.as_json())))
+    assert again == alone.config
+    shown = views[:1]  # which tells no plane
+    assert alone.find_symmetry(shown) == ACROSS
+    assert torch.equal(alone.adapt(views).render(views.cameras).images, made.render(views.cameras).images)
+
+
+def test_a_single_view_is_reflected_where_it_is_shown_better_so(monkeypatch):
+    view = balls(cameras(), BODY)[:1]
+    adapter = model()
+    planes = [None, ACROSS, Plane((0.0, 0.0, 1.0))]
+    asked = []
+    prepare = adapter.prepare
+
+    def prepared(views, *, symmetry=None, **given):
+        asked.append(symmetry)
+        return prepare(views, symmetry=symmetry, **given)
+
+    monkeypatch.setattr(adapter, "prepare", prepared)
+    found = adapter.find_symmetry(view)
+    assert asked == planes
+    errors = []
+    for plane in planes:
+        context = prepare(view, symmetry=plane)
+        shown = adapter.rendering_field(context, adapter.adapted_weights(context)).render(view.cameras).images
+        errors.append(float((shown - view.images).square().sum()))
+    assert found == planes[errors.index(min(errors))]
+    assert adapter.find_symmetry(replace(view, masks=None)) is None
