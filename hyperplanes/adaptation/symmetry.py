@@ -13,6 +13,7 @@ from hyperplanes.adaptation.base import Adapter, Renderable, hull
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.geometry.cameras import camera_directions
 from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.mirror_symmetry import most_symmetric_plane
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
@@ -23,6 +24,7 @@ from hyperplanes.views import Views, join_views
 __all__ = ["HANDICAP", "UNKNOWN", "Reflecting", "reflected", "symmetry_plane", "vertical_planes", "with_reflections"]
 
 FEWEST = 2  # views that planes are judged by: a single one contradicts none of them
+FEWEST_TO_SEARCH = 5
 MOST = 8
 SIZE = 64  # pixels of these along the longer side, at most
 LOST = 0.05  # share of the object's pixels that the hull with reflections may miss
@@ -79,27 +81,39 @@ def with_reflections(support: Views, plane: Plane | None) -> Views:
 def symmetry_plane(support: Views) -> Plane | None:
     """The plane about which an object looks symmetric, if there is one.
 
-    Three planes are tried: those through the middle of the scene that are orthogonal to its axes. If the object is
-    symmetric, the visual hull of its views and their reflections still shows the views. If not, this hull is too small,
-    or it has the colours of another part of the object. Silhouettes and colours are compared; no weights are needed.
+    If an object is symmetric, the visual hull of its views and their reflections still shows the views. If not, this
+    hull is too small, or it has the colours of another part of the object. Silhouettes and colours are compared; no
+    weights are needed. The planes through the middle of the scene that are orthogonal to its axes are tried first, then
+    the vertical one about which the hull of the views is most nearly symmetric (`most_symmetric_plane`).
 
     Args:
         support: views with masks; MOST of them, those farthest apart, are looked at.
 
     Returns:
         The plane by which `HullBlend` shows the views best, if its squared error is at most TOLERANCE times that
-        without reflections; None with fewer than FEWEST views, or without masks.
+        without reflections; None with fewer than FEWEST views, or without masks. Planes that are not orthogonal to an
+        axis are tried with FEWEST_TO_SEARCH views or more, whose hull is near enough to the object.
     """
     if support.masks is None or len(support) < FEWEST or not support.masks.any():
         return None
     centre = support.bounds.centre
     chosen = farthest_first(camera_directions(support.cameras, centre).cpu(), 0, min(MOST, len(support)))
-    support = support[sorted(chosen)].resized(SIZE)
+    views = support[sorted(chosen)].resized(SIZE)
+    found = _best_of(_planes(support.bounds, AXES), views)
+    if found is None and len(support) >= FEWEST_TO_SEARCH:
+        voxels = carve(support.masks, support.cameras, support.bounds, SIDE)
+        if voxels.occupied.any():
+            found = _best_of([most_symmetric_plane(voxels)], views)
+    return found
+
+
+def _best_of(planes: Sequence[Plane], support: Views) -> Plane | None:
+    """Of some planes the one by which the views are shown best together with their reflections, if any shows them."""
     assert support.masks is not None
     shown = support.masks >= SHOWN
     pixels = float(shown.sum())
     errors: dict[Plane, float] = {}
-    for plane in _planes(support.bounds, AXES):
+    for plane in planes:
         both = join_views(support, reflected(support, plane))
         held = _held(both, support)
         if held is not None and float((shown & ~held).sum()) <= LOST * pixels:

@@ -1,6 +1,7 @@
 """Source of truth: balls in known places, seen by cameras and by the reflections of these."""
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -21,6 +22,7 @@ from hyperplanes.geometry import Sphere, cast
 from hyperplanes.geometry.cameras import camera_from_world
 from hyperplanes.geometry.rays import pixel_grid
 from hyperplanes.geometry.reflections import Plane, reflected_cameras
+from hyperplanes.training.episodes.augmentation import Rotation
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views, join_views
 from tests.adaptation.test_stacking import CONFIG
@@ -79,6 +81,18 @@ def test_the_plane_goes_through_the_middle_of_the_scene():
     found = symmetry_plane(balls(cameras(), placed, Sphere((0.4, 0.0, 0.0))))
     assert found == Plane((1.0, 0.0, 0.0), 0.4)
     assert symmetry_plane(balls(cameras(), placed, Sphere((0.3, 0.0, 0.0)))) is None
+
+
+@pytest.mark.parametrize(("count", "found"), [(4, False), (5, True), (12, True)])
+def test_an_object_that_faces_another_way_is_found_symmetric_where_its_hull_is_near_enough(count, found):
+    angle = 0.5
+    views = Rotation(angle).views(balls(cameras(count), BODY))
+    plane = symmetry_plane(views)
+    assert (plane is not None) == found
+    if plane is not None:
+        along = plane.normal[0] * math.cos(angle) - plane.normal[2] * math.sin(angle)
+        assert abs(along) > math.cos(math.radians(1.0))
+        assert abs(plane.offset) < 0.02
 
 
 def test_an_object_of_two_colours_or_of_one_sided_shape_has_none():
