@@ -26,7 +26,7 @@ from hyperplanes.views import Views
 
 __all__ = ["HyperPlanesNetwork", "in_use"]
 
-SIZE_OF_ONE = 128  # pixels of a single view, along the longer side, at most, by which its plane is chosen
+SIZE_OF_ONE, PIXELS_OF_ONE = 128, 2048  # along the longer side of a single view, and those by which it is judged
 
 
 class HyperPlanesNetwork(nn.Module):
@@ -139,11 +139,14 @@ class HyperPlanesNetwork(nn.Module):
         if len(views) != 1 or views.masks is None or not views.masks.any():
             return symmetry_plane(views)
         view = views.resized(SIZE_OF_ONE)
+        generator = torch.Generator().manual_seed(0)
+        near_far = self.config.sampling.near_far
+        rays, truth = view.sample_rays(PIXELS_OF_ONE, generator=generator, near_far=near_far)
 
         def error(plane: Plane | None) -> float:
             context = self.prepare(view, symmetry=plane)
-            found = self.rendering_field(context, self.adapted_weights(context)).render(view.cameras)
-            return float((found.images - view.images).square().sum())
+            found = self.field(context, self.adapted_weights(context)).trace(rays, differentiable=False)
+            return float((found.colour - truth).square().sum())
 
         return min((None, *vertical_planes(view.bounds)), key=error)
 

@@ -42,7 +42,7 @@ def run(arguments: Arguments) -> int:
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "adapt")
     refuse_checkpoint(arguments.out, arguments.checkpoint)
-    model = load_adaptable(arguments.checkpoint, device)
+    model = load_adaptable(arguments.checkpoint, device, reflections=arguments.reflections)
     task, up = read_object(arguments, model, console)
     settings = FineTuning(trainable=arguments.fine_tune)
     field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)

@@ -101,7 +101,7 @@ def run(arguments: Arguments) -> int:
         with prefix_errors("--page-voxels"):
             coarsening(arguments.page_voxels)
     console, device, out = Console(), choose_device(arguments.device), arguments.out
-    source = load_source(arguments.checkpoint, device)
+    source = load_source(arguments.checkpoint, device, reflections=arguments.reflections)
     task, _ = read_object(arguments, source, console)
     refuse_sources(out / "images", arguments.views, task.query.names)
     shown, query = task.support.to(device), task.query.to(device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -28,32 +29,37 @@ __all__ = ["adapt_to", "bake_field", "load_adaptable", "load_source", "refuse_ba
 WORTH_KEEPING = 5.0  # seconds that adapting took
 
 
-def load_source(path: Path, device: torch.device) -> HyperPlanes | BakedScene:
+def load_source(path: Path, device: torch.device, *, reflections: bool = True) -> HyperPlanes | BakedScene:
     """The model of a checkpoint, or the scene of a file that `bake` wrote.
 
     Args:
         path: a folder, the name of a packaged model, or a file.
         device: where the model goes; a baked scene is rendered on the CPU.
+        reflections: as in `load_adaptable`.
     """
     if path.is_file():
         from hyperplanes.export.baking import BakedScene
         from hyperplanes.fields.baked import BakedField
 
         return BakedScene(BakedField.load(path))
-    return load_adaptable(path, device)
+    return load_adaptable(path, device, reflections=reflections)
 
 
-def load_adaptable(path: Path, device: torch.device) -> HyperPlanes:
+def load_adaptable(path: Path, device: torch.device, *, reflections: bool = True) -> HyperPlanes:
     """The model of a checkpoint.
 
     Args:
         path: a folder, or the name of a packaged model.
         device: where it goes.
+        reflections: whether it may be shown views of a symmetric object together with their reflections.
     """
     from hyperplanes.adaptation.checkpoints import find_checkpoint
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
 
-    return HyperPlanes.from_pretrained(find_checkpoint(path)).to(device)
+    model = HyperPlanes.from_pretrained(find_checkpoint(path)).to(device)
+    if not reflections:
+        model.config = replace(model.config, symmetric=False, symmetry=None)
+    return model
 
 
 def refuse_baked(path: Path, verb: str) -> None:

@@ -58,6 +58,7 @@ class Arguments:
             background together, and take what the object covers as masks.
         refine_poses: Refine the poses of the views first, and keep them where views that the model is not given are
             shown better by half a decibel: for poses that are a little wrong.
+        reflections: Show the model the views of an object that looks symmetric together with their reflections.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held.
         downscale: Reduce the images by this factor, averaging pixels. When not given, images of more than a megapixel
@@ -73,6 +74,7 @@ class Arguments:
     port: Annotated[int, range(65_536)] = 8080
     learn_background: bool = False
     refine_poses: bool = False
+    reflections: bool = True
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
     device: str = "auto"
@@ -88,7 +90,7 @@ def run(arguments: Arguments) -> int:
         "ignore", "Queued a .* on a closed connection", UserWarning
     )  # viser's, of visitors who left
     console, device = Console(), choose_device(arguments.device)
-    source = load_source(arguments.checkpoint, device)
+    source = load_source(arguments.checkpoint, device, reflections=arguments.reflections)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
     shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()

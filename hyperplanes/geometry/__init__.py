@@ -4,5 +4,17 @@ from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.lookup import Lookup, sample
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Rays, Sphere, cast
+from hyperplanes.geometry.reflections import Plane, reflected_cameras
 
-__all__ = ["ImagePlanes", "Lookup", "Occupancy", "Rays", "Sphere", "carve", "cast", "sample"]
+__all__ = [
+    "ImagePlanes",
+    "Lookup",
+    "Occupancy",
+    "Plane",
+    "Rays",
+    "Sphere",
+    "carve",
+    "cast",
+    "reflected_cameras",
+    "sample",
+]
