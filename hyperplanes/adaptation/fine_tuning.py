@@ -13,6 +13,7 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext, observe
 from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
+from hyperplanes.adaptation.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import stacked_field
 from hyperplanes.configuration.compatibility import check_fine_tuning
@@ -78,13 +79,13 @@ def fine_tune(
     support, settings = network.to_own(support), settings or FineTuning()
     check_fine_tuning(settings, steps, len(support), network.config, network.target)
     if steps != "auto":
-        context = network.prepare(support, symmetry=network.find_symmetry(support))
+        context = network.prepare(support, symmetry=find_symmetry(network, support))
         return fine_tune_to(network, context, steps, settings, views=_trained_on(context, support), on_step=on_step)
 
     # how many steps show some of the views best that the others were fine-tuned without, from as many random weights
     settings = replace(settings, fresh=settings.fresh_share(len(support)))
     shown, holdout = split_holdout(support, settings)
-    context = network.prepare(shown, symmetry=network.find_symmetry(shown))
+    context = network.prepare(shown, symmetry=find_symmetry(network, shown))
     trial, _ = make_descent(network, context, settings, _trained_on(context, shown))
     pixels = network.live_pixels_of(context, holdout)
     with torch.no_grad():
@@ -92,7 +93,7 @@ def fine_tune(
     stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
-    context, schedule = network.prepare(support, symmetry=network.find_symmetry(support)), settings.max_steps
+    context, schedule = network.prepare(support, symmetry=find_symmetry(network, support)), settings.max_steps
     views = _trained_on(context, support)
     return fine_tune_to(network, context, stop, settings, views=views, schedule=schedule, on_step=on_step)
 

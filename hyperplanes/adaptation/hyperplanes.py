@@ -12,12 +12,14 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.checkpoints import read_checkpoint, write_checkpoint
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.descent import Descent, Variables
+from hyperplanes.adaptation.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.fine_tuning import fine_tune, fine_tune_to, make_descent
 from hyperplanes.adaptation.hub import upload_checkpoint
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import learned_part, stacked_field
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.geometry.reflections import Plane
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
@@ -44,13 +46,29 @@ class HyperPlanes(HyperPlanesNetwork):
     def adapt(self, support: Views) -> AdaptedField:
         """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6).
 
-        Where `config.stacked` says so, its pictures are means with those of the visual hull (`adaptation.stacking`).
+        Where `config.symmetric` says so, reflections of the views of an object that looks symmetric count as views, too
+        (`adaptation.symmetry`). Where `config.stacked` says so, its pictures are means with those of the visual hull
+        (`adaptation.stacking`).
         """
         return self.adapt_to(self.prepare(support, symmetry=self.find_symmetry(support)))
 
+    @checked
+    def find_symmetry(self, support: Views) -> Plane | None:
+        """The plane about which the views of an object are to be reflected, where `config.symmetric` says so.
+
+        Args:
+            support: the views of one object.
+
+        Returns:
+            `config.symmetry` where that is known. Else the plane about which the object looks symmetric
+            (`symmetry.symmetry_plane`), or None. With ten views or more, two that are held out also have to be shown
+            better with reflections. A single view is reflected about a vertical plane if it is shown better so itself.
+        """
+        return find_symmetry(self, support)
+
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:
-        """As `adapt`, of an object that is prepared."""
+        """As `adapt`, of an object that is prepared, with reflections of its views or without."""
         return stacked_field(self, context, self.adapted_weights(context))
 
     @checked

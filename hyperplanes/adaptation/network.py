@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext, arrange, live_pixels, observe, prepare_context
 from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.symmetry import UNKNOWN, symmetry_plane, vertical_planes
+from hyperplanes.adaptation.symmetry import UNKNOWN
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
@@ -25,8 +25,6 @@ from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanesNetwork", "in_use"]
-
-SIZE_OF_ONE, PIXELS_OF_ONE = 128, 2048  # along the longer side of a single view, and those by which it is judged
 
 
 class HyperPlanesNetwork(nn.Module):
@@ -108,7 +106,12 @@ class HyperPlanesNetwork(nn.Module):
             symmetry: a plane about which the object is symmetric: reflections of the views count as views, too.
             carved: without, one voxel that may hold anything stands for the hull, for who never asks it. A hypernetwork
                 that reads the hull has it carved in any case.
+
+        Raises:
+            ValueError: a plane where the field knows its views by their places.
         """
+        if symmetry is not None and not self.target.permutation_invariant:
+            raise ValueError(f"symmetry: expected None for {self.config.target}, which knows views by their places")
         return prepare_context(
             self.to_own(support),
             self.target,
@@ -119,36 +122,6 @@ class HyperPlanesNetwork(nn.Module):
             masks_repeated=self.config.plane_dropout > 0,
             symmetry=symmetry,
         )
-
-    @checked
-    @torch.no_grad()
-    def find_symmetry(self, support: Views) -> Plane | None:
-        """The plane about which the views of an object are to be reflected, where `config.symmetric` says so.
-
-        Args:
-            support: the views of one object.
-
-        Returns:
-            `config.symmetry` where that is known. Else the plane about which the object looks symmetric
-            (`symmetry.symmetry_plane`), or None. A single view is reflected about one of the vertical planes if it is
-            shown better so than without its reflection.
-        """
-        if self.config.symmetry is not None or not self.config.symmetric:
-            return self.config.symmetry
-        views = self.to_own(support)
-        if len(views) != 1 or views.masks is None or not views.masks.any():
-            return symmetry_plane(views)
-        view = views.resized(SIZE_OF_ONE)
-        generator = torch.Generator().manual_seed(0)
-        near_far = self.config.sampling.near_far
-        rays, truth = view.sample_rays(PIXELS_OF_ONE, generator=generator, near_far=near_far)
-
-        def error(plane: Plane | None) -> float:
-            context = self.prepare(view, symmetry=plane)
-            found = self.field(context, self.adapted_weights(context)).trace(rays, differentiable=False)
-            return float((found.colour - truth).square().sum())
-
-        return min((None, *vertical_planes(view.bounds)), key=error)
 
     def to_own(self, support: Views) -> Views:
         """The views where the weights are, in their precision or at least single."""

@@ -11,24 +11,21 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, Pictures
-from hyperplanes.adaptation.context import SupportContext, live_pixels
+from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.gating import GatingNetwork
+from hyperplanes.adaptation.held_out import FEWEST, draw_pixels, hold_out
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
-from hyperplanes.fields.rig import camera_directions
-from hyperplanes.geometry.poses import outermost_first
-from hyperplanes.geometry.rays import SUBPIXELS, Rays
+from hyperplanes.geometry.rays import Rays
 from hyperplanes.geometry.reflections import Plane
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.rendering.footprint import pixels_across
-from hyperplanes.rendering.renderer import Sampler, render
+from hyperplanes.rendering.renderer import Sampler
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = [
-    "FEWEST",
     "Learned",
     "StackedField",
     "best_share",
@@ -39,10 +36,6 @@ __all__ = [
     "stacked_field",
 ]
 
-FEWEST = 5  # views, of which some can be held out
-HELD_OUT = 2
-PIXELS = 2048  # of the views that are held out, at whose edges pictures differ most
-SIZE = 128  # of all of them, along the longer side, at most: 256 pixels find no better shares, in three times the time
 CAUTION = 1.5  # power of the share that shows held-out views best: few views, so less than that (docs/small.md)
 OVERRULED = 0.8  # share of the hull from which on it is its surface that counts
 MARGIN = 0.02  # of the squared error, by which it has to be lower to be worth a second picture
@@ -201,8 +194,8 @@ def hull_share(network: HyperPlanesNetwork, support: Views, symmetry: Plane | No
     """The share of `HullBlend` in the pictures of an object, by which views that are held out are shown best.
 
     What was learned may not fit an object of another kind, and where it does fit, the errors of both are different
-    ones, so that a mean has less of them. Held out are the HELD_OUT views that the others stand closest around, and the
-    squared error of PIXELS of their pixels within the hull decides.
+    ones, so that a mean has less of them. The squared error of pixels of held-out views decides
+    (`adaptation.held_out`).
 
     Args:
         network: of a field that takes any number of views.
@@ -211,31 +204,18 @@ def hull_share(network: HyperPlanesNetwork, support: Views, symmetry: Plane | No
 
     Returns:
         The share, in [0, 1]: the best one (`best_share`) to the power of CAUTION. It is 0 where that lowers the squared
-        error by less than MARGIN, with fewer than FEWEST views, without masks, and where the object is seen by the
-        held-out views alone, or not by them.
+        error by less than MARGIN, and where no view can be held out (`hold_out`), or those do not see the object.
     """
-    if len(support) < FEWEST or support.masks is None:
+    parts = hold_out(support)
+    if parts is None:
         return 0.0
-    support = support.resized(SIZE)
-    order = outermost_first(camera_directions(support).cpu(), len(support))
-    shown, held_out = support[sorted(order[:-HELD_OUT])], support[order[-HELD_OUT:]]
-    assert shown.masks is not None
-    if not shown.masks.any():
-        return 0.0
+    shown, held_out = parts
     context = network.prepare(shown, symmetry=symmetry)
-    among = live_pixels(context.occupancy, held_out)
-    if not len(among):
+    pixels = draw_pixels(context, held_out, network.config.sampling.near_far)
+    if pixels is None:
         return 0.0
     learned = network.rendering_field(context, network.theta + network.update(context))
-    rays, truth, _ = held_out.sample_masked_rays(
-        PIXELS,
-        generator=torch.Generator().manual_seed(0),
-        among=among,
-        near_far=learned.sampling.near_far,
-        subpixels=SUBPIXELS,
-    )
-    across = pixels_across(held_out.cameras, support.bounds)
-    without, hull = (_pixels(each, rays, across) - truth for each in (learned, hull_field(context)))
+    without, hull = pixels.errors(learned), pixels.errors(hull_field(context))
     share = best_share(without, hull) ** CAUTION
     mixed = torch.lerp(without, hull, share)
     return share if float(mixed.square().sum()) < (1 - MARGIN) * float(without.square().sum()) else 0.0
@@ -249,19 +229,6 @@ def hull_field(context: SupportContext) -> AdaptedField:
     """
     assert isinstance(context.planes, VisibilityPlanes)
     return HullBlend().adapt_to(context.planes)
-
-
-def _pixels(adapted: AdaptedField, rays: Rays, across: float) -> Float[Tensor, "pixel 3"]:
-    """The colours of pixels, each the mean of its rays."""
-    found = render(
-        adapted.field,
-        rays,
-        adapted.sampling.for_rendering(across),
-        occupancy=adapted.occupancy,
-        proposal=adapted.proposal,
-        differentiable=False,
-    )
-    return found.pooled(len(SUBPIXELS)).colour
 
 
 def best_share(one: Float[Tensor, "pixel 3"], other: Float[Tensor, "pixel 3"]) -> float:

@@ -13,7 +13,7 @@ from hyperplanes.adaptation.base import Adapter, Renderable, hull
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.geometry.cameras import camera_directions
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.mirror_symmetry import most_symmetric_plane
+from hyperplanes.geometry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
@@ -21,10 +21,10 @@ from hyperplanes.geometry.reflections import Plane, reflected_cameras
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views, join_views
 
-__all__ = ["HANDICAP", "UNKNOWN", "Reflecting", "reflected", "symmetry_plane", "vertical_planes", "with_reflections"]
+__all__ = ["HANDICAP", "UNKNOWN", "Reflecting", "possible_planes", "reflected", "symmetry_plane", "with_reflections"]
 
 FEWEST = 2  # views that planes are judged by: a single one contradicts none of them
-FEWEST_TO_SEARCH = 5
+FEWEST_TO_SEARCH, FEWEST_TO_REFINE = 5, 10
 MOST = 8
 SIZE = 64  # pixels of these along the longer side, at most
 LOST = 0.05  # share of the object's pixels that the hull with reflections may miss
@@ -83,16 +83,17 @@ def symmetry_plane(support: Views) -> Plane | None:
 
     If an object is symmetric, the visual hull of its views and their reflections still shows the views. If not, this
     hull is too small, or it has the colours of another part of the object. Silhouettes and colours are compared; no
-    weights are needed. The planes through the middle of the scene that are orthogonal to its axes are tried first, then
-    the vertical one about which the hull of the views is most nearly symmetric (`most_symmetric_plane`).
+    weights are needed. The planes through the middle of the scene that are orthogonal to its axes are tried first. Then
+    the best of these is compared with one near to it (`more_symmetric_plane`) or, where none will do, the vertical
+    plane about which the hull of the views is most nearly symmetric is tried (`most_symmetric_plane`).
 
     Args:
         support: views with masks; MOST of them, those farthest apart, are looked at.
 
     Returns:
         The plane by which `HullBlend` shows the views best, if its squared error is at most TOLERANCE times that
-        without reflections; None with fewer than FEWEST views, or without masks. Planes that are not orthogonal to an
-        axis are tried with FEWEST_TO_SEARCH views or more, whose hull is near enough to the object.
+        without reflections; None with fewer than FEWEST views, or without masks. Other planes than those across the
+        axes need FEWEST_TO_SEARCH views, whose hull is near enough to the object, those near to one FEWEST_TO_REFINE.
     """
     if support.masks is None or len(support) < FEWEST or not support.masks.any():
         return None
@@ -100,11 +101,14 @@ def symmetry_plane(support: Views) -> Plane | None:
     chosen = farthest_first(camera_directions(support.cameras, centre).cpu(), 0, min(MOST, len(support)))
     views = support[sorted(chosen)].resized(SIZE)
     found = _best_of(_planes(support.bounds, AXES), views)
-    if found is None and len(support) >= FEWEST_TO_SEARCH:
-        voxels = carve(support.masks, support.cameras, support.bounds, SIDE)
-        if voxels.occupied.any():
-            found = _best_of([most_symmetric_plane(voxels)], views)
-    return found
+    if len(support) < (FEWEST_TO_SEARCH if found is None else FEWEST_TO_REFINE):
+        return found
+    voxels = carve(support.masks, support.cameras, support.bounds, SIDE)
+    if not voxels.occupied.any():
+        return found
+    if found is None:
+        return _best_of([most_symmetric_plane(voxels)], views)
+    return _best_of([found, more_symmetric_plane(voxels, found)], views)
 
 
 def _best_of(planes: Sequence[Plane], support: Views) -> Plane | None:
@@ -125,13 +129,20 @@ def _best_of(planes: Sequence[Plane], support: Views) -> Plane | None:
     return best if errors[best] + floor <= TOLERANCE * (alone + floor) else None
 
 
-def vertical_planes(bounds: Sphere) -> list[Plane]:
-    """The planes through the middle of a scene that are orthogonal to x or z; y is up, as models are trained.
+def possible_planes(view: Views) -> list[Plane]:
+    """The planes through the middle of a scene that are orthogonal to x or z, which a single view does not contradict.
 
     Args:
-        bounds: of the scene.
+        view: with a mask; y is up, as models are trained.
     """
-    return _planes(bounds, VERTICAL)
+    assert view.masks is not None
+    shown = view.masks >= SHOWN
+    found = []
+    for plane in _planes(view.bounds, VERTICAL):
+        held = _held(join_views(view, reflected(view, plane)), view)
+        if held is not None and float((shown & ~held).sum()) <= LOST * float(shown.sum()):
+            found.append(plane)
+    return found
 
 
 @dataclass(frozen=True)

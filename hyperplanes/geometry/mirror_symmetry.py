@@ -10,9 +10,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool3d
 
 from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.reflections import Plane
 
-__all__ = ["most_symmetric_plane"]
+__all__ = ["more_symmetric_plane", "most_symmetric_plane"]
 
 AZIMUTHS = 45  # of normals that are tried first
 OFFSETS = (-0.04, -0.02, 0.0, 0.02, 0.04)  # of planes from the middle of the voxels, in radii of the scene
@@ -20,6 +21,7 @@ APART = math.radians(20)  # between the azimuths of two planes that are followed
 FOLLOWED = 2  # of the planes
 COARSE, FINE = 3000, 12000  # points that are reflected, at most
 COARSE_ROUNDS, FINE_ROUNDS = 5, 9  # of the search for better planes around one
+SPAN = 0.01  # radians and radii, of the first steps around a plane that is given
 
 
 @torch.no_grad()
@@ -47,27 +49,50 @@ def most_symmetric_plane(voxels: Occupancy) -> Plane:
 
     # all azimuths, and the best ones that are not neighbours
     angles = torch.arange(AZIMUTHS) * (math.pi / AZIMUTHS)
-    middle = _normals(angles) @ points.mean(0)
-    planes = torch.cat([torch.stack([angles, middle + offset], 1) for offset in OFFSETS])
+    normals = torch.stack([angles.cos(), torch.zeros_like(angles), angles.sin()], 1)
+    offsets = normals @ points.mean(0)
+    planes = torch.cat([torch.cat([normals, (offsets + shift)[:, None]], 1) for shift in OFFSETS])
     order = _overlap(coarse, points, planes, "nearest").argsort(descending=True).tolist()
     followed: list[Tensor] = []
     for plane in planes[order]:
-        turns = [abs(float(plane[0] - each[0])) for each in followed]
-        if all(min(turn, math.pi - turn) > APART for turn in turns):
+        if all(abs(float(plane[:3] @ each[:3])) < math.cos(APART) for each in followed):
             followed.append(plane)
         if len(followed) == FOLLOWED:
             break
 
     # each refined, first by blocks and then by voxels
-    found = []
-    for plane in followed:
-        near = _refined(coarse, points, plane, (math.pi / AZIMUTHS / 2, 0.02), COARSE_ROUNDS, "nearest")
-        near = _refined(fine, surface, near, (math.pi / AZIMUTHS / 4, 0.01), FINE_ROUNDS, "bilinear")
-        found.append((float(_overlap(fine, surface, near[None], "bilinear")), near))
-    angle, offset = max(found, key=lambda each: each[0])[1].tolist()
-    normal = (math.cos(angle), 0.0, math.sin(angle))
-    through = sum(a * b for a, b in zip(normal, voxels.bounds.centre, strict=True))
-    return Plane(normal, through + offset * voxels.bounds.radius)
+    step = math.pi / AZIMUTHS
+    found = [_refined(coarse, points, each, (step / 2, 0.0, 0.02), COARSE_ROUNDS, "nearest") for each in followed]
+    found = [_refined(fine, surface, each, (step / 4, 0.0, 0.01), FINE_ROUNDS, "bilinear") for each in found]
+    return _in_world(max(found, key=lambda each: float(_overlap(fine, surface, each[None], "bilinear"))), voxels.bounds)
+
+
+@torch.no_grad()
+def more_symmetric_plane(voxels: Occupancy, plane: Plane) -> Plane:
+    """A plane near to another one about which voxels are more nearly symmetric, tilted and moved by a little.
+
+    Args:
+        voxels: some of them occupied.
+        plane: where the search begins, in the world.
+
+    Raises:
+        ValueError: no voxel is occupied.
+    """
+    if not voxels.occupied.any():
+        raise ValueError("voxels: expected some that are occupied, got none")
+    normal = torch.tensor(plane.normal)
+    through = float(normal @ torch.tensor(voxels.bounds.centre))
+    start = torch.cat([normal, torch.tensor([(plane.offset - through) / voxels.bounds.radius])])
+    surface = _points_of(voxels.surface(), FINE)
+    span = (SPAN, SPAN, SPAN)
+    return _in_world(_refined(voxels.occupied.float(), surface, start, span, FINE_ROUNDS, "bilinear"), voxels.bounds)
+
+
+def _in_world(plane: Float[Tensor, 4], bounds: Sphere) -> Plane:
+    """A plane of the unit sphere as one of the world."""
+    normal = torch.nn.functional.normalize(plane[:3].double(), dim=0).tolist()
+    through = sum(a * b for a, b in zip(normal, bounds.centre, strict=True))
+    return Plane((normal[0], normal[1], normal[2]), through + float(plane[3]) * bounds.radius)
 
 
 def _points_of(voxels: Occupancy, count: int) -> Float[Tensor, "point 3"]:
@@ -81,16 +106,12 @@ def _points_of(voxels: Occupancy, count: int) -> Float[Tensor, "point 3"]:
     return centres + shift * (2 / len(voxels.occupied))
 
 
-def _normals(angles: Float[Tensor, " plane"]) -> Float[Tensor, "plane 3"]:
-    return torch.stack([angles.cos(), torch.zeros_like(angles), angles.sin()], 1)
-
-
 def _overlap(
-    grid: Float[Tensor, "x y z"], points: Float[Tensor, "point 3"], planes: Float[Tensor, "plane 2"], mode: str
+    grid: Float[Tensor, "x y z"], points: Float[Tensor, "point 3"], planes: Float[Tensor, "plane 4"], mode: str
 ) -> Float[Tensor, " plane"]:
-    """The share of points whose mirror images lie in occupied cells, for planes of an azimuth and an offset each."""
-    normals = _normals(planes[:, 0])
-    heights = normals @ points.T - planes[:, 1:]  # (plane, point)
+    """The share of points whose mirror images lie in occupied cells, for planes of a normal and an offset each."""
+    normals = planes[:, :3]
+    heights = normals @ points.T - planes[:, 3:]  # (plane, point)
     mirrored = points - 2 * heights[..., None] * normals[:, None]
     sampled = grid_sample(grid[None, None], mirrored.flip(-1)[None, :, :, None], mode=mode, align_corners=False)
     return sampled.mean((0, 1, 3, 4))
@@ -99,15 +120,26 @@ def _overlap(
 def _refined(
     grid: Float[Tensor, "x y z"],
     points: Float[Tensor, "point 3"],
-    plane: Float[Tensor, 2],
-    span: tuple[float, float],
+    plane: Float[Tensor, 4],
+    span: tuple[float, float, float],
     rounds: int,
     mode: str,
-) -> Float[Tensor, 2]:
-    """The best of planes around one: a pattern search, whose steps are halved where no neighbour is better."""
-    steps, around = torch.tensor(span), torch.cartesian_prod(*[torch.tensor([0.0, -1.0, 1.0])] * 2)
+) -> Float[Tensor, 4]:
+    """The best of planes around one: a pattern search, whose steps are halved where no neighbour is better.
+
+    The steps are a turn of the normal about y, its tilt towards y, in radians, and a shift in radii.
+    """
+    steps = torch.tensor(span)
+    moves = [torch.tensor([0.0, -1.0, 1.0]) if step else torch.zeros(1) for step in span]
+    around = torch.cartesian_prod(*moves)
     for _ in range(rounds):
-        near = plane + around * steps
+        across = torch.linalg.cross(plane[:3], torch.tensor([0.0, 1.0, 0.0]))
+        across = across if float(across.norm()) > 0.1 else torch.tensor([1.0, 0.0, 0.0])  # of a horizontal plane
+        across = torch.nn.functional.normalize(across, dim=0)
+        up = torch.linalg.cross(across, plane[:3])
+        shifts = around * steps
+        normals = torch.nn.functional.normalize(plane[:3] + shifts[:, :1] * across + shifts[:, 1:2] * up, dim=1)
+        near = torch.cat([normals, plane[3] + shifts[:, 2:]], 1)
         best = int(_overlap(grid, points, near, mode).argmax())  # the first of equals, which is the plane itself
         plane, steps = near[best], steps if best else steps / 2
     return plane

@@ -7,7 +7,8 @@ import torch
 
 from hyperplanes.adaptation import HullBlend, HyperPlanes
 from hyperplanes.adaptation.gating import GatingNetwork, readings
-from hyperplanes.adaptation.stacking import FEWEST, StackedField, stack
+from hyperplanes.adaptation.held_out import FEWEST
+from hyperplanes.adaptation.stacking import StackedField, stack
 from hyperplanes.geometry.rays import cast
 from hyperplanes.training.gating import GatingExample, example_of, fit_gate, turned
 from hyperplanes.utilities.metrics import psnr

@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, stacking
+from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, held_out, stacking
 from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.fine_tuned import random_model
 from hyperplanes.adaptation.fine_tuning import fine_tune
 from hyperplanes.adaptation.gating import GatingNetwork
+from hyperplanes.adaptation.held_out import FEWEST
 from hyperplanes.adaptation.kept import keep_field, recall_field
 from hyperplanes.adaptation.stacking import (
     CAUTION,
-    FEWEST,
     MARGIN,
     StackedField,
     best_share,
@@ -150,7 +150,7 @@ def test_a_second_picture_is_made_only_where_it_is_worth_it(monkeypatch, other):
     support = ball_views(ring(6, (24, 24)))
     rays, _, opacity = support.sample_masked_rays(1)
     monkeypatch.setattr(type(support), "sample_masked_rays", lambda *_, **__: (rays, torch.zeros(1, 3), opacity))
-    monkeypatch.setattr(stacking, "_pixels", lambda *_: next(pixels))
+    monkeypatch.setattr(held_out.HeldOutPixels, "errors", lambda *_: next(pixels))
     share = (1 / (1 + other**2)) ** CAUTION
     worth_it = (1 - share) ** 2 + share**2 * other**2 < 1 - MARGIN
     assert hull_share(model(), support) == pytest.approx(share if worth_it else 0.0)
@@ -174,7 +174,7 @@ def test_few_views_or_none_with_masks_decide_nothing():
 def test_views_that_look_past_the_object_decide_nothing(monkeypatch):
     support = ball_views(ring(6, (24, 24)))
     assert hull_share(model(empty=True), support) > 0
-    monkeypatch.setattr(stacking, "live_pixels", lambda *_: torch.arange(0))
+    monkeypatch.setattr(held_out, "live_pixels", lambda *_: torch.arange(0))
     assert hull_share(model(empty=True), support) == 0
 
 

@@ -8,12 +8,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HullBlend, HyperPlanes
+from hyperplanes.adaptation import HullBlend, HyperPlanes, finding_symmetry
 from hyperplanes.adaptation.base import hull
 from hyperplanes.adaptation.symmetry import (
     HANDICAP,
     UNKNOWN,
     Reflecting,
+    possible_planes,
     reflected,
     symmetry_plane,
     with_reflections,
@@ -27,7 +28,7 @@ from hyperplanes.training.episodes.augmentation import Rotation
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views, join_views
 from tests.adaptation.test_stacking import CONFIG
-from tests.reference_rendering import ball_views, ring
+from tests.reference_rendering import ball_views, camera_at, ring, small_model
 
 RED, GREEN, BLUE = (0.9, 0.1, 0.1), (0.1, 0.9, 0.1), (0.1, 0.1, 0.9)
 ACROSS = Plane((1.0, 0.0, 0.0))
@@ -74,7 +75,16 @@ def test_the_reflection_of_a_view_is_the_view_of_the_reflected_camera():
 
 @pytest.mark.parametrize("count", [2, 3, 5, 12])
 def test_the_plane_of_a_symmetric_object_is_found(count):
-    assert symmetry_plane(balls(cameras(count), BODY)) == ACROSS
+    found = symmetry_plane(balls(cameras(count), BODY))
+    assert found is not None
+    assert math.dist((*found.normal, found.offset), (1.0, 0.0, 0.0, 0.0)) < (0.01 if count >= 10 else 1e-9)
+
+
+def test_from_ten_views_on_a_plane_beside_the_middle_of_the_scene_is_found():
+    found = symmetry_plane(balls(cameras(12), BODY, Sphere((0.012, 0.0, 0.0))))
+    assert found is not None
+    assert abs(found.normal[0]) > math.cos(math.radians(0.5))
+    assert abs(found.offset) < 0.006
 
 
 def test_the_plane_goes_through_the_middle_of_the_scene():
@@ -217,6 +227,29 @@ def test_the_field_of_an_object_keeps_the_plane_that_was_found():
     assert torch.equal(alone.adapt(views).render(views.cameras).images, made.render(views.cameras).images)
 
 
+def test_a_single_view_contradicts_a_plane_by_its_silhouette_or_none():
+    views = balls(cameras(), BODY)
+    for view in range(4):
+        assert ACROSS in possible_planes(views[[view]])
+    from_above = balls(camera_at((0.0, 3.0, 0.01), SIZE), [((0.5, 0.0, 0.0), 0.3, RED)])
+    assert possible_planes(from_above) == [Plane((0.0, 0.0, 1.0))]
+
+
+def test_a_field_that_knows_its_views_by_their_places_takes_no_reflections():
+    with pytest.raises(ValueError, match="symmetry: expected None for point_multiplane"):
+        small_model().prepare(balls(cameras(), BODY), symmetry=ACROSS)
+
+
+def test_from_ten_views_on_some_that_are_held_out_have_to_be_shown_better(monkeypatch):
+    adapter, judged = model(), []
+    monkeypatch.setattr(
+        finding_symmetry, "_is_shown_better", lambda network, views, plane: judged.append((len(views), plane))
+    )
+    assert adapter.find_symmetry(balls(cameras(9), BODY)) is not None
+    assert adapter.find_symmetry(balls(cameras(10), BODY)) is None
+    assert [count for count, _ in judged] == [10]
+
+
 @pytest.mark.parametrize("best", [None, ACROSS, Plane((0.0, 0.0, 1.0))])
 def test_a_single_view_is_reflected_about_the_vertical_plane_by_which_it_is_shown_best(monkeypatch, best):
     view, adapter = balls(cameras(), BODY)[:1], model()
@@ -235,6 +268,7 @@ def test_a_single_view_is_reflected_about_the_vertical_plane_by_which_it_is_show
     draw = Views.sample_rays
     monkeypatch.setattr(Views, "sample_rays", lambda self, *given, **more: (draw(self, *given, **more)[0], 0.0))
     monkeypatch.setattr(adapter, "field", lambda context, weights: Field(context.symmetry))
+    monkeypatch.setattr(finding_symmetry, "possible_planes", lambda view: [ACROSS, Plane((0.0, 0.0, 1.0))])
     assert adapter.find_symmetry(view) == best
     assert tried == [None, ACROSS, Plane((0.0, 0.0, 1.0))]
     assert adapter.find_symmetry(replace(view, masks=None)) is None
