@@ -100,33 +100,34 @@ def symmetry_plane(support: Views) -> Plane | None:
     centre = support.bounds.centre
     chosen = farthest_first(camera_directions(support.cameras, centre).cpu(), 0, min(MOST, len(support)))
     views = support[sorted(chosen)].resized(SIZE)
-    found = _best_of(_planes(support.bounds, AXES), views)
+    assert views.masks is not None
+    floor = FLOOR * float((views.masks >= SHOWN).sum())
+    most = TOLERANCE * (_error(views, views, torch.ones_like(views.masks, dtype=torch.bool)) + floor) - floor
+
+    def best_of(errors: dict[Plane, float]) -> Plane | None:
+        return min((plane for plane in errors if errors[plane] <= most), key=lambda plane: errors[plane], default=None)
+
+    errors = _errors(_planes(support.bounds, AXES), views)
+    found = best_of(errors)
     if len(support) < (FEWEST_TO_SEARCH if found is None else FEWEST_TO_REFINE):
         return found
     voxels = carve(support.masks, support.cameras, support.bounds, SIDE)
-    if not voxels.occupied.any():
-        return found
-    if found is None:
-        return _best_of([most_symmetric_plane(voxels)], views)
-    return _best_of([found, more_symmetric_plane(voxels, found)], views)
+    if voxels.occupied.any():
+        more = most_symmetric_plane(voxels) if found is None else more_symmetric_plane(voxels, found)
+        errors |= _errors([more], views)
+    return best_of(errors)
 
 
-def _best_of(planes: Sequence[Plane], support: Views) -> Plane | None:
-    """Of some planes the one by which the views are shown best together with their reflections, if any shows them."""
+def _errors(planes: Sequence[Plane], support: Views) -> dict[Plane, float]:
+    """The squared errors by which views are shown together with their reflections, of planes that lose few pixels."""
     assert support.masks is not None
-    shown = support.masks >= SHOWN
-    pixels = float(shown.sum())
-    errors: dict[Plane, float] = {}
+    shown, errors = support.masks >= SHOWN, dict[Plane, float]()
     for plane in planes:
         both = join_views(support, reflected(support, plane))
         held = _held(both, support)
-        if held is not None and float((shown & ~held).sum()) <= LOST * pixels:
+        if held is not None and float((shown & ~held).sum()) <= LOST * float(shown.sum()):
             errors[plane] = _error(support, both, held | ~shown)
-    if not errors:
-        return None
-    best, floor = min(errors, key=lambda plane: errors[plane]), FLOOR * pixels
-    alone = _error(support, support, torch.ones_like(shown))
-    return best if errors[best] + floor <= TOLERANCE * (alone + floor) else None
+    return errors
 
 
 def possible_planes(view: Views) -> list[Plane]:
