@@ -61,8 +61,9 @@ class FromScratch:
 
     @checked
     def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
-        """The field after so many steps from random weights."""
-        fresh = random_model(self.model.config, self.settings.seed)
+        """The field after so many steps from random weights, of views that are reflected as the model would have them."""
+        plane = self.model.find_symmetry(support)
+        fresh = random_model(replace(self.model.config, symmetric=False, symmetry=plane), self.settings.seed)
         fresh.rig.copy_(self.model.rig)
         settings = _rated(self.settings, fresh)
         return fresh.to(self.model.rig.device).fine_tune(support, self.steps, settings, on_step=on_step)

@@ -10,6 +10,8 @@ import torch
 
 from hyperplanes.adaptation import HullBlend, HyperPlanes, finding_symmetry
 from hyperplanes.adaptation.base import hull
+from hyperplanes.adaptation.fine_tuned import FromScratch
+from hyperplanes.adaptation.fine_tuning import made_anyway
 from hyperplanes.adaptation.symmetry import (
     HANDICAP,
     UNKNOWN,
@@ -248,6 +250,15 @@ def test_from_ten_views_on_some_that_are_held_out_have_to_be_shown_better(monkey
     assert adapter.find_symmetry(balls(cameras(9), BODY)) is not None
     assert adapter.find_symmetry(balls(cameras(10), BODY)) is None
     assert [count for count, _ in judged] == [10]
+
+
+@pytest.mark.parametrize("plane", [None, ACROSS])
+def test_random_weights_are_shown_the_reflections_that_the_model_decides_on(monkeypatch, plane):
+    adapter = model()
+    monkeypatch.setattr(adapter, "find_symmetry", lambda support: plane)
+    settings = FineTuning(rays=16, learning_rate=1e-4, muon_learning_rate=1e-4)
+    made = made_anyway(lambda: FromScratch(adapter, 1, settings).adapt(balls(cameras(), BODY)))
+    assert made.symmetry == plane
 
 
 @pytest.mark.parametrize("best", [None, ACROSS, Plane((0.0, 0.0, 1.0))])
