@@ -61,7 +61,7 @@ class FromScratch:
 
     @checked
     def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
-        """The field after so many steps from random weights, of views that are reflected as the model would have them."""
+        """The field after so many steps from random weights; views are reflected about the plane of the model."""
         plane = self.model.find_symmetry(support)
         fresh = random_model(replace(self.model.config, symmetric=False, symmetry=plane), self.settings.seed)
         fresh.rig.copy_(self.model.rig)
