@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 
-from hyperplanes.adaptation.held_out import draw_pixels, hold_out
-from hyperplanes.adaptation.network import HyperPlanesNetwork
+from hyperplanes.adaptation.held_out import Trial, hold_out
+from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.adaptation.symmetry import possible_planes, symmetry_plane
 from hyperplanes.geometry.reflections import Plane
 from hyperplanes.views import Views
 
-__all__ = ["find_symmetry"]
+__all__ = ["Symmetry", "find_symmetry"]
 
 SIZE, PIXELS = 128, 2048  # along the longer side of a single view, and those by which it is judged
 FEWEST_JUDGED = 10  # views from which on some are held out; fewer gain more, and tell less
 
 
+@dataclass(frozen=True)
+class Symmetry:
+    """What was found about the symmetry of an object.
+
+    Attributes:
+        plane: about which its views are to be reflected; None where they are not.
+        trial: what was made of it so while views were held out, if they were.
+    """
+
+    plane: Plane | None
+    trial: Trial | None = None
+
+
 @torch.no_grad()
-def find_symmetry(network: HyperPlanesNetwork, support: Views) -> Plane | None:
+def find_symmetry(network: HyperPlanesNetwork, support: Views) -> Symmetry:
     """As `HyperPlanes.find_symmetry`.
 
     Args:
@@ -26,14 +41,12 @@ def find_symmetry(network: HyperPlanesNetwork, support: Views) -> Plane | None:
     """
     config = network.config
     if config.symmetry is not None or not config.symmetric:
-        return config.symmetry
+        return Symmetry(config.symmetry)
     views = network.to_own(support)
     if len(views) == 1:
-        return _plane_of_one(network, views)
+        return Symmetry(_plane_of_one(network, views))
     plane = symmetry_plane(views)
-    if plane is None or len(views) < FEWEST_JUDGED:
-        return plane
-    return plane if _is_shown_better(network, views, plane) else None
+    return Symmetry(plane) if plane is None or len(views) < FEWEST_JUDGED else _judged(network, views, plane)
 
 
 def _plane_of_one(network: HyperPlanesNetwork, view: Views) -> Plane | None:
@@ -52,18 +65,11 @@ def _plane_of_one(network: HyperPlanesNetwork, view: Views) -> Plane | None:
     return min((None, *possible_planes(view)), key=error)
 
 
-def _is_shown_better(network: HyperPlanesNetwork, views: Views, plane: Plane) -> bool:
-    """Whether views that are held out are shown better with reflections of the others than without."""
-    parts = hold_out(views)
-    if parts is None:
-        return True
-    shown, held_out = parts
-    alone, both = network.prepare(shown), network.prepare(shown, symmetry=plane)
-    pixels = draw_pixels(alone, held_out, network.config.sampling.near_far)
-    if pixels is None:
-        return True
-    without, reflected = (
-        float(pixels.errors(network.rendering_field(each, network.adapted_weights(each))).square().sum())
-        for each in (alone, both)
-    )
-    return reflected < without
+def _judged(network: HyperPlanesNetwork, views: Views, plane: Plane) -> Symmetry:
+    """The plane if views that are held out are shown better with reflections of the others, or decide nothing."""
+    with in_use(network):
+        alone, both = hold_out(network, views), hold_out(network, views, plane)
+        if alone is None or both is None:
+            return Symmetry(plane)
+        without, reflected = (float(alone.pixels.errors(each.learned).square().sum()) for each in (alone, both))
+    return Symmetry(plane, both) if reflected < without else Symmetry(None, alone)

@@ -21,7 +21,7 @@ from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "made_anyway", "make_descent"]
+__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "made_anyway", "make_descent", "one_step"]
 
 Made = TypeVar("Made")
 
@@ -78,14 +78,18 @@ def fine_tune(
     """
     support, settings = network.to_own(support), settings or FineTuning()
     check_fine_tuning(settings, steps, len(support), network.config, network.target)
+    if steps == 0:
+        if on_step is not None:
+            on_step(0)
+        return one_step(network, support)
     if steps != "auto":
-        context = network.prepare(support, symmetry=find_symmetry(network, support))
+        context = network.prepare(support, symmetry=find_symmetry(network, support).plane)
         return fine_tune_to(network, context, steps, settings, views=_trained_on(context, support), on_step=on_step)
 
     # how many steps show some of the views best that the others were fine-tuned without, from as many random weights
     settings = replace(settings, fresh=settings.fresh_share(len(support)))
     shown, holdout = split_holdout(support, settings)
-    context = network.prepare(shown, symmetry=find_symmetry(network, shown))
+    context = network.prepare(shown, symmetry=find_symmetry(network, shown).plane)
     trial, _ = make_descent(network, context, settings, _trained_on(context, shown))
     pixels = network.live_pixels_of(context, holdout)
     with torch.no_grad():
@@ -93,9 +97,22 @@ def fine_tune(
     stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
-    context, schedule = network.prepare(support, symmetry=find_symmetry(network, support)), settings.max_steps
+    context = network.prepare(support, symmetry=find_symmetry(network, support).plane)
     views = _trained_on(context, support)
-    return fine_tune_to(network, context, stop, settings, views=views, schedule=schedule, on_step=on_step)
+    return fine_tune_to(network, context, stop, settings, views=views, schedule=settings.max_steps, on_step=on_step)
+
+
+@torch.no_grad()
+def one_step(network: HyperPlanesNetwork, support: Views) -> AdaptedField:
+    """As `HyperPlanes.adapt`.
+
+    Args:
+        network: the model.
+        support: the views of the object.
+    """
+    found = find_symmetry(network, support)
+    context = network.prepare(support, symmetry=found.plane)
+    return stacked_field(network, context, network.adapted_weights(context), found.trial)
 
 
 def _trained_on(context: SupportContext, support: Views) -> Views:

@@ -1,4 +1,4 @@
-"""Views of an object that are held out, and pixels of them by which what is made of the others is judged."""
+"""Views of an object that are held out, by whose pixels what is made of the others is judged."""
 
 from __future__ import annotations
 
@@ -6,17 +6,20 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext, live_pixels
+from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
+from hyperplanes.geometry.reflections import Plane
 from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.rendering.renderer import render
 from hyperplanes.views import Views
 
-__all__ = ["FEWEST", "HeldOutPixels", "draw_pixels", "hold_out"]
+__all__ = ["FEWEST", "HeldOutPixels", "Trial", "hold_out"]
 
 FEWEST = 5  # views, of which some can be held out
 HELD_OUT = 2
@@ -35,10 +38,10 @@ class HeldOutPixels:
     """
 
     rays: Rays
-    truth: Float[torch.Tensor, "pixel 3"]
+    truth: Float[Tensor, "pixel 3"]
     across: float
 
-    def errors(self, adapted: AdaptedField) -> Float[torch.Tensor, "pixel 3"]:
+    def errors(self, adapted: AdaptedField) -> Float[Tensor, "pixel 3"]:
         """By how much the colours of a field differ from the true ones.
 
         Args:
@@ -55,35 +58,52 @@ class HeldOutPixels:
         return found.pooled(len(SUBPIXELS)).colour - self.truth
 
 
-def hold_out(support: Views) -> tuple[Views, Views] | None:
-    """The views that are shown, and the HELD_OUT ones that these stand closest around, of SIZE pixels at most.
+@dataclass(frozen=True)
+class Trial:
+    """What a model makes of the views of an object while some are held out.
+
+    Attributes:
+        context: of the views that are shown.
+        learned: the field of one step.
+        pixels: of the others, within the hull of those that are shown.
+    """
+
+    context: SupportContext
+    learned: AdaptedField
+    pixels: HeldOutPixels
+
+
+@torch.no_grad()
+def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Plane | None = None) -> Trial | None:
+    """Holds out the HELD_OUT views that the others stand closest around; all have SIZE pixels at most.
 
     Args:
-        support: the views of an object.
+        network: of a field that takes any number of views.
+        support: the views of an object, where the model is.
+        symmetry: the plane about which the others are reflected.
 
     Returns:
-        None with fewer than FEWEST views, without masks, and where the object is seen by the held-out views alone.
+        None with fewer than FEWEST views, without masks, and where the object is seen by the held-out views alone, or
+        not by them.
     """
     if len(support) < FEWEST or support.masks is None:
         return None
     support = support.resized(SIZE)
     order = outermost_first(camera_directions(support).cpu(), len(support))
     shown, held_out = support[sorted(order[:-HELD_OUT])], support[order[-HELD_OUT:]]
-    return (shown, held_out) if shown.masks is not None and shown.masks.any() else None
-
-
-def draw_pixels(context: SupportContext, held_out: Views, near_far: str) -> HeldOutPixels | None:
-    """PIXELS of the views that are held out, within the hull of the others; None where they do not see it.
-
-    Args:
-        context: of the others.
-        held_out: the views.
-        near_far: of the rays, as in `geometry.cast`.
-    """
+    assert shown.masks is not None
+    if not shown.masks.any():
+        return None
+    context = network.prepare(shown, symmetry=symmetry)
     among = live_pixels(context.occupancy, held_out)
     if not len(among):
         return None
     rays, truth, _ = held_out.sample_masked_rays(
-        PIXELS, generator=torch.Generator().manual_seed(0), among=among, near_far=near_far, subpixels=SUBPIXELS
+        PIXELS,
+        generator=torch.Generator().manual_seed(0),
+        among=among,
+        near_far=network.config.sampling.near_far,
+        subpixels=SUBPIXELS,
     )
-    return HeldOutPixels(rays, truth, pixels_across(held_out.cameras, held_out.bounds))
+    learned = network.rendering_field(context, network.adapted_weights(context))
+    return Trial(context, learned, HeldOutPixels(rays, truth, pixels_across(held_out.cameras, held_out.bounds)))

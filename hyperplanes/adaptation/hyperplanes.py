@@ -13,7 +13,7 @@ from hyperplanes.adaptation.checkpoints import read_checkpoint, write_checkpoint
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.descent import Descent, Variables
 from hyperplanes.adaptation.finding_symmetry import find_symmetry
-from hyperplanes.adaptation.fine_tuning import fine_tune, fine_tune_to, make_descent
+from hyperplanes.adaptation.fine_tuning import fine_tune, fine_tune_to, make_descent, one_step
 from hyperplanes.adaptation.hub import upload_checkpoint
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import learned_part, stacked_field
@@ -50,7 +50,7 @@ class HyperPlanes(HyperPlanesNetwork):
         (`adaptation.symmetry`). Where `config.stacked` says so, its pictures are means with those of the visual hull
         (`adaptation.stacking`).
         """
-        return self.adapt_to(self.prepare(support, symmetry=self.find_symmetry(support)))
+        return one_step(self, support)
 
     @checked
     def find_symmetry(self, support: Views) -> Plane | None:
@@ -64,7 +64,7 @@ class HyperPlanes(HyperPlanesNetwork):
             (`symmetry.symmetry_plane`), or None. With ten views or more, two that are held out also have to be shown
             better with reflections. A single view is reflected about a vertical plane if it is shown better so itself.
         """
-        return find_symmetry(self, support)
+        return find_symmetry(self, support).plane
 
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:

@@ -13,17 +13,15 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.held_out import FEWEST, draw_pixels, hold_out
+from hyperplanes.adaptation.held_out import FEWEST, Trial, hold_out
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.geometry.reflections import Plane
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.renderer import Sampler
 from hyperplanes.utilities.arguments import checked
-from hyperplanes.views import Views
 
 __all__ = [
     "Learned",
@@ -164,7 +162,9 @@ def stack(
 
 
 @torch.no_grad()
-def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
+def stacked_field(
+    network: HyperPlanesNetwork, context: SupportContext, weights: Parameters, trial: Trial | None = None
+) -> AdaptedField:
     """The field of given weights, stacked with the visual hull where the model is configured so.
 
     The share of the hull is that of the object's own update (`hull_share`), whatever the weights are, or the one that
@@ -175,6 +175,7 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
         network: the model.
         context: the object.
         weights: of the field.
+        trial: with views held out, where there has been one.
     """
     learned = network.rendering_field(context, weights)
     if context.views.masks is None:
@@ -182,7 +183,7 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
     share = network.config.hull_share
     if network.config.stacked:
         with in_use(network):
-            share = hull_share(network, context.given, context.symmetry)
+            share = hull_share(trial or hold_out(network, context.given, context.symmetry))
     gate = network.gate if len(context.views) >= FEWEST else None
     if not share and gate is None:
         return learned
@@ -190,32 +191,22 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
 
 
 @torch.no_grad()
-def hull_share(network: HyperPlanesNetwork, support: Views, symmetry: Plane | None = None) -> float:
+def hull_share(trial: Trial | None) -> float:
     """The share of `HullBlend` in the pictures of an object, by which views that are held out are shown best.
 
     What was learned may not fit an object of another kind, and where it does fit, the errors of both are different
-    ones, so that a mean has less of them. The squared error of pixels of held-out views decides
-    (`adaptation.held_out`).
+    ones, so that a mean has less of them. The squared error of pixels of held-out views decides.
 
     Args:
-        network: of a field that takes any number of views.
-        support: the views of an object, where the model is.
-        symmetry: the plane about which they are reflected.
+        trial: with views held out (`held_out.hold_out`).
 
     Returns:
         The share, in [0, 1]: the best one (`best_share`) to the power of CAUTION. It is 0 where that lowers the squared
-        error by less than MARGIN, and where no view can be held out (`hold_out`), or those do not see the object.
+        error by less than MARGIN, and without a trial.
     """
-    parts = hold_out(support)
-    if parts is None:
+    if trial is None:
         return 0.0
-    shown, held_out = parts
-    context = network.prepare(shown, symmetry=symmetry)
-    pixels = draw_pixels(context, held_out, network.config.sampling.near_far)
-    if pixels is None:
-        return 0.0
-    learned = network.rendering_field(context, network.theta + network.update(context))
-    without, hull = pixels.errors(learned), pixels.errors(hull_field(context))
+    without, hull = (trial.pixels.errors(each) for each in (trial.learned, hull_field(trial.context)))
     share = best_share(without, hull) ** CAUTION
     mixed = torch.lerp(without, hull, share)
     return share if float(mixed.square().sum()) < (1 - MARGIN) * float(without.square().sum()) else 0.0

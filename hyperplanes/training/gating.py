@@ -11,6 +11,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
 from hyperplanes.adaptation.gating import GatingNetwork, readings
+from hyperplanes.adaptation.held_out import hold_out
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.stacking import hull_field, hull_share
 from hyperplanes.training.episodes.augmentation import moved
@@ -50,10 +51,10 @@ def example_of(model: HyperPlanes, task: Task) -> GatingExample:
         model: whose pictures are mixed with those of the hull.
         task: an object that the model was not trained on, with masks.
     """
-    context = model.prepare(task.support, symmetry=model.find_symmetry(task.support))
+    context = model.prepare(task.support)
     learned = model.rendering_field(context, model.adapted_weights(context)).render(task.query.cameras)
     hull = hull_field(context).render(task.query.cameras)
-    share, truth = hull_share(model, context.given, context.symmetry), _flat(task.query.images)
+    share, truth = hull_share(hold_out(model, context.views)), _flat(task.query.images)
     one, other = _flat(learned.images), _flat(hull.images)
     opacity, of_hull = learned.opacity.flatten(), hull.opacity.flatten()
     some = (opacity > 0) | (of_hull > 0)

@@ -10,7 +10,7 @@ from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.fine_tuned import random_model
 from hyperplanes.adaptation.fine_tuning import fine_tune
 from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.held_out import FEWEST
+from hyperplanes.adaptation.held_out import FEWEST, hold_out
 from hyperplanes.adaptation.kept import keep_field, recall_field
 from hyperplanes.adaptation.stacking import (
     CAUTION,
@@ -102,8 +102,10 @@ def test_a_model_in_double_precision_is_stacked_too():
     torch.testing.assert_close(one.images, other.images, atol=2e-2, rtol=0)
     learned = adapter.rendering_field(double, adapter.adapted_weights(double))
     assert stack(learned, HullBlend().adapt_to(double.planes), 0.3).render(cameras).images.dtype == torch.float32
-    expected = hull_share(model(empty=True), support)
-    assert hull_share(model(empty=True).double(), support.to(dtype=torch.float64)) == pytest.approx(expected, abs=1e-3)
+    expected = hull_share(hold_out(model(empty=True), support))
+    assert hull_share(hold_out(model(empty=True).double(), support.to(dtype=torch.float64))) == pytest.approx(
+        expected, abs=1e-3
+    )
 
 
 def test_densities_are_those_of_the_learned_field_unless_the_hull_overrules_it():
@@ -120,7 +122,7 @@ def test_the_views_that_decide_are_not_shown(monkeypatch):
     adapter, support, shown = model(), ball_views(ring(7, (24, 24))), []
     prepare = adapter.prepare
     monkeypatch.setattr(adapter, "prepare", lambda views, **given: shown.append(views) or prepare(views, **given))
-    assert 0 <= hull_share(adapter, support) <= 1
+    assert 0 <= hull_share(hold_out(adapter, support)) <= 1
     (rest,) = shown
     assert len(rest) == 5
     kept = sorted(outermost_first(camera_directions(support), 7)[:-2])  # without those that the others stand around
@@ -153,19 +155,19 @@ def test_a_second_picture_is_made_only_where_it_is_worth_it(monkeypatch, other):
     monkeypatch.setattr(held_out.HeldOutPixels, "errors", lambda *_: next(pixels))
     share = (1 / (1 + other**2)) ** CAUTION
     worth_it = (1 - share) ** 2 + share**2 * other**2 < 1 - MARGIN
-    assert hull_share(model(), support) == pytest.approx(share if worth_it else 0.0)
+    assert hull_share(hold_out(model(), support)) == pytest.approx(share if worth_it else 0.0)
     assert worth_it == (other < 5)
 
 
 def test_few_views_or_none_with_masks_decide_nothing():
     adapter = model()
     for count in (1, FEWEST - 1):
-        assert hull_share(adapter, ball_views(ring(count, (24, 24)))) == 0
+        assert hull_share(hold_out(adapter, ball_views(ring(count, (24, 24))))) == 0
     support = ball_views(ring(6, (24, 24)))
-    assert hull_share(model(empty=True), replace(support, masks=None)) == 0
+    assert hull_share(hold_out(model(empty=True), replace(support, masks=None))) == 0
     few = support.masks.clone()
     few[sorted(outermost_first(camera_directions(support), 6)[:-2])] = 0
-    assert hull_share(model(empty=True), replace(support, masks=few)) == 0  # of which none is shown
+    assert hull_share(hold_out(model(empty=True), replace(support, masks=few))) == 0  # of which none is shown
     saved = HyperPlanes(replace(CONFIG, stacked=False, hull_share=0.5))
     assert not isinstance(saved.adapt(replace(support, masks=None)), StackedField)
     assert isinstance(saved.adapt(support), StackedField)
@@ -173,9 +175,9 @@ def test_few_views_or_none_with_masks_decide_nothing():
 
 def test_views_that_look_past_the_object_decide_nothing(monkeypatch):
     support = ball_views(ring(6, (24, 24)))
-    assert hull_share(model(empty=True), support) > 0
+    assert hull_share(hold_out(model(empty=True), support)) > 0
     monkeypatch.setattr(held_out, "live_pixels", lambda *_: torch.arange(0))
-    assert hull_share(model(empty=True), support) == 0
+    assert hull_share(hold_out(model(empty=True), support)) == 0
 
 
 def test_a_field_that_knows_views_by_their_places_is_not_stacked():

@@ -10,8 +10,10 @@ import torch
 
 from hyperplanes.adaptation import HullBlend, HyperPlanes, finding_symmetry
 from hyperplanes.adaptation.base import hull
+from hyperplanes.adaptation.finding_symmetry import Symmetry
 from hyperplanes.adaptation.fine_tuned import FromScratch
 from hyperplanes.adaptation.fine_tuning import made_anyway
+from hyperplanes.adaptation.held_out import HeldOutPixels
 from hyperplanes.adaptation.symmetry import (
     HANDICAP,
     UNKNOWN,
@@ -244,12 +246,25 @@ def test_a_field_that_knows_its_views_by_their_places_takes_no_reflections():
 
 def test_from_ten_views_on_some_that_are_held_out_have_to_be_shown_better(monkeypatch):
     adapter, judged = model(), []
-    monkeypatch.setattr(
-        finding_symmetry, "_is_shown_better", lambda network, views, plane: judged.append((len(views), plane))
-    )
+
+    def judge(network, views, plane):
+        judged.append(len(views))
+        return Symmetry(None)
+
+    monkeypatch.setattr(finding_symmetry, "_judged", judge)
     assert adapter.find_symmetry(balls(cameras(9), BODY)) is not None
     assert adapter.find_symmetry(balls(cameras(10), BODY)) is None
-    assert [count for count, _ in judged] == [10]
+    assert judged == [10]
+
+
+@pytest.mark.parametrize("better", [False, True])
+def test_the_smaller_error_of_held_out_views_decides_and_its_trial_is_kept(monkeypatch, better):
+    errors = iter([torch.tensor([[0.5, 0.0, 0.0]]), torch.tensor([[0.4 if better else 0.6, 0.0, 0.0]])])
+    monkeypatch.setattr(HeldOutPixels, "errors", lambda *_: next(errors))
+    found = finding_symmetry.find_symmetry(model(), balls(cameras(10), BODY))
+    assert (found.plane is not None) == better
+    assert found.trial is not None
+    assert found.trial.context.symmetry == found.plane
 
 
 @pytest.mark.parametrize("plane", [None, ACROSS])
