@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, hull
-from hyperplanes.geometry.chosen_views import Penalties
+from hyperplanes.geometry.chosen_views import Penalties, Reading
 from hyperplanes.geometry.hull_hits import hull_hits
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays, Sphere
@@ -21,7 +21,7 @@ from hyperplanes.rendering.samplers import PackedSamples
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
-__all__ = ["HullBlend"]
+__all__ = ["HullBlend", "blend_views"]
 
 OPAQUE = 1e4  # density within the hull, per radius of the scene
 STOP = 2e-3  # transmittance; so low that every sample is evaluated: by every second one wings lose 0.05 to 0.5 dB
@@ -35,7 +35,7 @@ class HullBlend:
     """The visual hull of the support masks is the surface, and its colour that of the support views that see it.
 
     A point lies in the hull where no view that shows it has background there. Its colour is a mean of the `nearest` of
-    the support views that see it, by the weights of the unstructured lumigraph (`VisibilityPlanes.blended`). A view
+    the support views that see it, by the weights of the unstructured lumigraph (`blend_views`). A view
     sees a point in front of which no part of the hull lies and where its mask is whole, so that no background is mixed
     into the colour. Where fewer views see the point, the nearest of the others serve.
 
@@ -79,6 +79,30 @@ class HullBlend:
         blend = replace(blend, planes=planes.with_penalties(Penalties.alike()).with_surface(voxels.solid()))
         sampling = _FirstInHull(self.steps, STOP, planes=planes)
         return AdaptedField(blend, region, sampling, densities=(blend.density,), refined=voxels)
+
+
+def blend_views(
+    planes: VisibilityPlanes, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], nearest: int
+) -> Float[Tensor, "point 3"]:
+    """The mean of the colours of the views nearest to a direction that see the point (`lumigraph_weights`).
+
+    Args:
+        planes: the views.
+        points: in the world.
+        directions: unit vectors along which the points are seen.
+        nearest: how many views, at most all.
+    """
+    if planes.can_describe(points):
+        near = planes.describe(points, directions, Reading(0, nearest, 0, 0, 0.0), planes.occupancy.bounds)
+        weights, colours = near.near_weights.softmax(1), near.near_colours
+    else:
+        seen = planes.choose(points, directions, best=1, nearest=nearest).nearest
+        assert seen is not None
+        weights = seen.lumigraph_weights(seen.angles(directions), min(nearest, len(planes)))
+        weights = weights / weights.sum(1, keepdim=True)
+        colours = planes.colours.lookup(points).colours
+        colours = colours.gather(1, seen.first(nearest).views[..., None].expand(-1, -1, 3))
+    return (weights[..., None] * colours).sum(1)
 
 
 @dataclass(frozen=True)
@@ -136,7 +160,7 @@ class _Blend:
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
         """The blended colours, and the density."""
-        return self.planes.blended(points, directions, self.nearest), self.density(points)
+        return blend_views(self.planes, points, directions, self.nearest), self.density(points)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """High where every view that shows a point shows the object there, else 0."""
@@ -153,4 +177,4 @@ class _Blend:
 
     def colour_of(self, hidden: _HullPoints, directions: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
         """The blended colours."""
-        return self.planes.blended(hidden.points, directions, self.nearest)
+        return blend_views(self.planes, hidden.points, directions, self.nearest)

@@ -186,28 +186,6 @@ class VisibilityPlanes:
         chosen = [ChosenViews(each, *_split(value)) for each, value in zip(views, values, strict=True)]
         return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
 
-    def blended(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], nearest: int
-    ) -> Float[Tensor, "point 3"]:
-        """The mean of the colours of the views nearest to a direction that see the point (`lumigraph_weights`).
-
-        Args:
-            points: in the world.
-            directions: unit vectors along which the points are seen.
-            nearest: how many views, at most all.
-        """
-        if self.can_describe(points):
-            near = self.describe(points, directions, Reading(0, nearest, 0, 0, 0.0), self.occupancy.bounds)
-            weights, colours = near.near_weights.softmax(1), near.near_colours
-        else:
-            seen = self.choose(points, directions, best=1, nearest=nearest).nearest
-            assert seen is not None
-            weights = seen.lumigraph_weights(seen.angles(directions), min(nearest, len(self)))
-            weights = weights / weights.sum(1, keepdim=True)
-            colours = self.colours.lookup(points).colours
-            colours = colours.gather(1, seen.first(nearest).views[..., None].expand(-1, -1, 3))
-        return (weights[..., None] * colours).sum(1)
-
     def can_describe(self, points: Float[Tensor, "point 3"]) -> bool:
         """Whether `describe` takes these points: those that the kernels take, where no gradient goes through them."""
         given = (points, *(getattr(self.colours.cameras, name) for name in ("intrinsics", "extrinsics")))

@@ -91,6 +91,17 @@ def test_from_ten_views_on_a_plane_beside_the_middle_of_the_scene_is_found():
     assert abs(found.offset) < 0.006
 
 
+def test_from_ten_views_on_a_plane_that_leans_is_found():
+    angle = math.radians(1.0)  # about z
+    turned = [
+        ((x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle), z), radius, colour)
+        for (x, y, z), radius, colour in BODY
+    ]
+    found = symmetry_plane(balls(cameras(14), turned))
+    assert found is not None
+    assert math.dist(found.normal, (math.cos(angle), math.sin(angle), 0.0)) < math.radians(0.2)
+
+
 def test_the_plane_goes_through_the_middle_of_the_scene():
     placed = [((x + 0.4, y, z), radius, colour) for (x, y, z), radius, colour in BODY]
     found = symmetry_plane(balls(cameras(), placed, Sphere((0.4, 0.0, 0.0))))

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from hyperplanes.adaptation.hull_blend import blend_views
 from hyperplanes.geometry import Sphere, carve, cast
 from hyperplanes.geometry import visibility as module
 from hyperplanes.geometry.cameras import centres, projection_matrices
@@ -146,7 +147,7 @@ def test_blended_colours_are_those_of_the_unstructured_lumigraph(monkeypatch, co
     weights = (1 / score[:, :2] - 1 / (1.01 * score[:, 2:3])).clamp_min(1e-6)
     colours = shown.colours.lookup(points).colours.gather(1, order[:, :2, None].expand(-1, -1, 3))
     expected = (weights[..., None] * colours).sum(1) / weights.sum(1, keepdim=True)
-    torch.testing.assert_close(shown.blended(points, directions, 2), expected, atol=2e-3, rtol=0)
+    torch.testing.assert_close(blend_views(shown, points, directions, 2), expected, atol=2e-3, rtol=0)
 
 
 def test_a_point_on_a_ball_is_seen_from_its_side_and_lies_behind_it_from_the_other():
