@@ -38,7 +38,7 @@ from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.swapped import Swapped
-from hyperplanes.adaptation.symmetry import Reflecting
+from hyperplanes.adaptation.symmetry import ReflectedHullBlend
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Inputs, Shown
 from hyperplanes.evaluation import Score, evaluate
@@ -319,7 +319,7 @@ def _swapped(model: HyperPlanes, shown: Tasks, names: list[str]) -> Adapter:
 METHODS = {
     "nearest_view": lambda *_: NearestView(),
     "hull_blend": lambda *_: HullBlend(),
-    "hull_blend_reflected": lambda *_: Reflecting(HullBlend()),
+    "hull_blend_reflected": lambda *_: ReflectedHullBlend(),
     "random_weights": lambda model, *_: FromScratch(model, 0),
     "theta": lambda model, *_: _Partly(model, lambda name: False),
     "swapped": _swapped,

@@ -23,7 +23,7 @@ from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
-from hyperplanes.adaptation.symmetry import Reflecting
+from hyperplanes.adaptation.symmetry import ReflectedHullBlend
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.configuration.model import ModelConfig
@@ -180,7 +180,7 @@ METHODS: dict[str, Method] = {
     "hull_blend": Method("support views blended on the visual hull", lambda request: HullBlend()),
     "hull_blend_reflected": Method(
         "support views and, of symmetric objects, their reflections, blended on the visual hull",
-        lambda request: Reflecting(HullBlend()),
+        lambda request: ReflectedHullBlend(),
     ),
     "nerf": _shared_weights("nerf", "NeRF"),
     "multiplane": _shared_weights("multiplane", "MultiPlaneNeRF"),

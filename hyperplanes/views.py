@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,7 +19,7 @@ from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.utilities.arguments import checked, kind_of
 
-__all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views"]
+__all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views", "moved"]
 
 
 MOST = 1.5
@@ -230,6 +230,17 @@ def join_views(first: Views, second: Views) -> Views:
     names = first.names + second.names if first.names and second.names else ()
     cameras = camera.concatenate([first.cameras, second.cameras])
     return Views(torch.cat([first.images, second.images]), cameras, masks, first.bounds, names, first.up)
+
+
+def moved(views: Views, motion: Float[Tensor, "4 4"]) -> Views:
+    """The views of an object after a rigid motion: the same pictures, whose cameras move with it.
+
+    Args:
+        views: of the object.
+        motion: in world coordinates, in float64.
+    """
+    pose = camera.camera_from_world(views.cameras)
+    return replace(views, cameras=camera.with_poses(views.cameras, pose @ torch.linalg.inv(motion).to(pose)))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.occupancy import Occupancy, carve, full
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.geometry.reflections import Plane
+from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.rendering.images import Pictures
@@ -63,7 +63,7 @@ class AdaptedField:
         proposal: the coarse field of `Hierarchical` sampling, where it is another one.
         densities: points -> density alone, of the field and of its proposal.
         refined: the voxels of `occupancy` in which it has density, where they are known.
-        symmetry: the plane about which its views were reflected, where they were.
+        symmetry: by which its views were reflected, where they were.
     """
 
     field: FieldFunction
@@ -72,7 +72,7 @@ class AdaptedField:
     proposal: FieldFunction | None = None
     densities: tuple[Callable[[Tensor], Tensor], ...] = ()
     refined: RefinedOccupancy | None = None
-    symmetry: Plane | None = None
+    symmetry: Symmetry | None = None
 
     def __repr__(self) -> str:
         side = self.occupancy.occupied.shape[0]

@@ -11,13 +11,13 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from hyperplanes.adaptation.base import hull
-from hyperplanes.adaptation.symmetry import HANDICAP, with_reflections
+from hyperplanes.adaptation.reflections import handicaps, with_reflections
 from hyperplanes.fields import Target
 from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy, full
-from hyperplanes.geometry.reflections import Plane
+from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.hypernetwork import HyperNetwork, Observed
 from hyperplanes.rendering.footprint import footprint
@@ -36,8 +36,8 @@ class SupportContext:
         occupancy: the visual hull of all support masks.
         hyperplanes: indices of the views that the hypernetwork reads.
         volume: what the planes show on a grid over the scene, for a hypernetwork that reads it.
-        symmetry: the plane about which the object is symmetric, where the second half of the views are the reflections
-            of the first; None where all of them are views that were given.
+        symmetry: of the object, by which the views after the first ones are reflections of these
+            (`reflections.images_by`); None where all of them are views that were given.
     """
 
     views: Views
@@ -45,12 +45,12 @@ class SupportContext:
     occupancy: Occupancy
     hyperplanes: Int[Tensor, " k"]
     volume: Float[Tensor, "channel x y z"] | None = None
-    symmetry: Plane | None = None
+    symmetry: Symmetry | None = None
 
     @property
     def given(self) -> Views:
         """The views without their reflections."""
-        return self.views if self.symmetry is None else self.views[: len(self.views) // 2]
+        return self.views if self.symmetry is None else self.views[: len(self.views) // self.symmetry.images]
 
     def mask_views(self, views: Int[Tensor, " masked"]) -> SupportContext:
         """The same object, of which some views show the field nothing.
@@ -81,7 +81,7 @@ def prepare_context(
     *,
     carved: bool = True,
     masks_repeated: bool = False,
-    symmetry: Plane | None = None,
+    symmetry: Symmetry | None = None,
 ) -> SupportContext:
     """The support side of one object.
 
@@ -94,7 +94,7 @@ def prepare_context(
         carved: without, one voxel that may hold anything stands for the hull; a hypernetwork that reads the hull has it
             carved in any case.
         masks_repeated: where there are fewer views than planes, each view is shown at one plane alone.
-        symmetry: a plane about which the object is symmetric: reflections of the views count as views, too.
+        symmetry: of the object: reflections of the views count as views, too.
     """
     given, support = len(support), with_reflections(support, symmetry)
     views, device = arrange(support, target, rig), support.images.device
@@ -109,7 +109,7 @@ def prepare_context(
     # what the field looks colours up in
     planes = target.planes_of(views, occupancy)
     if isinstance(planes, VisibilityPlanes) and symmetry is not None:
-        planes = planes.with_handicaps(HANDICAP * (torch.arange(len(views)) >= given))
+        planes = planes.with_handicaps(handicaps(given, symmetry))
     if masks_repeated and len(support) < len(views):
         planes = planes.mask_views(rig.repeated(support).to(device))
 

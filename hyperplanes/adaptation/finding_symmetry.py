@@ -1,38 +1,39 @@
-"""The plane about which a model is shown reflections of an object's views."""
+"""The symmetry by which a model is shown reflections of an object's views."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 
 from hyperplanes.adaptation.held_out import Trial, hold_out
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
-from hyperplanes.adaptation.symmetry import possible_planes, symmetry_plane
-from hyperplanes.geometry.reflections import Plane
+from hyperplanes.adaptation.symmetry import possible_symmetries, symmetry_of
+from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.views import Views
 
-__all__ = ["Symmetry", "find_symmetry"]
+__all__ = ["FoundSymmetry", "find_symmetry"]
 
 SIZE, PIXELS = 128, 2048  # along the longer side of a single view, and those by which it is judged
 FEWEST_JUDGED = 10  # views from which on some are held out; fewer gain more, and tell less
 
 
 @dataclass(frozen=True)
-class Symmetry:
+class FoundSymmetry:
     """What was found about the symmetry of an object.
 
     Attributes:
-        plane: about which its views are to be reflected; None where they are not.
+        symmetry: by which its views are to be reflected; None where they are not.
         trial: what was made of it so while views were held out, if they were.
     """
 
-    plane: Plane | None
+    symmetry: Symmetry | None
     trial: Trial | None = None
 
 
 @torch.no_grad()
-def find_symmetry(network: HyperPlanesNetwork, support: Views) -> Symmetry:
+def find_symmetry(network: HyperPlanesNetwork, support: Views) -> FoundSymmetry:
     """As `HyperPlanes.find_symmetry`.
 
     Args:
@@ -41,35 +42,48 @@ def find_symmetry(network: HyperPlanesNetwork, support: Views) -> Symmetry:
     """
     config = network.config
     if config.symmetry is not None or not config.symmetric:
-        return Symmetry(config.symmetry)
+        return FoundSymmetry(config.symmetry)
     views = network.to_own(support)
     if len(views) == 1:
-        return Symmetry(_plane_of_one(network, views))
-    plane = symmetry_plane(views)
-    return Symmetry(plane) if plane is None or len(views) < FEWEST_JUDGED else _judged(network, views, plane)
+        return FoundSymmetry(_of_one_view(network, views))
+    found = symmetry_of(views)
+    if found is None or len(views) < FEWEST_JUDGED:
+        return FoundSymmetry(found)
+    return _judged(network, views, found)
 
 
-def _plane_of_one(network: HyperPlanesNetwork, view: Views) -> Plane | None:
-    """The plane by which a single view is shown best, if not without a reflection."""
+def _of_one_view(network: HyperPlanesNetwork, view: Views) -> Symmetry | None:
+    """Several planes where the view shows them; else the plane by which it is shown best, if not without a reflection.
+
+    The model itself shows a view with few planes: with many, the view is what the hull is made of.
+    """
     if view.masks is None or not view.masks.any():
         return None
     view = view.resized(SIZE)
+    possible = possible_symmetries(view)
+    if any(each.order > 1 for each in possible):
+        return possible[0]
     near_far = network.config.sampling.near_far
     rays, truth = view.sample_rays(PIXELS, generator=torch.Generator().manual_seed(0), near_far=near_far)
 
-    def error(plane: Plane | None) -> float:
-        context = network.prepare(view, symmetry=plane)
+    def error(symmetry: Symmetry | None) -> float:
+        context = network.prepare(view, symmetry=symmetry)
         found = network.field(context, network.adapted_weights(context)).trace(rays, differentiable=False)
         return float((found.colour - truth).square().sum())
 
-    return min((None, *possible_planes(view)), key=error)
+    return min((None, *possible), key=error)
 
 
-def _judged(network: HyperPlanesNetwork, views: Views, plane: Plane) -> Symmetry:
-    """The plane if views that are held out are shown better with reflections of the others, or decide nothing."""
+def _judged(network: HyperPlanesNetwork, views: Views, symmetry: Symmetry) -> FoundSymmetry:
+    """The symmetry, unless views that are held out are shown worse with reflections of the others.
+
+    By more than the standard error of the difference: what looks symmetric mostly is.
+    """
     with in_use(network):
-        alone, both = hold_out(network, views), hold_out(network, views, plane)
+        alone, both = hold_out(network, views), hold_out(network, views, symmetry)
         if alone is None or both is None:
-            return Symmetry(plane)
-        without, reflected = (float(alone.pixels.errors(each.learned).square().sum()) for each in (alone, both))
-    return Symmetry(plane, both) if reflected < without else Symmetry(None, alone)
+            return FoundSymmetry(symmetry)
+        without, reflected = (alone.pixels.errors(each.learned).square().sum(1) for each in (alone, both))
+    lost = reflected - without
+    worse = lost.mean() > lost.std() / math.sqrt(len(lost))
+    return FoundSymmetry(None, alone) if worse else FoundSymmetry(symmetry, both)

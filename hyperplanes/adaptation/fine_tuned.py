@@ -62,8 +62,8 @@ class FromScratch:
     @checked
     def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
         """The field after so many steps from random weights; views are reflected about the plane of the model."""
-        plane = self.model.find_symmetry(support)
-        fresh = random_model(replace(self.model.config, symmetric=False, symmetry=plane), self.settings.seed)
+        symmetry = self.model.find_symmetry(support)
+        fresh = random_model(replace(self.model.config, symmetric=False, symmetry=symmetry), self.settings.seed)
         fresh.rig.copy_(self.model.rig)
         settings = _rated(self.settings, fresh)
         return fresh.to(self.model.rig.device).fine_tune(support, self.steps, settings, on_step=on_step)

@@ -14,7 +14,7 @@ from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
-from hyperplanes.geometry.reflections import Plane
+from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.rendering.renderer import render
 from hyperplanes.views import Views
@@ -74,13 +74,13 @@ class Trial:
 
 
 @torch.no_grad()
-def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Plane | None = None) -> Trial | None:
+def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | None = None) -> Trial | None:
     """Holds out the HELD_OUT views that the others stand closest around; all have SIZE pixels at most.
 
     Args:
         network: of a field that takes any number of views.
         support: the views of an object, where the model is.
-        symmetry: the plane about which the others are reflected.
+        symmetry: by which the others are reflected.
 
     Returns:
         None with fewer than FEWEST views, without masks, and where the object is seen by the held-out views alone, or

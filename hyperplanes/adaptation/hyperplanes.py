@@ -19,7 +19,7 @@ from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import learned_part, stacked_field
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
-from hyperplanes.geometry.reflections import Plane
+from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
@@ -53,18 +53,19 @@ class HyperPlanes(HyperPlanesNetwork):
         return one_step(self, support)
 
     @checked
-    def find_symmetry(self, support: Views) -> Plane | None:
-        """The plane about which the views of an object are to be reflected, where `config.symmetric` says so.
+    def find_symmetry(self, support: Views) -> Symmetry | None:
+        """The symmetry by which the views of an object are to be reflected, where `config.symmetric` says so.
 
         Args:
             support: the views of one object.
 
         Returns:
-            `config.symmetry` where that is known. Else the plane about which the object looks symmetric
-            (`symmetry.symmetry_plane`), or None. With ten views or more, two that are held out also have to be shown
-            better with reflections. A single view is reflected about a vertical plane if it is shown better so itself.
+            `config.symmetry` where that is known. Else the planes about which the object looks symmetric
+            (`symmetry.symmetry_of`), or None. With ten views or more, two that are held out must not be shown
+            worse with reflections. A single view is reflected about several planes if its silhouette and colours
+            show them, and about one if it is shown better so itself.
         """
-        return find_symmetry(self, support).plane
+        return find_symmetry(self, support).symmetry
 
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:

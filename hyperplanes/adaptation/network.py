@@ -12,12 +12,12 @@ from torch import Tensor, nn
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext, arrange, live_pixels, observe, prepare_context
 from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.symmetry import UNKNOWN
+from hyperplanes.adaptation.reflections import UNKNOWN
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
 from hyperplanes.fields.rig import Rig, camera_directions
-from hyperplanes.geometry.reflections import Plane
+from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
@@ -98,17 +98,17 @@ class HyperPlanesNetwork(nn.Module):
         return arrange(support, self.target, self.known_rig)
 
     @checked
-    def prepare(self, support: Views, *, carved: bool = True, symmetry: Plane | None = None) -> SupportContext:
+    def prepare(self, support: Views, *, carved: bool = True, symmetry: Symmetry | None = None) -> SupportContext:
         """All that depends on the support views and not on weights.
 
         Args:
             support: the views of one object, on any device and in any precision.
-            symmetry: a plane about which the object is symmetric: reflections of the views count as views, too.
+            symmetry: of the object: reflections of the views count as views, too.
             carved: without, one voxel that may hold anything stands for the hull, for who never asks it. A hypernetwork
                 that reads the hull has it carved in any case.
 
         Raises:
-            ValueError: a plane where the field knows its views by their places.
+            ValueError: a symmetry where the field knows its views by their places.
         """
         if symmetry is not None and not self.target.permutation_invariant:
             raise ValueError(f"symmetry: expected None for {self.config.target}, which knows views by their places")

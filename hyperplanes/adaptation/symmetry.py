@@ -1,27 +1,32 @@
-"""Reflections of views: a symmetric object is seen from twice as many sides as it was photographed from."""
+"""The symmetry of an object, as its views tell it: their visual hull and its colours, without any weights."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
-from hyperplanes.adaptation.base import Adapter, Renderable, hull
+from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hull_blend import HullBlend
+from hyperplanes.adaptation.reflections import (
+    HULL_SIDE,
+    SHOWN,
+    held_pixels,
+    images_by,
+    reflected,
+    with_reflections,
+)
 from hyperplanes.geometry.cameras import camera_directions
-from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
-from hyperplanes.geometry.occupancy import Occupancy, carve
+from hyperplanes.geometry.occupancy import carve
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.reflections import Plane, reflected_cameras
-from hyperplanes.rendering.footprint import footprint
+from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.views import Views, join_views
 
-__all__ = ["HANDICAP", "UNKNOWN", "Reflecting", "possible_planes", "reflected", "symmetry_plane", "with_reflections"]
+__all__ = ["ReflectedHullBlend", "possible_symmetries", "symmetry_of"]
 
 FEWEST = 2  # views that planes are judged by: a single one contradicts none of them
 FEWEST_TO_SEARCH, FEWEST_TO_REFINE = 5, 10
@@ -31,164 +36,163 @@ LOST = 0.05  # share of the object's pixels that the hull with reflections may m
 TOLERANCE = 1.75  # times the squared error without reflections, by which the views still show the same object
 FLOOR = 3e-3  # of that error in a pixel of the object; smaller ones are those of the hull's voxels
 
-SIDE = 96  # voxels an axis of the hull in which parts that are not symmetric are looked for
-SHOWN = 0.9  # opacity of a mask from which on a pixel shows the object
-REACH = 4  # voxels, by which these parts go on where other ones hide their beginning
-UNKNOWN = 0.97  # opacity where a reflection is known to be wrong: nothing is carved, and its colour does not count
-HANDICAP = 0.05  # penalty of reflections as planes: light falls from one side, and writing is reversed
+ORDERS = {2: (), 3: (), 4: (2,), 6: (2, 3), 8: (2, 4)}
+"""Orders that are tried, and those that an object of such a symmetry has, too."""
+MOST_IMAGES = 64  # views and reflections; more make no better pictures, and take longer
+SINGLE_VIEW_ORDER = 3  # at least: by one view, many a car is the same from the front and from the back
+WORTH = 0.5  # power of the order by which the error may grow
 
 VERTICAL = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 AXES = (*VERTICAL, (0.0, 1.0, 0.0))
 """Normals of planes that are tried."""
 
 
-def reflected(views: Views, plane: Plane) -> Views:
-    """The views of the mirror image of an object: the same pictures, flipped, by cameras that are reflected.
-
-    Args:
-        views: of the object.
-        plane: of the reflection.
-    """
-    masks = None if views.masks is None else views.masks.flip(3)
-    cameras = reflected_cameras(views.cameras, plane)
-    return Views(views.images.flip(3), cameras, masks, views.bounds, views.names, views.up)
-
-
 @torch.no_grad()
-def with_reflections(support: Views, plane: Plane | None) -> Views:
-    """The views, and after them their reflections in the same order.
-
-    Few things are symmetric in all of their parts. What views show, and the visual hull of views and reflections does
-    not hold, is such a part. Where it would be in a reflection, the opacity is UNKNOWN.
-
-    Args:
-        support: of an object that is symmetric about the plane, but for some parts.
-        plane: of the symmetry; None leaves the views as they are.
-    """
-    if plane is None:
-        return support
-    mirrored = reflected(support, plane)
-    if support.masks is None or mirrored.masks is None:
-        return join_views(support, mirrored)
-    parts = _asymmetric_parts(support, join_views(support, mirrored))
-    if parts.occupied.any():
-        wrong = footprint(parts, mirrored.cameras)[:, None]
-        mirrored = replace(mirrored, masks=torch.where(wrong, UNKNOWN, mirrored.masks))
-    return join_views(support, mirrored)
-
-
-@torch.no_grad()
-def symmetry_plane(support: Views) -> Plane | None:
-    """The plane about which an object looks symmetric, if there is one.
+def symmetry_of(support: Views) -> Symmetry | None:
+    """The planes about which an object looks symmetric, if there are any.
 
     If an object is symmetric, the visual hull of its views and their reflections still shows the views. If not, this
     hull is too small, or it has the colours of another part of the object. Silhouettes and colours are compared; no
     weights are needed. The planes through the middle of the scene that are orthogonal to its axes are tried first. Then
     the best of these is compared with one near to it (`more_symmetric_plane`) or, where none will do, the vertical
-    plane about which the hull of the views is most nearly symmetric is tried (`most_symmetric_plane`).
+    plane about which the hull of the views is most nearly symmetric is tried (`most_symmetric_plane`). Of few views of
+    an object that is symmetric about a vertical plane, likewise 2, 3, 4, 6 and 8 planes through one axis are tried.
 
     Args:
-        support: views with masks; MOST of them, those farthest apart, are looked at.
+        support: views with masks, y up; MOST of them, those farthest apart, are looked at.
 
     Returns:
-        The plane by which `HullBlend` shows the views best, if its squared error is at most TOLERANCE times that
+        The symmetry by which `HullBlend` shows the views best, if its squared error is at most TOLERANCE times that
         without reflections; None with fewer than FEWEST views, or without masks. Other planes than those across the
         axes need FEWEST_TO_SEARCH views, whose hull is near enough to the object, those near to one FEWEST_TO_REFINE.
+        Several planes are found with fewer views than that, where they show more than light and details cost.
     """
     if support.masks is None or len(support) < FEWEST or not support.masks.any():
         return None
     centre = support.bounds.centre
     chosen = farthest_first(camera_directions(support.cameras, centre).cpu(), 0, min(MOST, len(support)))
-    views = support[sorted(chosen)].resized(SIZE)
-    assert views.masks is not None
-    floor = FLOOR * float((views.masks >= SHOWN).sum())
-    most = TOLERANCE * (_error(views, views, torch.ones_like(views.masks, dtype=torch.bool)) + floor) - floor
-
-    def best_of(errors: dict[Plane, float]) -> Plane | None:
-        return min((plane for plane in errors if errors[plane] <= most), key=lambda plane: errors[plane], default=None)
-
-    errors = _errors(_planes(support.bounds, AXES), views)
-    found = best_of(errors)
-    if len(support) < (FEWEST_TO_SEARCH if found is None else FEWEST_TO_REFINE):
-        return found
-    voxels = carve(support.masks, support.cameras, support.bounds, SIDE)
-    if voxels.occupied.any():
-        more = most_symmetric_plane(voxels) if found is None else more_symmetric_plane(voxels, found)
-        errors |= _errors([more], views)
-    return best_of(errors)
+    judge = _Judge.of(support[sorted(chosen)])
+    errors = judge.planes(_planes(support.bounds, AXES))
+    found = min(errors, key=errors.__getitem__, default=None)
+    if len(support) >= (FEWEST_TO_SEARCH if found is None else FEWEST_TO_REFINE):
+        voxels = carve(support.masks, support.cameras, support.bounds, HULL_SIDE)
+        if voxels.occupied.any():
+            more = most_symmetric_plane(voxels) if found is None else more_symmetric_plane(voxels, found)
+            errors |= judge.planes([more])
+            found = min(errors, key=errors.__getitem__, default=None)
+    if found is None:
+        return None
+    several = judge.several(found, errors[found], len(support)) if len(support) < FEWEST_TO_REFINE else None
+    return Symmetry(found) if several is None else several[0]
 
 
-def _errors(planes: Sequence[Plane], support: Views) -> dict[Plane, float]:
-    """The squared errors by which views are shown together with their reflections, of planes that lose few pixels."""
-    assert support.masks is not None
-    shown, errors = support.masks >= SHOWN, dict[Plane, float]()
-    for plane in planes:
-        both = join_views(support, reflected(support, plane))
-        held = _held(both, support)
-        if held is not None and float((shown & ~held).sum()) <= LOST * float(shown.sum()):
-            errors[plane] = _error(support, both, held | ~shown)
-    return errors
-
-
-def possible_planes(view: Views) -> list[Plane]:
-    """The planes through the middle of a scene that are orthogonal to x or z, which a single view does not contradict.
+@torch.no_grad()
+def possible_symmetries(view: Views) -> list[Symmetry]:
+    """The symmetries about vertical planes through the middle of a scene that a single view does not contradict.
 
     Args:
         view: with a mask; y is up, as models are trained.
+
+    Returns:
+        The most likely one where there are several planes through one axis: few other objects look like such a one.
+        Else those about one plane, of which a single view tells nothing more.
     """
-    assert view.masks is not None
-    shown = view.masks >= SHOWN
-    found = []
-    for plane in _planes(view.bounds, VERTICAL):
-        held = _held(join_views(view, reflected(view, plane)), view)
-        if held is not None and float((shown & ~held).sum()) <= LOST * float(shown.sum()):
-            found.append(plane)
-    return found
+    judge = _Judge.of(view)
+    errors = judge.planes(_planes(view.bounds, VERTICAL), most=math.inf)
+    several = [judge.several(plane, errors[plane], 1, SINGLE_VIEW_ORDER) for plane in errors]
+    likely = [each for each in several if each is not None]
+    if likely:
+        return [min(likely, key=lambda each: each[1])[0]]
+    return [Symmetry(plane) for plane in errors]
 
 
 @dataclass(frozen=True)
-class Reflecting:
-    """Another method that is shown the views of an object that looks symmetric together with their reflections.
+class ReflectedHullBlend:
+    """`HullBlend` of the views of an object that looks symmetric and of their reflections.
 
     Attributes:
-        adapter: the method.
+        blend: the method.
     """
 
-    adapter: Adapter
+    blend: HullBlend = HullBlend()
 
-    def adapt(self, support: Views) -> Renderable:
-        """What the method makes of views and reflections."""
-        return self.adapter.adapt(with_reflections(support, symmetry_plane(support)))
-
-
-def _planes(bounds: Sphere, normals: Sequence[tuple[float, float, float]]) -> list[Plane]:
-    """The planes through the middle of a scene that have these normals."""
-    return [Plane(normal, sum(a * b for a, b in zip(normal, bounds.centre, strict=True))) for normal in normals]
+    def adapt(self, support: Views) -> AdaptedField:
+        """The hull of views and reflections, and its colours."""
+        return self.blend.adapt(with_reflections(support, symmetry_of(support)))
 
 
-def _held(views: Views, support: Views) -> Bool[Tensor, "view 1 height width"] | None:
-    """The pixels of support views that the hull of other views may show; None where there is no hull."""
-    assert views.masks is not None
-    found = carve(views.masks, views.cameras, views.bounds, SIDE)
-    return footprint(found, support.cameras)[:, None] if found.occupied.any() else None
+@dataclass(frozen=True)
+class _Judge:
+    """How well views are shown by `HullBlend` of them and their reflections.
+
+    Attributes:
+        views: small ones.
+        alone: their squared error without reflections, and FLOOR.
+        floor: of all errors.
+    """
+
+    views: Views
+    alone: float
+    floor: float
+
+    @classmethod
+    def of(cls, support: Views) -> _Judge:
+        """The judge of some views with masks."""
+        views = support.resized(SIZE)
+        assert views.masks is not None
+        floor = FLOOR * float((views.masks >= SHOWN).sum())
+        return cls(views, _error(views, views, torch.ones_like(views.masks, dtype=torch.bool)) + floor, floor)
+
+    def planes(self, planes: Sequence[Plane], most: float = TOLERANCE) -> dict[Plane, float]:
+        """The errors, relative to that without reflections, of planes by which they are at most so large."""
+        errors = {plane: self.error(join_views(self.views, reflected(self.views, plane))) for plane in planes}
+        return {plane: error for plane, error in errors.items() if error <= most and math.isfinite(error)}
+
+    def several(self, plane: Plane, error: float, given: int, least: int = 2) -> tuple[Symmetry, float] | None:
+        """The most likely order of symmetries of several planes, one of which is known, and its error over its worth.
+
+        Args:
+            plane: the one.
+            error: by it alone.
+            given: views of which the object is made, and so their images.
+            least: order.
+
+        Returns:
+            None where it is more likely that there are no other ones.
+        """
+        if abs(plane.normal[1]) > 1e-6:
+            return None
+        centre = self.views.bounds.centre
+        apart = sum(a * b for a, b in zip(plane.normal, centre, strict=True)) - plane.offset
+        x, y, z = (a - apart * b for a, b in zip(centre, plane.normal, strict=True))
+        found, best, possible = None, error, set[int]()
+        for order, parts in ORDERS.items():
+            symmetry = Symmetry(plane, order, (x, y, z))
+            if given * symmetry.images > MOST_IMAGES or not possible.issuperset(parts):
+                continue
+            error = self.error(images_by(self.views, symmetry))
+            if error > TOLERANCE:
+                continue
+            possible.add(order)
+            if order >= least and error / order**WORTH < best:
+                found, best = symmetry, error / order**WORTH
+        return None if found is None else (found, best)
+
+    def error(self, shown: Views) -> float:
+        """That of the hull of more views; infinite where it loses too many pixels."""
+        assert self.views.masks is not None
+        held, seen = held_pixels(shown, self.views), self.views.masks >= SHOWN
+        if held is None or float((seen & ~held).sum()) > LOST * float(seen.sum()):
+            return math.inf
+        return (_error(self.views, shown, held | ~seen) + self.floor) / self.alone
 
 
-def _error(support: Views, shown: Views, among: Bool[Tensor, "view 1 height width"]) -> float:
+def _error(support: Views, shown: Views, among: torch.Tensor) -> float:
     """The squared error of some pixels of support views by the hull of the views that are shown, and their colours."""
     found = HullBlend().adapt(shown).render(support.cameras)
     return float((found.images - support.images).square().mean(1, keepdim=True)[among].sum())
 
 
-def _asymmetric_parts(support: Views, both: Views) -> Occupancy:
-    """The voxels of the hull of views that lie where these show what their hull with reflections does not hold."""
-    assert support.masks is not None
-    found, held = hull(support, SIDE), _held(both, support)
-    missed = support.masks >= SHOWN
-    if held is not None:
-        missed &= ~held
-    points, occupied = found.centres().to(support.images), found.occupied.clone()
-    where = ImagePlanes(missed.to(support.images), support.cameras, background=0.0).lookup(points).colours
-    occupied[found.occupied] = where.amax(1)[:, 0] > 0.5
-    # up to where they meet the others: there they stand before or behind something that is held
-    grown = replace(found, occupied=occupied).dilated(REACH)
-    return replace(grown, occupied=grown.occupied & found.occupied)
+def _planes(bounds: Sphere, normals: Sequence[tuple[float, float, float]]) -> list[Plane]:
+    """The planes through the middle of a scene that have these normals."""
+    return [Plane(normal, sum(a * b for a, b in zip(normal, bounds.centre, strict=True))) for normal in normals]

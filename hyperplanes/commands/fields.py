@@ -141,7 +141,9 @@ def adapt_to(
         except OSError as error:  # the field is there, and what is asked of it can be done
             console.warn(f"{folder}: not kept for another time: {error}")
     how = f", {taken[-1]} fine-tuning steps" if any(taken) else ""
-    how += ", together with their reflections" if field.symmetry is not None else ""
+    if field.symmetry is not None:
+        planes = field.symmetry.order
+        how += ", together with their reflections" + (f" about {planes} planes" if planes > 1 else "")
     how += ", averaged with the visual hull" if isinstance(field, StackedField) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from hyperplanes.configuration.initialisation import InitialisationConfig
 from hyperplanes.configuration.upgrade import upgrade_model
 from hyperplanes.fields import TargetConfig, find_targets
-from hyperplanes.geometry.reflections import Plane
+from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.hypernetwork import KINDS, AutoencoderConfig, HyperNetworkConfig, ImageHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.utilities.arguments import checked_fields
@@ -57,7 +57,7 @@ class ModelConfig:
             it after the model.
         symmetric: views of an object that looks symmetric are shown to the model together with their reflections
             (`adaptation.symmetry`). Training does without.
-        symmetry: the plane of these, where it is known: what was found for one object.
+        symmetry: that of the object, where it is known: what was found for one.
     """
 
     target: str = "point_multiplane"
@@ -74,7 +74,7 @@ class ModelConfig:
     hull_share: float = 0.0
     gated: bool = False
     symmetric: bool = False
-    symmetry: Plane | None = None
+    symmetry: Symmetry | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.plane_dropout < 1:

@@ -1,4 +1,4 @@
-"""Reflections about planes: of points, and of cameras whose pictures are flipped."""
+"""Reflections about planes: of points, and of cameras whose pictures are flipped; and symmetries of objects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.utilities.arguments import checked
 
-__all__ = ["Plane", "reflected_cameras"]
+__all__ = ["Plane", "Symmetry", "reflected_cameras", "rotation_about"]
 
 UNIT = 1e-4  # by which the length of a normal may differ from 1
 
@@ -53,6 +53,58 @@ class Plane:
         result[:3, :3] -= 2 * torch.outer(normal, normal)
         result[:3, 3] = 2 * self.offset * normal
         return result
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """The planes about which an object is its own mirror image: one, or several through a vertical axis.
+
+    Several meet at equal angles. About their axis the object then is its own image after a rotation by 360° / order,
+    too (the group C_nv of Schoenflies' notation).
+
+    Attributes:
+        plane: one of the planes.
+        order: how many there are.
+        axis: a point of their axis; y is up.
+
+    Raises:
+        ValueError: no plane, or several through a plane that is not vertical or that the axis does not lie in.
+    """
+
+    plane: Plane
+    order: int = 1
+    axis: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.order < 1:
+            raise ValueError(f"order: expected at least 1, got {self.order}")
+        apart = sum(a * b for a, b in zip(self.plane.normal, self.axis, strict=True)) - self.plane.offset
+        through = abs(self.plane.normal[1]) < UNIT and abs(apart) < UNIT * (1 + math.hypot(*self.axis))
+        if self.order > 1 and not through:
+            raise ValueError(f"symmetry: expected a vertical plane through the axis, got {self.plane} and {self.axis}")
+
+    @property
+    def images(self) -> int:
+        """How many images of the object, itself among them, are the same: 2 a plane."""
+        return 2 * self.order
+
+    @property
+    def rotations(self) -> list[Float[Tensor, "4 4"]]:
+        """The rotations of the world after which the object is the same, in float64; the first one is none."""
+        return [rotation_about(self.axis, 2 * math.pi * index / self.order) for index in range(self.order)]
+
+
+def rotation_about(point: tuple[float, float, float], angle: float) -> Float[Tensor, "4 4"]:
+    """The rotation of the world about the vertical axis through a point, in float64.
+
+    Args:
+        point: of the axis.
+        angle: in radians; by a quarter turn the z axis is mapped onto the x axis.
+    """
+    x, _, z = point
+    cos, sin = math.cos(angle), math.sin(angle)
+    rows = [[cos, 0, sin, x - cos * x - sin * z], [0, 1, 0, 0], [-sin, 0, cos, z + sin * x - cos * z], [0, 0, 0, 1]]
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 @checked

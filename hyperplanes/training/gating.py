@@ -14,8 +14,7 @@ from hyperplanes.adaptation.gating import GatingNetwork, readings
 from hyperplanes.adaptation.held_out import hold_out
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.stacking import hull_field, hull_share
-from hyperplanes.training.episodes.augmentation import moved
-from hyperplanes.views import Task
+from hyperplanes.views import Task, moved
 
 __all__ = ["GatingExample", "example_of", "fit_gate", "turned"]
 

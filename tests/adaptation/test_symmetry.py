@@ -10,24 +10,25 @@ import torch
 
 from hyperplanes.adaptation import HullBlend, HyperPlanes, finding_symmetry
 from hyperplanes.adaptation.base import hull
-from hyperplanes.adaptation.finding_symmetry import Symmetry
+from hyperplanes.adaptation.finding_symmetry import FoundSymmetry
 from hyperplanes.adaptation.fine_tuned import FromScratch
 from hyperplanes.adaptation.fine_tuning import made_anyway
 from hyperplanes.adaptation.held_out import HeldOutPixels
-from hyperplanes.adaptation.symmetry import (
+from hyperplanes.adaptation.reflections import (
     HANDICAP,
+    ROTATED,
     UNKNOWN,
-    Reflecting,
-    possible_planes,
+    handicaps,
+    images_by,
     reflected,
-    symmetry_plane,
     with_reflections,
 )
+from hyperplanes.adaptation.symmetry import ReflectedHullBlend, possible_symmetries, symmetry_of
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.geometry import Sphere, cast
-from hyperplanes.geometry.cameras import camera_from_world
+from hyperplanes.geometry.cameras import camera_from_world, image_size
 from hyperplanes.geometry.rays import pixel_grid
-from hyperplanes.geometry.reflections import Plane, reflected_cameras
+from hyperplanes.geometry.reflections import Plane, Symmetry, reflected_cameras
 from hyperplanes.training.episodes.augmentation import Rotation
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views, join_views
@@ -35,15 +36,18 @@ from tests.adaptation.test_stacking import CONFIG
 from tests.reference_rendering import ball_views, camera_at, ring, small_model
 
 RED, GREEN, BLUE = (0.9, 0.1, 0.1), (0.1, 0.9, 0.1), (0.1, 0.1, 0.9)
-ACROSS = Plane((1.0, 0.0, 0.0))
+ACROSS = Symmetry(Plane((1.0, 0.0, 0.0)))
+ALONG = Symmetry(Plane((0.0, 0.0, 1.0)))
 BODY = [((-0.3, 0.0, 0.0), 0.35, RED), ((0.3, 0.0, 0.0), 0.35, RED), ((0.0, 0.35, 0.3), 0.25, BLUE)]
 ANTENNA = ((0.3, 0.6, -0.3), 0.08, GREEN)
 SIZE = (64, 64)
+SMOOTH = (256, 256)  # whose edges are means over pixels once the pictures are looked at
+REVOLVED = [((0.0, -0.4, 0.0), 0.4, RED), ((0.0, 0.2, 0.0), 0.3, BLUE), ((0.0, 0.6, 0.0), 0.2, GREEN)]
 
 
 def balls(cameras, placed, bounds=None):
     """Pictures of opaque balls (centre, radius, colour) of flat colours, the nearest one first."""
-    height, width = SIZE
+    height, width = image_size(cameras)
     view = torch.arange(cameras.batch_size).repeat_interleave(height * width)
     rays = cast(cameras, view, pixel_grid(height, width).repeat(cameras.batch_size, 1), Sphere(radius=2.0))
     colours, nearest = torch.ones(len(view), 3), torch.full((len(view),), torch.inf)
@@ -59,9 +63,9 @@ def balls(cameras, placed, bounds=None):
     return Views(images, cameras, nearest.isfinite().float().reshape(shape)[:, None], bounds or Sphere())
 
 
-def cameras(count=4):
+def cameras(count=4, size=SIZE):
     """Cameras of no symmetric arrangement."""
-    return ring(count, SIZE, shift=2)
+    return ring(count, size, shift=2)
 
 
 def model(**changes):
@@ -69,8 +73,8 @@ def model(**changes):
 
 
 def test_the_reflection_of_a_view_is_the_view_of_the_reflected_camera():
-    found = reflected(balls(cameras(), BODY), ACROSS)
-    truth = balls(reflected_cameras(cameras(), ACROSS), BODY)
+    found = reflected(balls(cameras(), BODY), ACROSS.plane)
+    truth = balls(reflected_cameras(cameras(), ACROSS.plane), BODY)
     torch.testing.assert_close(camera_from_world(found.cameras), camera_from_world(truth.cameras))
     same = (found.images - truth.images).abs().amax(1) < 1e-5
     assert same.float().mean() > 0.999  # rays that graze a ball fall either way
@@ -79,16 +83,16 @@ def test_the_reflection_of_a_view_is_the_view_of_the_reflected_camera():
 
 @pytest.mark.parametrize("count", [2, 3, 5, 12])
 def test_the_plane_of_a_symmetric_object_is_found(count):
-    found = symmetry_plane(balls(cameras(count), BODY))
+    found = symmetry_of(balls(cameras(count), BODY))
     assert found is not None
-    assert math.dist((*found.normal, found.offset), (1.0, 0.0, 0.0, 0.0)) < (0.01 if count >= 10 else 1e-9)
+    assert math.dist((*found.plane.normal, found.plane.offset), (1.0, 0.0, 0.0, 0.0)) < (0.01 if count >= 10 else 1e-9)
 
 
 def test_from_ten_views_on_a_plane_beside_the_middle_of_the_scene_is_found():
-    found = symmetry_plane(balls(cameras(12), BODY, Sphere((0.012, 0.0, 0.0))))
+    found = symmetry_of(balls(cameras(12), BODY, Sphere((0.012, 0.0, 0.0))))
     assert found is not None
-    assert abs(found.normal[0]) > math.cos(math.radians(0.5))
-    assert abs(found.offset) < 0.006
+    assert abs(found.plane.normal[0]) > math.cos(math.radians(0.5))
+    assert abs(found.plane.offset) < 0.006
 
 
 def test_from_ten_views_on_a_plane_that_leans_is_found():
@@ -97,54 +101,131 @@ def test_from_ten_views_on_a_plane_that_leans_is_found():
         ((x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle), z), radius, colour)
         for (x, y, z), radius, colour in BODY
     ]
-    found = symmetry_plane(balls(cameras(14), turned))
+    found = symmetry_of(balls(cameras(14), turned))
     assert found is not None
-    assert math.dist(found.normal, (math.cos(angle), math.sin(angle), 0.0)) < math.radians(0.2)
+    assert math.dist(found.plane.normal, (math.cos(angle), math.sin(angle), 0.0)) < math.radians(0.2)
 
 
 def test_the_plane_goes_through_the_middle_of_the_scene():
     placed = [((x + 0.4, y, z), radius, colour) for (x, y, z), radius, colour in BODY]
-    found = symmetry_plane(balls(cameras(), placed, Sphere((0.4, 0.0, 0.0))))
-    assert found == Plane((1.0, 0.0, 0.0), 0.4)
-    assert symmetry_plane(balls(cameras(), placed, Sphere((0.3, 0.0, 0.0)))) is None
+    found = symmetry_of(balls(cameras(), placed, Sphere((0.4, 0.0, 0.0))))
+    assert found is not None
+    assert found.plane == Plane((1.0, 0.0, 0.0), 0.4)
+    assert symmetry_of(balls(cameras(), placed, Sphere((0.3, 0.0, 0.0)))) is None
 
 
 @pytest.mark.parametrize(("count", "found"), [(4, False), (5, True), (12, True)])
 def test_an_object_that_faces_another_way_is_found_symmetric_where_its_hull_is_near_enough(count, found):
     angle = 0.5
     views = Rotation(angle).views(balls(cameras(count), BODY))
-    plane = symmetry_plane(views)
+    plane = symmetry_of(views)
     assert (plane is not None) == found
     if plane is not None:
-        along = plane.normal[0] * math.cos(angle) - plane.normal[2] * math.sin(angle)
+        along = plane.plane.normal[0] * math.cos(angle) - plane.plane.normal[2] * math.sin(angle)
         assert abs(along) > math.cos(math.radians(1.0))
-        assert abs(plane.offset) < 0.02
+        assert abs(plane.plane.offset) < 0.02
+
+
+def around(order, colours, radius=0.25):
+    """Balls around the vertical axis, the first of them on the z axis, and one below them in the middle."""
+    angles = [2 * math.pi * index / order for index in range(order)]
+    placed = [(0.5 * math.sin(angle), 0.0, 0.5 * math.cos(angle)) for angle in angles]
+    return [
+        *((place, radius, colours[index % len(colours)]) for index, place in enumerate(placed)),
+        ((0.0, -0.4, 0.0), 0.3, GREEN),
+    ]
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.parametrize(
+    ("placed", "order"),
+    [
+        (around(2, [RED]), 2),
+        (around(3, [RED]), 3),
+        (around(4, [RED]), 4),
+        (around(4, [RED, BLUE]), 2),
+        (around(6, [RED, BLUE]), 3),
+    ],
+)
+def test_of_few_views_all_planes_through_one_axis_are_found(count, placed, order):
+    found = symmetry_of(balls(cameras(count, SMOOTH), placed))
+    assert found is not None
+    assert (found.order, found.axis) == (order, (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("count", "order"), [(2, 8), (4, 8), (5, 6), (8, 4), (9, 3), (12, 1)])
+def test_a_solid_of_revolution_has_as_many_planes_as_there_is_room_for_images(count, order):
+    found = symmetry_of(balls(cameras(count, SMOOTH), REVOLVED))
+    assert found is not None
+    assert found.order == order
+
+
+def test_of_an_object_that_faces_another_way_all_planes_are_found_and_meet_in_the_middle():
+    found = symmetry_of(Rotation(0.5).views(balls(cameras(6, SMOOTH), around(4, [RED]))))
+    assert found is not None
+    assert found.order == 4
+    quarter = math.pi / 4  # between two planes
+    turned = (math.atan2(found.plane.normal[2], found.plane.normal[0]) + 0.5) % quarter
+    assert min(turned, quarter - turned) < math.radians(0.5)
+    assert math.hypot(found.axis[0], found.axis[2]) < 0.002
+
+
+def test_a_single_view_does_not_tell_the_front_from_the_back():
+    """So two planes are not taken, of which a car from ahead shows as much as a lamp."""
+    for view in range(4):
+        shown = cameras(4, SMOOTH)
+        assert {each.order for each in possible_symmetries(balls(shown, around(2, [RED]))[[view]])} == {1}
+        assert [each.order for each in possible_symmetries(balls(shown, REVOLVED)[[view]])] == [8]
+
+
+def test_images_by_a_symmetry_are_views_of_the_same_object():
+    symmetry = Symmetry(ACROSS.plane, 3)
+    found = images_by(balls(cameras(2), around(3, [RED])), symmetry)
+    assert len(found) == 2 * symmetry.images
+    truth = balls(found.cameras, around(3, [RED]))
+    assert ((found.images - truth.images).abs().amax(1) < 1e-5).float().mean() > 0.999
+    assert handicaps(2, symmetry).tolist() == pytest.approx([0.0] * 2 + [HANDICAP] * 2 + [ROTATED] * 8)
+
+
+def test_the_context_of_a_model_knows_which_views_were_given():
+    views, symmetry = balls(cameras(2), around(3, [RED])), Symmetry(ACROSS.plane, 3)
+    context = model().prepare(views, symmetry=symmetry)
+    assert len(context.planes) == 12
+    assert torch.equal(context.given.images, views.images)
+
+
+def test_a_part_on_one_side_stays_in_the_hull_of_several_planes_and_leaves_nothing_elsewhere():
+    views = balls(cameras(8), [*around(4, [RED]), ANTENNA])
+    both = hull(with_reflections(views, Symmetry(ACROSS.plane, 4)), 64)
+    assert both.contains(torch.tensor([ANTENNA[0]]))
+    elsewhere = torch.tensor([[-0.3, 0.6, -0.3], [-0.3, 0.6, 0.3], [0.3, 0.6, 0.3]])
+    assert not both.contains(elsewhere).any()
 
 
 def test_an_object_of_two_colours_or_of_one_sided_shape_has_none():
-    assert symmetry_plane(balls(cameras(), BODY)) is not None
-    assert symmetry_plane(balls(cameras(), [BODY[0], (*BODY[1][:2], GREEN), BODY[2]])) is None
-    assert symmetry_plane(balls(cameras(), [BODY[0], BODY[2]])) is None
+    assert symmetry_of(balls(cameras(), BODY)) is not None
+    assert symmetry_of(balls(cameras(), [BODY[0], (*BODY[1][:2], GREEN), BODY[2]])) is None
+    assert symmetry_of(balls(cameras(), [BODY[0], BODY[2]])) is None
 
 
 def test_neither_a_single_view_nor_views_without_masks_or_object_tell_a_plane():
     views = balls(cameras(), BODY)
     for given in (views[:1], replace(views, masks=None), replace(views, masks=torch.zeros_like(views.masks))):
-        assert symmetry_plane(given) is None
+        assert symmetry_of(given) is None
 
 
 def test_where_no_plane_is_found_the_views_are_as_they_were():
     views = balls(cameras(), BODY)
     assert with_reflections(views, None) is views
-    plain = join_views(replace(views, masks=None), reflected(replace(views, masks=None), ACROSS))
+    plain = join_views(replace(views, masks=None), reflected(replace(views, masks=None), ACROSS.plane))
     assert torch.equal(with_reflections(replace(views, masks=None), ACROSS).images, plain.images)
 
 
 def test_a_part_that_is_not_symmetric_stays_in_the_hull_and_leaves_nothing_on_the_other_side():
     views = balls(cameras(8), [*BODY, ANTENNA])
-    assert symmetry_plane(views) == ACROSS
+    assert symmetry_of(views) == ACROSS
     own, mirrored = torch.tensor([ANTENNA[0]]), torch.tensor([[-0.3, 0.6, -0.3]])
-    carelessly = hull(join_views(views, reflected(views, ACROSS)), 64)
+    carelessly = hull(join_views(views, reflected(views, ACROSS.plane)), 64)
     carefully = hull(with_reflections(views, ACROSS), 64)
     assert not carelessly.contains(own)
     assert carefully.contains(own)
@@ -161,7 +242,7 @@ def test_of_a_symmetric_object_every_pixel_of_a_reflection_is_known():
 def test_the_hull_of_views_and_reflections_shows_sides_that_no_view_sees():
     from_left = [index for index, direction in enumerate(cameras(16).extrinsics) if float(direction[2, 0]) > 0.3][:3]
     views, others = balls(cameras(16), BODY)[from_left], balls(cameras(16), BODY)
-    alone, both = (each.adapt(views).render(others.cameras).images for each in (HullBlend(), Reflecting(HullBlend())))
+    alone, both = (each.adapt(views).render(others.cameras).images for each in (HullBlend(), ReflectedHullBlend()))
     assert psnr(both, others.images).mean() > psnr(alone, others.images).mean() + 1
 
 
@@ -245,9 +326,9 @@ def test_the_field_of_an_object_keeps_the_plane_that_was_found():
 def test_a_single_view_contradicts_a_plane_by_its_silhouette_or_none():
     views = balls(cameras(), BODY)
     for view in range(4):
-        assert ACROSS in possible_planes(views[[view]])
+        assert ACROSS in possible_symmetries(views[[view]])
     from_above = balls(camera_at((0.0, 3.0, 0.01), SIZE), [((0.5, 0.0, 0.0), 0.3, RED)])
-    assert possible_planes(from_above) == [Plane((0.0, 0.0, 1.0))]
+    assert possible_symmetries(from_above) == [ALONG]
 
 
 def test_a_field_that_knows_its_views_by_their_places_takes_no_reflections():
@@ -260,7 +341,7 @@ def test_from_ten_views_on_some_that_are_held_out_have_to_be_shown_better(monkey
 
     def judge(network, views, plane):
         judged.append(len(views))
-        return Symmetry(None)
+        return FoundSymmetry(None)
 
     monkeypatch.setattr(finding_symmetry, "_judged", judge)
     assert adapter.find_symmetry(balls(cameras(9), BODY)) is not None
@@ -268,14 +349,15 @@ def test_from_ten_views_on_some_that_are_held_out_have_to_be_shown_better(monkey
     assert judged == [10]
 
 
-@pytest.mark.parametrize("better", [False, True])
-def test_the_smaller_error_of_held_out_views_decides_and_its_trial_is_kept(monkeypatch, better):
-    errors = iter([torch.tensor([[0.5, 0.0, 0.0]]), torch.tensor([[0.4 if better else 0.6, 0.0, 0.0]])])
+@pytest.mark.parametrize(("lost", "better"), [((0.3, 0.3), False), ((0.2, -0.3), True), ((-0.1, -0.1), True)])
+def test_held_out_views_that_are_surely_shown_worse_decide_and_the_trial_is_kept(monkeypatch, lost, better):
+    without = torch.full((20, 3), 0.5)
+    errors = iter([without, without + torch.tensor(lost).repeat(10)[:, None]])
     monkeypatch.setattr(HeldOutPixels, "errors", lambda *_: next(errors))
     found = finding_symmetry.find_symmetry(model(), balls(cameras(10), BODY))
-    assert (found.plane is not None) == better
+    assert (found.symmetry is not None) == better
     assert found.trial is not None
-    assert found.trial.context.symmetry == found.plane
+    assert found.trial.context.symmetry == found.symmetry
 
 
 @pytest.mark.parametrize("plane", [None, ACROSS])
@@ -287,7 +369,7 @@ def test_random_weights_are_shown_the_reflections_that_the_model_decides_on(monk
     assert made.symmetry == plane
 
 
-@pytest.mark.parametrize("best", [None, ACROSS, Plane((0.0, 0.0, 1.0))])
+@pytest.mark.parametrize("best", [None, ACROSS, ALONG])
 def test_a_single_view_is_reflected_about_the_vertical_plane_by_which_it_is_shown_best(monkeypatch, best):
     view, adapter = balls(cameras(), BODY)[:1], model()
     tried = []
@@ -305,7 +387,7 @@ def test_a_single_view_is_reflected_about_the_vertical_plane_by_which_it_is_show
     draw = Views.sample_rays
     monkeypatch.setattr(Views, "sample_rays", lambda self, *given, **more: (draw(self, *given, **more)[0], 0.0))
     monkeypatch.setattr(adapter, "field", lambda context, weights: Field(context.symmetry))
-    monkeypatch.setattr(finding_symmetry, "possible_planes", lambda view: [ACROSS, Plane((0.0, 0.0, 1.0))])
+    monkeypatch.setattr(finding_symmetry, "possible_symmetries", lambda view: [ACROSS, ALONG])
     assert adapter.find_symmetry(view) == best
-    assert tried == [None, ACROSS, Plane((0.0, 0.0, 1.0))]
+    assert tried == [None, ACROSS, ALONG]
     assert adapter.find_symmetry(replace(view, masks=None)) is None

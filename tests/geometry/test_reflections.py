@@ -7,7 +7,7 @@ import torch
 
 from hyperplanes.geometry.cameras import camera_from_world, centres, intrinsics
 from hyperplanes.geometry.distortion import DistortedCamera, distorted
-from hyperplanes.geometry.reflections import Plane, reflected_cameras
+from hyperplanes.geometry.reflections import Plane, Symmetry, reflected_cameras
 from tests.reference_rendering import ring
 
 SIZE = (20, 24)
@@ -57,3 +57,36 @@ def test_points_of_the_plane_stay_and_others_change_sides():
 def test_a_plane_has_a_normal_of_length_1_and_a_finite_offset(plane):
     with pytest.raises(ValueError, match="plane: expected a normal of length 1"):
         Plane(*plane)
+
+
+def test_the_rotations_of_a_symmetry_and_its_reflection_make_a_group():
+    """Each product of two is one of them: rotations, and the reflections about its planes."""
+    symmetry = Symmetry(TILTED, 3, (0.5, 7.0, 0.0))
+    rotations = symmetry.rotations
+    torch.testing.assert_close(rotations[0], torch.eye(4).double())
+    assert len(rotations) == 3
+    group = torch.stack([*rotations, *(rotation @ TILTED.reflection for rotation in rotations)])
+    assert symmetry.images == len(group)
+    products = (group[:, None] @ group).flatten(0, 1)
+    apart = (products[:, None] - group).abs().amax((2, 3))
+    assert apart.amin(1).max() < 1e-12
+    on_axis = torch.tensor([0.5, -3.0, 0.0, 1.0]).double()
+    torch.testing.assert_close(group @ on_axis, on_axis.expand(6, 4))
+
+
+def test_by_a_quarter_turn_the_z_axis_is_mapped_onto_the_x_axis():
+    turned = Symmetry(Plane((1.0, 0.0, 0.0)), 4).rotations[1] @ torch.tensor([0.0, 0.0, 1.0, 1.0]).double()
+    torch.testing.assert_close(turned, torch.tensor([1.0, 0.0, 0.0, 1.0]).double())
+
+
+@pytest.mark.parametrize(
+    ("plane", "order", "message"),
+    [
+        (Plane((1.0, 0.0, 0.0)), 0, "order: expected at least 1"),
+        (Plane((0.0, 1.0, 0.0)), 2, "symmetry: expected a vertical plane through the axis"),
+        (Plane((1.0, 0.0, 0.0), 0.1), 2, "symmetry: expected a vertical plane through the axis"),
+    ],
+)
+def test_several_planes_are_vertical_and_meet_in_the_axis(plane, order, message):
+    with pytest.raises(ValueError, match=message):
+        Symmetry(plane, order)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -11,12 +11,11 @@ from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.reflections import rotation_about
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.views import Views
+from hyperplanes.views import Views, moved
 
-__all__ = ["Rotation", "draw_rotation", "drop_planes", "moved", "over_random_colour"]
+__all__ = ["Rotation", "draw_rotation", "drop_planes", "over_random_colour"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Rotation:
 
     def views(self, views: Views) -> Views:
         """The views of the rotated object: the same pictures, whose cameras are rotated with it."""
-        return moved(views, _rotation(self.angle, views.bounds)) if self.angle else views
+        return moved(views, rotation_about(views.bounds.centre, self.angle)) if self.angle else views
 
     def volume(self, volume: Float[Tensor, "4 x y z"]) -> Float[Tensor, "4 x y z"]:
         """The first channels of a volume (`geometry.volume.volume_of`) of the rotated object.
@@ -41,17 +40,6 @@ class Rotation:
                 the result is smoother than the volume of the rotated views.
         """
         return _resampled(volume, self.angle) if self.angle else volume
-
-
-def moved(views: Views, motion: Float[Tensor, "4 4"]) -> Views:
-    """The views of an object after a rigid motion: the same pictures, whose cameras move with it.
-
-    Args:
-        views: of the object.
-        motion: in world coordinates, in float64.
-    """
-    pose = camera.camera_from_world(views.cameras)
-    return replace(views, cameras=camera.with_poses(views.cameras, pose @ torch.linalg.inv(motion).to(pose)))
 
 
 def draw_rotation(share: float, generator: torch.Generator) -> Rotation:
@@ -92,14 +80,6 @@ def over_random_colour(
     """
     colour = torch.rand(3, generator=generator).to(truth)
     return rendered.over(colour), truth + (1 - opacity) * (colour - 1)
-
-
-def _rotation(angle: float, bounds: Sphere) -> Float[Tensor, "4 4"]:
-    """The rigid motion about the vertical axis through the centre of a sphere, in float64."""
-    x, y, z = bounds.centre
-    cos, sin = math.cos(angle), math.sin(angle)
-    rows = [[cos, 0, sin, x - cos * x - sin * z], [0, 1, 0, 0], [-sin, 0, cos, z + sin * x - cos * z], [0, 0, 0, 1]]
-    return torch.tensor(rows, dtype=torch.float64)
 
 
 def _resampled(volume: Float[Tensor, "4 x y z"], angle: float) -> Float[Tensor, "4 x y z"]:

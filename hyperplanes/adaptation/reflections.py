@@ -1,0 +1,115 @@
+"""Reflections of views: a symmetric object is seen from more sides than it was photographed from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hyperplanes.adaptation.base import hull
+from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.occupancy import Occupancy, carve
+from hyperplanes.geometry.reflections import Plane, Symmetry, reflected_cameras
+from hyperplanes.rendering.footprint import footprint
+from hyperplanes.views import Views, join_views, moved
+
+__all__ = ["HULL_SIDE", "SHOWN", "UNKNOWN", "handicaps", "held_pixels", "images_by", "reflected", "with_reflections"]
+
+HULL_SIDE = 96  # voxels an axis of the hull in which parts that are not symmetric are looked for
+SHOWN = 0.9  # opacity of a mask from which on a pixel shows the object
+REACH = 4  # voxels, by which these parts go on where other ones hide their beginning
+UNKNOWN = 0.97  # opacity where a reflection is known to be wrong: nothing is carved, and its colour does not count
+HANDICAP = 0.05  # penalty of reflections as planes: light falls from one side, and writing is reversed
+ROTATED = 0.2  # likewise of those about other planes, which few objects are the same about in each detail
+
+
+def reflected(views: Views, plane: Plane) -> Views:
+    """The views of the mirror image of an object: the same pictures, flipped, by cameras that are reflected.
+
+    Args:
+        views: of the object.
+        plane: of the reflection.
+    """
+    masks = None if views.masks is None else views.masks.flip(3)
+    cameras = reflected_cameras(views.cameras, plane)
+    return Views(views.images.flip(3), cameras, masks, views.bounds, views.names, views.up)
+
+
+def images_by(views: Views, symmetry: Symmetry) -> Views:
+    """The views, after them their reflections about the plane, and then the rotations of both.
+
+    Args:
+        views: of the object.
+        symmetry: of the object.
+    """
+    both = join_views(views, reflected(views, symmetry.plane))
+    result = both
+    for rotation in symmetry.rotations[1:]:
+        result = join_views(result, moved(both, rotation))
+    return result
+
+
+def handicaps(given: int, symmetry: Symmetry) -> Float[Tensor, " view"]:
+    """The penalties of the views of `images_by` as planes.
+
+    Args:
+        given: how many of them were given.
+        symmetry: of the object.
+    """
+    result = torch.full((given * symmetry.images,), ROTATED)
+    result[: 2 * given] = HANDICAP
+    result[:given] = 0.0
+    return result
+
+
+@torch.no_grad()
+def with_reflections(support: Views, symmetry: Symmetry | None) -> Views:
+    """The views, and after them their reflections (`images_by`).
+
+    Few things are symmetric in all of their parts. What views show, and the visual hull of views and reflections does
+    not hold, is such a part. Where it would be in a reflection, the opacity is UNKNOWN.
+
+    Args:
+        support: of an object that is symmetric, but for some parts.
+        symmetry: None leaves the views as they are.
+    """
+    if symmetry is None:
+        return support
+    found = images_by(support, symmetry)
+    if support.masks is None or found.masks is None:
+        return found
+    parts = _asymmetric_parts(support, found)
+    if parts.occupied.any():
+        wrong = footprint(parts, found.cameras)[:, None]
+        wrong[: len(support)] = False
+        found = replace(found, masks=torch.where(wrong, UNKNOWN, found.masks))
+    return found
+
+
+def held_pixels(views: Views, support: Views) -> Bool[Tensor, "view 1 height width"] | None:
+    """The pixels of support views that the hull of other views may show; None where there is no hull.
+
+    Args:
+        views: with masks, whose hull is carved.
+        support: the views, with masks or without.
+    """
+    assert views.masks is not None
+    found = carve(views.masks, views.cameras, views.bounds, HULL_SIDE)
+    return footprint(found, support.cameras)[:, None] if found.occupied.any() else None
+
+
+def _asymmetric_parts(support: Views, both: Views) -> Occupancy:
+    """The voxels of the hull of views that lie where these show what their hull with reflections does not hold."""
+    assert support.masks is not None
+    found, held = hull(support, HULL_SIDE), held_pixels(both, support)
+    missed = support.masks >= SHOWN
+    if held is not None:
+        missed &= ~held
+    points, occupied = found.centres().to(support.images), found.occupied.clone()
+    where = ImagePlanes(missed.to(support.images), support.cameras, background=0.0).lookup(points).colours
+    occupied[found.occupied] = where.amax(1)[:, 0] > 0.5
+    # up to where they meet the others: there they stand before or behind something that is held
+    grown = replace(found, occupied=occupied).dilated(REACH)
+    return replace(grown, occupied=grown.occupied & found.occupied)
