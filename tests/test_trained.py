@@ -181,7 +181,7 @@ def test_a_lamp_with_the_update_of_a_car_is_worse_with_25_planes_too():
 
 @torch.no_grad()
 def test_colours_by_the_surface_of_the_density_are_better_than_by_that_of_the_hull():
-    """By 0.55 dB on a lamp, whose shade the hull fills; docs/small.md has means over many objects."""
+    """By 0.55 dB on a lamp, whose shade the hull fills; docs/image-based.md has means over many objects."""
     model, query = coarse("small"), lamp().query[::12][:2]
     context = model.prepare(few(lamp(), 25))
     weights = model.theta + model.update(context)
@@ -306,7 +306,7 @@ def test_views_that_are_held_out_find_out_what_is_wrong_for_an_object():
 
 @pytest.mark.parametrize(("kind", "count"), [("lamp", 10), ("random", 25)])
 def test_a_mean_with_the_hull_is_better_than_either_and_one_by_pixel_better_still(kind, count):
-    """By 0.31 and 0.24 dB, and by 0.12 and 0.06 more; docs/small.md has means over many objects."""
+    """By 0.31 and 0.24 dB, and by 0.12 and 0.06 more; docs/image-based.md has means over many objects."""
     model, task = coarse("small"), {"lamp": lamp, "random": shape}[kind]()
     alone, by_object, by_pixel = by_parts(task, count, model)
     assert by_object > max(alone, mean_psnr(HullBlend(), task, count)) + 0.1

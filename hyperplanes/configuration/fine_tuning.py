@@ -23,7 +23,7 @@ docs/adaptation.md."""
 
 
 FRESH = 0.5
-"""Share of random weights that fine-tuning a field with a grid of features begins with; docs/small.md."""
+"""Share of random weights that fine-tuning a field with a grid of features begins with; docs/small-training.md."""
 
 FRESH_VIEWS = 10
 """Support views from which on it does; with fewer, what was learned is worth more than what the steps learn."""

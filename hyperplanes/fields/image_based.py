@@ -39,7 +39,7 @@ EMPTY = -4.0  # what the density head begins with outside the masks, before soft
 SOLID = 4.0  # and within them
 
 GRID_RATES = {"learning_rate": 2e-2, "muon_learning_rate": 0.05}
-"""Of fine-tuning the weights of a field with a grid of features, trained or random; docs/small.md."""
+"""Of fine-tuning the weights of a field with a grid of features, trained or random; docs/small-training.md."""
 
 
 READ = 9  # numbers that the trunk reads of a view: colour, depth, coverage, validity, direction

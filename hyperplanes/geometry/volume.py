@@ -29,7 +29,7 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
     Returns:
         Five channels: the share of the cell that the hull occupies; the mean of the colours, in [-1, 1], that the views
         which see the cell best show at its centre; and the logarithm of the number of views that show it. The variance
-        of these colours and the penalty of the best view brought nothing (docs/small.md).
+        of these colours and the penalty of the best view brought nothing (docs/image-based.md).
     """
     occupancy = planes.occupancy
     # which share of each cell is within the hull (x, y, z), and the centres of cells that have some

@@ -20,7 +20,7 @@ class VolumeHyperNetwork(HyperNetwork):
 
     The grid of features among the weights of the target gets an update for every cell, from the convolutions of
     `VolumeNetwork`; it starts at zero. Neither the number of the views nor their order matters. Updates of the other
-    layers brought nothing beside that of the grid (docs/small.md), so there are none, and theta is not read.
+    layers brought nothing beside that of the grid (docs/image-based.md), so there are none, and theta is not read.
 
     Args:
         shapes: of the parameters by name; those of four dimensions are grids of features, with as many cells as V.

@@ -79,7 +79,7 @@ def render_images(
     Rays are cast in the precision of the cameras and rendered in single precision. A pixel of a photograph is the mean
     of what its area shows, and one ray shows its centre alone. With `antialias` pixels that differ much from one beside
     them are the mean of three rays. Views by `small` from 25 others gain 0.2 dB by a quarter more samples, nearly as
-    much as by four rays in every pixel (docs/small.md).
+    much as by four rays in every pixel (docs/image-based.md).
 
     Args:
         cameras: any number, one image size.

@@ -172,8 +172,8 @@ def test_of_an_object_that_faces_another_way_all_planes_are_found_and_meet_in_th
 
 def test_a_single_view_does_not_tell_the_front_from_the_back():
     """So two planes are not taken, of which a car from ahead shows as much as a lamp."""
-    for view in range(4):
-        shown = cameras(4, SMOOTH)
+    shown = cameras(4, SMOOTH)
+    for view in (0, 2):
         assert {each.order for each in possible_symmetries(balls(shown, around(2, [RED]))[[view]])} == {1}
         assert [each.order for each in possible_symmetries(balls(shown, REVOLVED)[[view]])] == [8]
 
