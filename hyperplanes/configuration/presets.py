@@ -204,6 +204,8 @@ PRESETS: dict[str, Preset] = {
             hypernetwork=VolumeHyperNetworkConfig(),
             sampling=RayMarching(steps=64),
             hull_resolution=96,
+            stacked=True,
+            symmetric=True,
         ),
         replace(
             MUON_TRAINING,

@@ -83,6 +83,8 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
             raise ValueError(f"checkpoint: expected what the training in {folder} began with, {began}, got {reference}")
         return
     found = HyperPlanes.from_pretrained(reference)
+    if model.gate is None:  # a gating network is trained after the model, on what that shows
+        found.gate = None
     if _shapes(model) != _shapes(found):
         config, names = found.config, model.config.differences(found.config)
         parts = {name: name.partition(".")[0] for name in names}
