@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import hull
@@ -15,7 +15,7 @@ from hyperplanes.geometry.reflections import Plane, Symmetry, reflected_cameras
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views, join_views, moved
 
-__all__ = ["HULL_SIDE", "SHOWN", "UNKNOWN", "handicaps", "held_pixels", "images_by", "reflected", "with_reflections"]
+__all__ = ["HULL_SIDE", "SHOWN", "UNKNOWN", "handicaps", "images_by", "reflected", "with_reflections"]
 
 HULL_SIDE = 96  # voxels an axis of the hull in which parts that are not symmetric are looked for
 SHOWN = 0.9  # opacity of a mask from which on a pixel shows the object
@@ -88,25 +88,12 @@ def with_reflections(support: Views, symmetry: Symmetry | None) -> Views:
     return found
 
 
-def held_pixels(views: Views, support: Views) -> Bool[Tensor, "view 1 height width"] | None:
-    """The pixels of support views that the hull of other views may show; None where there is no hull.
-
-    Args:
-        views: with masks, whose hull is carved.
-        support: the views, with masks or without.
-    """
-    assert views.masks is not None
-    found = carve(views.masks, views.cameras, views.bounds, HULL_SIDE)
-    return footprint(found, support.cameras)[:, None] if found.occupied.any() else None
-
-
 def _asymmetric_parts(support: Views, both: Views) -> Occupancy:
     """The voxels of the hull of views that lie where these show what their hull with reflections does not hold."""
     assert support.masks is not None
-    found, held = hull(support, HULL_SIDE), held_pixels(both, support)
-    missed = support.masks >= SHOWN
-    if held is not None:
-        missed &= ~held
+    assert both.masks is not None
+    found, common = hull(support, HULL_SIDE), carve(both.masks, both.cameras, both.bounds, HULL_SIDE)
+    missed = (support.masks >= SHOWN) & ~footprint(common, support.cameras)[:, None]
     points, occupied = found.centres().to(support.images), found.occupied.clone()
     where = ImagePlanes(missed.to(support.images), support.cameras, background=0.0).lookup(points).colours
     occupied[found.occupied] = where.amax(1)[:, 0] > 0.5

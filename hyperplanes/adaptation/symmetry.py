@@ -7,23 +7,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.reflections import (
     HULL_SIDE,
     SHOWN,
-    held_pixels,
     images_by,
     reflected,
     with_reflections,
 )
 from hyperplanes.geometry.cameras import camera_directions
 from hyperplanes.geometry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
-from hyperplanes.geometry.occupancy import carve
+from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views, join_views
 
 __all__ = ["ReflectedHullBlend", "possible_symmetries", "symmetry_of"]
@@ -75,7 +78,7 @@ def symmetry_of(support: Views) -> Symmetry | None:
     errors = judge.planes(_planes(support.bounds, AXES))
     found = min(errors, key=errors.__getitem__, default=None)
     if len(support) >= (FEWEST_TO_SEARCH if found is None else FEWEST_TO_REFINE):
-        voxels = carve(support.masks, support.cameras, support.bounds, HULL_SIDE)
+        voxels = _hull(support)
         if voxels.occupied.any():
             more = most_symmetric_plane(voxels) if found is None else more_symmetric_plane(voxels, found)
             errors |= judge.planes([more])
@@ -141,7 +144,8 @@ class _Judge:
         views = support.resized(SIZE)
         assert views.masks is not None
         floor = FLOOR * float((views.masks >= SHOWN).sum())
-        return cls(views, _error(views, views, torch.ones_like(views.masks, dtype=torch.bool)) + floor, floor)
+        every = torch.ones_like(views.masks, dtype=torch.bool)
+        return cls(views, _error(views, views, _hull(views), every) + floor, floor)
 
     def planes(self, planes: Sequence[Plane], most: float = TOLERANCE) -> dict[Plane, float]:
         """The errors, relative to that without reflections, of planes by which they are at most so large."""
@@ -181,15 +185,24 @@ class _Judge:
     def error(self, shown: Views) -> float:
         """That of the hull of more views; infinite where it loses too many pixels."""
         assert self.views.masks is not None
-        held, seen = held_pixels(shown, self.views), self.views.masks >= SHOWN
-        if held is None or float((seen & ~held).sum()) > LOST * float(seen.sum()):
+        seen, hull = self.views.masks >= SHOWN, _hull(shown)
+        held = footprint(hull, self.views.cameras)[:, None]
+        if not hull.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
             return math.inf
-        return (_error(self.views, shown, held | ~seen) + self.floor) / self.alone
+        return (_error(self.views, shown, hull, held | ~seen) + self.floor) / self.alone
 
 
-def _error(support: Views, shown: Views, among: torch.Tensor) -> float:
+def _hull(views: Views) -> Occupancy:
+    """The visual hull of views with masks."""
+    assert views.masks is not None
+    return carve(views.masks, views.cameras, views.bounds, HULL_SIDE)
+
+
+def _error(support: Views, shown: Views, hull: Occupancy, among: Bool[Tensor, "view 1 height width"]) -> float:
     """The squared error of some pixels of support views by the hull of the views that are shown, and their colours."""
-    found = HullBlend().adapt(shown).render(support.cameras)
+    assert shown.masks is not None
+    blend = HullBlend().adapt_to(VisibilityPlanes(shown.images, shown.cameras, shown.masks, hull))
+    found = blend.render(support.cameras)
     return float((found.images - support.images).square().mean(1, keepdim=True)[among].sum())
 
 
