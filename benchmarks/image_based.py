@@ -255,7 +255,7 @@ def _judged(model: HyperPlanes, data: Dataset, count: int, objects: int) -> floa
 def configured(name: str, steps: int, seed: int) -> Preset:
     """The preset "small" with a network of 3 x 96, a hull of 64 voxels an axis, 128 rays an object, and one change.
 
-    Objects are not rotated.
+    Objects are not rotated, and pictures are the field's alone.
 
     Args:
         name: of VARIANTS, "white" or HYPERNETWORKS; only the last have a hypernetwork.
@@ -283,6 +283,7 @@ def configured(name: str, steps: int, seed: int) -> Preset:
     if wanted is not None and wanted.images:
         reader = replace(ALL_LAYERS, join="mean", views=6, resolution=64)
     model = replace(made.model, target=name, network=network, hypernetwork=reader, hull_resolution=64)
+    model = replace(model, stacked=False, symmetric=False)  # what the field alone shows
     return replace(made, model=model, training=training)
 
 

@@ -216,19 +216,25 @@ def shape():
     return held_out(2, 64, kind="random")[1]
 
 
-def mean_psnr(adapter, task, count, antialias=None):
-    """In dB, over two views that are not among the `count` that are shown."""
+def quality(field, task, antialias=None):
+    """PSNR in dB of two views that no model is shown."""
     query = task.query[::12][:2]
     with torch.no_grad():
-        found = adapter.adapt(few(task, count)).render(query.cameras, antialias=antialias)
+        found = field.render(query.cameras, antialias=antialias)
     return float(psnr(found.images, query.images).mean())
+
+
+def mean_psnr(adapter, task, count):
+    """That of the field of `count` views."""
+    return quality(adapter.adapt(few(task, count)), task)
 
 
 @pytest.mark.parametrize("car", [0, 1])
 def test_three_rays_at_edges_bring_decibels_from_many_views(car):
     """1.0 and 0.9 dB at 64x64; `benchmarks views --methods one_ray` has the mean over many at 128x128."""
-    model, task = coarse("small"), cars()[car]
-    assert mean_psnr(model, task, 25) > mean_psnr(model, task, 25, antialias=False) + 0.5
+    task = cars()[car]
+    field = coarse("small").adapt(few(task, 25))
+    assert quality(field, task) > quality(field, task, antialias=False) + 0.5
 
 
 @pytest.mark.parametrize(("count", "least"), [(5, 2.0), (25, 1.3)])
@@ -274,28 +280,23 @@ def test_reflections_about_several_planes_bring_decibels_on_a_lamp(count):
 
 def test_reflections_about_a_wrong_plane_do_harm_and_that_one_is_not_found():
     model, task = coarse("small"), cars()[0]
-    views, query = few(task, 5), task.query[::12][:2]
+    views, along = few(task, 5), Symmetry(Plane((0.0, 0.0, 1.0)))
     across = model.find_symmetry(views)
     assert across is not None
     assert across.plane.normal == (1.0, 0.0, 0.0)
-
-    def by(symmetry):
-        with torch.no_grad():
-            found = model.adapt_to(model.prepare(views, symmetry=symmetry)).render(query.cameras)
-        return float(psnr(found.images, query.images).mean())
-
-    assert by(Symmetry(Plane((0.0, 0.0, 1.0)))) < by(None) - 1
+    wrongly, alone = (quality(model.adapt_to(model.prepare(views, symmetry=each)), task) for each in (along, None))
+    assert wrongly < alone - 1
     assert model.find_symmetry(few(task, 12)) is not None
-    right, wrong = (_judged(model, few(task, 12), each).symmetry for each in (across, Symmetry(Plane((0.0, 0.0, 1.0)))))
-    assert (right, wrong) == (across, None)  # as held-out views say
+    assert _judged(model, few(task, 12), along).symmetry is None  # as held-out views say
 
 
 def by_parts(task, count, model):
     """PSNR by the field alone, by its mean with the hull by one share, and by a share of every pixel."""
-    found, gate = [], model.gate
+    found, gate, views = [], model.gate, few(task, count)
+    context = model.prepare(views, symmetry=model.find_symmetry(views))
     for stacked, model.gate in ((False, None), (True, None), (True, gate)):
         model.config = replace(model.config, stacked=stacked)
-        found.append(mean_psnr(model, task, count))
+        found.append(quality(model.adapt_to(context), task))
     return found
 
 
