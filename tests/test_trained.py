@@ -254,9 +254,9 @@ def test_reflections_bring_decibels_on_symmetric_objects():
 
 
 def with_symmetry(symmetry):
-    """The packaged model, told that objects are symmetric so."""
+    """The packaged model, told that objects are symmetric so, without the pictures of the hull."""
     model = coarse("small")
-    model.config = replace(model.config, symmetric=False, symmetry=symmetry)
+    model.config = replace(model.config, symmetric=False, symmetry=symmetry, stacked=False)
     return model
 
 
