@@ -9,7 +9,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import pad
@@ -22,7 +22,7 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.arguments import checked
 
-__all__ = ["Occupancy", "ball_extent", "carve", "full"]
+__all__ = ["Occupancy", "ball_extent", "carve", "dilate", "full"]
 
 LARGEST_SIDE = 1024  # voxels an axis: 1 GiB
 
@@ -57,8 +57,11 @@ class Occupancy:
 
     def centres(self) -> Float[Tensor, "voxel 3"]:
         """World positions of the centres of the occupied voxels, in index order."""
-        cell = self.occupied.nonzero().float()
-        unit = (cell + 0.5) * (2 / self.occupied.shape[0]) - 1
+        return self.centres_of(self.occupied.nonzero())
+
+    def centres_of(self, cells: Int[Tensor, "voxel 3"]) -> Float[Tensor, "voxel 3"]:
+        """World positions of the centres of some voxels, by their indices."""
+        unit = (cells.float() + 0.5) * (2 / self.occupied.shape[0]) - 1
         return unit * self.bounds.radius + unit.new_tensor(self.bounds.centre)
 
     def surface(self) -> Occupancy:
@@ -77,12 +80,17 @@ class Occupancy:
 
     def dilated(self, voxels: int = 1) -> Occupancy:
         """The grid grown by some voxels in every direction."""
-        grown, last = self.occupied.clone(), self.occupied.shape[0] - 1
-        for axis in voxels * (0, 1, 2):
-            before = grown.clone()
-            grown.narrow(axis, 1, last).logical_or_(before.narrow(axis, 0, last))
-            grown.narrow(axis, 0, last).logical_or_(before.narrow(axis, 1, last))
-        return Occupancy(grown, self.bounds)
+        return Occupancy(dilate(self.occupied, voxels), self.bounds)
+
+
+def dilate(occupied: Bool[Tensor, "x y z"], voxels: int = 1) -> Bool[Tensor, "x y z"]:
+    """The occupied voxels of a box and all that are at most so many voxels away along each axis."""
+    grown = occupied.clone()
+    for axis in voxels * (0, 1, 2):
+        before, last = grown.clone(), grown.shape[axis] - 1
+        grown.narrow(axis, 1, last).logical_or_(before.narrow(axis, 0, last))
+        grown.narrow(axis, 0, last).logical_or_(before.narrow(axis, 1, last))
+    return grown
 
 
 def _middle(axis: int) -> tuple[slice, ...]:

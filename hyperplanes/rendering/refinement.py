@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.occupancy import Occupancy, dilate
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["RefinedOccupancy", "refine"]
@@ -93,7 +93,7 @@ def refine(
     kept, divided = _dilated(occupancy, filled, margin), torch.zeros_like(filled)
     # what lies between the centres: voxels beside those that are kept are asked in eight places
     while True:
-        near = Occupancy(kept, bounds).dilated().occupied if large else occupancy.occupied
+        near = _dilated(occupancy, kept, 1) if large else occupancy.occupied
         asked = near & occupancy.occupied & ~kept & ~divided
         divided |= asked
         found = _filled(occupancy, asked, density, threshold)
@@ -138,15 +138,25 @@ def _from_outside(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Te
     car lie behind, and no ray gets there.
     """
     result = torch.where(asked, torch.inf, 0.0)
-    padded = torch.nn.functional.pad(asked, (1,) * 6)  # what lies beyond the grid is outside, too
-    layer = asked & Occupancy(~padded, grid.bounds).dilated().occupied[1:-1, 1:-1, 1:-1]
+    box, corner = _box_of(asked)
+    left, depth = asked[box].clone(), result[box]  # an object fills a small part of its grid
+    padded = torch.nn.functional.pad(left, (1,) * 6)  # what lies beyond the box is outside
+    layer = left & dilate(~padded)[1:-1, 1:-1, 1:-1]
     while layer.any():
-        found = _densities(Occupancy(layer, grid.bounds).centres(), density) * grid.voxel
-        result[layer] = found.to(result)
-        passed = torch.zeros_like(asked)
+        found = _densities(grid.centres_of(layer.nonzero() + corner), density) * grid.voxel
+        depth[layer] = found.to(depth)
+        left &= ~layer
+        passed = torch.zeros_like(left)
         passed[layer] = found < OPAQUE
-        layer = Occupancy(passed, grid.bounds).dilated().occupied & result.isinf()
+        layer = dilate(passed) & left
     return result
+
+
+def _box_of(occupied: Tensor) -> tuple[tuple[slice, ...], Tensor]:
+    """The smallest box around the occupied voxels, and its first voxel."""
+    ranges = [occupied.any(dim=axes[0]).any(dim=axes[1]).nonzero()[:, 0] for axes in ((2, 1), (2, 0), (0, 0))]
+    ends = [(int(each[0]), int(each[-1]) + 1) if len(each) else (0, 0) for each in ranges]
+    return tuple(slice(*each) for each in ends), torch.tensor([each[0] for each in ends], device=occupied.device)
 
 
 def _densities(points: Tensor, density: Callable[[Tensor], Tensor]) -> Tensor:
@@ -170,7 +180,11 @@ def _filled(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor],
 
 def _dilated(grid: Occupancy, filled: Tensor, margin: int) -> Tensor:
     """Filled voxels grown by some, within the grid."""
-    return Occupancy(filled, grid.bounds).dilated(margin).occupied & grid.occupied
+    box, _ = _box_of(filled)
+    box = tuple(slice(max(0, each.start - margin), each.stop + margin) for each in box)
+    result = torch.zeros_like(filled)
+    result[box] = dilate(filled[box], margin) & grid.occupied[box]
+    return result
 
 
 def _halved(occupancy: Occupancy) -> Occupancy:
