@@ -153,6 +153,11 @@ def test_of_few_views_all_planes_through_one_axis_are_found(count, placed, order
     assert (found.order, found.axis) == (order, (0.0, 0.0, 0.0))
 
 
+def test_a_horizontal_plane_is_one_of_one():
+    placed = [((0.2, 0.35, 0.1), 0.3, RED), ((0.2, -0.35, 0.1), 0.3, RED), ((-0.3, 0.0, -0.2), 0.2, BLUE)]
+    assert symmetry_of(balls(cameras(4), placed)) == Symmetry(Plane((0.0, 1.0, 0.0)))
+
+
 @pytest.mark.parametrize(("count", "order"), [(2, 8), (5, 6), (9, 3), (12, 1)])
 def test_a_solid_of_revolution_has_as_many_planes_as_there_is_room_for_images(count, order):
     found = symmetry_of(balls(cameras(count, SMOOTH), REVOLVED))
@@ -225,7 +230,10 @@ def test_a_part_that_is_not_symmetric_stays_in_the_hull_and_leaves_nothing_on_th
     assert symmetry_of(views) == ACROSS
     own, mirrored = torch.tensor([ANTENNA[0]]), torch.tensor([[-0.3, 0.6, -0.3]])
     carelessly = hull(join_views(views, reflected(views, ACROSS.plane)), 64)
-    carefully = hull(with_reflections(views, ACROSS), 64)
+    both = with_reflections(views, ACROSS)
+    assert torch.equal(both.masks[: len(views)], views.masks)
+    assert (both.masks[len(views) :] == UNKNOWN).any()
+    carefully = hull(both, 64)
     assert not carelessly.contains(own)
     assert carefully.contains(own)
     assert not carefully.contains(mirrored)
