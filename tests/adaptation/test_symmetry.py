@@ -285,18 +285,31 @@ def test_adapting_shows_the_model_reflections_and_another_plane_or_none_can_be_g
     assert not torch.allclose(found, other, atol=1e-3)
 
 
-def test_gradient_steps_draw_rays_of_reflections_but_none_where_they_are_wrong(monkeypatch):
-    views, drawn = balls(cameras(8), [*BODY, ANTENNA]), []
-    sample = Views.sample_rays
+@pytest.fixture
+def drawn(monkeypatch):
+    """Of all rays that are drawn, from how many views they are, and the opacities of the pixels they are drawn among."""
+    result, sample = [], Views.sample_rays
 
     def sampled(self, count, *, among=None, **given):
-        drawn.append((len(self), self.masks.flatten()[among]))
+        result.append((len(self), self.masks.flatten()[among]))
         return sample(self, count, among=among, **given)
 
     monkeypatch.setattr(Views, "sample_rays", sampled)
-    model().fine_tune(views, 2, FineTuning(rays=64, learning_rate=1e-3, muon_learning_rate=1e-3))
+    return result
+
+
+TUNING = FineTuning(rays=64, learning_rate=1e-3, muon_learning_rate=1e-3)
+
+
+def test_gradient_steps_draw_rays_of_reflections_but_none_where_they_are_wrong(drawn):
+    model().fine_tune(balls(cameras(8), [*BODY, ANTENNA]), 2, TUNING)
     assert [count for count, _ in drawn].count(16) >= 2
     assert not any((opacity == UNKNOWN).any() for _, opacity in drawn)
+
+
+def test_gradient_steps_draw_no_rays_of_reflections_about_further_planes(drawn):
+    model(symmetry=Symmetry(ACROSS.plane, 3)).fine_tune(balls(cameras(4), around(3, [RED])), 2, TUNING)
+    assert {count for count, _ in drawn} == {8}
 
 
 def test_views_of_a_ball_are_reflected_by_kernels_and_plain_pytorch_alike(monkeypatch):
@@ -334,6 +347,13 @@ def test_a_single_view_contradicts_a_plane_by_its_silhouette_or_none():
     assert ACROSS in possible_symmetries(balls(cameras(), BODY)[:1])
     from_above = balls(camera_at((0.0, 3.0, 0.01), SIZE), [((0.5, 0.0, 0.0), 0.3, RED)])
     assert possible_symmetries(from_above) == [ALONG]
+
+
+def test_several_planes_that_a_single_view_shows_are_taken_whatever_the_model_shows(monkeypatch):
+    adapter, shown = model(), Symmetry(ACROSS.plane, 3)
+    monkeypatch.setattr(finding_symmetry, "possible_symmetries", lambda view: [shown])
+    monkeypatch.setattr(adapter, "field", lambda *_: pytest.fail("the model need not be asked"))
+    assert adapter.find_symmetry(balls(cameras(), BODY)[:1]) == shown
 
 
 def test_a_field_that_knows_its_views_by_their_places_takes_no_reflections():
