@@ -287,7 +287,7 @@ def test_adapting_shows_the_model_reflections_and_another_plane_or_none_can_be_g
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """Of all rays that are drawn, from how many views they are, and the opacities of the pixels they are drawn among."""
+    """From how many views rays are drawn, each time, and the opacities of the pixels that they are drawn among."""
     result, sample = [], Views.sample_rays
 
     def sampled(self, count, *, among=None, **given):
