@@ -121,6 +121,8 @@ def _first(error: BaseException, kind: Any, path: tuple[str, ...]) -> SettingsEr
         name = str(sorted(error.extra_fields, key=str)[0])
         known = [each.name for each in fields(error.cl)] if is_dataclass(error.cl) else []
         return SettingsError(".".join([*path, name]), f"an unknown entry; {nearest(name, known)}")
+    if isinstance(error, KeyError):
+        return SettingsError(where, "a missing entry")
     if isinstance(error, ValueError | TypeError):
         return SettingsError(where, " ".join(str(error).split()))
     return None

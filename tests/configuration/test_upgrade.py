@@ -13,6 +13,7 @@ from hyperplanes.configuration.settings_file import changed, parse_options, read
 from hyperplanes.configuration.upgrade import upgrade_model
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig, VolumeHyperNetworkConfig
+from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.settings import SettingsError
 
 FORMER = Path(__file__).parent / "former"
@@ -36,6 +37,12 @@ def test_former_files_of_settings_say_what_the_presets_say(name):
         made, later = changed(preset(base), given), {"stacked": False, "symmetric": False}
         assert replace(made.model, **later) == replace(preset(name).model, **later)
         assert made.training == preset(name).training
+
+
+def test_an_entry_that_lacks_a_part_is_named():
+    entries = json.loads((FORMER / "small.json").read_text())
+    with pytest.raises(CheckpointError, match=r"symmetry\.plane: a missing entry"):
+        ModelConfig.of_json({**entries, "symmetry": {"normal": [1.0, 0.0, 0.0]}})
 
 
 def test_another_kind_has_its_own_settings():
