@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from html import escape
 from typing import Any, Protocol, runtime_checkable
 
@@ -222,14 +222,19 @@ class Views:
         )
 
 
-def join_views(first: Views, second: Views) -> Views:
-    """Two sets of views of one scene as one; the sphere of the first counts, and masks where both have them."""
-    masks = None
-    if first.masks is not None and second.masks is not None:
-        masks = torch.cat([first.masks, second.masks])
-    names = first.names + second.names if first.names and second.names else ()
-    cameras = camera.concatenate([first.cameras, second.cameras])
-    return Views(torch.cat([first.images, second.images]), cameras, masks, first.bounds, names, first.up)
+def join_views(first: Views, *others: Views) -> Views:
+    """Sets of views of one scene as one; the sphere of the first counts, and masks where all have them."""
+    parts = (first, *others)
+    masks = [each.masks for each in parts if each.masks is not None]
+    names = tuple(name for each in parts for name in each.names) if all(each.names for each in parts) else ()
+    return Views(
+        torch.cat([each.images for each in parts]),
+        camera.concatenate([each.cameras for each in parts]),
+        torch.cat(masks) if len(masks) == len(parts) else None,
+        first.bounds,
+        names,
+        first.up,
+    )
 
 
 def moved(views: Views, motion: Float[Tensor, "4 4"]) -> Views:
@@ -240,7 +245,7 @@ def moved(views: Views, motion: Float[Tensor, "4 4"]) -> Views:
         motion: in world coordinates, in float64.
     """
     pose = camera.camera_from_world(views.cameras)
-    return replace(views, cameras=camera.with_poses(views.cameras, pose @ torch.linalg.inv(motion).to(pose)))
+    return views._derived(cameras=camera.with_poses(views.cameras, pose @ torch.linalg.inv(motion).to(pose)))
 
 
 @dataclass(frozen=True)

@@ -45,10 +45,7 @@ def images_by(views: Views, symmetry: Symmetry) -> Views:
         symmetry: of the object.
     """
     both = join_views(views, reflected(views, symmetry.plane))
-    result = both
-    for rotation in symmetry.rotations[1:]:
-        result = join_views(result, moved(both, rotation))
-    return result
+    return join_views(both, *(moved(both, rotation) for rotation in symmetry.rotations[1:]))
 
 
 def handicaps(given: int, symmetry: Symmetry) -> Float[Tensor, " view"]:

@@ -16,7 +16,6 @@ from hyperplanes.adaptation.reflections import (
     HULL_SIDE,
     SHOWN,
     images_by,
-    reflected,
     with_reflections,
 )
 from hyperplanes.geometry.cameras import camera_directions
@@ -27,7 +26,7 @@ from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.footprint import footprint
-from hyperplanes.views import Views, join_views
+from hyperplanes.views import Views
 
 __all__ = ["ReflectedHullBlend", "possible_symmetries", "symmetry_of"]
 
@@ -68,7 +67,7 @@ def symmetry_of(support: Views) -> Symmetry | None:
         The symmetry by which `HullBlend` shows the views best, if its squared error is at most TOLERANCE times that
         without reflections; None with fewer than FEWEST views, or without masks. Other planes than those across the
         axes need FEWEST_TO_SEARCH views, whose hull is near enough to the object, those near to one FEWEST_TO_REFINE.
-        Several planes are found with fewer views than that, where they show more than light and details cost.
+        Several planes are looked for with fewer views than that.
     """
     if support.masks is None or len(support) < FEWEST or not support.masks.any():
         return None
@@ -109,19 +108,12 @@ def possible_symmetries(view: Views) -> list[Symmetry]:
     return [Symmetry(plane) for plane in errors]
 
 
-@dataclass(frozen=True)
 class ReflectedHullBlend:
-    """`HullBlend` of the views of an object that looks symmetric and of their reflections.
-
-    Attributes:
-        blend: the method.
-    """
-
-    blend: HullBlend = HullBlend()
+    """`HullBlend` of the views of an object that looks symmetric and of their reflections."""
 
     def adapt(self, support: Views) -> AdaptedField:
         """The hull of views and reflections, and its colours."""
-        return self.blend.adapt(with_reflections(support, symmetry_of(support)))
+        return HullBlend().adapt(with_reflections(support, symmetry_of(support)))
 
 
 @dataclass(frozen=True)
@@ -149,7 +141,7 @@ class _Judge:
 
     def planes(self, planes: Sequence[Plane], most: float = TOLERANCE) -> dict[Plane, float]:
         """The errors, relative to that without reflections, of planes by which they are at most so large."""
-        errors = {plane: self.error(join_views(self.views, reflected(self.views, plane))) for plane in planes}
+        errors = {plane: self.error(Symmetry(plane)) for plane in planes}
         return {plane: error for plane, error in errors.items() if error <= most and math.isfinite(error)}
 
     def several(self, plane: Plane, error: float, given: int, least: int = 2) -> tuple[Symmetry, float] | None:
@@ -174,7 +166,7 @@ class _Judge:
             symmetry = Symmetry(plane, order, (x, y, z))
             if given * symmetry.images > MOST_IMAGES or not possible.issuperset(parts):
                 continue
-            error = self.error(images_by(self.views, symmetry))
+            error = self.error(symmetry)
             if error > TOLERANCE:
                 continue
             possible.add(order)
@@ -182,9 +174,10 @@ class _Judge:
                 found, best = symmetry, error / order**WORTH
         return None if found is None else (found, best)
 
-    def error(self, shown: Views) -> float:
-        """That of the hull of more views; infinite where it loses too many pixels."""
+    def error(self, symmetry: Symmetry) -> float:
+        """That of the hull of views and reflections; infinite where it loses too many pixels."""
         assert self.views.masks is not None
+        shown = images_by(self.views, symmetry)
         seen, hull = self.views.masks >= SHOWN, _hull(shown)
         held = footprint(hull, self.views.cameras)[:, None]
         if not hull.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):

@@ -106,8 +106,9 @@ class Preset:
         return replace(chosen, model=chosen.model.with_target(target))
 
     def for_known_places(self) -> Preset:
-        """Without what only a field of any number of views can be trained by: episodes of some of the views."""
-        return replace(self, training=replace(_of_all_views(self.training), volume_loss=0.0))
+        """Without what only a field of any number of views can do: be trained by some of them, and be shown more."""
+        model = replace(self.model, stacked=False, symmetric=False)
+        return replace(self, model=model, training=replace(_of_all_views(self.training), volume_loss=0.0))
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""

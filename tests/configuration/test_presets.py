@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
-from hyperplanes.configuration.compatibility import check_model
+from hyperplanes.configuration.compatibility import check_model, check_training
 from hyperplanes.configuration.presets import PRESETS, preset
 from hyperplanes.fields import find_targets
 from hyperplanes.hypernetwork import ConvNet, ResNet101
@@ -31,6 +31,14 @@ def test_the_papers_target_network(name):
         assert network.layers[0].in_features == 25 * 5 + 63
     assert set(model.networks) == {"fine", "coarse"}
     assert len(model.rig) == 25
+
+
+@pytest.mark.parametrize("method", ["nerf", "multiplane", "point_multiplane", "image_based", "mv_meta", "maml"])
+@pytest.mark.parametrize("name", ["small", "quick"])
+def test_a_preset_fits_every_method_that_has_no_hypernetwork(name, method):
+    made = preset(name).by_method(method)
+    assert check_model(made.model) is find_targets()[made.model.target]
+    check_training(made.training, made.model)
 
 
 @pytest.mark.parametrize(("name", "depth", "views"), [("paper-128", 3, 5), ("paper-200", 10, 25)])
