@@ -41,6 +41,9 @@ FLOOR = 3e-3  # of that error in a pixel of the object; smaller ones are those o
 ORDERS = {2: (), 3: (), 4: (2,), 6: (2, 3), 8: (2, 4)}
 """Orders that are tried, and those that an object of such a symmetry has, too."""
 MOST_IMAGES = 64  # views and reflections; more make no better pictures, and take longer
+MOST_PIXELS = (
+    1 << 25
+)  # of these, where there are several planes: with 192 million adapting takes 10 GB and ten times as long
 SINGLE_VIEW_ORDER = 3  # at least: by one view, many a car is the same from the front and from the back
 WORTH = 0.5  # power of the order by which the error may grow
 
@@ -84,7 +87,7 @@ def symmetry_of(support: Views) -> Symmetry | None:
             found = min(errors, key=errors.__getitem__, default=None)
     if found is None:
         return None
-    several = judge.several(found, errors[found], len(support)) if len(support) < FEWEST_TO_REFINE else None
+    several = judge.several(found, errors[found], support) if len(support) < FEWEST_TO_REFINE else None
     return Symmetry(found) if several is None else several[0]
 
 
@@ -101,7 +104,7 @@ def possible_symmetries(view: Views) -> list[Symmetry]:
     """
     judge = _Judge.of(view)
     errors = judge.planes(_planes(view.bounds, VERTICAL), most=math.inf)
-    several = [judge.several(plane, errors[plane], 1, SINGLE_VIEW_ORDER) for plane in errors]
+    several = [judge.several(plane, errors[plane], view, SINGLE_VIEW_ORDER) for plane in errors]
     likely = [each for each in several if each is not None]
     if likely:
         return [min(likely, key=lambda each: each[1])[0]]
@@ -144,13 +147,13 @@ class _Judge:
         errors = {plane: self.error(Symmetry(plane)) for plane in planes}
         return {plane: error for plane, error in errors.items() if error <= most and math.isfinite(error)}
 
-    def several(self, plane: Plane, error: float, given: int, least: int = 2) -> tuple[Symmetry, float] | None:
+    def several(self, plane: Plane, error: float, given: Views, least: int = 2) -> tuple[Symmetry, float] | None:
         """The most likely order of symmetries of several planes, one of which is known, and its error over its worth.
 
         Args:
             plane: the one.
             error: by it alone.
-            given: views of which the object is made, and so their images.
+            given: all views of the object, of which there are to be reflections.
             least: order.
 
         Returns:
@@ -161,10 +164,11 @@ class _Judge:
         centre = self.views.bounds.centre
         apart = sum(a * b for a, b in zip(plane.normal, centre, strict=True)) - plane.offset
         x, y, z = (a - apart * b for a, b in zip(centre, plane.normal, strict=True))
+        room = min(MOST_IMAGES // len(given), MOST_PIXELS // given.images[:, 0].numel())
         found, best, possible = None, error, set[int]()
         for order, parts in ORDERS.items():
             symmetry = Symmetry(plane, order, (x, y, z))
-            if given * symmetry.images > MOST_IMAGES or not possible.issuperset(parts):
+            if symmetry.images > room or not possible.issuperset(parts):
                 continue
             error = self.error(symmetry)
             if error > TOLERANCE:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HullBlend, HyperPlanes, finding_symmetry
+from hyperplanes.adaptation import HullBlend, HyperPlanes, finding_symmetry, symmetry
 from hyperplanes.adaptation.base import hull
 from hyperplanes.adaptation.finding_symmetry import FoundSymmetry
 from hyperplanes.adaptation.fine_tuned import FromScratch
@@ -163,6 +163,12 @@ def test_a_solid_of_revolution_has_as_many_planes_as_there_is_room_for_images(co
     found = symmetry_of(balls(cameras(count, SMOOTH), REVOLVED))
     assert found is not None
     assert found.order == order
+
+
+def test_large_pictures_have_room_for_fewer(monkeypatch):
+    views = balls(cameras(2, SMOOTH), REVOLVED)
+    monkeypatch.setattr(symmetry, "MOST_PIXELS", 13 * views.images[:, 0].numel())
+    assert symmetry_of(views).order == 6
 
 
 def test_of_an_object_that_faces_another_way_all_planes_are_found_and_meet_in_the_middle():
