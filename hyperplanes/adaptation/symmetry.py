@@ -41,9 +41,7 @@ FLOOR = 3e-3  # of that error in a pixel of the object; smaller ones are those o
 ORDERS = {2: (), 3: (), 4: (2,), 6: (2, 3), 8: (2, 4)}
 """Orders that are tried, and those that an object of such a symmetry has, too."""
 MOST_IMAGES = 64  # views and reflections; more make no better pictures, and take longer
-MOST_PIXELS = (
-    1 << 25
-)  # of these, where there are several planes: with 192 million adapting takes 10 GB and ten times as long
+MOST_PIXELS = 1 << 25  # of them about several planes: with 192 million adapting takes 10 GB and ten times as long
 SINGLE_VIEW_ORDER = 3  # at least: by one view, many a car is the same from the front and from the back
 WORTH = 0.5  # power of the order by which the error may grow
 
