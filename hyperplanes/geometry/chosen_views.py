@@ -10,8 +10,11 @@ from torch import Tensor
 
 __all__ = [
     "ANGLE",
+    "BEYOND",
+    "CUT",
     "DEEPEST",
     "FADING",
+    "MARGIN",
     "PARTLY",
     "SMALLEST_ANGLE",
     "UNSEEN",
@@ -27,6 +30,9 @@ DEEPEST = 2.0  # radii
 PARTLY = 2.0  # penalty of a mask that is not whole
 WHOLE = 0.98  # opacity of a mask from which on it counts as whole
 UNSEEN = 8.0  # penalty of a view that does not show the point
+MARGIN = 0.15  # of the shorter side of a picture whose border cuts the object
+CUT = 0.03  # penalty in the middle of the margin
+BEYOND = 1.01  # margins from where it begins, at which the penalty would be infinite
 FADING = 10.0  # of the weights of views, with their penalty
 ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
 SMALLEST_ANGLE = 1e-2  # between a view and a direction, in radians: nearer ones count as that far
@@ -41,17 +47,19 @@ class Penalties:
         partly: what a mask costs that is not whole.
         steep: cost of a radius behind the surface.
         highest: of both together.
+        least: of a point before the surface.
     """
 
     deepest: float = DEEPEST
     partly: float = PARTLY
     steep: float = 1.0
     highest: float = DEEPEST + PARTLY
+    least: float = -DEEPEST
 
     @classmethod
     def alike(cls) -> Penalties:
         """A view sees a point or does not: whatever hides it costs 1."""
-        return cls(deepest=1e3, partly=1e6, steep=1e6, highest=1.0)
+        return cls(deepest=1e3, partly=1e6, steep=1e6, highest=1.0, least=0.0)
 
 
 @dataclass(frozen=True)

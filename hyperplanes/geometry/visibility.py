@@ -15,7 +15,10 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.chosen_views import (
     ANGLE,
+    BEYOND,
+    CUT,
     FADING,
+    MARGIN,
     SMALLEST_ANGLE,
     UNSEEN,
     WHOLE,
@@ -37,6 +40,8 @@ from hyperplanes.geometry.rays import Sphere
 __all__ = ["VisibilityPlanes"]
 
 POINTS = 512  # that one call of the kernel works on
+CUTTING = 0.02  # of the shorter side of a picture: as many pixels of the object at its border cut it
+OPAQUE = 0.5  # opacity of a mask from which on a pixel shows the object
 
 
 class VisibilityPlanes:
@@ -44,7 +49,9 @@ class VisibilityPlanes:
 
     A view's penalty at a point is how far the point lies behind the first surface that it sees, in radii of the scene
     beyond the `tolerance` and at most DEEPEST; PARTLY more where its mask is not whole, so that background is mixed
-    into the colour; and UNSEEN where the point is not in the picture.
+    into the colour; and UNSEEN where the point is not in the picture. Where the border of a picture cuts the object,
+    the penalty rises over a MARGIN towards it, so that the view has no weight left where the picture ends: a seam would
+    be seen between pictures of different exposure (Buehler et al. 2001, "Unstructured Lumigraph Rendering").
 
     Args:
         images: (view, 3, height, width), RGB in [0, 1].
@@ -71,6 +78,7 @@ class VisibilityPlanes:
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
         self._masked = torch.zeros(len(images), dtype=torch.bool, device=images.device)
         self._handicaps = images.new_zeros(len(images))
+        self._margins = images.new_zeros(len(images)) if masks is None else _margins(masks).to(images)
         self._penalties = Penalties()
 
     def __len__(self) -> int:
@@ -162,11 +170,12 @@ class VisibilityPlanes:
         """The numbers by which the kernels judge."""
         per_radius, own = 1 / self.occupancy.bounds.radius, self._penalties
         limits = [self.colours.nearest, per_radius, self.tolerance, own.deepest, own.partly, WHOLE, UNSEEN, ANGLE]
-        return [*limits, own.steep, own.highest]
+        return [*limits, own.steep, own.highest, own.least, 1 / _margin(*self.depth_opacity.shape[1:3]), CUT]
 
     def shown_cameras(self) -> Tensor:
-        """What the kernels read of each view: centre, projection matrix, 0 where it is hidden, and its handicap."""
-        return torch.cat([self._cameras, torch.stack([(~self._masked).to(self._cameras), self._handicaps])])
+        """What the kernels read of each view: centre, projection matrix, 0 where hidden, its handicap and margin."""
+        shown = (~self._masked).to(self._cameras)
+        return torch.cat([self._cameras, torch.stack([shown, self._handicaps, self._margins])])
 
     def _choose_compiled(
         self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
@@ -256,8 +265,13 @@ class VisibilityPlanes:
         # how far behind the surface, in radii, and what that and a broken mask cost
         behind = torch.where(valid, (found.distances - depth) / self.occupancy.bounds.radius, 0.0)
         own = self._penalties
-        penalty = (own.steep * (behind - self.tolerance)).clamp(-own.deepest, own.deepest)
+        penalty = (own.steep * (behind - self.tolerance)).clamp(own.least, own.deepest)
         penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self._handicaps
+        height, width = depth_opacity.shape[1:3]
+        last = found.coordinates.new_tensor([width - 1, height - 1])
+        inside = ((1 - found.coordinates.abs()) * last / 2).amin(-1)
+        cut = (self._margins - inside).clamp_min(0) / _margin(height, width)
+        penalty = torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
         penalty = torch.where(valid, penalty, UNSEEN)
         values = torch.cat([found.directions, torch.stack([behind, coverage, penalty], -1)], -1)
 
@@ -270,6 +284,19 @@ class VisibilityPlanes:
             angle = torch.acos((found.directions * directions[:, None]).sum(-1).clamp(-1, 1))
             near = chosen(angle + ANGLE * penalty.clamp_min(0), nearest)
         return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
+
+
+def _margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, " view"]:
+    """The pixels of the margin of each view: 0 where the border of the picture does not cut the object."""
+    height, width = masks.shape[2:]
+    sides = masks[:, 0, [0, -1]].flatten(1), masks[:, 0, :, [0, -1]].flatten(1)
+    outermost = (torch.cat(sides, 1) >= OPAQUE).sum(1)
+    return _margin(height, width) * (outermost >= max(2, CUTTING * min(height, width)))
+
+
+def _margin(height: int, width: int) -> float:
+    """Of a picture of this size, in pixels."""
+    return MARGIN * min(height, width)
 
 
 def _split(values: Float[Tensor, "point chosen 6"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

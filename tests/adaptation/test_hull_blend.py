@@ -8,7 +8,7 @@ from torch.nn.functional import max_pool2d
 
 from hyperplanes.adaptation import HullBlend, hull_blend
 from hyperplanes.adaptation.base import hull
-from hyperplanes.geometry import Sphere
+from hyperplanes.geometry import Sphere, visibility
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
 from hyperplanes.geometry.chosen_views import ANGLE
 from hyperplanes.geometry.occupancy import Occupancy
@@ -78,6 +78,28 @@ def test_a_view_from_which_a_ball_is_hidden_gives_it_no_colour(monkeypatch, comp
     with_surface = VisibilityPlanes.with_surface
     monkeypatch.setattr(VisibilityPlanes, "with_surface", nothing)
     assert redness() > 0.5  # where nothing hides it
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_no_seam_is_seen_where_the_border_of_a_picture_cuts_the_object(monkeypatch, compiled):
+    """A near view whose lower border cuts the ball, red, and one from farther away that shows it whole, blue."""
+    if not compiled:
+        monkeypatch.setattr(VisibilityPlanes, "has_kernels", lambda self, points: False)
+    eyes = [(2.2, 0.1, 0.0), (2.9, 0.1, 0.5), (-3.0, 0.0, 0.0), (0.0, 0.2, -3.0)]
+    targets = [(0.0, 0.65, 0.0)] + [(0.0, 0.0, 0.0)] * 3
+    cameras = concatenate([camera_at(eye, (48, 48), target=at) for eye, at in zip(eyes, targets, strict=True)])
+    support = painted(cameras, [(1.0, 0.0, 0.0)] + [(0.0, 0.0, 1.0)] * 3)
+    assert support.masks[0, 0, -1].sum() > 10  # cut by the border
+
+    def steepest():
+        red = HullBlend(side=48, steps=96).adapt(support).render(camera_at((2.9, 0.1, 0.1), (96, 96))).images[0, 0]
+        column = red[:, 47][ball_views(camera_at((2.9, 0.1, 0.1), (96, 96))).masks[0, 0, :, 47] > 0][3:-3]
+        assert column[0] > 0.7 > 0.1 > column[-1]  # from red to blue
+        return float(column.diff().abs().max())
+
+    smooth = steepest()
+    monkeypatch.setattr(visibility, "CUTTING", 10.0)  # as if nothing cut it
+    assert steepest() > 3 * smooth
 
 
 def test_where_the_world_has_its_origin_does_not_matter():

@@ -8,8 +8,8 @@ import torch
 from hyperplanes.adaptation.hull_blend import blend_views
 from hyperplanes.geometry import Sphere, carve, cast
 from hyperplanes.geometry import visibility as module
-from hyperplanes.geometry.cameras import centres, projection_matrices
-from hyperplanes.geometry.chosen_views import ANGLE, DEEPEST, PARTLY, UNSEEN, WHOLE, Penalties
+from hyperplanes.geometry.cameras import centres, concatenate, projection_matrices
+from hyperplanes.geometry.chosen_views import ANGLE, BEYOND, CUT, DEEPEST, MARGIN, PARTLY, UNSEEN, WHOLE, Penalties
 from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import pixel_grid
@@ -26,8 +26,10 @@ def ball(radius=0.5, side=64):
     return Occupancy(inside.reshape(side, side, side), Sphere())
 
 
-def planes(count=5):
-    views = ball_views(ring(count, SIZE))
+def planes(cameras=None):
+    """Views of a ball; where no cameras are given, the border of the last one cuts it."""
+    cutting = camera_at((1.5, 0.5, 2.5), SIZE, target=(0.0, 0.8, 0.0))
+    views = ball_views(cameras or concatenate([ring(4, SIZE), cutting]))
     return VisibilityPlanes(views.images, views.cameras, views.masks, carve(views.masks, views.cameras, Sphere(), 32))
 
 
@@ -91,6 +93,9 @@ def slow_penalties(shown, points, hidden=()):
             depth, opacity = (top * (1 - v + row) + low * (v - row)).tolist()
             behind = distance - depth
             penalty = min(max(behind - shown.tolerance, -DEEPEST), DEEPEST) + (PARTLY if opacity < WHOLE else 0)
+            cut = 1 - min(u, width - 1 - u, v, height - 1 - v) / (MARGIN * height)
+            if view == len(shown) - 1 and cut > 0:
+                penalty = max(penalty, 0) + CUT * cut / (BEYOND - cut)
             rows.append([*direction.tolist(), behind, opacity, penalty])
     return torch.tensor(rows).reshape(len(points), len(shown), 6)
 
@@ -123,7 +128,8 @@ def test_the_chosen_views_are_those_of_the_definition(monkeypatch, compiled):
 @pytest.mark.parametrize("compiled", [True, False])
 def test_what_hides_a_point_costs_alike_where_penalties_are_alike(monkeypatch, compiled):
     """Points of the surface that each view sees, which the others see, see from behind, or see at an edge."""
-    shown = planes()
+    handicaps = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4])
+    shown = planes(ring(5, SIZE)).with_handicaps(handicaps)
     if not compiled:
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     view, row, column = (shown.depth_opacity[..., 1] == 1).nonzero().unbind(1)
@@ -132,8 +138,9 @@ def test_what_hides_a_point_costs_alike_where_penalties_are_alike(monkeypatch, c
     seen = shown.with_penalties(Penalties.alike()).choose(points, best=len(shown)).best
     hidden, valid = (seen.behind > shown.tolerance) | (seen.coverage < WHOLE), seen.penalty < UNSEEN
     assert 0.1 < hidden[valid].float().mean() < 0.9  # of both kinds
-    torch.testing.assert_close(seen.penalty[hidden & valid], torch.ones(int((hidden & valid).sum())))
-    assert (seen.penalty[~hidden & valid] <= 0).all()
+    expected = hidden.float() + handicaps[seen.views]
+    clear = (seen.behind - shown.tolerance).abs() > 1e-5
+    torch.testing.assert_close(seen.penalty[valid & clear], expected[valid & clear])
 
 
 @pytest.mark.parametrize("compiled", [True, False])

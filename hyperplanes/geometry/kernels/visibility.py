@@ -10,6 +10,7 @@ from typing import no_type_check
 
 import numpy as np
 
+from hyperplanes.geometry.chosen_views import BEYOND
 from hyperplanes.geometry.kernels.blocks import inlined
 from hyperplanes.geometry.kernels.llvm import load, load_int, read, store, store_int
 from hyperplanes.geometry.lookup_torch import BORDER
@@ -17,10 +18,10 @@ from hyperplanes.geometry.lookup_torch import BORDER
 __all__ = ["choose", "judge", "least", "place", "rank"]
 
 # Rows of the scratch: the direction from the camera, depth behind the hull, opacity and penalty, which are results;
-# then the distance, whether the view shows the point, the fractions of a pixel, the pixel, the score by direction, and
-# the angle in it.
-X, Y, Z, BEHIND, OPACITY, PENALTY, DISTANCE, SHOWN, ACROSS, DOWN, AT, SCORE, TURN = range(13)
-RESULTS, ROWS = 6, 13
+# then the distance, whether the view shows the point, the fractions of a pixel, the pixel, the score by direction, the
+# angle in it, and how many pixels inside its margin a view shows the point.
+X, Y, Z, BEHIND, OPACITY, PENALTY, DISTANCE, SHOWN, ACROSS, DOWN, AT, SCORE, TURN, CUT = range(14)
+RESULTS, ROWS = 6, 14
 
 
 @inlined
@@ -56,6 +57,8 @@ def place(s, pitch, total, x, y, z, cameras, shape, min_z):
         shown = front & (u >= low) & (u <= right) & (v >= low) & (v <= bottom) & (read(cameras, 15 * pitch, k) > zero)
         u, v = (min(max(u, zero), last_column) if shown else zero), (min(max(v, zero), last_row) if shown else zero)
         column, row = np.int32(min(u, most_column)), np.int32(min(v, most_row))
+        inside = min(min(u, last_column - u), min(v, last_row - v))
+        store(s, CUT * pitch + k, max(read(cameras, 17 * pitch, k) - inside, zero))
         store(s, X * pitch + k, dx * reciprocal)
         store(s, Y * pitch + k, dy * reciprocal)
         store(s, Z * pitch + k, dz * reciprocal)
@@ -75,6 +78,7 @@ def judge(s, pitch, total, cameras, maps, shape, limits):
     across_next, down_next = np.int32(2 * min(shape[2] - 1, 1)), np.int32(2 * shape[2] * min(shape[1] - 1, 1))
     per_unit, tolerance, deepest = limits[1], limits[2], limits[3]
     partly, whole, unseen, steep, highest = limits[4], limits[5], limits[6], limits[8], limits[9]
+    lowest, per_pixel, halfway, end = limits[10], limits[11], limits[12], number(BEYOND)
     for k in range(total):
         at, across, down = load_int(s, AT * pitch, k), load(s, ACROSS * pitch + k), load(s, DOWN * pitch + k)
         right, below = np.int32(at + across_next), np.int32(at + down_next)
@@ -90,8 +94,11 @@ def judge(s, pitch, total, cameras, maps, shape, limits):
         # how far behind the surface the point lies, in radii, and what that costs
         shown = load(s, SHOWN * pitch + k) > zero
         behind = (load(s, DISTANCE * pitch + k) - depth) * per_unit
-        penalty = min(max(steep * (behind - tolerance), -deepest), deepest)
+        penalty = min(max(steep * (behind - tolerance), lowest), deepest)
         penalty = min(penalty + (partly if opacity < whole else zero), highest) + read(cameras, 16 * pitch, k)
+        # a margin where the border of the view cuts the object: more and more towards it
+        cut = per_pixel * load(s, CUT * pitch + k)
+        penalty = max(penalty, zero) + halfway * cut / (end - cut) if cut > zero else penalty
         store(s, BEHIND * pitch + k, behind if shown else zero)
         store(s, OPACITY * pitch + k, opacity if shown else one)
         store(s, PENALTY * pitch + k, penalty if shown else unseen)
@@ -162,13 +169,14 @@ def choose(
 ):
     """Writes the chosen views of points start..stop. All arrays are flat.
 
-    `cameras` holds 17 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
-    matrix, 0 where it is hidden, and its handicap. `maps` (view, row, column, 2) hold depth and opacity. `shape` is the
-    number of views, height, width, the numbers of chosen views, and the pitch; `limits` min_z, 1 / radius, the
-    tolerance, deepest and partly of `chosen_views.Penalties`, WHOLE, UNSEEN, ANGLE, steep and highest. `best` and
-    `near` (point, chosen) get indices of views, their values (point, chosen, 6) direction, depth behind the hull,
-    opacity and penalty of each, and `overall` (point, 2) the least opacity and the number of the views that show the
-    point. Where there are no directions nothing is written to `near`.
+    `cameras` holds 18 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
+    matrix, 0 where it is hidden, its handicap, and the pixels of its margin. `maps` (view, row, column, 2) hold depth
+    and opacity. `shape` is the number of views, height, width, the numbers of chosen views, and the pitch; `limits`
+    min_z, 1 / radius, the tolerance, deepest and partly of `chosen_views.Penalties`, WHOLE, UNSEEN, ANGLE, steep,
+    highest, least, 1 / the pixels of a margin, and CUT. `best` and `near` (point, chosen) get indices of views, their
+    values (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each, and `overall` (point, 2)
+    the least opacity and the number of the views that show the point. Where there are no directions nothing is written
+    to `near`.
     """
     number = limits.dtype.type
     total, best_count, near_count, pitch = shape[0], shape[3], shape[4], shape[5]
