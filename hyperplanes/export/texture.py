@@ -19,6 +19,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.mesh import Surface
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.geometry.visibility import margins
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
@@ -61,8 +62,8 @@ def texture_surface(
 ) -> TexturedSurface:
     """The surface with a texture in place of colours a vertex.
 
-    A texel takes its colour from the views that see its place, those that look straight at it most; where none does,
-    it is the field's as seen from straight above.
+    A texel takes its colour from the views that see its place, those that look straight at it most, less where it lies
+    near a border that cuts the object; where none does, it is the field's as seen from straight above.
 
     Args:
         surface: of `extract_mesh`; simplified by quadric error where it has more faces.
@@ -164,7 +165,8 @@ def _distances(
 def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views) -> Any:  # noqa: ANN401
     """Yields for every view the colours (texel, 3) that it shows at points, and their weights (texel, 1)."""
     height, width = views.size
-    pixels = pixel_grid(height, width)
+    pixels, last = pixel_grid(height, width), torch.tensor([width - 1, height - 1])
+    fading = torch.zeros(len(views)) if views.masks is None else margins(views.masks)
     for view in range(len(views)):
         one = camera.select(views.cameras, [view])
         depth = _distances(solid, views.cameras, view, pixels).reshape(1, 1, height, width)
@@ -175,13 +177,16 @@ def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views)
         distance = offsets.norm(dim=-1)
         facing = (offsets / distance[:, None] * outward).sum(-1)
         local = points @ camera.camera_from_world(one)[0, 2, :3] + camera.camera_from_world(one)[0, 2, 3]
-        at = one.project(points[None])[0] / torch.tensor([width - 1, height - 1]) * 2 - 1
+        at = one.project(points[None])[0] / last * 2 - 1
         at = torch.where((local > 1e-6)[:, None], at, 2.0)[None, None]
         first, span = grid_sample(maps, at, mode="nearest", align_corners=True)[0, :, 0]
         tolerance = TOLERANCE * pixel * distance / facing.clamp_min(OBLIQUE)
         visible = ((first - distance).abs() < tolerance) & (span < 3 * tolerance)  # and no edge beside it
         colour = grid_sample(views.images[view : view + 1], at, padding_mode="border", align_corners=True)[0, :, 0].T
-        yield colour, (facing.clamp_min(0) ** SHARPNESS * visible)[:, None]
+        weight = facing.clamp_min(0) ** SHARPNESS * visible
+        if fading[view]:
+            weight *= ((1 - at[0, 0].abs()) * last / 2).amin(-1).div(fading[view]).clamp(0, 1)
+        yield colour, weight[:, None]
 
 
 def _spread(

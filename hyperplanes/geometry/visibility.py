@@ -37,7 +37,7 @@ from hyperplanes.geometry.lookup_torch import transform_of
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["VisibilityPlanes"]
+__all__ = ["VisibilityPlanes", "margins"]
 
 POINTS = 512  # that one call of the kernel works on
 CUTTING = 0.02  # of the shorter side of a picture: as many pixels of the object at its border cut it
@@ -78,7 +78,7 @@ class VisibilityPlanes:
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
         self._masked = torch.zeros(len(images), dtype=torch.bool, device=images.device)
         self._handicaps = images.new_zeros(len(images))
-        self._margins = images.new_zeros(len(images)) if masks is None else _margins(masks).to(images)
+        self._margins = images.new_zeros(len(images)) if masks is None else margins(masks).to(images)
         self._penalties = Penalties()
 
     def __len__(self) -> int:
@@ -286,8 +286,12 @@ class VisibilityPlanes:
         return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
 
 
-def _margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, " view"]:
-    """The pixels of the margin of each view: 0 where the border of the picture does not cut the object."""
+def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, " view"]:
+    """The pixels from the border of each picture within which it fades out: 0 where no border cuts the object.
+
+    Args:
+        masks: opacity in [0, 1].
+    """
     height, width = masks.shape[2:]
     sides = masks[:, 0, [0, -1]].flatten(1), masks[:, 0, :, [0, -1]].flatten(1)
     outermost = (torch.cat(sides, 1) >= OPAQUE).sum(1)

@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import trimesh
 from torch.nn.functional import grid_sample
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.export import texture
 from hyperplanes.export.mesh import extract_mesh
 from hyperplanes.export.texture import save_textured, texture_surface
 from hyperplanes.geometry import cameras as camera
@@ -87,6 +89,26 @@ def test_colours_come_from_the_views_where_they_see(mesh, field, views):
     painted = texture_surface(surface, field, Views(blue, views.cameras), faces=400, size=64).texture
     assert float((painted[..., 2] > 230).mean()) > 0.95
     assert mesh.texture[..., 0].std() > 50
+
+
+def test_a_view_fades_out_towards_a_border_that_cuts_the_object(field, monkeypatch):
+    """A red view whose four borders cut the ball, and a blue one from the same place that shows it whole."""
+    eyes = camera.look_at(torch.tensor([[0.0, 0.0, 3.0]]), (0.0, 0.0, 0.0))
+    near, far = (camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, a), eyes, SIZE, SIZE) for a in (0.25, 0.7))
+    cameras = camera.concatenate([near, far])
+    colours = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])[:, :, None, None].expand(-1, -1, SIZE, SIZE)
+    support = Views(colours.contiguous(), cameras, field.render(cameras).opacity)
+    surface = extract_mesh(field, voxels=24, level=6.0)
+    blue = replace(field, field=lambda p, d: (torch.tensor([[0.0, 0.0, 1.0]]).expand_as(p), striped(p, d)[1]))
+
+    def share_between():
+        red = texture_surface(surface, blue, support, faces=400, size=128).texture[..., 0] / 255.0
+        assert red.max() > 0.45  # half of it red, where both views see it
+        return float(((red > 0.05) & (red < 0.4)).mean())
+
+    smooth = share_between()
+    monkeypatch.setattr(texture, "margins", lambda masks: torch.zeros(len(masks)))
+    assert share_between() < smooth / 4
 
 
 def test_the_file_opens_with_normals_texture_and_an_unlit_material(mesh, tmp_path):
