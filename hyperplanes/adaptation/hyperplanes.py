@@ -61,8 +61,8 @@ class HyperPlanes(HyperPlanesNetwork):
 
         Returns:
             `config.symmetry` where that is known. Else the planes about which the object looks symmetric
-            (`symmetry.symmetry_of`), or None. With ten views or more, two that are held out must not be shown
-            worse with reflections. A single view is reflected about several planes if its silhouette and colours
+            (`symmetry.symmetry_of`), or None. With ten views or more, some that are held out must not be
+            shown worse with reflections. A single view is reflected about several planes if its silhouette and colours
             show them, and about one if it is shown better so itself.
         """
         return find_symmetry(self, support).symmetry

@@ -60,6 +60,12 @@ def both(support):
     return adapter.rendering_field(context, adapter.adapted_weights(context)), HullBlend().adapt_to(context.planes)
 
 
+@pytest.mark.parametrize(("given", "held_out"), [(5, 2), (35, 2), (36, 3), (48, 4)])
+def test_two_views_are_held_out_or_one_in_twelve(given, held_out):
+    trial = hold_out(model(), ball_views(ring(given, (12, 12))))
+    assert len(trial.context.given) == given - held_out
+
+
 def test_the_best_share_has_the_least_squared_error_of_a_grid():
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):

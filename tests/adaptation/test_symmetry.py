@@ -382,7 +382,10 @@ def test_from_ten_views_on_some_that_are_held_out_have_to_be_shown_better(monkey
     assert judged == [10]
 
 
-@pytest.mark.parametrize(("lost", "better"), [((0.3, 0.3), False), ((0.2, -0.3), True), ((-0.1, -0.1), True)])
+@pytest.mark.parametrize(  # the last two: by 1.8 and 2.2 standard errors
+    ("lost", "better"),
+    [((0.3, 0.3), False), ((0.2, -0.3), True), ((-0.1, -0.1), True), ((0.3, -0.2), True), ((0.3, -0.15), False)],
+)
 def test_held_out_views_that_are_surely_shown_worse_decide_and_the_trial_is_kept(monkeypatch, lost, better):
     without = torch.full((20, 3), 0.5)
     errors = iter([without, without + torch.tensor(lost).repeat(10)[:, None]])
