@@ -10,11 +10,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.reflections import (
     HULL_SIDE,
     SHOWN,
+    handicaps,
     images_by,
     with_reflections,
 )
@@ -110,11 +111,16 @@ def possible_symmetries(view: Views) -> list[Symmetry]:
 
 
 class ReflectedHullBlend:
-    """`HullBlend` of the views of an object that looks symmetric and of their reflections."""
+    """`HullBlend` of the views of an object that looks symmetric and of their reflections, by their handicaps."""
 
     def adapt(self, support: Views) -> AdaptedField:
         """The hull of views and reflections, and its colours."""
-        return HullBlend().adapt(with_reflections(support, symmetry_of(support)))
+        symmetry = symmetry_of(support)
+        if symmetry is None:
+            return HullBlend().adapt(support)
+        views = with_reflections(support, symmetry).to(dtype=torch.float32)
+        planes = VisibilityPlanes(views.images, views.cameras, views.masks, hull(views, HullBlend.side))
+        return HullBlend().adapt_to(planes.with_handicaps(handicaps(len(support), symmetry)))
 
 
 @dataclass(frozen=True)

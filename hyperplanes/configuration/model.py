@@ -49,8 +49,8 @@ class ModelConfig:
         plane_dropout: how likely a step of training hides a plane of an object, for a field that knows planes by their
             places. It learns to do without any of them, and where there are fewer views than planes, each stands at one
             plane and the others are hidden, not filled with views that stand elsewhere.
-        stacked: pictures of a field of any number of views are means with those of `hull_blend`, by a share that two of
-            five or more views decide, which are held out for the purpose (`adaptation.stacking`). Training does
+        stacked: pictures of a field of any number of views are means with those of `hull_blend`, by a share that some
+            of five or more views decide, which are held out for the purpose (`adaptation.stacking`). Training does
             without.
         hull_share: of `hull_blend` in the pictures of a model that is not `stacked`: what was decided for one object.
         gated: a gating network makes a share of every pixel of that one (`adaptation.gating`); `training.gating` trains

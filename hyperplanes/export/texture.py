@@ -19,7 +19,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.mesh import Surface
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
-from hyperplanes.geometry.visibility import margins
+from hyperplanes.geometry.visibility import fading, margins
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
@@ -166,7 +166,7 @@ def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views)
     """Yields for every view the colours (texel, 3) that it shows at points, and their weights (texel, 1)."""
     height, width = views.size
     pixels, last = pixel_grid(height, width), torch.tensor([width - 1, height - 1])
-    fading = torch.zeros(len(views)) if views.masks is None else margins(views.masks)
+    borders = torch.zeros(len(views), 4) if views.masks is None else margins(views.masks)
     for view in range(len(views)):
         one = camera.select(views.cameras, [view])
         depth = _distances(solid, views.cameras, view, pixels).reshape(1, 1, height, width)
@@ -183,10 +183,8 @@ def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views)
         tolerance = TOLERANCE * pixel * distance / facing.clamp_min(OBLIQUE)
         visible = ((first - distance).abs() < tolerance) & (span < 3 * tolerance)  # and no edge beside it
         colour = grid_sample(views.images[view : view + 1], at, padding_mode="border", align_corners=True)[0, :, 0].T
-        weight = facing.clamp_min(0) ** SHARPNESS * visible
-        if fading[view]:
-            weight *= ((1 - at[0, 0].abs()) * last / 2).amin(-1).div(fading[view]).clamp(0, 1)
-        yield colour, weight[:, None]
+        shown = 1 - fading(borders[[view]], at[0, 0, :, None].clamp(-1, 1), views.size)
+        yield colour, facing.clamp_min(0)[:, None] ** SHARPNESS * visible[:, None] * shown
 
 
 def _spread(

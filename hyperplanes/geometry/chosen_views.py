@@ -29,9 +29,9 @@ __all__ = [
 DEEPEST = 2.0  # radii
 PARTLY = 2.0  # penalty of a mask that is not whole
 WHOLE = 0.98  # opacity of a mask from which on it counts as whole
-UNSEEN = 8.0  # penalty of a view that does not show the point
-MARGIN = 0.15  # of the shorter side of a picture whose border cuts the object
-CUT = 0.03  # penalty in the middle of the margin
+UNSEEN = 8.0  # penalty of a view that does not show the point: more than all others together
+MARGIN = 0.15  # of the shorter side of a picture, along a border that cuts the object
+CUT = 0.03  # penalty in the middle of the margin; 3 at the border
 BEYOND = 1.01  # margins from where it begins, at which the penalty would be infinite
 FADING = 10.0  # of the weights of views, with their penalty
 ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
@@ -58,7 +58,7 @@ class Penalties:
 
     @classmethod
     def alike(cls) -> Penalties:
-        """A view sees a point or does not: whatever hides it costs 1."""
+        """A view sees a point or does not: whatever hides it costs 1; handicaps and margins count beside that."""
         return cls(deepest=1e3, partly=1e6, steep=1e6, highest=1.0, least=0.0)
 
 

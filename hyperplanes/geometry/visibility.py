@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -37,11 +38,10 @@ from hyperplanes.geometry.lookup_torch import transform_of
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 
-__all__ = ["VisibilityPlanes", "margins"]
+__all__ = ["VisibilityPlanes", "fading", "margins"]
 
 POINTS = 512  # that one call of the kernel works on
-CUTTING = 0.02  # of the shorter side of a picture: as many pixels of the object at its border cut it
-OPAQUE = 0.5  # opacity of a mask from which on a pixel shows the object
+CUTTING = 0.02  # of the shorter side of a picture: as many pixels of the object along a border are cut by it
 
 
 class VisibilityPlanes:
@@ -49,9 +49,9 @@ class VisibilityPlanes:
 
     A view's penalty at a point is how far the point lies behind the first surface that it sees, in radii of the scene
     beyond the `tolerance` and at most DEEPEST; PARTLY more where its mask is not whole, so that background is mixed
-    into the colour; and UNSEEN where the point is not in the picture. Where the border of a picture cuts the object,
-    the penalty rises over a MARGIN towards it, so that the view has no weight left where the picture ends: a seam would
-    be seen between pictures of different exposure (Buehler et al. 2001, "Unstructured Lumigraph Rendering").
+    into the colour; and UNSEEN where the point is not in the picture. Where a border of a picture cuts the object, the
+    penalty rises over a MARGIN towards it, so that the view has no weight left where the picture ends: a seam would be
+    seen between pictures of different exposure (Buehler et al. 2001, "Unstructured Lumigraph Rendering").
 
     Args:
         images: (view, 3, height, width), RGB in [0, 1].
@@ -78,7 +78,7 @@ class VisibilityPlanes:
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
         self._masked = torch.zeros(len(images), dtype=torch.bool, device=images.device)
         self._handicaps = images.new_zeros(len(images))
-        self._margins = images.new_zeros(len(images)) if masks is None else margins(masks).to(images)
+        self._margins = images.new_zeros(len(images), 4) if masks is None else margins(masks).to(images)
         self._penalties = Penalties()
 
     def __len__(self) -> int:
@@ -170,12 +170,12 @@ class VisibilityPlanes:
         """The numbers by which the kernels judge."""
         per_radius, own = 1 / self.occupancy.bounds.radius, self._penalties
         limits = [self.colours.nearest, per_radius, self.tolerance, own.deepest, own.partly, WHOLE, UNSEEN, ANGLE]
-        return [*limits, own.steep, own.highest, own.least, 1 / _margin(*self.depth_opacity.shape[1:3]), CUT]
+        return [*limits, own.steep, own.highest, own.least, 1 / _margin(*self.depth_opacity.shape[1:3]), CUT, BEYOND]
 
     def shown_cameras(self) -> Tensor:
-        """What the kernels read of each view: centre, projection matrix, 0 where hidden, its handicap and margin."""
+        """What the kernels read of each view: centre, projection matrix, 0 where hidden, its handicap and margins."""
         shown = (~self._masked).to(self._cameras)
-        return torch.cat([self._cameras, torch.stack([shown, self._handicaps, self._margins])])
+        return torch.cat([self._cameras, torch.stack([shown, self._handicaps]), self._margins.T])
 
     def _choose_compiled(
         self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
@@ -267,10 +267,7 @@ class VisibilityPlanes:
         own = self._penalties
         penalty = (own.steep * (behind - self.tolerance)).clamp(own.least, own.deepest)
         penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self._handicaps
-        height, width = depth_opacity.shape[1:3]
-        last = found.coordinates.new_tensor([width - 1, height - 1])
-        inside = ((1 - found.coordinates.abs()) * last / 2).amin(-1)
-        cut = (self._margins - inside).clamp_min(0) / _margin(height, width)
+        cut = fading(self._margins, found.coordinates, depth_opacity.shape[1:3])
         penalty = torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
         penalty = torch.where(valid, penalty, UNSEEN)
         values = torch.cat([found.directions, torch.stack([behind, coverage, penalty], -1)], -1)
@@ -286,16 +283,36 @@ class VisibilityPlanes:
         return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
 
 
-def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, " view"]:
-    """The pixels from the border of each picture within which it fades out: 0 where no border cuts the object.
+def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 4"]:
+    """The pixels from the left, right, upper and lower border of each picture within which it fades out.
 
     Args:
-        masks: opacity in [0, 1].
+        masks: opacity in [0, 1]. A border cuts the object where it has some pixels that are whole, not one (of a mask
+            that is not clean, or UNKNOWN as in a reflection).
+
+    Returns:
+        0 where a border does not cut the object.
     """
     height, width = masks.shape[2:]
-    sides = masks[:, 0, [0, -1]].flatten(1), masks[:, 0, :, [0, -1]].flatten(1)
-    outermost = (torch.cat(sides, 1) >= OPAQUE).sum(1)
-    return _margin(height, width) * (outermost >= max(2, CUTTING * min(height, width)))
+    whole = masks[:, 0] >= WHOLE
+    borders = whole[:, :, 0], whole[:, :, -1], whole[:, 0], whole[:, -1]
+    cut = torch.stack([each.sum(1) >= max(2, CUTTING * min(height, width)) for each in borders], 1)
+    return _margin(height, width) * cut
+
+
+def fading(margins: Float[Tensor, "view 4"], coordinates: Float[Tensor, "point view 2"], size: Sequence[int]) -> Tensor:
+    """How far into a margin points lie: 0 inside of all, 1 at the border (point, view).
+
+    Args:
+        margins: of `margins`.
+        coordinates: (column, row) in [-1, 1], from the first pixel's centre to the last one's.
+        size: height and width of the pictures.
+    """
+    height, width = size
+    last = coordinates.new_tensor([width - 1, height - 1])
+    pixels = torch.minimum(((coordinates + 1) * last / 2).clamp_min(0), last)
+    inside = torch.stack([pixels, last - pixels], -1).flatten(-2)  # left, right, upper, lower
+    return (margins - inside).amax(-1).clamp_min(0) / _margin(height, width)
 
 
 def _margin(height: int, width: int) -> float:

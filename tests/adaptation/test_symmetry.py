@@ -259,6 +259,16 @@ def test_the_hull_of_views_and_reflections_shows_sides_that_no_view_sees():
     assert psnr(both, others.images).mean() > psnr(alone, others.images).mean() + 1
 
 
+def test_the_hull_of_views_and_reflections_prefers_views():
+    views = balls(cameras(), BODY)
+    planes = ReflectedHullBlend().adapt(views).field.planes
+    points = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) - 1
+    along = torch.tensor([[0.0, -1.0, 0.0]]).expand(300, 3)
+    seen = planes.choose(points, along, best=1, nearest=len(planes)).nearest
+    assert seen.penalty[seen.views < len(views)].min() == 0
+    assert seen.penalty[seen.views >= len(views)].min() == pytest.approx(HANDICAP)
+
+
 def test_a_model_counts_reflections_as_views_and_gives_the_nearer_ones_a_handicap():
     views = balls(cameras(), BODY)
     symmetric, plain = model(), model()

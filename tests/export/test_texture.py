@@ -107,7 +107,7 @@ def test_a_view_fades_out_towards_a_border_that_cuts_the_object(field, monkeypat
         return float(((red > 0.05) & (red < 0.4)).mean())
 
     smooth = share_between()
-    monkeypatch.setattr(texture, "margins", lambda masks: torch.zeros(len(masks)))
+    monkeypatch.setattr(texture, "margins", lambda masks: torch.zeros(len(masks), 4))
     assert share_between() < smooth / 4
 
 

@@ -25,9 +25,9 @@ def network(seed=0, config=SMALL):
     return ImageBasedNeRF(config)
 
 
-def coloured(count):
+def coloured(count, distance=3.0):
     """Views of a ball with a pattern on every picture, so that no two views show the same colour."""
-    views = ball_views(ring(count, SIZE))
+    views = ball_views(ring(count, SIZE, distance=distance))
     noise = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(3))
     return Views(torch.where(views.masks > 0, 0.5 * views.images + 0.5 * noise, 1.0), views.cameras, views.masks)
 
@@ -152,7 +152,7 @@ def test_density_does_not_depend_on_the_direction_and_colour_does():
 @pytest.mark.parametrize("count", [1, 3, 9])
 @pytest.mark.parametrize("grid", [0, 3])
 def test_the_kernel_reads_what_plain_pytorch_does(count, grid, monkeypatch):
-    """Another implementation; points outside the pictures and hidden views among them."""
+    """Another implementation; points outside the pictures, hidden views and pictures that cut the ball among them."""
     config = ImageBasedConfig(**{**asdict(SMALL), "grid": grid})
     target, views, (points, directions) = network(config=config), coloured(count), queries()
     parameters = Parameters({name: value.clone() for name, value in Parameters.of(target).items()})
@@ -163,9 +163,11 @@ def test_the_kernel_reads_what_plain_pytorch_does(count, grid, monkeypatch):
     occupancy = field.planes.occupancy
     smaller = Occupancy(occupancy.occupied & ~occupancy.surface().occupied, occupancy.bounds)
     judged = replace(field, planes=field.planes.with_surface(smaller))
+    close = bound(target, coloured(count, distance=1.2), parameters)
+    close = replace(close, planes=close.planes.with_handicaps(torch.linspace(0, 0.1, count)))
 
     def outputs():
-        for each in (field, hiding, judged):
+        for each in (field, hiding, judged, close):
             hidden = each.hidden(points)
             yield each(points, directions)
             yield each.colour_of(hidden[::3], directions[::3]), each.density_of(hidden)

@@ -13,7 +13,7 @@ from hyperplanes.geometry.chosen_views import ANGLE, BEYOND, CUT, DEEPEST, MARGI
 from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import pixel_grid
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility import VisibilityPlanes, fading, margins
 from tests.reference_rendering import ball_views, camera_at, ring
 
 SIZE = (20, 24)
@@ -27,7 +27,7 @@ def ball(radius=0.5, side=64):
 
 
 def planes(cameras=None):
-    """Views of a ball; where no cameras are given, the border of the last one cuts it."""
+    """Views of a ball; where no cameras are given, the lower border of the last one cuts it."""
     cutting = camera_at((1.5, 0.5, 2.5), SIZE, target=(0.0, 0.8, 0.0))
     views = ball_views(cameras or concatenate([ring(4, SIZE), cutting]))
     return VisibilityPlanes(views.images, views.cameras, views.masks, carve(views.masks, views.cameras, Sphere(), 32))
@@ -93,7 +93,7 @@ def slow_penalties(shown, points, hidden=()):
             depth, opacity = (top * (1 - v + row) + low * (v - row)).tolist()
             behind = distance - depth
             penalty = min(max(behind - shown.tolerance, -DEEPEST), DEEPEST) + (PARTLY if opacity < WHOLE else 0)
-            cut = 1 - min(u, width - 1 - u, v, height - 1 - v) / (MARGIN * height)
+            cut = 1 - (height - 1 - v) / (MARGIN * height)
             if view == len(shown) - 1 and cut > 0:
                 penalty = max(penalty, 0) + CUT * cut / (BEYOND - cut)
             rows.append([*direction.tolist(), behind, opacity, penalty])
@@ -155,6 +155,35 @@ def test_blended_colours_are_those_of_the_unstructured_lumigraph(monkeypatch, co
     colours = shown.colours.lookup(points).colours.gather(1, order[:, :2, None].expand(-1, -1, 3))
     expected = (weights[..., None] * colours).sum(1) / weights.sum(1, keepdim=True)
     torch.testing.assert_close(blend_views(shown, points, directions, 2), expected, atol=2e-3, rtol=0)
+
+
+def test_a_border_cuts_an_object_where_some_pixels_along_it_are_whole():
+    """Two of them at least, and a fiftieth of the shorter side: four of 200 x 400."""
+    masks = torch.zeros(7, 1, 40, 60)
+    masks[1, 0, 5:35, 10:50] = 1  # nothing is cut
+    masks[2, 0, 0, 0] = 1  # one pixel of two sides
+    masks[3, 0, 10:12, 0] = 1  # two on the left
+    masks[4, 0, :, -1] = 0.97  # all of the right, where there may be anything
+    masks[5, 0, 20:, 30:] = 1  # right and lower
+    masks[6] = 1
+    cut = torch.tensor(
+        [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 1], [1, 1, 1, 1]]
+    )
+    torch.testing.assert_close(margins(masks), MARGIN * 40 * cut)
+    large = torch.zeros(2, 1, 200, 400)
+    large[0, 0, 0, :3], large[1, 0, 0, :4] = 1, 1
+    torch.testing.assert_close(margins(large), MARGIN * 200 * torch.tensor([[0, 0, 0, 0], [0, 0, 1, 0]]))
+
+
+def test_a_picture_fades_out_over_the_margins_of_the_borders_that_cut_the_object():
+    """By hand, of 41 x 61 pixels: at the left border, halfway, beyond the margin, at the lower and the right border."""
+    margin = MARGIN * 41
+    pixels = torch.tensor([[0.0, 20.0], [margin / 2, 20.0], [margin + 1, 20.0], [30.0, 40.0], [60.0, 20.0]])
+    coordinates = (pixels / torch.tensor([60.0, 40.0]) * 2 - 1)[:, None].expand(-1, 2, 2)
+    found = fading(torch.tensor([[margin, 0, 0, margin], [0, 0, 0, 0]]), coordinates, (41, 61))
+    torch.testing.assert_close(found, torch.tensor([[1.0, 0], [0.5, 0], [0, 0], [1, 0], [0, 0]]), atol=1e-5, rtol=0)
+    beyond = torch.full((1, 1, 2), 1 + 1e-6)  # as lookups round
+    assert float(fading(torch.zeros(1, 4), beyond, (41, 61))) == 0
 
 
 def test_a_point_on_a_ball_is_seen_from_its_side_and_lies_behind_it_from_the_other():

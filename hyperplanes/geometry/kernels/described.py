@@ -118,7 +118,7 @@ def _describe_best(s, pitch, packed, shape, chosen, numbers, covered, seen, row,
     zero, one, two = number(0), number(1), number(2)
     total, height, width, slots, bits = shape[0], shape[1], shape[2], shape[3], shape[6]
     best = min(slots, total)
-    unseen, fading, falloff = numbers[6], numbers[13], numbers[14]
+    unseen, fading, falloff = numbers[6], numbers[14], numbers[15]
     sum_of_weights = zero
     for index in range(best):
         view = chosen[index]
@@ -168,8 +168,8 @@ def _describe_nearest(s, pitch, packed, shape, chosen, scores, numbers, row, at,
     unseen, by_angle, falloff, smallest, least_turn = (
         numbers[6],
         numbers[7],
-        numbers[14],
         numbers[15],
+        numbers[16],
         number(LEAST_TURN),
     )
     for index in range(ranked):  # the angle, and what the view is weighted by

@@ -10,7 +10,6 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.chosen_views import BEYOND
 from hyperplanes.geometry.kernels.blocks import inlined
 from hyperplanes.geometry.kernels.llvm import load, load_int, read, store, store_int
 from hyperplanes.geometry.lookup_torch import BORDER
@@ -19,15 +18,15 @@ __all__ = ["choose", "judge", "least", "place", "rank"]
 
 # Rows of the scratch: the direction from the camera, depth behind the hull, opacity and penalty, which are results;
 # then the distance, whether the view shows the point, the fractions of a pixel, the pixel, the score by direction, the
-# angle in it, and how many pixels inside its margin a view shows the point.
-X, Y, Z, BEHIND, OPACITY, PENALTY, DISTANCE, SHOWN, ACROSS, DOWN, AT, SCORE, TURN, CUT = range(14)
+# angle in it, and how many pixels inside the margin of a border the point lies.
+X, Y, Z, BEHIND, OPACITY, PENALTY, DISTANCE, SHOWN, ACROSS, DOWN, AT, SCORE, TURN, INSIDE = range(14)
 RESULTS, ROWS = 6, 14
 
 
 @inlined
 @no_type_check
 def place(s, pitch, total, x, y, z, cameras, shape, min_z):
-    """Projects a point into every view: direction, distance, whether it is shown, the pixel and the fractions."""
+    """Projects a point into every view: direction, distance, whether it is shown, pixel and fractions, and margins."""
     number = s.dtype.type
     zero, one = number(0), number(1)
     height, width = np.int32(shape[1]), np.int32(shape[2])
@@ -57,8 +56,11 @@ def place(s, pitch, total, x, y, z, cameras, shape, min_z):
         shown = front & (u >= low) & (u <= right) & (v >= low) & (v <= bottom) & (read(cameras, 15 * pitch, k) > zero)
         u, v = (min(max(u, zero), last_column) if shown else zero), (min(max(v, zero), last_row) if shown else zero)
         column, row = np.int32(min(u, most_column)), np.int32(min(v, most_row))
-        inside = min(min(u, last_column - u), min(v, last_row - v))
-        store(s, CUT * pitch + k, max(read(cameras, 17 * pitch, k) - inside, zero))
+        m = 17 * pitch
+        inside = max(read(cameras, m, k) - u, read(cameras, m + pitch, k) - (last_column - u))
+        m += 2 * pitch
+        inside = max(inside, max(read(cameras, m, k) - v, read(cameras, m + pitch, k) - (last_row - v)))
+        store(s, INSIDE * pitch + k, max(inside, zero))
         store(s, X * pitch + k, dx * reciprocal)
         store(s, Y * pitch + k, dy * reciprocal)
         store(s, Z * pitch + k, dz * reciprocal)
@@ -78,7 +80,7 @@ def judge(s, pitch, total, cameras, maps, shape, limits):
     across_next, down_next = np.int32(2 * min(shape[2] - 1, 1)), np.int32(2 * shape[2] * min(shape[1] - 1, 1))
     per_unit, tolerance, deepest = limits[1], limits[2], limits[3]
     partly, whole, unseen, steep, highest = limits[4], limits[5], limits[6], limits[8], limits[9]
-    lowest, per_pixel, halfway, end = limits[10], limits[11], limits[12], number(BEYOND)
+    lowest, per_pixel, halfway, end = limits[10], limits[11], limits[12], limits[13]
     for k in range(total):
         at, across, down = load_int(s, AT * pitch, k), load(s, ACROSS * pitch + k), load(s, DOWN * pitch + k)
         right, below = np.int32(at + across_next), np.int32(at + down_next)
@@ -96,8 +98,8 @@ def judge(s, pitch, total, cameras, maps, shape, limits):
         behind = (load(s, DISTANCE * pitch + k) - depth) * per_unit
         penalty = min(max(steep * (behind - tolerance), lowest), deepest)
         penalty = min(penalty + (partly if opacity < whole else zero), highest) + read(cameras, 16 * pitch, k)
-        # a margin where the border of the view cuts the object: more and more towards it
-        cut = per_pixel * load(s, CUT * pitch + k)
+        # in the margin of a border that cuts the object: more and more towards it
+        cut = per_pixel * load(s, INSIDE * pitch + k)
         penalty = max(penalty, zero) + halfway * cut / (end - cut) if cut > zero else penalty
         store(s, BEHIND * pitch + k, behind if shown else zero)
         store(s, OPACITY * pitch + k, opacity if shown else one)
@@ -169,14 +171,14 @@ def choose(
 ):
     """Writes the chosen views of points start..stop. All arrays are flat.
 
-    `cameras` holds 18 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
-    matrix, 0 where it is hidden, its handicap, and the pixels of its margin. `maps` (view, row, column, 2) hold depth
+    `cameras` holds 21 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
+    matrix, 0 where it is hidden, its handicap, and the pixels of its margins. `maps` (view, row, column, 2) hold depth
     and opacity. `shape` is the number of views, height, width, the numbers of chosen views, and the pitch; `limits`
     min_z, 1 / radius, the tolerance, deepest and partly of `chosen_views.Penalties`, WHOLE, UNSEEN, ANGLE, steep,
-    highest, least, 1 / the pixels of a margin, and CUT. `best` and `near` (point, chosen) get indices of views, their
-    values (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each, and `overall` (point, 2)
-    the least opacity and the number of the views that show the point. Where there are no directions nothing is written
-    to `near`.
+    highest, least, 1 / the pixels of a margin, CUT and BEYOND. `best` and `near` (point, chosen) get indices of views,
+    their values (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each, and `overall`
+    (point, 2) the least opacity and the number of the views that show the point. Where there are no directions nothing
+    is written to `near`.
     """
     number = limits.dtype.type
     total, best_count, near_count, pitch = shape[0], shape[3], shape[4], shape[5]
