@@ -16,7 +16,6 @@ from hyperplanes.views import Views
 __all__ = ["FoundSymmetry", "find_symmetry"]
 
 SIZE, PIXELS = 128, 2048  # along the longer side of a single view, and those by which it is judged
-SURE = 2.0  # 104 objects gain 0.54 dB on average; by 1 it is 0.50, and if none is rejected, too
 FEWEST_JUDGED = 10  # views from which on some are held out; fewer gain more, and tell less
 
 
@@ -78,7 +77,8 @@ def _of_one_view(network: HyperPlanesNetwork, view: Views) -> Symmetry | None:
 def _judged(network: HyperPlanesNetwork, views: Views, symmetry: Symmetry) -> FoundSymmetry:
     """The symmetry, unless views that are held out are shown worse with reflections of the others.
 
-    By more than SURE standard errors of the difference: what looks symmetric mostly is.
+    What looks symmetric mostly is, but the more views there are, the less there is to gain. So the difference counts
+    from two standard errors on with 10 views, from half of one with 25, and with more than 30 reflections have to help.
     """
     with in_use(network):
         alone, both = hold_out(network, views), hold_out(network, views, symmetry)
@@ -86,5 +86,5 @@ def _judged(network: HyperPlanesNetwork, views: Views, symmetry: Symmetry) -> Fo
             return FoundSymmetry(symmetry)
         without, reflected = (alone.pixels.errors(each.learned).square().sum(1) for each in (alone, both))
     lost = reflected - without
-    worse = lost.mean() > SURE * lost.std() / math.sqrt(len(lost))
+    worse = lost.mean() > (3 - len(views) / 10) * lost.std() / math.sqrt(len(lost))
     return FoundSymmetry(None, alone) if worse else FoundSymmetry(symmetry, both)
