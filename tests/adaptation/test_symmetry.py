@@ -408,7 +408,7 @@ def test_held_out_views_that_are_surely_shown_worse_decide_and_the_trial_is_kept
 
 @pytest.mark.parametrize(("count", "better"), [(10, True), (14, False)])
 def test_the_more_views_the_less_may_be_lost(monkeypatch, count, better):
-    """By 1.8 standard errors, of which ten views allow 2 and fourteen 1.6."""
+    """By 1.8 standard errors, of which ten views allow 2 and fourteen 1.7."""
     without = torch.full((20, 3), 0.5)
     errors = iter([without, without + torch.tensor((0.3, -0.2)).repeat(10)[:, None]])
     monkeypatch.setattr(HeldOutPixels, "errors", lambda *_: next(errors))
