@@ -77,8 +77,7 @@ def _of_one_view(network: HyperPlanesNetwork, view: Views) -> Symmetry | None:
 def _judged(network: HyperPlanesNetwork, views: Views, symmetry: Symmetry) -> FoundSymmetry:
     """The symmetry, unless views that are held out are shown worse with reflections of the others.
 
-    What looks symmetric mostly is, but the more views there are, the less there is to gain. So the difference counts
-    from two standard errors on with 10 views, from one with 25, and with more than 40 reflections have to help.
+    By more than the standard error of the difference: what looks symmetric mostly is.
     """
     with in_use(network):
         alone, both = hold_out(network, views), hold_out(network, views, symmetry)
@@ -86,5 +85,5 @@ def _judged(network: HyperPlanesNetwork, views: Views, symmetry: Symmetry) -> Fo
             return FoundSymmetry(symmetry)
         without, reflected = (alone.pixels.errors(each.learned).square().sum(1) for each in (alone, both))
     lost = reflected - without
-    worse = lost.mean() > (40 - len(views)) / 15 * lost.std() / math.sqrt(len(lost))
+    worse = lost.mean() > lost.std() / math.sqrt(len(lost))
     return FoundSymmetry(None, alone) if worse else FoundSymmetry(symmetry, both)

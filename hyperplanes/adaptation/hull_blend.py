@@ -52,7 +52,11 @@ class HullBlend:
     @checked
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The hull and its colours.
+        """The hull and its colours; errors are those of `planes_of`."""
+        return self.adapt_to(self.planes_of(support))
+
+    def planes_of(self, support: Views) -> VisibilityPlanes:
+        """The views and their hull, as `adapt_to` takes them.
 
         Raises:
             ValueError: views without masks, or masks that leave nothing.
@@ -60,8 +64,7 @@ class HullBlend:
         if support.masks is None:
             raise ValueError("hull_blend: expected support views with masks, got none; images with alpha have them")
         support = support.to(dtype=torch.float32)
-        region = hull(support, self.side)
-        return self.adapt_to(VisibilityPlanes(support.images, support.cameras, support.masks, region))
+        return VisibilityPlanes(support.images, support.cameras, support.masks, hull(support, self.side))
 
     @torch.no_grad()
     def adapt_to(self, planes: VisibilityPlanes) -> AdaptedField:

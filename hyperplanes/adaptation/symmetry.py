@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from hyperplanes.adaptation.base import AdaptedField, hull
+from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.reflections import (
     HULL_SIDE,
@@ -115,12 +115,11 @@ class ReflectedHullBlend:
 
     def adapt(self, support: Views) -> AdaptedField:
         """The hull of views and reflections, and its colours."""
-        symmetry = symmetry_of(support)
-        if symmetry is None:
-            return HullBlend().adapt(support)
-        views = with_reflections(support, symmetry).to(dtype=torch.float32)
-        planes = VisibilityPlanes(views.images, views.cameras, views.masks, hull(views, HullBlend.side))
-        return HullBlend().adapt_to(planes.with_handicaps(handicaps(len(support), symmetry)))
+        symmetry, blend = symmetry_of(support), HullBlend()
+        planes = blend.planes_of(with_reflections(support, symmetry))
+        if symmetry is not None:
+            planes = planes.with_handicaps(handicaps(len(support), symmetry))
+        return blend.adapt_to(planes)
 
 
 @dataclass(frozen=True)

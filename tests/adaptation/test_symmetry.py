@@ -392,9 +392,9 @@ def test_from_ten_views_on_some_that_are_held_out_have_to_be_shown_better(monkey
     assert judged == [10]
 
 
-@pytest.mark.parametrize(  # the last two: by 1.8 and 2.2 standard errors
+@pytest.mark.parametrize(  # the last two: by 0.8 and 1.3 standard errors
     ("lost", "better"),
-    [((0.3, 0.3), False), ((0.2, -0.3), True), ((-0.1, -0.1), True), ((0.3, -0.2), True), ((0.3, -0.15), False)],
+    [((0.3, 0.3), False), ((0.2, -0.3), True), ((-0.1, -0.1), True), ((0.23, -0.26), True), ((0.25, -0.22), False)],
 )
 def test_held_out_views_that_are_surely_shown_worse_decide_and_the_trial_is_kept(monkeypatch, lost, better):
     without = torch.full((20, 3), 0.5)
@@ -404,16 +404,6 @@ def test_held_out_views_that_are_surely_shown_worse_decide_and_the_trial_is_kept
     assert (found.symmetry is not None) == better
     assert found.trial is not None
     assert found.trial.context.symmetry == found.symmetry
-
-
-@pytest.mark.parametrize(("count", "better"), [(10, True), (14, False)])
-def test_the_more_views_the_less_may_be_lost(monkeypatch, count, better):
-    """By 1.8 standard errors, of which ten views allow 2 and fourteen 1.7."""
-    without = torch.full((20, 3), 0.5)
-    errors = iter([without, without + torch.tensor((0.3, -0.2)).repeat(10)[:, None]])
-    monkeypatch.setattr(HeldOutPixels, "errors", lambda *_: next(errors))
-    found = finding_symmetry.find_symmetry(model(), balls(cameras(count), BODY))
-    assert (found.symmetry is not None) == better
 
 
 @pytest.mark.parametrize("plane", [None, ACROSS])
