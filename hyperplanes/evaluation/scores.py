@@ -13,7 +13,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from hyperplanes.adaptation.base import Adapter, Pictures
+from hyperplanes.adaptation.base import Adapter, Pictures, Renderable
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
@@ -150,7 +150,7 @@ def evaluate(
     adapter: Adapter,
     data: Tasks,
     names: Sequence[str],
-    on_object: Callable[[ObjectScore, Task, Pictures], None] | None = None,
+    on_object: Callable[[ObjectScore, Task, Pictures, Renderable], None] | None = None,
     lpips: Perceptual | None = None,
     on_failure: Callable[[str, Exception], None] | None = None,
 ) -> Score:
@@ -163,7 +163,7 @@ def evaluate(
         adapter: the method.
         data: where the tasks are.
         names: the objects, never trained on.
-        on_object: called after each, with its score, task and pictures.
+        on_object: called after each, with its score, task, pictures and field.
         lpips: where the perceptual distance is asked for, too.
         on_failure: called with an object that cannot be evaluated and the reason, and the next one follows; where
             absent, the first failure ends it.
@@ -180,21 +180,21 @@ def evaluate(
     scores = []
     for name in names:
         try:
-            score, task, pictures = _evaluate_one(name, adapter, data, lpips)
+            found = _evaluate_one(name, adapter, data, lpips)
         except (ValueError, OSError) as error:
             if on_failure is None:
                 raise
             on_failure(name, error)
             continue
-        scores.append(score)
+        scores.append(found[0])
         if on_object is not None:
-            on_object(score, task, pictures)
+            on_object(*found)
     return Score(method, tuple(scores))
 
 
 def _evaluate_one(
     name: str, adapter: Adapter, data: Tasks, lpips: Perceptual | None
-) -> tuple[ObjectScore, Task, Pictures]:
+) -> tuple[ObjectScore, Task, Pictures, Renderable]:
     task = data.task(name)
     if not len(task.query):
         raise ValueError(f"{name}: expected at least one query view to compare with, got none")
@@ -215,7 +215,7 @@ def _evaluate_one(
         None if masks is None else _number(float(foreground_psnr(images, truth, masks).nanmean())),
         None if lpips is None else float(lpips(images, truth).mean()),
     )
-    return score, task, pictures
+    return score, task, pictures, adapted
 
 
 def evaluate_all(
@@ -258,7 +258,7 @@ def evaluate_all(
         assert on_failure is not None
         on_failure(method, seed, name, error)
 
-    def seen(method: str, seed: int, score: ObjectScore, task: Task, pictures: Pictures) -> None:
+    def seen(method: str, seed: int, score: ObjectScore, task: Task, pictures: Pictures, _: Renderable) -> None:
         nonlocal done
         done += 1
         report(done, len(methods) * len(names) * seeds, f"{method} on {score.name}: {score.psnr:.2f} dB")

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hyperplanes.adaptation.base import Pictures
+from hyperplanes.adaptation.base import Pictures, Renderable
 from hyperplanes.adaptation.checkpoints import find_checkpoints
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.initialisation import LEARNED
@@ -27,13 +27,15 @@ from hyperplanes.experiments.scales import Scale
 from hyperplanes.experiments.trainings import Train, Trainings
 from hyperplanes.experiments.workers import Result, Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
-from hyperplanes.export.images import save_images
+from hyperplanes.export.images import orbit_cameras, save_images
 from hyperplanes.methods import Unchecked, WithSampler, make_method
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.writing import write_json
 from hyperplanes.views import Task, Tasks
 
-__all__ = ["Curve", "OnScore", "Outcome", "Runner", "curve_of", "file_name"]
+__all__ = ["ORBIT", "Curve", "OnScore", "Outcome", "Runner", "curve_of", "file_name"]
+
+ORBIT = "orbit"  # folder of pictures
 
 Curve = list[dict[str, float]]
 
@@ -206,6 +208,7 @@ class Runner:
             "views": self._views(cell, checkpoint),
             "fine_tuning": stated(self.fine_tuning(cell)),
             **({} if cell.query is None else {"query": cell.query}),
+            **({"orbit": cell.orbit} if cell.orbit else {}),
             **self.data.reading,
         }
         for name in self.data.evaluated(cell.on, cell.split, experiment.objects):
@@ -225,7 +228,7 @@ class Runner:
         method = self.scale.method(cell.method)
         if self._method_in_use is None or self._method_in_use[0] != made_for:
             self._method_in_use = made_for, self._method(experiment, cell, method, job.checkpoint, job.seed)
-        keep = partial(_save_pictures, self.pictures(cell, job.name)) if experiment.keep_pictures else None
+        keep = partial(_save_pictures, self.pictures(cell, job.name), cell) if experiment.keep_pictures else None
         return evaluate(method, *self._method_in_use[1], [job.name], keep).objects[0]
 
     def _given(self, class_name: str) -> dict[str, Path]:
@@ -240,7 +243,10 @@ class Runner:
         return self.workspace.out / "evaluations" / f"{unique_name(start, settings)}.json"
 
     def pictures(self, cell: Cell, name: str) -> Path:
-        """The folder of the query views of an object, as a cell shows them, where they are kept."""
+        """The folder of the query views of an object, as a cell shows them, where they are kept.
+
+        Views on a circle are in its folder ORBIT.
+        """
         return self.workspace.out / "pictures" / cell.column / file_name(cell.row) / name
 
     def picture(self, experiment: Experiment, cell: Cell) -> tuple[Tensor, Tensor]:
@@ -306,7 +312,11 @@ def _evaluate(job: Evaluation, runner: Runner) -> ObjectScore:
     return runner.evaluate(job)
 
 
-def _save_pictures(folder: Path, score: ObjectScore, task: Task, pictures: Pictures) -> None:
+def _save_pictures(
+    folder: Path, cell: Cell, score: ObjectScore, task: Task, pictures: Pictures, adapted: Renderable
+) -> None:
+    if cell.orbit:
+        save_images(adapted.render(orbit_cameras(task.support, cell.orbit)).images, folder / ORBIT)
     save_images(pictures.images, folder, task.query.names)
 
 

@@ -53,6 +53,7 @@ class Cell:
         views: support views that are shown; as many as the model has planes where None.
         query: query views that are kept back, where the views that are shown are chosen as far apart as all of them
             stand; all query views where None, and the first support views are shown.
+        orbit: views on a circle around each object that are kept as files, where pictures are.
     """
 
     row: str
@@ -65,6 +66,7 @@ class Cell:
     trainable: Literal["hypernetwork", "weights"] = "hypernetwork"
     views: int | None = None
     query: int | None = None
+    orbit: int = 0
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples, Sampler
-from hyperplanes.rendering.scene import FieldFunction, Scene, SplitField, evaluate, points_per_batch
+from hyperplanes.rendering.scene import FieldFunction, Scene, SplitField, evaluate, join_hidden, points_per_batch
 
 __all__ = ["integrate"]
 
@@ -23,7 +23,7 @@ BESIDE = 0.03  # optical depth of a sample from which on those beside it are eva
 JUMP = 1.0  # of the optical depth from one sample to the next from which on the one between them is evaluated
 MIN_SHARE = 0.1  # of the largest weight of a pixel: samples from which on their colours are evaluated
 MIN_OPACITY = 1 / 64  # of a pixel whose colour is
-GROWTH = 4  # every later round takes this fraction of the samples so far, and at least as many as the first
+GROWTH = 2  # every later round takes this fraction of the samples so far, and at least as many as the first
 FIRST_REACH = 4  # samples a ray whose densities are evaluated first to draw those that have a gradient
 UNSEEN = 1 / 512  # `stop` up to which a ray that is stopped keeps its rest of background, half a grey level of 8 bits
 DIFFERENTIATED = 0.01  # weight of a sample from which on it always has its gradient, below in proportion to it
@@ -282,14 +282,33 @@ def _colours(
     scale = total / zeros.index_add(0, ray, weights * known)  # infinite where no colour is known
     colour, wanted = weights.new_zeros(len(samples), 3), torch.zeros_like(samples.ray, dtype=torch.bool)
     wanted[index] = known
-    for batch, values in hidden:
-        chosen = wanted[batch].nonzero()[:, 0]
-        if len(chosen):
-            place = batch[chosen]
-            here = samples.ray[place]
-            seen = field.colour_of(values[chosen], rays.directions[here])
-            colour[place] = (seen * scale[here, None]).to(colour)
+    for place, values in _joined(hidden, wanted):
+        here = samples.ray[place]
+        seen = field.colour_of(values, rays.directions[here])
+        colour[place] = (seen * scale[here, None]).to(colour)
     return torch.where(scale.isfinite()[ray, None], colour[index], background)
+
+
+def _joined(batches: Iterable[tuple[Tensor, Any]], wanted: Tensor) -> Generator[tuple[Tensor, Any]]:
+    """The wanted samples of batches in fewer ones: those of late rounds are so small that their number is what counts.
+
+    Args:
+        batches: indices of samples, and what their colours are computed from.
+        wanted: of each sample, whether it is.
+
+    Yields:
+        Batches as they came, of at most `points_per_batch` samples.
+    """
+    held: list[tuple[Tensor, Any]] = []
+    for index, values in batches:
+        chosen = wanted[index].nonzero()[:, 0]
+        if held and sum(len(place) for place, _ in held) + len(chosen) > points_per_batch(wanted.device):
+            yield torch.cat([place for place, _ in held]), join_hidden([part for _, part in held])
+            held = []
+        if len(chosen):
+            held.append((index[chosen], values[chosen]))
+    if held:
+        yield torch.cat([place for place, _ in held]), join_hidden([part for _, part in held])
 
 
 def _in_batches(function: Callable[[Tensor], Any], points: Tensor) -> list[Any]:

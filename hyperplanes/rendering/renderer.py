@@ -25,6 +25,8 @@ from hyperplanes.utilities.arguments import checked
 
 __all__ = ["FieldFunction", "Hierarchical", "RayMarching", "Sampler", "allow_tf32", "render"]
 
+SMALLEST_PART = 16  # of these in as many rays as are rendered at once: fewer are not worth a second thread
+
 
 class _Options(TypedDict, total=False):
     bounds: Sphere | None
@@ -143,11 +145,11 @@ def _in_chunks(
 def _bounds(total: int, size: int) -> list[int]:
     """Where parts of at most so many begin and end: equal ones, an even number of them for two threads.
 
-    >>> _bounds(10, 4), _bounds(2, 4), _bounds(0, 4)
+    >>> _bounds(10, 4), _bounds(2, 64), _bounds(0, 4)
     ([0, 3, 5, 8, 10], [0, 2], [0, 0])
     """
     count = max(1, -(-total // size))
-    count += count % 2 if total > size // 2 else 0
+    count += count % 2 if total > size // SMALLEST_PART else 0
     return [-(-part * total // count) for part in range(count + 1)]
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.utilities.arguments import kind_of
 
-__all__ = ["FieldFunction", "Scene", "SplitField", "evaluate", "points_per_batch"]
+__all__ = ["FieldFunction", "Scene", "SplitField", "evaluate", "join_hidden", "points_per_batch"]
 
 FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Points (n, 3) and unit directions (n, 3) -> colours (n, 3) in [0, 1] and densities (n,) per world unit.
@@ -33,7 +33,10 @@ class SplitField(Protocol):
         ...
 
     def hidden(self, points: Tensor) -> Any:
-        """What densities and colours of points (n, 3) are computed from; it can be indexed like a tensor."""
+        """What densities and colours of points (n, 3) are computed from.
+
+        A tensor of as many rows, or a dataclass of such tensors that can be indexed like one.
+        """
         ...
 
     def density_of(self, hidden: Any) -> Tensor:
@@ -109,6 +112,20 @@ def _is_negative(density: Tensor) -> bool:
     if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
         return False
     return bool((density.detach() < 0).any())
+
+
+def join_hidden(parts: Sequence[Any]) -> Any:
+    """What a `SplitField` computes densities and colours from, of several batches of points as one.
+
+    Args:
+        parts: at least one.
+    """
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    if isinstance(first, Tensor):
+        return torch.cat(list(parts))
+    return type(first)(*(torch.cat([getattr(part, each.name) for part in parts]) for each in fields(first)))
 
 
 def points_per_batch(device: torch.device) -> int:

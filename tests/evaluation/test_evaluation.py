@@ -93,8 +93,8 @@ def test_pictures_are_clamped_before_they_are_compared():
 def test_every_object_is_shown_to_the_caller():
     data, seen = Balls(test=2), []
     evaluate("nearest_view", NearestView(), data, data.names("test"), lambda *shown: seen.append(shown))
-    assert [score.name for score, _, _ in seen] == [task.name for _, task, _ in seen] == data.names("test")
-    assert all(pictures.images.shape == task.query.images.shape for _, task, pictures in seen)
+    assert [score.name for score, _, _, _ in seen] == [task.name for _, task, _, _ in seen] == data.names("test")
+    assert all(pictures.images.shape == task.query.images.shape for _, task, pictures, _ in seen)
 
 
 def test_a_row_in_json():

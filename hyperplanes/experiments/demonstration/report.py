@@ -25,7 +25,7 @@ from hyperplanes.experiments.demonstration.settings import (
     DemoSettings,
     describe_row,
 )
-from hyperplanes.experiments.engine import Runner, curve_of
+from hyperplanes.experiments.engine import ORBIT, Runner, curve_of
 from hyperplanes.experiments.experiment import Cell
 from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
 from hyperplanes.experiments.page.content import Pixels
@@ -57,7 +57,6 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
         settings: of the demonstration.
         scores: by row, over all classes.
     """
-    model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(runner.device)
     fewest, most = settings.first_counts[0], settings.first_counts[-1]
     best = f"views_{most}"
     exhibits, names = [], []
@@ -65,7 +64,8 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
         cells = [cell for cell in settings.packaged.cells if cell.on == on]
         for name in runner.data.evaluated(on, "all", settings.packaged.objects):
             task = Shown(runner.data.tasks(on), most, QUERY_VIEWS).task(name)
-            around = _round(model, task.support, orbit_cameras(task.support, settings.frames // 2))
+            shown = next(runner.pictures(cell, name) for cell in cells if cell.orbit)
+            around = np.stack([_read(path) for path in sorted((shown / ORBIT).iterdir())])
             read, query = range(len(task.support)), range(len(task.query))
             exhibits.append(_exhibit(runner, cells, scores, task, read, query, around))
             names.append(f"{on}/{name}")

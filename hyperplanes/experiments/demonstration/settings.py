@@ -124,7 +124,8 @@ class DemoSettings:
             method = row if row == "nearest_view" else "hyperplanes"
             for on in (*self.first, *(["meshes"] if self.meshes else [])):
                 trained = Trained(on, packaged=PACKAGED)
-                cells.append(Cell(row, on, trained, method, on, "all", views=count, query=QUERY_VIEWS))
+                orbit = self.frames // 2 if row == f"views_{self.first_counts[-1]}" else 0
+                cells.append(Cell(row, on, trained, method, on, "all", views=count, query=QUERY_VIEWS, orbit=orbit))
         return self._experiment(cells, objects=MOST - len(self.first), keep_pictures=True)
 
     def _cell(self, row: str, method: str, on: str = "") -> Cell:
