@@ -50,7 +50,8 @@ def test_the_cpu_build_of_torch_is_looked_for_and_what_comes_is_said(reached, gp
     }
     done = subprocess.run(["scripts/setup", "venv"], cwd=root, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    *of_torch, package = log.read_text().splitlines()
+    *of_torch, of_kernels, package = log.read_text().splitlines()
+    assert of_kernels == "install -q --no-compile -c constraints.txt jaxtyping kornia numba scipy"
     assert package == "install -q --no-compile -c constraints.txt -e ."
     assert len(of_torch) == len(asked)
     for call, expected in zip(of_torch, asked, strict=True):
