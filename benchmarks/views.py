@@ -113,7 +113,7 @@ def main(arguments: list[str]) -> int:
                     adapter,
                     shown,
                     names,
-                    lambda _, task, found, made=made: made.extend(zip(task.query.images, found.images, strict=True)),
+                    lambda _, task, found, field, made=made: made.extend(zip(task.query.images, found.images, strict=True)),
                 )
                 row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
                 row["worst"] = min(each.psnr for each in score.objects)

@@ -142,7 +142,7 @@ def test_no_method_reads_a_pixel_of_the_query_views(folders, monkeypatch):
     objects = [data.task(name).support for name in data.names("test")]
     for name in (f"{name}_2" if name.endswith("scratch") else name for name in METHODS):
         adapter = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))
-        evaluate(name, adapter, data, ["test0"], lambda score, task, pictures: read.append(pictures.images))
+        evaluate(name, adapter, data, ["test0"], lambda score, task, pictures, field: read.append(pictures.images))
         again = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))
         shown = again.adapt(clean.task("test0").support).render(clean.task("test0").query[:1].cameras).images
         assert torch.equal(read[-1], shown), name

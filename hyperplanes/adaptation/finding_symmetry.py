@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 
 from hyperplanes.adaptation.held_out import Trial, hold_out
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.adaptation.symmetry import possible_symmetries, symmetry_of
+from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.views import Views
 
@@ -80,10 +82,11 @@ def _judged(network: HyperPlanesNetwork, views: Views, symmetry: Symmetry) -> Fo
     By more than the standard error of the difference: what looks symmetric mostly is.
     """
     with in_use(network):
-        alone, both = hold_out(network, views), hold_out(network, views, symmetry)
+        alone, both = parallel_map(partial(hold_out, network, views), [None, symmetry])
         if alone is None or both is None:
             return FoundSymmetry(symmetry)
-        without, reflected = (alone.pixels.errors(each.learned).square().sum(1) for each in (alone, both))
+        errors = parallel_map(lambda each: alone.pixels.errors(each.learned), [alone, both])
+        without, reflected = (each.square().sum(1) for each in errors)
     lost = reflected - without
     worse = lost.mean() > lost.std() / math.sqrt(len(lost))
     return FoundSymmetry(None, alone) if worse else FoundSymmetry(symmetry, both)
