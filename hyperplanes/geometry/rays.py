@@ -126,15 +126,17 @@ def cast(
     if view.device.type == "cpu":
         check_indices(view, cameras.batch_size, "view", "cameras")
     pixels = pixels.to(cameras.extrinsics)
-    pose = camera.camera_from_world(cameras)[view]
-    matrix = camera.intrinsics(cameras)[view]
+    # of a single camera, the numbers stand for all of its rays
+    row = slice(None) if cameras.batch_size == 1 else view
+    rotation, matrix = camera.camera_from_world(cameras)[row, :3, :3], camera.intrinsics(cameras)[row]
     shown = None
     if isinstance(cameras, DistortedCamera):
         pixels, shown = undistorted_pixels(cameras, view, pixels)
     y = (pixels[:, 1] - matrix[:, 1, 2]) / matrix[:, 1, 1]
     x = (pixels[:, 0] - matrix[:, 0, 2] - matrix[:, 0, 1] * y) / matrix[:, 0, 0]
     local = torch.stack([x, y, torch.ones_like(x)], -1)
-    directions = torch.nn.functional.normalize((pose[:, :3, :3].mT @ local[..., None]).squeeze(-1), dim=-1)
+    along = local @ rotation[0] if len(rotation) == 1 else (rotation.mT @ local[..., None]).squeeze(-1)
+    directions = torch.nn.functional.normalize(along, dim=-1)
     origins = camera.centres(cameras)[view]
     to_centre = origins.new_tensor(bounds.centre) - origins
     if near_far == "constant":
