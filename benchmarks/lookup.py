@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 from pathlib import Path
 
 import torch
 
 from benchmarks._timing import copy_bandwidth, interleaved, peak_bytes, ratio, table
+from benchmarks.load import load_at_start
 from benchmarks.lookup_plot import plot
 from benchmarks.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
 from benchmarks.reporting import Row
@@ -100,7 +100,7 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.threads:
         torch.set_num_threads(options.threads)
-    about = environment() | {"load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None}
+    about = environment() | {"load": round(load_at_start(), 2)}
     bandwidth = copy_bandwidth(128 if options.quick else 512)
     about["copy_gigabytes_per_second"] = bandwidth / 1e9
     title = f"{about['processor']}, {about['threads']} threads, commit {about['commit']}, load {about['load']:.1f}"

@@ -24,6 +24,7 @@ import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -41,7 +42,7 @@ from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.adaptation.symmetry import ReflectedHullBlend
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Inputs, Shown
-from hyperplanes.evaluation import Score, evaluate
+from hyperplanes.evaluation import ObjectScore, Score, evaluate
 from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
 from hyperplanes.geometry.volume import CHANNELS
@@ -113,7 +114,7 @@ def main(arguments: list[str]) -> int:
                     adapter,
                     shown,
                     names,
-                    lambda _, task, found, field, made=made: made.extend(zip(task.query.images, found.images, strict=True)),
+                    partial(_keep, made),
                 )
                 row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
                 row["worst"] = min(each.psnr for each in score.objects)
@@ -129,6 +130,11 @@ def main(arguments: list[str]) -> int:
         sheet = [pad(row, (0, widest - row.shape[2]), value=1.0) for row in sheet]
         write_whole(chosen.pictures, encode_png(to_pixels(torch.cat(sheet, 1)[None])[0], small=True))
     return 0
+
+
+def _keep(made: list[tuple[Tensor, Tensor]], _: ObjectScore, task: Task, pictures: Pictures, field: Renderable) -> None:
+    """Take the query views of an object, and what was made of them, into a list."""
+    made.extend(zip(task.query.images, pictures.images, strict=True))
 
 
 def add_data_options(parser: argparse.ArgumentParser) -> None:

@@ -14,6 +14,8 @@ from PIL import Image
 from small_demo import demo_folder
 
 from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.checkpoints import packaged_folder
+from hyperplanes.data.support import Shown
 from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.experiments.demonstration.settings import DemoSettings
 from hyperplanes.experiments.demonstration.steps import Demonstration
@@ -21,6 +23,7 @@ from hyperplanes.experiments.engine import Runner
 from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
 from hyperplanes.experiments.page.charts import line_chart
 from hyperplanes.experiments.page.pictures import ERROR_SCALE, colour_scale, error_map
+from hyperplanes.export.images import orbit_cameras, to_pixels
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.environment import find_commit
 from tests.reference_rendering import Balls
@@ -189,7 +192,7 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     shown, balls = [], NamedBalls(train=0, test=1, views=6, size=(24, 24))
     monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: balls)
     monkeypatch.setattr(DataSets, "folder", lambda data, class_name: tmp_path)
-    settings = replace(DemoSettings.quick_check(), first=("car",), first_counts=(3,), frames=2)
+    settings = replace(DemoSettings.quick_check(), first=("car",), first_counts=(3,), frames=4)
     cpu = torch.device("cpu")
 
     def make_runner(workspace, scale):
@@ -199,3 +202,9 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     assert (tmp_path / "first.html").exists()
     rows = [line.partition(":")[0] for line in shown]
     assert rows == ["nearest of 3 views, copied", "3 views", "the first page"]
+    frames = sorted((tmp_path / "first/pictures/car/views_3/test0/orbit").iterdir())
+    model = HyperPlanes.from_pretrained(packaged_folder("small"))
+    support = Shown(balls, 3, 2).task("test0").support
+    found = to_pixels(model.adapt(support).render(orbit_cameras(support, 2)).images)
+    read = np.stack([np.asarray(Image.open(frame).convert("RGB")) for frame in frames])
+    assert np.abs(read.astype(int) - found).max() <= 1

@@ -38,3 +38,10 @@ def test_a_link_or_a_folder_of_another_user_is_not_used(tmp_path, cache_folder, 
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
     with pytest.warns(UserWarning, match="not this user's alone"):
         assert Path(cache_folder()).name.startswith("hyperplanes-kernels-")
+
+
+def test_setup_compiles_every_kernel_without_gradients():
+    from hyperplanes.geometry.kernels.__main__ import RENDERING
+    from hyperplanes.geometry.kernels.compiling import _SIGNATURES
+
+    assert set(RENDERING) == {name for name in _SIGNATURES if "backward" not in name}

@@ -351,7 +351,7 @@ class SplitBall:
     """A soft ball of some share of its density, whose colours are asked for after it; it counts for how many points."""
 
     def __init__(self, share):
-        self.share, self.coloured = share, 0
+        self.share, self.coloured, self.calls = share, 0, 0
 
     def __call__(self, points, directions):
         return self.colour_of(points, directions), self.density_of(points)
@@ -363,8 +363,17 @@ class SplitBall:
         return self.share * soft_ball(hidden, hidden)[1]
 
     def colour_of(self, hidden, directions):
-        self.coloured += len(hidden)
+        self.coloured, self.calls = self.coloured + len(hidden), self.calls + 1
         return soft_ball(hidden, directions)[0]
+
+
+def test_colours_of_all_rounds_are_asked_for_in_one_call():
+    split, called = SplitBall(0.1), []
+    render(split, some_rays(300), RayMarching(96, 1e-3), occupancy=GRID, differentiable=False, chunk=1000)
+    called.append(split.calls)
+    render(split, some_rays(3), RayMarching(96, 1e-3), occupancy=GRID, differentiable=False, chunk=1000)
+    called.append(split.calls - called[0])
+    assert called == [2, 1]  # a part of the rays for each thread, and one part
 
 
 @pytest.mark.parametrize("share", [1.0, 0.02])
