@@ -10,6 +10,7 @@ from hyperplanes.geometry import Sphere, carve, cast
 from hyperplanes.geometry import visibility as module
 from hyperplanes.geometry.cameras import centres, concatenate, projection_matrices
 from hyperplanes.geometry.chosen_views import ANGLE, BEYOND, CUT, DEEPEST, MARGIN, PARTLY, UNSEEN, WHOLE, Penalties
+from hyperplanes.geometry.distortion import distorted, distorted_pixels
 from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import pixel_grid
@@ -184,6 +185,31 @@ def test_a_picture_fades_out_over_the_margins_of_the_borders_that_cut_the_object
     torch.testing.assert_close(found, torch.tensor([[1.0, 0], [0.5, 0], [0, 0], [1, 0], [0, 0]]), atol=1e-5, rtol=0)
     beyond = torch.full((1, 1, 2), 1 + 1e-6)  # as lookups round
     assert float(fading(torch.zeros(1, 4), beyond, (41, 61))) == 0
+
+
+def test_a_picture_fades_out_by_where_its_lens_shows_a_point():
+    pinholes = concatenate([ring(4, SIZE), camera_at((1.5, 0.5, 2.5), SIZE, target=(0.0, 0.8, 0.0))])
+    cameras = distorted(pinholes, torch.tensor([0.4, 0.0, 0.0, 0.0, 0.0]))
+    views, (points, _) = ball_views(cameras), queries(500)
+    given = views.images, views.cameras, views.masks, ball()
+    fading_out, whole = VisibilityPlanes(*given), VisibilityPlanes(*given)
+    whole._margins = torch.zeros_like(whole._margins)
+    found, plain = (_penalties_of(each.choose(points, best=5).best, 4) for each in (fading_out, whole))
+    # by hand: the row where the lens shows the point, and how far it lies in the margin of the lower border
+    matrix = projection_matrices(pinholes)[4]
+    ideal = points @ matrix[:, :3].T + matrix[:, 3]
+    ideal = (ideal[:, :2] / ideal[:, 2:])[:, None].expand(-1, 5, -1)
+    row = distorted_pixels(cameras, ideal)[0][:, 4, 1].clamp(0, SIZE[0] - 1)
+    cut = 1 - (SIZE[0] - 1 - row) / (MARGIN * SIZE[0])
+    expected = torch.where(cut > 0, plain.clamp_min(0) + CUT * cut / (BEYOND - cut), plain)
+    expected = torch.where(plain == UNSEEN, UNSEEN, expected)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+    assert ((cut > 0) & (plain < UNSEEN)).sum() > 10  # some lie in the margin
+
+
+def _penalties_of(chosen, view):
+    """The penalties of one of the views, all of which were chosen."""
+    return chosen.penalty[chosen.views == view]
 
 
 def test_a_point_on_a_ball_is_seen_from_its_side_and_lies_behind_it_from_the_other():

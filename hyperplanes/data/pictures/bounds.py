@@ -86,6 +86,9 @@ def estimate_bounds(
 def cut_off(masks: Float[Tensor, "view 1 height width"]) -> Bool[Tensor, " view"]:
     """Which masks reach the border of their picture.
 
+    A single pixel that is hardly opaque counts: of a view that is taken to show the object whole, all of it is used. For
+    the weights of colours, where little of it does no harm, `geometry.visibility.margins` asks for more.
+
     Args:
         masks: opacity.
     """
