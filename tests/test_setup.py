@@ -16,6 +16,10 @@ case "$*" in
     *+cpu*) exit 1 ;;
 esac
 """
+PYTHON = """#!/bin/sh
+[ "$1" = -m ] && echo "$2" >> "$ASKED.run"
+[ "$1" != -c ]
+"""  # cannot import torch
 
 
 def script(path, text):
@@ -40,7 +44,7 @@ def test_the_cpu_build_of_torch_is_looked_for_and_what_comes_is_said(reached, gp
     shutil.copy(ROOT / "constraints.txt", root)
     torch = next(line for line in (root / "constraints.txt").read_text().splitlines() if line.startswith("torch=="))
     script(root / "venv/bin/pip", PIP)
-    script(root / "venv/bin/python", "#!/bin/sh\n[ $1 != -c ]\n")  # cannot import torch
+    script(root / "venv/bin/python", PYTHON)
     script(tmp_path / "bin/nvidia-smi", f"#!/bin/sh\nexit {int(not gpu)}\n")
     script(tmp_path / "bin/ldconfig", "#!/bin/sh\necho libEGL.so.1 libGL.so.1 libXrender.so.1\n")
     environment = os.environ | {
@@ -53,6 +57,7 @@ def test_the_cpu_build_of_torch_is_looked_for_and_what_comes_is_said(reached, gp
     *of_torch, of_kernels, package = log.read_text().splitlines()
     assert of_kernels == "install -q --no-compile -c constraints.txt jaxtyping kornia numba scipy"
     assert package == "install -q --no-compile -c constraints.txt -e ."
+    assert Path(f"{log}.run").read_text() == "hyperplanes.geometry.kernels\n"
     assert len(of_torch) == len(asked)
     for call, expected in zip(of_torch, asked, strict=True):
         assert expected.replace("torch==N", torch) in call

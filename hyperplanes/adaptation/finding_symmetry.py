@@ -11,7 +11,7 @@ import torch
 from hyperplanes.adaptation.held_out import Trial, hold_out
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.adaptation.symmetry import possible_symmetries, symmetry_of
-from hyperplanes.geometry.kernels.threads import parallel_map
+from hyperplanes.geometry.kernels.threads import side_by_side
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.views import Views
 
@@ -82,10 +82,11 @@ def _judged(network: HyperPlanesNetwork, views: Views, symmetry: Symmetry) -> Fo
     By more than the standard error of the difference: what looks symmetric mostly is.
     """
     with in_use(network):
-        alone, both = parallel_map(partial(hold_out, network, views), [None, symmetry])
+        device = views.images.device
+        alone, both = side_by_side(partial(hold_out, network, views), [None, symmetry], device)
         if alone is None or both is None:
             return FoundSymmetry(symmetry)
-        errors = parallel_map(lambda each: alone.pixels.errors(each.learned), [alone, both])
+        errors = side_by_side(lambda each: alone.pixels.errors(each.learned), [alone, both], device)
         without, reflected = (each.square().sum(1) for each in errors)
     lost = reflected - without
     worse = lost.mean() > lost.std() / math.sqrt(len(lost))

@@ -20,7 +20,7 @@ from hyperplanes.adaptation.reflections import (
     with_reflections,
 )
 from hyperplanes.geometry.cameras import camera_directions
-from hyperplanes.geometry.kernels.threads import parallel_map
+from hyperplanes.geometry.kernels.threads import side_by_side
 from hyperplanes.geometry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.poses import farthest_first
@@ -148,7 +148,7 @@ class _Judge:
 
     def planes(self, planes: Sequence[Plane], most: float = TOLERANCE) -> dict[Plane, float]:
         """The errors, relative to that without reflections, of planes by which they are at most so large."""
-        errors = parallel_map(self.error, [Symmetry(plane) for plane in planes])
+        errors = side_by_side(self.error, [Symmetry(plane) for plane in planes], self.views.images.device)
         return {plane: e for plane, e in zip(planes, errors, strict=True) if e <= most and math.isfinite(e)}
 
     def several(self, plane: Plane, error: float, given: Views, least: int = 2) -> tuple[Symmetry, float] | None:

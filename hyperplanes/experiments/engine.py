@@ -27,7 +27,7 @@ from hyperplanes.experiments.scales import Scale
 from hyperplanes.experiments.trainings import Train, Trainings
 from hyperplanes.experiments.workers import Result, Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
-from hyperplanes.export.images import orbit_cameras, save_images
+from hyperplanes.export.images import orbit_cameras, picture_paths, save_images
 from hyperplanes.methods import Unchecked, WithSampler, make_method
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.writing import write_json
@@ -35,7 +35,7 @@ from hyperplanes.views import Task, Tasks
 
 __all__ = ["ORBIT", "Curve", "OnScore", "Outcome", "Runner", "curve_of", "file_name"]
 
-ORBIT = "orbit"  # folder of pictures
+ORBIT = "orbit"  # in the folder of an object's pictures: views on a circle around it
 
 Curve = list[dict[str, float]]
 
@@ -215,7 +215,8 @@ class Runner:
             settings = {**shared, "object": name}
             path, whole = self._evaluation(cell, settings), True
             if experiment.keep_pictures:
-                whole = self.pictures(cell, name).exists()
+                folder = self.pictures(cell, name)
+                whole = folder.exists() and all(each.exists() for each in picture_paths(cell.orbit, folder / ORBIT))
             known = read_json(path) if path.exists() else {}
             found = known.get("settings") == plain(settings) and whole
             score = Score.of_json(method, known["score"]) if found else None

@@ -13,7 +13,15 @@ from torch import Tensor
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples, Sampler
-from hyperplanes.rendering.scene import FieldFunction, Scene, SplitField, evaluate, join_hidden, points_per_batch
+from hyperplanes.rendering.scene import (
+    FieldFunction,
+    Scene,
+    SplitField,
+    can_be_joined,
+    evaluate,
+    join_hidden,
+    points_per_batch,
+)
 
 __all__ = ["integrate"]
 
@@ -23,7 +31,7 @@ BESIDE = 0.03  # optical depth of a sample from which on those beside it are eva
 JUMP = 1.0  # of the optical depth from one sample to the next from which on the one between them is evaluated
 MIN_SHARE = 0.1  # of the largest weight of a pixel: samples from which on their colours are evaluated
 MIN_OPACITY = 1 / 64  # of a pixel whose colour is
-GROWTH = 2  # every later round takes this fraction of the samples so far, and at least as many as the first
+GROWTH = 2  # every later round takes one of so many of the samples so far, and at least as many as the first
 FIRST_REACH = 4  # samples a ray whose densities are evaluated first to draw those that have a gradient
 UNSEEN = 1 / 512  # `stop` up to which a ray that is stopped keeps its rest of background, half a grey level of 8 bits
 DIFFERENTIATED = 0.01  # weight of a sample from which on it always has its gradient, below in proportion to it
@@ -297,12 +305,15 @@ def _joined(batches: Iterable[tuple[Tensor, Any]], wanted: Tensor) -> Generator[
         wanted: of each sample, whether it is.
 
     Yields:
-        Batches as they came, of at most `points_per_batch` samples.
+        Successive batches as one, of at most `points_per_batch` samples unless one has more. Values of a kind that
+        cannot be joined come as they are.
     """
     held: list[tuple[Tensor, Any]] = []
+    most = points_per_batch(wanted.device)
     for index, values in batches:
         chosen = wanted[index].nonzero()[:, 0]
-        if held and sum(len(place) for place, _ in held) + len(chosen) > points_per_batch(wanted.device):
+        full = sum(len(place) for place, _ in held) + len(chosen) > most
+        if held and (full or not can_be_joined(values)):
             yield torch.cat([place for place, _ in held]), join_hidden([part for _, part in held])
             held = []
         if len(chosen):

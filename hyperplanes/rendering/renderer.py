@@ -25,7 +25,7 @@ from hyperplanes.utilities.arguments import checked
 
 __all__ = ["FieldFunction", "Hierarchical", "RayMarching", "Sampler", "allow_tf32", "render"]
 
-SMALLEST_PART = 16  # of these in as many rays as are rendered at once: fewer are not worth a second thread
+FEW = 16  # a chunk's part: fewer rays are not worth a second thread
 
 
 class _Options(TypedDict, total=False):
@@ -136,20 +136,21 @@ def _in_chunks(
     """The pixels of rays without gradients, so many at once."""
     size = chunk or sampler.rays_per_chunk(rays.origins.device)
     with allow_tf32(rays.origins.device):
-        parts = [rays[first:last] for first, last in pairwise(_bounds(len(rays), size))]
-        alone = generator is not None or rays.origins.device.type != "cpu" or not scene.is_thread_safe
+        on_cpu = rays.origins.device.type == "cpu"
+        alone = generator is not None or not on_cpu or not scene.is_thread_safe
+        parts = [rays[first:last] for first, last in pairwise(_bounds(len(rays), size, even=on_cpu))]
         run = map if alone else parallel_map
         return _joined(list(run(lambda part: integrate(scene, part, sampler, generator, differentiable=False), parts)))
 
 
-def _bounds(total: int, size: int) -> list[int]:
-    """Where parts of at most so many begin and end: equal ones, an even number of them for two threads.
+def _bounds(total: int, size: int, even: bool = True) -> list[int]:
+    """Where parts of at most so many begin and end: equal ones, `even` in number for two threads.
 
     >>> _bounds(10, 4), _bounds(2, 64), _bounds(0, 4)
     ([0, 3, 5, 8, 10], [0, 2], [0, 0])
     """
     count = max(1, -(-total // size))
-    count += count % 2 if total > size // SMALLEST_PART else 0
+    count += count % 2 if even and total > size // FEW else 0
     return [-(-part * total // count) for part in range(count + 1)]
 
 

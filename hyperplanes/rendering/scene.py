@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.utilities.arguments import kind_of
 
-__all__ = ["FieldFunction", "Scene", "SplitField", "evaluate", "join_hidden", "points_per_batch"]
+__all__ = ["FieldFunction", "Scene", "SplitField", "can_be_joined", "evaluate", "join_hidden", "points_per_batch"]
 
 FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Points (n, 3) and unit directions (n, 3) -> colours (n, 3) in [0, 1] and densities (n,) per world unit.
@@ -35,7 +35,8 @@ class SplitField(Protocol):
     def hidden(self, points: Tensor) -> Any:
         """What densities and colours of points (n, 3) are computed from.
 
-        A tensor of as many rows, or a dataclass of such tensors that can be indexed like one.
+        It can be indexed like a tensor. What is a tensor of as many rows, or a dataclass of such tensors, is joined
+        from several calls before colours are asked for.
         """
         ...
 
@@ -114,8 +115,20 @@ def _is_negative(density: Tensor) -> bool:
     return bool((density.detach() < 0).any())
 
 
+def can_be_joined(hidden: Any) -> bool:
+    """Whether `join_hidden` takes what a `SplitField` computes densities and colours from.
+
+    Args:
+        hidden: of a batch of points.
+    """
+    if isinstance(hidden, Tensor):
+        return True
+    parts = fields(hidden) if is_dataclass(hidden) else ()
+    return bool(parts) and all(each.init and isinstance(getattr(hidden, each.name), Tensor) for each in parts)
+
+
 def join_hidden(parts: Sequence[Any]) -> Any:
-    """What a `SplitField` computes densities and colours from, of several batches of points as one.
+    """What a `SplitField` computes densities and colours from, of several batches of points as one (`can_be_joined`).
 
     Args:
         parts: at least one.
@@ -125,7 +138,7 @@ def join_hidden(parts: Sequence[Any]) -> Any:
         return first
     if isinstance(first, Tensor):
         return torch.cat(list(parts))
-    return type(first)(*(torch.cat([getattr(part, each.name) for part in parts]) for each in fields(first)))
+    return type(first)(**{each.name: torch.cat([getattr(part, each.name) for part in parts]) for each in fields(first)})
 
 
 def points_per_batch(device: torch.device) -> int:

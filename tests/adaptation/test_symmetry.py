@@ -398,12 +398,27 @@ def test_from_ten_views_on_some_that_are_held_out_have_to_be_shown_better(monkey
 )
 def test_held_out_views_that_are_surely_shown_worse_decide_and_the_trial_is_kept(monkeypatch, lost, better):
     without = torch.full((20, 3), 0.5)
-    errors = iter([without, without + torch.tensor(lost).repeat(10)[:, None]])
-    monkeypatch.setattr(HeldOutPixels, "errors", lambda *_: next(errors))
+    reflected = without + torch.tensor(lost).repeat(10)[:, None]
+    monkeypatch.setattr(HeldOutPixels, "errors", lambda _, found: reflected if found.symmetry else without)
     found = finding_symmetry.find_symmetry(model(), balls(cameras(10), BODY))
     assert (found.symmetry is not None) == better
     assert found.trial is not None
     assert found.trial.context.symmetry == found.symmetry
+
+
+def test_two_threads_find_what_one_does():
+    views, found = balls(cameras(10), BODY), []
+    before = torch.get_num_threads()
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            found.append(finding_symmetry.find_symmetry(model(), views))
+    finally:
+        torch.set_num_threads(before)
+    one, two = found
+    assert one.symmetry == two.symmetry
+    errors = [each.trial.pixels.errors(each.trial.learned) for each in found]
+    torch.testing.assert_close(*errors, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("plane", [None, ACROSS])

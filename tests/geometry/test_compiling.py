@@ -1,6 +1,8 @@
 """Source of truth: a property: numba unpickles cached machine code, so nobody else may write where it lies."""
 
 import os
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -45,3 +47,27 @@ def test_setup_compiles_every_kernel_without_gradients():
     from hyperplanes.geometry.kernels.compiling import _SIGNATURES
 
     assert set(RENDERING) == {name for name in _SIGNATURES if "backward" not in name}
+
+
+def test_threads_that_ask_at_once_compile_once_and_into_the_folder(tmp_path, monkeypatch):
+    import numba
+    from numba.core import config
+
+    from hyperplanes.geometry.kernels import compiling
+
+    folders = []
+
+    def njit(**options):
+        time.sleep(0.05)
+        folders.append(config.CACHE_DIR)
+        return lambda function: function
+
+    monkeypatch.setattr(numba, "njit", njit)
+    monkeypatch.setattr(compiling, "_cache_folder", lambda: str(tmp_path))
+    before = config.CACHE_DIR
+    with ThreadPoolExecutor(2) as pool:
+        work = lambda: None  # noqa: E731 - of this test alone: what was compiled is kept
+        found = list(pool.map(compiling.compile_function, [work, work]))
+    assert found == [work, work]
+    assert folders == [str(tmp_path)]
+    assert before == config.CACHE_DIR

@@ -90,8 +90,8 @@ def test_rays():
     def run(pixels, change, shift, lens):
         bare = cameras.pinhole(grown(matrix, change), moved(pose, shift), 6, 7)
         for ours in (bare, distorted(bare, lens)):
-            rays = cast(ours, view, pixels)
-            yield from (rays.origins, rays.directions, rays.near, rays.far)
+            for rays in (cast(ours, view, pixels), cast(cameras.select(ours, [1]), view[:1], pixels[:1])):
+                yield from (rays.origins, rays.directions, rays.near, rays.far)
 
     lens = torch.tensor([-0.1, 0.02, 0.001, -0.002, 0.0], dtype=torch.float64, requires_grad=True)
     small = torch.zeros(4, dtype=torch.float64), torch.zeros(3, 6, dtype=torch.float64)

@@ -376,6 +376,34 @@ def test_colours_of_all_rounds_are_asked_for_in_one_call():
     assert called == [2, 1]  # a part of the rays for each thread, and one part
 
 
+class Rows(list):
+    """Rows that are chosen by a tensor of indices."""
+
+    def __getitem__(self, chosen):
+        return Rows(list.__getitem__(self, index) for index in chosen.tolist())
+
+
+class Unjoined(SplitBall):
+    """What it keeps of points can be indexed, and not joined."""
+
+    def hidden(self, points):
+        return Rows(points)
+
+    def density_of(self, hidden):
+        return super().density_of(torch.stack(list(hidden)))
+
+    def colour_of(self, hidden, directions):
+        return super().colour_of(torch.stack(list(hidden)), directions)
+
+
+def test_what_cannot_be_joined_is_asked_for_batch_by_batch():
+    rays, sampling, split = some_rays(300), RayMarching(96, 1e-3), Unjoined(0.1)
+    expected = render(SplitBall(0.1), rays, sampling, occupancy=GRID, differentiable=False)
+    found = render(split, rays, sampling, occupancy=GRID, differentiable=False)
+    torch.testing.assert_close(found.colour, expected.colour)
+    assert split.calls > 2
+
+
 @pytest.mark.parametrize("share", [1.0, 0.02])
 def test_colours_that_hardly_count_are_not_asked_for(share):
     # Another implementation: the same field as a function, all of whose colours are. In haze all samples count alike.

@@ -86,8 +86,8 @@ def estimate_bounds(
 def cut_off(masks: Float[Tensor, "view 1 height width"]) -> Bool[Tensor, " view"]:
     """Which masks reach the border of their picture.
 
-    A single pixel that is hardly opaque counts: of a view that is taken to show the object whole, all of it is used. For
-    the weights of colours, where little of it does no harm, `geometry.visibility.margins` asks for more.
+    A single pixel that is hardly opaque counts: a view that is taken to show the object whole bounds it. For the
+    weights of colours, where a few pixels do no harm, `geometry.visibility.margins` asks for more.
 
     Args:
         masks: opacity.

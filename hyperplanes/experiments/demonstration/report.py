@@ -29,7 +29,7 @@ from hyperplanes.experiments.engine import ORBIT, Runner, curve_of
 from hyperplanes.experiments.experiment import Cell
 from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
 from hyperplanes.experiments.page.content import Pixels
-from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
+from hyperplanes.export.images import encode_animation, orbit_cameras, picture_paths, to_pixels
 from hyperplanes.geometry.cameras import resized
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import encode_png
@@ -65,7 +65,7 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
         for name in runner.data.evaluated(on, "all", settings.packaged.objects):
             task = Shown(runner.data.tasks(on), most, QUERY_VIEWS).task(name)
             shown = next(runner.pictures(cell, name) for cell in cells if cell.orbit)
-            around = np.stack([_read(path) for path in sorted((shown / ORBIT).iterdir())])
+            around = np.stack([_read(frame) for frame in picture_paths(settings.first_frames, shown / ORBIT)])
             read, query = range(len(task.support)), range(len(task.query))
             exhibits.append(_exhibit(runner, cells, scores, task, read, query, around))
             names.append(f"{on}/{name}")

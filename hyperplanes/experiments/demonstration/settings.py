@@ -91,6 +91,11 @@ class DemoSettings:
         return "car" if self.class_name == "chair" else "chair"
 
     @property
+    def first_frames(self) -> int:
+        """Of each turntable on the first page."""
+        return max(1, self.frames // 2)
+
+    @property
     def methods(self) -> tuple[str, ...]:
         """The rows of the table on the class that was trained on."""
         few, many = self.fine_tuned
@@ -124,7 +129,7 @@ class DemoSettings:
             method = row if row == "nearest_view" else "hyperplanes"
             for on in (*self.first, *(["meshes"] if self.meshes else [])):
                 trained = Trained(on, packaged=PACKAGED)
-                orbit = self.frames // 2 if row == f"views_{self.first_counts[-1]}" else 0
+                orbit = self.first_frames if row == f"views_{self.first_counts[-1]}" else 0
                 cells.append(Cell(row, on, trained, method, on, "all", views=count, query=QUERY_VIEWS, orbit=orbit))
         return self._experiment(cells, objects=MOST - len(self.first), keep_pictures=True)
 

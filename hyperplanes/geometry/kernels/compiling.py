@@ -10,6 +10,7 @@ import os
 import shutil
 import stat
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -75,14 +76,21 @@ def compile_kernel(name: str, dtype: torch.dtype, points: str = "") -> Callable[
     return compile_function(getattr(kernels, function), f"void({signature})")
 
 
-@functools.cache
 def compile_function(function: Callable[..., Any], signature: str | None = None) -> Callable[..., Any]:
     """A function compiled by numba, which releases the interpreter lock when called.
+
+    Threads that ask for it at once compile it once.
 
     Args:
         function: loops over NumPy arrays.
         signature: types of its arguments, compiled at once; without it they are those of the first call.
     """
+    with _compiling:
+        return _compiled(function, signature)
+
+
+@functools.cache
+def _compiled(function: Callable[..., Any], signature: str | None) -> Callable[..., Any]:
     from numba import njit
     from numba.core import config
 
@@ -96,6 +104,18 @@ def compile_function(function: Callable[..., Any], signature: str | None = None)
             return njit(signature, **options)(function)
     finally:
         setattr(config, "CACHE_DIR", previous)  # noqa: B010
+
+
+_compiling = threading.RLock()  # numba's settings are those of the process
+
+
+def _forget() -> None:
+    global _compiling
+    _compiling = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):  # a thread that held it is not in the child
+    os.register_at_fork(after_in_child=_forget)
 
 
 @contextmanager

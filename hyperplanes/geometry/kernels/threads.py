@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import torch
 
-__all__ = ["parallel_for", "parallel_map"]
+__all__ = ["parallel_for", "parallel_map", "side_by_side"]
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
@@ -83,6 +83,20 @@ def parallel_map(work: Callable[[Part], Result], parts: Sequence[Part]) -> Itera
     finally:
         for future in futures:
             future.cancel()
+
+
+def side_by_side(work: Callable[[Part], Result], parts: Sequence[Part], device: torch.device) -> list[Result]:
+    """The results of a few long parts, in order, as `parallel_map` where no thread is left idle by it.
+
+    On another device than the CPU, and with more threads than parts, one part follows the other and takes all threads.
+
+    Args:
+        work: as in `parallel_map`.
+        parts: of the work.
+        device: where it is done.
+    """
+    alone = device.type != "cpu" or torch.get_num_threads() > len(parts)
+    return list(map(work, parts) if alone else parallel_map(work, parts))
 
 
 def _single_pool(size: int) -> ThreadPoolExecutor:
