@@ -14,6 +14,7 @@ from PIL import Image
 
 from hyperplanes.adaptation.checkpoints import find_checkpoint, packaged_folder
 from hyperplanes.adaptation.diagnostics import Diagnostics
+from hyperplanes.adaptation.held_out import FEWEST
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.data.dataset import EXAMPLES, read_task
 from hyperplanes.data.support import Shown
@@ -114,7 +115,8 @@ def compile_kernels(device: torch.device) -> None:
     """Have everything compiled and loaded that the packaged model renders with, by one small view of an example."""
     example = read_task(EXAMPLES / "example-car")
     model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(device)
-    model.adapt(example.support).render(resized(example.query[:1].cameras, 32, 32))  # of so many that it stacks
+    few = example.support[:FEWEST].resized(32)  # as many as have it stack
+    model.adapt(few).render(resized(example.query[:1].cameras, 32, 32))
 
 
 def describe_count(row: str, most: int) -> str:
