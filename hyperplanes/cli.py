@@ -18,6 +18,7 @@ from typing import Any, get_type_hints
 
 from hyperplanes.commands import EXAMPLES, find_verb, find_verbs, split_settings
 from hyperplanes.utilities.entry_points import find_entries
+from hyperplanes.utilities.errors import MissingPackageError
 from hyperplanes.utilities.interrupts import Terminated, interruptible
 
 __all__ = ["main"]
@@ -89,7 +90,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         sys.stdout = None  # as in `_flush`
         return 0
     except (ValueError, OSError, MemoryError, RuntimeError) as error:
-        if traceback or not (isinstance(error, ValueError | OSError) or _is_memory(error)):
+        if traceback or not (isinstance(error, ValueError | OSError | MissingPackageError) or _is_memory(error)):
             raise
         return _complain(f"hyperplanes {verb}: {_one_line(error)}")
 

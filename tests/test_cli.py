@@ -744,3 +744,10 @@ def test_a_real_posed_scene_is_evaluated(tmp_path):
     data = ["--data", str(SHARED / "posed" / "chair"), "--json", str(table)]
     assert main(["evaluate", "--method", "nearest_view", *data]) == 0
     assert json.loads(table.read_text())["nearest_view"]["psnr"] > 10
+
+
+def test_a_package_that_is_missing_is_named_in_one_line(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", "example-car", "--downscale", "4"]) == 2
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line == "hyperplanes view: expected the package viser, found none; pip install 'hyperplanes[viz]'"

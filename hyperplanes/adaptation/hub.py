@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hyperplanes.utilities.checkpoints import CheckpointError
+from hyperplanes.utilities.errors import MissingPackageError
 
 __all__ = ["download_checkpoint", "is_repository", "upload_checkpoint"]
 
@@ -56,12 +57,13 @@ def upload_checkpoint(save: Callable[[Path], None], name: str, *, private: bool,
 
     Raises:
         ValueError: a name of another form.
-        RuntimeError: huggingface_hub is not installed.
+        MissingPackageError: huggingface_hub is not installed.
     """
     if not REPOSITORY.fullmatch(name):
         raise ValueError(f"repository: expected user/model, got {name!r}")
     if importlib.util.find_spec("huggingface_hub") is None:
-        raise RuntimeError("push_to_hub: expected huggingface_hub, found none; pip install hyperplanes[hub]")
+        missing = "push_to_hub: expected the package huggingface_hub, found none; pip install 'hyperplanes[hub]'"
+        raise MissingPackageError(missing)
     from huggingface_hub import HfApi
 
     api = HfApi()

@@ -21,6 +21,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.errors import MissingPackageError
 from hyperplanes.utilities.files import format_of
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
@@ -92,7 +93,8 @@ def _video(frames: npt.NDArray[np.uint8], kind: str, rate: float) -> bytes:
     try:
         from imageio_ffmpeg import write_frames
     except ImportError:
-        raise RuntimeError(f"{kind}: expected imageio-ffmpeg, found none; pip install hyperplanes[video]") from None
+        missing = f"{kind}: expected the package imageio-ffmpeg, found none; pip install 'hyperplanes[video]'"
+        raise MissingPackageError(missing) from None
     height, width = frames.shape[1:3]
     even = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     with tempfile.TemporaryDirectory() as folder:

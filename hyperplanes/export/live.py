@@ -17,6 +17,7 @@ from torch import Tensor
 from hyperplanes.export.images import orbit_cameras, to_pixels, upward
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.images import Pictures
+from hyperplanes.utilities.errors import MissingPackageError
 from hyperplanes.views import Views
 
 __all__ = ["LiveViewer", "beside", "viewed_camera"]
@@ -77,7 +78,7 @@ class LiveViewer:
             their fields.
 
     Raises:
-        RuntimeError: viser is not installed.
+        MissingPackageError: viser is not installed.
     """
 
     def __init__(
@@ -90,7 +91,8 @@ class LiveViewer:
         try:
             import viser
         except ImportError:
-            raise RuntimeError("view: expected the package viser, found none; pip install hyperplanes[viz]") from None
+            missing = "expected the package viser, found none; pip install 'hyperplanes[viz]'"
+            raise MissingPackageError(missing) from None
         self._shown: Shown | None = None
         self._others: dict[str, Shown] = {}
         self._chosen = ALONE

@@ -6,7 +6,11 @@ import difflib
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 
-__all__ = ["did_you_mean", "prefix_errors"]
+__all__ = ["MissingPackageError", "did_you_mean", "prefix_errors"]
+
+
+class MissingPackageError(RuntimeError):
+    """A package that not everybody needs is not installed; the message says how to install it."""
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

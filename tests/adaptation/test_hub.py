@@ -72,7 +72,7 @@ def test_what_is_not_there_is_said_in_one_line(hub, model):
 def test_without_the_package_it_says_what_to_install(model, monkeypatch, tmp_path):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(RuntimeError, match=r"pip install hyperplanes\[hub\]"):
+    with pytest.raises(RuntimeError, match=r"pip install 'hyperplanes\[hub\]"):
         model.push_to_hub("someone/a-model")
     with pytest.raises(CheckpointError, match=r"model\.json: expected"):
         HyperPlanes.from_pretrained("someone/a-model")
