@@ -240,7 +240,9 @@ def adapters(
             found[name] = (METHODS | PARTS)[name](model, shown, names)
     found["one_step"] = model
     for each in steps:
-        found[f"{each}_steps"] = FineTuned(model, each)
+        found[f"{each}_steps"] = tuned = FineTuned(model, each)
+        if "ungated" in wanted:
+            found[f"{each}_steps_ungated"] = _Ungated(tuned)
         found[f"scratch_{each}"] = FromScratch(model, each)
     return found
 
@@ -274,9 +276,9 @@ class _Partly:
 
 @dataclass(frozen=True)
 class _Ungated:
-    """A model whose pictures are means with those of the visual hull by one share an object."""
+    """A model whose pictures are means with those of the visual hull by one share an object; fine-tuned, by none."""
 
-    model: HyperPlanes
+    model: HyperPlanes | FineTuned
 
     def adapt(self, support: Views) -> AdaptedField:
         """The model's own field without its gating network."""

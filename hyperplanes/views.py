@@ -207,9 +207,26 @@ class Views:
             raise ValueError(f"among: expected at least one pixel of {len(self)} views to draw rays from, got none")
         flat = torch.randint(total, (count,), generator=generator).to(self.images.device)
         flat = flat if among is None else among[flat]
-        view, pixel = flat // (height * width), flat % (height * width)
         if among is not None and flat.device.type == "cpu":  # elsewhere it would be waited for
             check_indices(flat, len(self) * height * width, "among", f"pixels of {len(self)} views")
+        return self.rays_at(flat, near_far=near_far, subpixels=subpixels)
+
+    def rays_at(
+        self,
+        flat: Int[Tensor, " pixel"],
+        *,
+        near_far: str = "sphere",
+        subpixels: Sequence[tuple[float, float]] = ((0.0, 0.0),),
+    ) -> tuple[Rays, Float[Tensor, "pixel 3"], Float[Tensor, "pixel 1"]]:
+        """The rays through some pixels, their colours, and the opacity of the masks there; 1 without masks.
+
+        Args:
+            flat: flat indices (view, row, column) of the pixels.
+            near_far: as in `geometry.cast`.
+            subpixels: as in `sample_masked_rays`.
+        """
+        height, width = self.size
+        view, pixel = flat // (height * width), flat % (height * width)
         row, column = pixel // width, pixel % width
         places = torch.stack([column, row], -1).to(self.images)
         places = torch.cat([places + places.new_tensor(each) for each in subpixels])

@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.gradients import summed_gradients
@@ -25,17 +26,61 @@ from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
 
-__all__ = ["Descent", "Variables", "ray_loss", "split_holdout"]
+__all__ = ["Descent", "Variables", "contrast", "draw_pixels", "ray_loss", "split_holdout"]
 
 HOLDOUT_RAYS = 4096  # of held-out views that "auto" compares
 PART = 512  # rays of a step whose gradients one thread finds, at most
 CHECKS = 10  # times that it compares them
+EVEN = 0.05  # of importance that pixels have among equal ones
 
 
-def ray_loss(seen: Rendered, truth: Tensor) -> Tensor:
-    """Mean squared error of the colours of rays, that of the coarse pass added where there was one (Eq. 2)."""
-    loss = (seen.colour - truth).square().mean()
-    return loss if seen.coarse is None else loss + (seen.coarse.colour - truth).square().mean()
+def ray_loss(seen: Rendered, truth: Tensor, weights: Tensor | float = 1.0) -> Tensor:
+    """Mean squared error of the colours of rays, that of the coarse pass added where there was one (Eq. 2).
+
+    Args:
+        seen: the rays.
+        truth: their colours (ray, 3).
+        weights: of each ray (ray, 1).
+    """
+    loss = (weights * (seen.colour - truth).square()).mean()
+    return loss if seen.coarse is None else loss + (weights * (seen.coarse.colour - truth).square()).mean()
+
+
+def contrast(images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view height width"]:
+    """By how much colours differ among the pixels of 3x3 around each, the mean over the channels, and at least EVEN.
+
+    Args:
+        images: in [0, 1].
+    """
+    around = pad(images, (1, 1, 1, 1), mode="replicate")
+    return (max_pool2d(around, 3, 1) + max_pool2d(-around, 3, 1)).mean(1) + EVEN
+
+
+def draw_pixels(
+    importance: Float[Tensor, " pixel"], among: Int[Tensor, " some"] | None, count: int, generator: torch.Generator
+) -> tuple[Int[Tensor, " drawn"], Float[Tensor, "drawn 1"]]:
+    """Pixels drawn in proportion to an importance, and the weights by which their mean is that over all pixels.
+
+    Errors are where colours change, so that a mean of few such pixels varies less (importance sampling: Kahn & Marshall
+    1953).
+
+    Args:
+        importance: above 0.
+        among: indices of the pixels to draw from; all where None.
+        count: how many, drawn with replacement.
+        generator: on the CPU.
+
+    Raises:
+        ValueError: no pixel to draw from.
+    """
+    known = importance if among is None else importance[among]
+    if not len(known):
+        raise ValueError("among: expected at least one pixel to draw rays from, got none")
+    summed = known.to(torch.float64).cumsum(0)
+    places = torch.rand(count, generator=generator, dtype=torch.float64).to(summed.device) * summed[-1]
+    drawn = torch.searchsorted(summed, places).clamp_max(len(summed) - 1)
+    weights = (summed[-1] / len(summed) / known[drawn]).to(importance)
+    return drawn if among is None else among[drawn], weights[:, None]
 
 
 @dataclass(frozen=True)
@@ -112,6 +157,7 @@ class Descent:
         rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
         generator = torch.Generator().manual_seed(settings.seed)
         masks_views = self.masks_views and settings.mask_views and len(views) > 1
+        importance = contrast(views.images).flatten() if settings.draw == "contrast" else None
         yield 0
         for step in range(steps):
             with torch.enable_grad():
@@ -120,10 +166,13 @@ class Descent:
                 among = self._pixels_of(masked) if masked is not None else self.pixels
                 # the field of the variables as they are now, and how far its rays are from the truth
                 field = self.field(masked)
-                rays, truth = views.sample_rays(
-                    settings.rays, generator=generator, among=among, near_far=field.sampling.near_far
-                )
-                gradients = self._gradients(field, rays, truth, generator)
+                near_far, weights = field.sampling.near_far, None
+                if importance is None:
+                    rays, truth = views.sample_rays(settings.rays, generator=generator, among=among, near_far=near_far)
+                else:
+                    drawn, weights = draw_pixels(importance, among, settings.rays, generator)
+                    rays, truth, _ = views.rays_at(drawn, near_far=near_far)
+                gradients = self._gradients(field, rays, truth, generator, weights)
                 # one step of every optimiser, at the rate of the schedule
                 for tensor, gradient in zip(self.tensors, gradients, strict=True):
                     tensor.grad = gradient
@@ -133,7 +182,12 @@ class Descent:
             yield step + 1
 
     def _gradients(
-        self, field: AdaptedField, rays: Rays, truth: Tensor, generator: torch.Generator
+        self,
+        field: AdaptedField,
+        rays: Rays,
+        truth: Tensor,
+        generator: torch.Generator,
+        weights: Tensor | None = None,
     ) -> Sequence[Tensor | None]:
         """The gradients of the mean loss of rays, parts of which have a thread and a generator each."""
         # the graph of a hypernetwork is one for all rays
@@ -147,7 +201,8 @@ class Descent:
         def loss(index: int) -> Tensor:
             part = slice(starts[index], starts[index] + size)
             share = len(truth[part]) / len(truth)
-            return share * ray_loss(field.trace(rays[part], generators[index]), truth[part])
+            counted = 1.0 if weights is None else weights[part]
+            return share * ray_loss(field.trace(rays[part], generators[index]), truth[part], counted)
 
         return summed_gradients(loss, len(starts), self.tensors, thread_safe=field.thread_safe)[1]
 

@@ -101,12 +101,7 @@ class FieldFromScratch:
 
 def random_model(config: ModelConfig, seed: int) -> HyperPlanes:
     """The target network of a model with random weights, without what finds better ones."""
-    return HyperPlanes(
-        replace(
-            config, hypernetwork=None, autoencoder=None, initialisation=None, stacked=False, hull_share=0.0, gated=False
-        ),
-        seed=seed,
-    )
+    return HyperPlanes(config.target_alone(), seed=seed)
 
 
 def _rated(settings: FineTuning, model: HyperPlanes) -> FineTuning:

@@ -15,9 +15,9 @@ from hyperplanes.adaptation.context import SupportContext, observe
 from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
 from hyperplanes.adaptation.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.network import HyperPlanesNetwork
-from hyperplanes.adaptation.stacking import stacked_field
+from hyperplanes.adaptation.stacking import stacked_field, tuned_field
 from hyperplanes.configuration.compatibility import check_fine_tuning
-from hyperplanes.configuration.fine_tuning import FineTuning, Steps
+from hyperplanes.configuration.fine_tuning import CONTRAST_VIEWS, FineTuning, Steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
@@ -162,7 +162,7 @@ def fine_tune_to(
             break
     after, empty = descent.errors()
     with torch.no_grad():
-        made = network.rendering_field(context, variables.weights())
+        made = tuned_field(network, context, variables.weights())
     if not after < max(before, empty * NEARLY):
         raise NoProgressError(
             f"fine-tuning: expected {steps} steps to lower the squared error, {before:.3g}, got {after:.3g}, where an "
@@ -196,8 +196,11 @@ def make_descent(
     def field(masked: Tensor | None) -> AdaptedField:
         return network.field(context if masked is None else context.mask_views(masked), variables.weights())
 
-    pixels, masks_views = network.live_pixels_of(context, views), network.target.permutation_invariant
-    return Descent(field, variables.tensors, views, settings, pixels, masks_views), variables
+    pixels, any_views = network.live_pixels_of(context, views), network.target.permutation_invariant
+    if settings.draw is None:
+        many = any_views and len(context.given) >= CONTRAST_VIEWS
+        settings = replace(settings, draw="contrast" if many and settings.trainable == "weights" else "uniform")
+    return Descent(field, variables.tensors, views, settings, pixels, masks_views=any_views), variables
 
 
 def _variables(
@@ -217,8 +220,6 @@ def _refreshed(network: HyperPlanesNetwork, weights: Parameters, settings: FineT
     share = settings.fresh_share(views)
     if not share or not network.reads_volume:
         return weights
-    made = HyperPlanesNetwork(
-        replace(network.config, hypernetwork=None, stacked=False, hull_share=0.0, gated=False), settings.seed
-    )
+    made = HyperPlanesNetwork(network.config.target_alone(), settings.seed)
     random = made.to(network.rig.device, network.rig.dtype).theta.detach()
     return Parameters((name, torch.lerp(value, random[name], share)) for name, value in weights.items())

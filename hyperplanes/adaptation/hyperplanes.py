@@ -122,9 +122,9 @@ class HyperPlanes(HyperPlanesNetwork):
             no network of this model is a ValueError.
         """
         learned = learned_part(adapted)
-        beside = {"stacked": False, "hull_share": learned.share, "gated": learned.gate is not None}
+        beside = {"hull_share": learned.share, "gated": learned.gate is not None}
         beside |= {"symmetric": False, "symmetry": adapted.symmetry}
-        result = HyperPlanes(replace(self.config, hypernetwork=None, autoencoder=None, initialisation=None, **beside))
+        result = HyperPlanes(replace(self.config.target_alone(), **beside))
         if result.gate is not None and learned.gate is not None:
             result.gate.load_state_dict(learned.gate.state_dict())
         result.rig.copy_(self.rig)

@@ -32,6 +32,7 @@ __all__ = [
     "learned_part",
     "stack",
     "stacked_field",
+    "tuned_field",
 ]
 
 CAUTION = 1.5  # power of the share that shows held-out views best: few views, so less than that (docs/image-based.md)
@@ -188,6 +189,24 @@ def stacked_field(
     if not share and gate is None:
         return learned
     return stack(learned, hull_field(context), share, gate, len(context.views))
+
+
+@torch.no_grad()
+def tuned_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
+    """The field of weights after gradient steps, stacked with the visual hull where the model is configured so.
+
+    From FEWEST views on the model's gating network makes a share of every pixel, as for what held-out views give no
+    share of the hull. None is held out: gradient steps learn from all of them.
+
+    Args:
+        network: the model.
+        context: the object.
+        weights: of the field.
+    """
+    tuned, count = network.rendering_field(context, weights), len(context.views)
+    if network.gate is None or context.views.masks is None or count < FEWEST:
+        return tuned
+    return stack(tuned, hull_field(context), 0.0, network.gate, count)
 
 
 @torch.no_grad()

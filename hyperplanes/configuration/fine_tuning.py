@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.utilities.arguments import checked_fields
 
-__all__ = ["FRESH", "FRESH_VIEWS", "RATES", "FineTuning", "Steps"]
+__all__ = ["CONTRAST_VIEWS", "FRESH", "FRESH_VIEWS", "RATES", "FineTuning", "Steps"]
 
 Steps: TypeAlias = int | Literal["auto"]
 
@@ -27,6 +27,9 @@ FRESH = 0.5
 
 FRESH_VIEWS = 10
 """Support views from which on it does; with fewer, what was learned is worth more than what the steps learn."""
+
+CONTRAST_VIEWS = 10
+"""Support views from which on rays are drawn by contrast; docs/adaptation.md has what it brings."""
 
 
 @checked_fields
@@ -53,6 +56,9 @@ class FineTuning:
             features: trained weights interpolated with random ones learn more in the same steps (Ash & Adams 2020, "On
             warm-starting neural network training"). Where None, FRESH with FRESH_VIEWS views or more, else none.
         seed: of rays and samples, and of random weights.
+        draw: the pixels of rays: all with the same probability ("uniform"), or those more often around which colours differ
+            ("contrast"), which count less in the loss by as much. Where None, "contrast" for the weights of a field
+            that takes any number of views, with CONTRAST_VIEWS or more of them, else "uniform", as in the paper.
 
     Raises:
         ValueError: an unknown name, no ray, a rate that is negative or not finite, or every view held out.
@@ -71,9 +77,11 @@ class FineTuning:
     mask_views: bool = True
     fresh: float | None = None
     seed: int = 0
+    draw: Literal["uniform", "contrast"] | None = None
 
     def __post_init__(self) -> None:
         choices = {"trainable": RATES, "optimiser": (None, "adam", "muon", "sgd"), "decay": ("cosine", "exponential")}
+        choices |= {"draw": (None, "uniform", "contrast")}
         check_choices(self, choices)
         for name, least in (("rays", 1), ("max_steps", 1), ("holdout", 2)):
             if getattr(self, name) < least:

@@ -54,7 +54,7 @@ class ModelConfig:
             without.
         hull_share: of `hull_blend` in the pictures of a model that is not `stacked`: what was decided for one object.
         gated: a gating network makes a share of every pixel of that one (`adaptation.gating`); `training.gating` trains
-            it after the model.
+            it after the model. Pictures after gradient steps are means by it, too.
         symmetric: views of an object that looks symmetric are shown to the model together with their reflections
             (`adaptation.symmetry`). Training does without.
         symmetry: that of the object, where it is known: what was found for one.
@@ -104,6 +104,11 @@ class ModelConfig:
         shared = {each.name for each in fields(kind)} & {each.name for each in fields(self.network)}
         network = kind(**{name: getattr(self.network, name) for name in shared})
         return replace(self, target=name, network=network)
+
+    def target_alone(self) -> ModelConfig:
+        """The model without what finds weights for its target, and without the visual hull beside its pictures."""
+        alone = replace(self, hypernetwork=None, autoencoder=None, initialisation=None)
+        return replace(alone, stacked=False, hull_share=0.0, gated=False)
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""

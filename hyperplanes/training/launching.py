@@ -103,7 +103,17 @@ def launched(devices: int, nodes: int, device: torch.device) -> Generator[torch.
         for process in getattr(strategy.launcher, "procs", []):
             process.wait()
     finally:
+        _leave()
         _end(getattr(strategy.launcher, "procs", []))
+
+
+def _leave() -> None:
+    """Leave the group after an error: gloo's threads abort an interpreter that ends before them.
+
+    Collectives are synchronous, so none is under way. NCCL is not asked, which may wait for a process that has gone.
+    """
+    if distributed.is_initialized() and distributed.get_backend() == "gloo":
+        distributed.destroy_process_group()
 
 
 def _end(started: Iterable[subprocess.Popen[bytes]]) -> None:

@@ -10,14 +10,16 @@ import torch
 
 from hyperplanes.adaptation import AdaptedField, fine_tuning
 from hyperplanes.adaptation import descent as descent_module
-from hyperplanes.adaptation.descent import ray_loss, split_holdout
+from hyperplanes.adaptation.descent import EVEN, contrast, draw_pixels, ray_loss, split_holdout
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.configuration.fine_tuning import CONTRAST_VIEWS, FineTuning
+from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.rendering import Hierarchical, RayMarching
+from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring, small_model
 
@@ -46,6 +48,56 @@ def test_an_empty_picture_is_judged_by_the_distance_of_the_views_from_white(mode
     grey = replace(grey, images=torch.full_like(grey.images, 0.25))
     descent, _ = make_descent(model, model.prepare(grey), WEIGHTS)
     assert descent.errors()[1] == 0.75**2
+
+
+def test_the_contrast_of_a_pixel_is_the_range_of_the_colours_around_it():
+    images = torch.full((1, 3, 4, 5), 0.2)
+    images[0, 0, :, 3:] = 0.8  # one of three channels changes, between the columns 2 and 3
+    expected = torch.tensor([0.0, 0.0, 0.2, 0.2, 0.0]).expand(1, 4, 5) + EVEN
+    torch.testing.assert_close(contrast(images), expected)
+
+
+@pytest.mark.parametrize("some", [False, True])
+def test_the_weighted_mean_of_drawn_pixels_is_that_of_all(some):
+    generator, count = torch.Generator().manual_seed(0), 200_000
+    importance, values = torch.rand(50, generator=generator) + EVEN, torch.randn(50, generator=generator)
+    among = torch.arange(50)[::3] if some else None
+    drawn, weights = draw_pixels(importance, among, count, generator)
+    chosen = torch.arange(50) if among is None else among
+    often = torch.bincount(drawn, minlength=50)[chosen] / count
+    torch.testing.assert_close(often, importance[chosen] / importance[chosen].sum(), atol=4e-3, rtol=0)
+    assert set(drawn.tolist()) == set(chosen.tolist())
+    assert float((weights[:, 0] * values[drawn]).mean()) == pytest.approx(float(values[chosen].mean()), abs=0.02)
+    even, ones = draw_pixels(torch.full((7,), EVEN), None, 100, generator)
+    torch.testing.assert_close(ones, torch.ones(100, 1))
+    assert len(even.unique()) == 7
+
+
+def test_a_loss_counts_each_ray_by_its_weight():
+    seen = Rendered(*(torch.zeros(2, *shape) for shape in ((3,), (), ())), samples=0)
+    truth = torch.tensor([[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]])
+    assert float(ray_loss(seen, truth)) == 2.5
+    assert float(ray_loss(seen, truth, torch.tensor([[3.0], [0.5]]))) == 2.5
+    assert float(ray_loss(seen, truth, torch.tensor([[4.0], [0.0]]))) == 2.0
+
+
+def test_pixels_are_drawn_by_contrast_for_the_weights_of_a_field_of_any_number_of_views(model, support):
+    many = ball_views(ring(CONTRAST_VIEWS))
+    any_number = small_model(target="image_based", hypernetwork=None, network=ImageBasedConfig(depth=2, width=16))
+    for made, settings, draw in (
+        (any_number, WEIGHTS, "contrast"),
+        (any_number, replace(WEIGHTS, draw="uniform"), "uniform"),
+        (model, WEIGHTS, "uniform"),
+        (model, PAPER, "uniform"),
+    ):
+        assert make_descent(made, made.prepare(many), settings)[0].settings.draw == draw
+    assert make_descent(any_number, any_number.prepare(support), WEIGHTS)[0].settings.draw == "uniform"  # four of them
+    tuned = [
+        model.fine_tune(support, 2, replace(WEIGHTS, draw=draw)).render(ring(1)).images
+        for draw in (None, "uniform", "contrast")
+    ]
+    assert torch.equal(tuned[0], tuned[1])
+    assert not torch.equal(tuned[1], tuned[2])
 
 
 @pytest.mark.parametrize("settings", [PAPER, WEIGHTS])
@@ -266,9 +318,9 @@ def test_a_field_that_is_not_thread_safe_is_called_by_one_thread(model, support,
         torch.set_num_threads(2)
         for safe, callers in found.items():
 
-            def noting(seen, truth, callers=callers):
+            def noting(*given, callers=callers):
                 callers.add(threading.get_ident())
-                return ray_loss(seen, truth)
+                return ray_loss(*given)
 
             monkeypatch.setattr(Field, "thread_safe", safe)
             monkeypatch.setattr(descent_module, "ray_loss", noting)
