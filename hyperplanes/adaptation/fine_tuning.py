@@ -17,7 +17,7 @@ from hyperplanes.adaptation.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import stacked_field, tuned_field
 from hyperplanes.configuration.compatibility import check_fine_tuning
-from hyperplanes.configuration.fine_tuning import CONTRAST_VIEWS, FineTuning, Steps
+from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning, Steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
@@ -198,7 +198,7 @@ def make_descent(
 
     pixels, any_views = network.live_pixels_of(context, views), network.target.permutation_invariant
     if settings.draw is None:
-        many = any_views and len(context.given) >= CONTRAST_VIEWS
+        many = any_views and len(context.given) >= MANY_VIEWS
         settings = replace(settings, draw="contrast" if many and settings.trainable == "weights" else "uniform")
     return Descent(field, variables.tensors, views, settings, pixels, masks_views=any_views), variables
 

@@ -16,6 +16,7 @@ from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.held_out import FEWEST, Trial, hold_out
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
+from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.parameters import Parameters
@@ -195,18 +196,18 @@ def stacked_field(
 def tuned_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
     """The field of weights after gradient steps, stacked with the visual hull where the model is configured so.
 
-    From FEWEST views on the model's gating network makes a share of every pixel, as for what held-out views give no
-    share of the hull. None is held out: gradient steps learn from all of them.
+    From MANY_VIEWS on the model's gating network makes a share of every pixel, as where held-out views give the hull
+    none. No view is held out: gradient steps learn from all of them.
 
     Args:
         network: the model.
         context: the object.
         weights: of the field.
     """
-    tuned, count = network.rendering_field(context, weights), len(context.views)
-    if network.gate is None or context.views.masks is None or count < FEWEST:
+    tuned = network.rendering_field(context, weights)
+    if network.gate is None or context.views.masks is None or len(context.given) < MANY_VIEWS:
         return tuned
-    return stack(tuned, hull_field(context), 0.0, network.gate, count)
+    return stack(tuned, hull_field(context), 0.0, network.gate, len(context.views))
 
 
 @torch.no_grad()

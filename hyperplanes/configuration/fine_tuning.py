@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.utilities.arguments import checked_fields
 
-__all__ = ["CONTRAST_VIEWS", "FRESH", "FRESH_VIEWS", "RATES", "FineTuning", "Steps"]
+__all__ = ["FRESH", "MANY_VIEWS", "RATES", "FineTuning", "Steps"]
 
 Steps: TypeAlias = int | Literal["auto"]
 
@@ -25,11 +25,10 @@ docs/adaptation.md."""
 FRESH = 0.5
 """Share of random weights that fine-tuning a field with a grid of features begins with; docs/small-training.md."""
 
-FRESH_VIEWS = 10
-"""Support views from which on it does; with fewer, what was learned is worth more than what the steps learn."""
-
-CONTRAST_VIEWS = 10
-"""Support views from which on rays are drawn by contrast; docs/adaptation.md has what it brings."""
+MANY_VIEWS = 10
+"""Support views of a field of any number of them from which on fine-tuning begins with weights that are partly random,
+draws rays by contrast, and shows means with the visual hull; with fewer each of the three costs as often as it brings
+(docs/small-training.md, docs/adaptation.md, docs/image-based.md)."""
 
 
 @checked_fields
@@ -54,11 +53,11 @@ class FineTuning:
             `1 / holdout` of them, as it could copy their colours; a single view cannot be masked.
         fresh: share of random weights in those that the steps begin with, where a hypernetwork writes a grid of
             features: trained weights interpolated with random ones learn more in the same steps (Ash & Adams 2020, "On
-            warm-starting neural network training"). Where None, FRESH with FRESH_VIEWS views or more, else none.
+            warm-starting neural network training"). Where None, FRESH with MANY_VIEWS or more, else none.
         seed: of rays and samples, and of random weights.
-        draw: the pixels of rays: all with the same probability ("uniform"), or those more often around which colours differ
-            ("contrast"), which count less in the loss by as much. Where None, "contrast" for the weights of a field
-            that takes any number of views, with CONTRAST_VIEWS or more of them, else "uniform", as in the paper.
+        draw: the pixels of rays: all with the same probability ("uniform"), or those more often around which colours
+            differ ("contrast"), which count less in the loss by as much. Where None, "contrast" for the weights of a
+            field that takes any number of views, with MANY_VIEWS or more of them, else "uniform", as in the paper.
 
     Raises:
         ValueError: an unknown name, no ray, a rate that is negative or not finite, or every view held out.
@@ -96,7 +95,7 @@ class FineTuning:
 
     def fresh_share(self, views: int) -> float:
         """How much of the first weights is random, with so many support views."""
-        return (FRESH if views >= FRESH_VIEWS else 0.0) if self.fresh is None else self.fresh
+        return (FRESH if views >= MANY_VIEWS else 0.0) if self.fresh is None else self.fresh
 
     def with_rates(self, rates: Mapping[str, float]) -> FineTuning:
         """The settings with these rates where they state none; `rates` are fields of the settings by name."""

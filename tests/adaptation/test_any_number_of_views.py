@@ -11,7 +11,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.descent import Descent
 from hyperplanes.adaptation.fine_tuned import FromScratch
 from hyperplanes.adaptation.swapped import Swapped
-from hyperplanes.configuration.fine_tuning import FRESH, FRESH_VIEWS, FineTuning
+from hyperplanes.configuration.fine_tuning import FRESH, MANY_VIEWS, FineTuning
 from hyperplanes.fields import ImageBasedConfig, TargetConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
@@ -271,7 +271,7 @@ def test_steps_from_nothing_but_fresh_weights_are_those_from_random_ones():
     none = adapter.fine_tune(support, 3, FineTuning(fresh=0.0)).render(cameras).images
     assert not torch.allclose(fresh, none, atol=1e-3)
     assert torch.equal(none, adapter.fine_tune(support, 3).render(cameras).images)  # with few views, as before
-    assert FineTuning().fresh_share(FRESH_VIEWS) == FRESH
+    assert FineTuning().fresh_share(MANY_VIEWS) == FRESH
     with pytest.raises(ValueError, match="fresh: expected a share"):
         FineTuning(fresh=1.5)
 

@@ -14,7 +14,7 @@ from hyperplanes.adaptation.descent import EVEN, contrast, draw_pixels, ray_loss
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.configuration.fine_tuning import CONTRAST_VIEWS, FineTuning
+from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry.occupancy import full
@@ -82,7 +82,7 @@ def test_a_loss_counts_each_ray_by_its_weight():
 
 
 def test_pixels_are_drawn_by_contrast_for_the_weights_of_a_field_of_any_number_of_views(model, support):
-    many = ball_views(ring(CONTRAST_VIEWS))
+    many = ball_views(ring(MANY_VIEWS))
     any_number = small_model(target="image_based", hypernetwork=None, network=ImageBasedConfig(depth=2, width=16))
     for made, settings, draw in (
         (any_number, WEIGHTS, "contrast"),

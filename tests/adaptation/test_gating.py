@@ -9,7 +9,7 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes
 from hyperplanes.adaptation.gating import GatingNetwork, readings
 from hyperplanes.adaptation.held_out import FEWEST
 from hyperplanes.adaptation.stacking import StackedField, stack
-from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.geometry.rays import cast
 from hyperplanes.training.gating import GatingExample, example_of, fit_gate, turned
 from hyperplanes.utilities.metrics import psnr
@@ -69,15 +69,15 @@ def test_pixels_are_gated_from_five_views_with_masks_on():
         assert not isinstance(adapter.adapt(replace(support, masks=None)), StackedField)
 
 
-def test_fine_tuned_pictures_are_gated_from_five_views_with_masks_on():
+def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
     """By what the gate gives where held-out views give no share of the hull."""
     adapter, settings = HyperPlanes(replace(CONFIG, gated=True)), FineTuning(rays=8)
     cameras = ring(2, (10, 13), shift=1)
     adapter.gate.load_state_dict(constant(0.3).state_dict())
-    for count in (FEWEST - 1, FEWEST):
+    for count in (MANY_VIEWS - 1, MANY_VIEWS):
         support = ball_views(ring(count, (24, 24)))
         tuned = adapter.fine_tune(support, 1, settings)
-        assert isinstance(tuned, StackedField) == (count == FEWEST)
+        assert isinstance(tuned, StackedField) == (count == MANY_VIEWS)
         assert not isinstance(adapter.fine_tune(replace(support, masks=None), 1, settings), StackedField)
     assert tuned.share == 0
     alone, hull = replace(tuned, gate=None), HullBlend().adapt_to(adapter.prepare(support).planes)
