@@ -276,7 +276,7 @@ class _Partly:
 
 @dataclass(frozen=True)
 class _Ungated:
-    """A model whose pictures are means with those of the visual hull by one share an object; fine-tuned, by none."""
+    """A model without its gating network: one share of the visual hull an object, and fine-tuned fields alone."""
 
     model: HyperPlanes | FineTuned
 

@@ -211,22 +211,29 @@ class Views:
             check_indices(flat, len(self) * height * width, "among", f"pixels of {len(self)} views")
         return self.rays_at(flat, near_far=near_far, subpixels=subpixels)
 
+    @checked
     def rays_at(
         self,
-        flat: Int[Tensor, " pixel"],
+        pixels: Int[Tensor, " pixel"],
         *,
         near_far: str = "sphere",
         subpixels: Sequence[tuple[float, float]] = ((0.0, 0.0),),
     ) -> tuple[Rays, Float[Tensor, "pixel 3"], Float[Tensor, "pixel 1"]]:
-        """The rays through some pixels, their colours, and the opacity of the masks there; 1 without masks.
+        """The rays through some pixels.
 
         Args:
-            flat: flat indices (view, row, column) of the pixels.
+            pixels: their flat indices (view, row, column).
             near_far: as in `geometry.cast`.
             subpixels: as in `sample_masked_rays`.
+
+        Returns:
+            The rays, the colours of the pixels, and the opacity of the masks there; 1 without masks. The index of no
+            pixel raises ValueError.
         """
         height, width = self.size
-        view, pixel = flat // (height * width), flat % (height * width)
+        if pixels.device.type == "cpu":  # elsewhere it would be waited for
+            check_indices(pixels, len(self) * height * width, "pixels", f"pixels of {len(self)} views")
+        view, pixel = pixels // (height * width), pixels % (height * width)
         row, column = pixel // width, pixel % width
         places = torch.stack([column, row], -1).to(self.images)
         places = torch.cat([places + places.new_tensor(each) for each in subpixels])

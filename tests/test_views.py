@@ -118,6 +118,18 @@ def test_no_pixel_to_draw_from_is_refused():
     for wrong in (216, -1):
         with pytest.raises(ValueError, match=f"among: expected indices of 216 pixels of 4 views, got {wrong} to"):
             views().sample_rays(3, among=torch.tensor([wrong]))
+        with pytest.raises(ValueError, match=f"pixels: expected indices of 216 pixels of 4 views, got {wrong} to"):
+            views().rays_at(torch.tensor([wrong]))
+
+
+def test_rays_through_pixels_are_those_of_their_view():
+    whole = views((6, 9))
+    rays, truth, opacity = whole.rays_at(torch.tensor([(2 * 6 + 4) * 9 + 7, 8]))
+    for place, (view, row, column) in enumerate([(2, 4, 7), (0, 0, 8)]):
+        expected = whole.rays(view)[row * 9 + column : row * 9 + column + 1]
+        torch.testing.assert_close(rays.directions[place : place + 1], expected.directions)
+        assert torch.equal(truth[place], whole.images[view, :, row, column])
+        assert torch.equal(opacity[place], whole.masks[view, :, row, column])
 
 
 @pytest.fixture

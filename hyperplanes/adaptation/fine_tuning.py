@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TypeVar
 
 import torch
@@ -17,7 +16,7 @@ from hyperplanes.adaptation.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import stacked_field, tuned_field
 from hyperplanes.configuration.compatibility import check_fine_tuning
-from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning, Steps
+from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
@@ -87,7 +86,7 @@ def fine_tune(
         return fine_tune_to(network, context, steps, settings, views=_trained_on(context, support), on_step=on_step)
 
     # how many steps show some of the views best that the others were fine-tuned without, from as many random weights
-    settings = replace(settings, fresh=settings.fresh_share(len(support)))
+    settings = settings.for_views(len(support), network.target.permutation_invariant)
     shown, holdout = split_holdout(support, settings)
     context = network.prepare(shown, symmetry=find_symmetry(network, shown).symmetry)
     trial, _ = make_descent(network, context, settings, _trained_on(context, shown))
@@ -188,7 +187,8 @@ def make_descent(
         views: where rays come from; those of the planes where absent.
         start: the weights to begin with; those of `adapt` where absent.
     """
-    views = context.views if views is None else views
+    views, any_views = context.views if views is None else views, network.target.permutation_invariant
+    settings = settings.for_views(len(context.given), any_views)
     if settings.trainable == "weights":
         settings = settings.with_rates(network.target.fine_tuning_rates)
     variables = _variables(network, context, settings, start)
@@ -196,10 +196,7 @@ def make_descent(
     def field(masked: Tensor | None) -> AdaptedField:
         return network.field(context if masked is None else context.mask_views(masked), variables.weights())
 
-    pixels, any_views = network.live_pixels_of(context, views), network.target.permutation_invariant
-    if settings.draw is None:
-        many = any_views and len(context.given) >= MANY_VIEWS
-        settings = replace(settings, draw="contrast" if many and settings.trainable == "weights" else "uniform")
+    pixels = network.live_pixels_of(context, views)
     return Descent(field, variables.tensors, views, settings, pixels, masks_views=any_views), variables
 
 
@@ -211,13 +208,13 @@ def _variables(
         observed, theta = observe([context], network.hypernetwork.resolution), network.theta.detach()
         return Variables.of_hypernetwork(network.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
     if start is None:
-        start = _refreshed(network, network.adapted_weights(context), settings, len(context.given))
+        start = _refreshed(network, network.adapted_weights(context), settings)
     return Variables.of_weights(start)
 
 
-def _refreshed(network: HyperPlanesNetwork, weights: Parameters, settings: FineTuning, views: int) -> Parameters:
+def _refreshed(network: HyperPlanesNetwork, weights: Parameters, settings: FineTuning) -> Parameters:
     """Trained weights interpolated with random ones, where a hypernetwork writes a grid; others as they are."""
-    share = settings.fresh_share(views)
+    share = settings.fresh
     if not share or not network.reads_volume:
         return weights
     made = HyperPlanesNetwork(network.config.target_alone(), settings.seed)

@@ -86,7 +86,8 @@ class HyperPlanes(HyperPlanesNetwork):
 
         It begins at theta + delta, of which `settings.fresh` is replaced by random weights. Either these weights
         themselves are optimised, or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes,
-        section 3, fine-tuning). No step is the field of `adapt`.
+        section 3, fine-tuning). No step is the field of `adapt`. Where the model has a gating network, pictures from
+        ten views on are means with those of the visual hull (`stacking.tuned_field`).
 
         Args:
             support: the views of the object.

@@ -194,10 +194,11 @@ def stacked_field(
 
 @torch.no_grad()
 def tuned_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
-    """The field of weights after gradient steps, stacked with the visual hull where the model is configured so.
+    """The field of weights after gradient steps, stacked with the visual hull by the model's gating network.
 
-    From MANY_VIEWS on the model's gating network makes a share of every pixel, as where held-out views give the hull
-    none. No view is held out: gradient steps learn from all of them.
+    It is the field alone where there is no such network, and with fewer than MANY_VIEWS given views, their reflections
+    not counted. The network makes a share of every pixel, as where held-out views give the hull none. No view is held
+    out: gradient steps learn from all of them.
 
     Args:
         network: the model.

@@ -147,6 +147,7 @@ def _adapt(
     import torch
 
     from hyperplanes.adaptation.fine_tuning import make_descent
+    from hyperplanes.adaptation.stacking import tuned_field
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene, default_side
 
@@ -158,7 +159,7 @@ def _adapt(
         if done % EVERY == 0 or done == steps:
             with torch.no_grad():
                 weights = variables.weights().detach()
-            field = model.rendering_field(context, weights) if steps else model.adapt_to(context)
+            field = tuned_field(model, context, weights) if steps else model.adapt_to(context)
             viewer.show(field, f"{len(shown)} support views, {done} of {steps} fine-tuning steps")
         if not wanted.empty():
             return

@@ -97,6 +97,17 @@ class FineTuning:
         """How much of the first weights is random, with so many support views."""
         return (FRESH if views >= MANY_VIEWS else 0.0) if self.fresh is None else self.fresh
 
+    def for_views(self, views: int, any_number: bool) -> FineTuning:
+        """The settings with the `fresh` and the `draw` that so many support views have, where they state none.
+
+        Args:
+            views: how many there are.
+            any_number: whether the field takes any number of them.
+        """
+        by_contrast = any_number and views >= MANY_VIEWS and self.trainable == "weights"
+        draw = self.draw or ("contrast" if by_contrast else "uniform")
+        return replace(self, fresh=self.fresh_share(views), draw=draw)
+
     def with_rates(self, rates: Mapping[str, float]) -> FineTuning:
         """The settings with these rates where they state none; `rates` are fields of the settings by name."""
         return replace(self, **{name: rate for name, rate in rates.items() if getattr(self, name) is None})

@@ -49,7 +49,7 @@ class InitialisationConfig:
             raise ValueError(f"method: expected one of {', '.join(LEARNED)}, got {self.method!r}")
 
     def descent(self, rays: int | None = None, given: FineTuning | None = None) -> FineTuning:
-        """Plain gradient descent at a constant rate, `inner_rate`, where nothing else is stated.
+        """Plain gradient descent at a constant rate, `inner_rate`, on rays of all pixels, where nothing else is stated.
 
         Args:
             rays: a step; those of a new object where absent.
@@ -64,5 +64,6 @@ class InitialisationConfig:
             trainable="weights",
             rays=rays or self.test_rays,
             optimiser=optimiser,
+            draw=given.draw or "uniform",
             final_rate_factor=1.0 if plain else given.final_rate_factor,
         )

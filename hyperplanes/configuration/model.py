@@ -54,7 +54,7 @@ class ModelConfig:
             without.
         hull_share: of `hull_blend` in the pictures of a model that is not `stacked`: what was decided for one object.
         gated: a gating network makes a share of every pixel of that one (`adaptation.gating`); `training.gating` trains
-            it after the model. Pictures after gradient steps are means by it, too.
+            it after the model. With ten given views or more it also mixes the hull into pictures after gradient steps.
         symmetric: views of an object that looks symmetric are shown to the model together with their reflections
             (`adaptation.symmetry`). Training does without.
         symmetry: that of the object, where it is known: what was found for one.

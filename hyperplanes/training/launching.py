@@ -103,8 +103,10 @@ def launched(devices: int, nodes: int, device: torch.device) -> Generator[torch.
         for process in getattr(strategy.launcher, "procs", []):
             process.wait()
     finally:
-        _leave()
-        _end(getattr(strategy.launcher, "procs", []))
+        try:
+            _leave()
+        finally:
+            _end(getattr(strategy.launcher, "procs", []))
 
 
 def _leave() -> None:

@@ -226,12 +226,13 @@ def test_a_single_view_is_not_fine_tuned_on_unless_it_may_be_copied():
     adapter.fine_tune(views(1), 1, FineTuning(mask_views=False))
 
 
+@pytest.mark.parametrize("draw", ["uniform", "contrast"])
 @pytest.mark.parametrize("among", [False, True])
-def test_rays_come_from_hidden_views_only(among):
+def test_rays_come_from_hidden_views_only(among, draw):
     support = views(12)
     pixels = (support.masks[:, 0] > 0).flatten().nonzero()[:, 0] if among else None
     recorder = Recorder(support)
-    settings = FineTuning(rays=64, holdout=4)
+    settings = FineTuning(rays=64, holdout=4, draw=draw)
     assert list(recorder.descent(support, settings, pixels).run(8))[-1] == 8
     assert all(sources <= hidden and len(hidden) == 3 for hidden, sources in recorder.notes)
     assert len(set.union(*(hidden for hidden, _ in recorder.notes))) > 6  # others in every step

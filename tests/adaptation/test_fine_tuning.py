@@ -10,7 +10,7 @@ import torch
 
 from hyperplanes.adaptation import AdaptedField, fine_tuning
 from hyperplanes.adaptation import descent as descent_module
-from hyperplanes.adaptation.descent import EVEN, contrast, draw_pixels, ray_loss, split_holdout
+from hyperplanes.adaptation.descent import contrast, draw_pixels, ray_loss, split_holdout
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
@@ -18,6 +18,7 @@ from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry.occupancy import full
+from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.utilities.metrics import psnr
@@ -53,14 +54,13 @@ def test_an_empty_picture_is_judged_by_the_distance_of_the_views_from_white(mode
 def test_the_contrast_of_a_pixel_is_the_range_of_the_colours_around_it():
     images = torch.full((1, 3, 4, 5), 0.2)
     images[0, 0, :, 3:] = 0.8  # one of three channels changes, between the columns 2 and 3
-    expected = torch.tensor([0.0, 0.0, 0.2, 0.2, 0.0]).expand(1, 4, 5) + EVEN
-    torch.testing.assert_close(contrast(images), expected)
+    torch.testing.assert_close(contrast(images), torch.tensor([0.0, 0.0, 0.2, 0.2, 0.0]).expand(1, 4, 5))
 
 
 @pytest.mark.parametrize("some", [False, True])
 def test_the_weighted_mean_of_drawn_pixels_is_that_of_all(some):
     generator, count = torch.Generator().manual_seed(0), 200_000
-    importance, values = torch.rand(50, generator=generator) + EVEN, torch.randn(50, generator=generator)
+    importance, values = torch.rand(50, generator=generator) + 0.05, torch.randn(50, generator=generator)
     among = torch.arange(50)[::3] if some else None
     drawn, weights = draw_pixels(importance, among, count, generator)
     chosen = torch.arange(50) if among is None else among
@@ -68,36 +68,54 @@ def test_the_weighted_mean_of_drawn_pixels_is_that_of_all(some):
     torch.testing.assert_close(often, importance[chosen] / importance[chosen].sum(), atol=4e-3, rtol=0)
     assert set(drawn.tolist()) == set(chosen.tolist())
     assert float((weights[:, 0] * values[drawn]).mean()) == pytest.approx(float(values[chosen].mean()), abs=0.02)
-    even, ones = draw_pixels(torch.full((7,), EVEN), None, 100, generator)
+    _, ones = draw_pixels(torch.full((7,), 0.3), None, 100, generator)
     torch.testing.assert_close(ones, torch.ones(100, 1))
-    assert len(even.unique()) == 7
+    with pytest.raises(ValueError, match="among: expected at least one pixel to draw rays from, got none"):
+        draw_pixels(importance, torch.arange(0), 1, generator)
 
 
 def test_a_loss_counts_each_ray_by_its_weight():
     seen = Rendered(*(torch.zeros(2, *shape) for shape in ((3,), (), ())), samples=0)
     truth = torch.tensor([[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]])
     assert float(ray_loss(seen, truth)) == 2.5
-    assert float(ray_loss(seen, truth, torch.tensor([[3.0], [0.5]]))) == 2.5
     assert float(ray_loss(seen, truth, torch.tensor([[4.0], [0.0]]))) == 2.0
+    assert float(ray_loss(replace(seen, coarse=seen), truth, torch.tensor([[4.0], [0.0]]))) == 4.0
 
 
-def test_pixels_are_drawn_by_contrast_for_the_weights_of_a_field_of_any_number_of_views(model, support):
-    many = ball_views(ring(MANY_VIEWS))
-    any_number = small_model(target="image_based", hypernetwork=None, network=ImageBasedConfig(depth=2, width=16))
-    for made, settings, draw in (
-        (any_number, WEIGHTS, "contrast"),
-        (any_number, replace(WEIGHTS, draw="uniform"), "uniform"),
-        (model, WEIGHTS, "uniform"),
-        (model, PAPER, "uniform"),
-    ):
-        assert make_descent(made, made.prepare(many), settings)[0].settings.draw == draw
-    assert make_descent(any_number, any_number.prepare(support), WEIGHTS)[0].settings.draw == "uniform"  # four of them
+@pytest.mark.parametrize(
+    ("target", "trainable", "count", "draw"),
+    [
+        ("image_based", "weights", MANY_VIEWS, "contrast"),
+        ("image_based", "weights", MANY_VIEWS - 1, "uniform"),
+        ("image_based", "hypernetwork", MANY_VIEWS, "uniform"),
+        ("point_multiplane", "weights", MANY_VIEWS, "uniform"),
+    ],
+)
+def test_pixels_are_drawn_by_contrast_for_the_weights_of_a_field_of_any_number_of_views(target, trainable, count, draw):
+    many = ball_views(ring(count))
+    if target == "image_based":
+        network = ImageBasedConfig(depth=2, width=16, grid=2)
+        model = small_model(target=target, network=network, hypernetwork=VolumeHyperNetworkConfig())
+    else:
+        model = small_model(network=replace(small_model().config.network, planes=count))
+        model.set_rig(many)
+    settings = FineTuning(trainable, rays=8)
+    context = model.prepare(many)
+    assert len(context.given) == count
+    assert make_descent(model, context, settings)[0].settings.draw == draw
+    for stated in ("uniform", "contrast"):
+        assert make_descent(model, context, replace(settings, draw=stated))[0].settings.draw == stated
+
+
+def test_the_draw_of_pixels_decides(model, support):
     tuned = [
         model.fine_tune(support, 2, replace(WEIGHTS, draw=draw)).render(ring(1)).images
         for draw in (None, "uniform", "contrast")
     ]
     assert torch.equal(tuned[0], tuned[1])
     assert not torch.equal(tuned[1], tuned[2])
+    with pytest.raises(ValueError, match="draw: expected one of .*, got 'random'"):
+        replace(WEIGHTS, draw="random")
 
 
 @pytest.mark.parametrize("settings", [PAPER, WEIGHTS])
@@ -262,15 +280,21 @@ def test_settings_that_cannot_be_are_refused(settings, message):
         FineTuning(**settings)
 
 
-def test_auto_tries_the_start_that_it_goes_on_from(monkeypatch):
-    shares, made = [], fine_tuning.make_descent
-    monkeypatch.setattr(fine_tuning, "make_descent", lambda *given: shares.append(given[2].fresh) or made(*given))
+def test_auto_tries_what_it_goes_on_with(monkeypatch):
+    decided, made = [], fine_tuning.make_descent
+
+    def noting(*given):
+        descent = made(*given)
+        decided.append((descent[0].settings.fresh, descent[0].settings.draw))
+        return descent
+
+    monkeypatch.setattr(fine_tuning, "make_descent", noting)
+    model = small_model(target="image_based", hypernetwork=None, network=ImageBasedConfig(depth=2, width=16))
     for count in (9, 10, 12):
-        shares.clear()
-        awaken(small_model()).fine_tune(
-            ball_views(ring(count)), "auto", replace(WEIGHTS, max_steps=4, learning_rate=1e-4)
-        )
-        assert set(shares) == {0.5 if count >= 10 else 0.0}
+        decided.clear()
+        model.fine_tune(ball_views(ring(count, (8, 8))), "auto", FineTuning(rays=16, max_steps=4, learning_rate=1e-4))
+        assert len(decided) == 2
+        assert set(decided) == {(0.5, "contrast") if count >= 10 else (0.0, "uniform")}
 
 
 def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
@@ -295,13 +319,14 @@ def test_parts_of_the_rays_of_a_step_have_the_gradients_of_all_whatever_the_thre
     seeds = torch.randint(2**62, (3,), generator=torch.Generator().manual_seed(2)).tolist()
     parts = [(slice(12 * place, 12 * place + 12), seed) for place, seed in enumerate(seeds)]
     seen = [field.trace(rays[part], torch.Generator().manual_seed(seed)).colour for part, seed in parts]
-    loss = (torch.cat(seen) - truth).square().mean()
+    weights = torch.rand(30, 1, generator=torch.Generator().manual_seed(3))
+    loss = (weights * (torch.cat(seen) - truth).square()).mean()
     expected = torch.autograd.grad(loss, descent.tensors, allow_unused=True)
     before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            found.append(descent._gradients(field, rays, truth, torch.Generator().manual_seed(2)))
+            found.append(descent._gradients(field, rays, truth, torch.Generator().manual_seed(2), weights))
     finally:
         torch.set_num_threads(before)
     for one, two, whole in zip(*found, expected, strict=True):

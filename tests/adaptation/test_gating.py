@@ -11,6 +11,7 @@ from hyperplanes.adaptation.held_out import FEWEST
 from hyperplanes.adaptation.stacking import StackedField, stack
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.geometry.rays import cast
+from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.training.gating import GatingExample, example_of, fit_gate, turned
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task
@@ -79,7 +80,12 @@ def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
         tuned = adapter.fine_tune(support, 1, settings)
         assert isinstance(tuned, StackedField) == (count == MANY_VIEWS)
         assert not isinstance(adapter.fine_tune(replace(support, masks=None), 1, settings), StackedField)
-    assert tuned.share == 0
+    assert (tuned.share, tuned.views) == (0, MANY_VIEWS)
+    again = adapter.with_weights_of(tuned).adapt(support)
+    torch.testing.assert_close(again.render(cameras).images, tuned.render(cameras).images, atol=1e-6, rtol=0)
+    few = adapter.prepare(ball_views(ring(MANY_VIEWS - 1, (24, 24))), symmetry=Symmetry(Plane((1.0, 0.0, 0.0))))
+    assert len(few.views) > MANY_VIEWS
+    assert not isinstance(adapter.fine_tune_to(few, 1, settings), StackedField)  # reflections do not count
     alone, hull = replace(tuned, gate=None), HullBlend().adapt_to(adapter.prepare(support).planes)
     one, other, mixed = (each.render(cameras).images for each in (alone, hull, tuned))
     torch.testing.assert_close(mixed, torch.lerp(one, other, 0.3))
