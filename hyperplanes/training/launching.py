@@ -110,7 +110,7 @@ def launched(devices: int, nodes: int, device: torch.device) -> Generator[torch.
 
 
 def _leave() -> None:
-    """Leave the group after an error: gloo's threads abort an interpreter that ends before them.
+    """Leave the group after an error, since an interpreter that ends beside gloo's threads can be aborted by them.
 
     Collectives are synchronous, so none is under way. NCCL is not asked, which may wait for a process that has gone.
     """

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import distributed
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.commands.train import Arguments, resolve
 from hyperplanes.training import start_training
 from hyperplanes.training.distributed import Processes, check_shares
-from hyperplanes.training.launching import count_processes
+from hyperplanes.training.launching import _leave, count_processes
 from hyperplanes.utilities.checkpoints import load_tensors, read_json
 from hyperplanes.utilities.processes import is_first_process
 from tests.training.two_processes import KINDS, OPTIONS, Data, normalised, weights_of
@@ -118,6 +119,13 @@ def test_torchrun_says_how_many_processes_there_are(monkeypatch):
     assert not is_first_process(1)
     with pytest.raises(ValueError, match="--devices: expected the 3 processes on each of 2 .*, got 2 on each of 1"):
         count_processes(2, 1)
+
+
+def test_a_process_that_ends_in_an_error_leaves_its_group():
+    distributed.init_process_group("gloo", store=distributed.HashStore(), rank=0, world_size=1)
+    _leave()
+    assert not distributed.is_initialized()
+    _leave()  # where there is none, too
 
 
 def test_shares_are_all_values_in_their_order():
