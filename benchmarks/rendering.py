@@ -12,9 +12,12 @@ import resource
 import statistics
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
 
 from benchmarks._timing import timed
 from benchmarks.objects import held_out
@@ -83,70 +86,94 @@ def main(arguments: list[str]) -> int:
     return finish("rendering", rows, options.json)
 
 
-def paper_view(adapted: AdaptedField, query: Views, view: int) -> tuple[float, float, float, float]:
-    """One view by the paper's protocol: seconds, samples a ray, its squared error and the default protocol's.
+@dataclass(frozen=True)
+class PaperView:
+    """One view by the paper's protocol.
 
-    Of a picture with many rays an even subset is rendered and the time scaled; both errors are over the same rays.
+    Of a picture with many rays an even subset is rendered and the time scaled.
+
+    Attributes:
+        seconds: of the whole view.
+        samples: a ray.
+        error: squared, over the rays of the subset.
+        chosen: these rays' pixels.
+        truth: their colours.
     """
-    height, width = query.size
-    total = height * width
-    chosen = torch.arange(0, total, max(1, total // RAYS_OF_A_LARGE_VIEW) if total > 128 * 128 else 1)
-    pixels = pixel_grid(height, width)[chosen]
-    rays = cast(query.cameras, torch.full_like(chosen, view), pixels, query.bounds, near_far=PAPER.near_far)
-    seconds, seen = timed(lambda: render(adapted.field, rays, PAPER, proposal=adapted.proposal, differentiable=False))
-    truth = query.images[view].flatten(1).T[chosen]
-    ours = adapted.render(camera.select(query.cameras, [view])).images[0].flatten(1).T[chosen]
-    error = (seen.colour - truth).square().mean()
-    return (
-        seconds * total / len(chosen),
-        seen.samples / len(chosen),
-        float(error),
-        float((ours - truth).square().mean()),
-    )
+
+    seconds: float
+    samples: float
+    error: float
+    chosen: Tensor
+    truth: Tensor
+
+    @classmethod
+    def of(cls, adapted: AdaptedField, query: Views, view: int) -> PaperView:
+        """Render a view, or some rays of it."""
+        height, width = query.size
+        total = height * width
+        chosen = torch.arange(0, total, max(1, total // RAYS_OF_A_LARGE_VIEW) if total > 128 * 128 else 1)
+        pixels = pixel_grid(height, width)[chosen]
+        rays = cast(query.cameras, torch.full_like(chosen, view), pixels, query.bounds, near_far=PAPER.near_far)
+        seconds, seen = timed(
+            lambda: render(adapted.field, rays, PAPER, proposal=adapted.proposal, differentiable=False)
+        )
+        truth = query.images[view].flatten(1).T[chosen]
+        error = float((seen.colour - truth).square().mean())
+        return cls(seconds * total / len(chosen), seen.samples / len(chosen), error, chosen, truth)
+
+    def error_of(self, pictures: Pictures) -> float:
+        """The squared error of another rendering of the view, over the same rays."""
+        return float((pictures.images[0].flatten(1).T[self.chosen] - self.truth).square().mean())
+
+
+PROTOCOLS = {"default protocol": True, "one ray a pixel": False}
+"""Ours by name, and whether pixels at edges are the mean of three rays; the paper's has one ray a pixel."""
 
 
 def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
-    """One view of each object by both protocols: ours, the paper's, ours again."""
-    rows, ratios, paper_seconds, our_seconds, adapt_seconds = [], [], [], [], []
-    paper_errors, our_errors, samples, paper_samples, refine_seconds = [], [], [], [], []
+    """One view of each object by all protocols: ours, the paper's, ours again."""
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in PROTOCOLS}
     for number, task in enumerate(tasks):
         view = (7 * number + 3) % len(task.query)
         adapt, adapted = timed(lambda task=task: model.adapt(task.support))
         refine, _ = timed(lambda adapted=adapted: adapted.refined_occupancy)
         one = camera.select(task.query.cameras, [view])
-        seconds, pictures = timed(lambda adapted=adapted, one=one: adapted.render(one))
-        slow, asked, paper_error, our_error = paper_view(adapted, task.query, view)
-        again, _ = timed(lambda adapted=adapted, one=one: adapted.render(one))
-        fast = (seconds + again) / 2
-        ratios.append(slow / fast)
-        paper_seconds.append(slow)
-        our_seconds.append(fast)
-        adapt_seconds.append(adapt)
-        refine_seconds.append(refine)
-        paper_errors.append(paper_error)
-        our_errors.append(our_error)
-        samples.append(pictures.samples / (task.query.size[0] * task.query.size[1]))
-        paper_samples.append(asked)
-    size = tasks[0].query.size[0]
-    paper_psnr, our_psnr = (statistics.fmean(_decibels(e) for e in errors) for errors in (paper_errors, our_errors))
-    rows.append(
-        {
-            "name": f"default protocol, {size}x{size}, one view",
-            "seconds": statistics.median(our_seconds),
-            "reference_seconds": statistics.median(paper_seconds),
-            "speedup": statistics.median(ratios),
-            "speedup_lowest": min(ratios),
-            "speedup_highest": max(ratios),
-            "samples_a_ray": statistics.fmean(samples),
-            "reference_samples_a_ray": statistics.fmean(paper_samples),
-            "psnr": our_psnr,
-            "reference_psnr": paper_psnr,
-            "psnr_loss": paper_psnr - our_psnr,
-            "adapt_seconds": statistics.median(adapt_seconds),
-            "refine_seconds": statistics.median(refine_seconds),
-        }
-    )
-    return rows
+        pixels = task.query.size[0] * task.query.size[1]
+
+        def ours(name: str, adapted: AdaptedField = adapted, one: PinholeCamera = one) -> tuple[float, Pictures]:
+            return timed(lambda: adapted.render(one, antialias=PROTOCOLS[name]))
+
+        before = {name: ours(name) for name in PROTOCOLS}
+        paper = PaperView.of(adapted, task.query, view)
+        for name, (first, pictures) in before.items():
+            again, _ = ours(name)
+            row = {"seconds": (first + again) / 2, "reference_seconds": paper.seconds}
+            row |= {"samples": pictures.samples / pixels, "reference_samples": paper.samples}
+            row |= {"error": paper.error_of(pictures), "reference_error": paper.error}
+            found[name].append(row | {"adapt_seconds": adapt, "refine_seconds": refine})
+    return [_summary(name, tasks[0].query.size[0], rows) for name, rows in found.items()]
+
+
+def _summary(name: str, size: int, rows: list[dict[str, float]]) -> Row:
+    """One row of several views."""
+    ratios = [row["reference_seconds"] / row["seconds"] for row in rows]
+    ours, paper = (statistics.fmean(_decibels(row[error]) for row in rows) for error in ("error", "reference_error"))
+    median = {
+        key: statistics.median(row[key] for row in rows)
+        for key in ("seconds", "reference_seconds", "adapt_seconds", "refine_seconds")
+    }
+    return {
+        "name": f"{name}, {size}x{size}, one view",
+        **median,
+        "speedup": statistics.median(ratios),
+        "speedup_lowest": min(ratios),
+        "speedup_highest": max(ratios),
+        "samples_a_ray": statistics.fmean(row["samples"] for row in rows),
+        "reference_samples_a_ray": statistics.fmean(row["reference_samples"] for row in rows),
+        "psnr": ours,
+        "reference_psnr": paper,
+        "psnr_loss": paper - ours,
+    }
 
 
 def _decibels(error: float) -> float:

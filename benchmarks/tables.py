@@ -157,15 +157,23 @@ def _rendering(result: Result) -> str:
     named = {row["name"]: row for row in result["rows"]}
     lines = []
     for name, row in named.items():
-        if not (size := re.fullmatch(r"default protocol, (\d+x\d+), one view", name)):
+        if not (size := re.fullmatch(r"(?:default protocol|(one ray a pixel)), (\d+x\d+), one view", name)):
             continue
-        baked = named.get(f"baked, {size[1]}")
+        baked = None if size[1] else named.get(f"baked, {size[2]}")
         over = f"{row['speedup']:.0f} ({row['speedup_lowest']:.0f} to {row['speedup_highest']:.0f})"
         adapting = _seconds(row["adapt_seconds"] + row["refine_seconds"])
         times = [_seconds(row["reference_seconds"]), _seconds(row["seconds"]), over]
         last = [_seconds(baked["seconds"]), f"{baked['psnr_loss']:.2f} dB"] if baked else ["-", "-"]
         other = f", commit {row['commit']}" if "commit" in row else ""
-        lines.append([f"{size[1]}{other}", *times, f"{row['psnr_loss']:.2f} dB", adapting, *last])
+        lines.append(
+            [
+                f"{size[2]}{size[1] and f', {size[1]}' or ''}{other}",
+                *times,
+                f"{row['psnr_loss']:.2f} dB",
+                adapting,
+                *last,
+            ]
+        )
     headings = ["`paper`", "`ray_marching`", "ratio", "PSNR lost", "adapting and refining", "baked"]
     return markdown_table(["one view", *headings, "PSNR lost by baking"], lines)
 
