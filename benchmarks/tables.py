@@ -165,15 +165,8 @@ def _rendering(result: Result) -> str:
         times = [_seconds(row["reference_seconds"]), _seconds(row["seconds"]), over]
         last = [_seconds(baked["seconds"]), f"{baked['psnr_loss']:.2f} dB"] if baked else ["-", "-"]
         other = f", commit {row['commit']}" if "commit" in row else ""
-        lines.append(
-            [
-                f"{size[2]}{size[1] and f', {size[1]}' or ''}{other}",
-                *times,
-                f"{row['psnr_loss']:.2f} dB",
-                adapting,
-                *last,
-            ]
-        )
+        how = f", {size[1]}" if size[1] else ""
+        lines.append([f"{size[2]}{how}{other}", *times, f"{row['psnr_loss']:.2f} dB", adapting, *last])
     headings = ["`paper`", "`ray_marching`", "ratio", "PSNR lost", "adapting and refining", "baked"]
     return markdown_table(["one view", *headings, "PSNR lost by baking"], lines)
 
