@@ -25,7 +25,7 @@ COMMANDS: dict[str, list[str]] = {
     "lookup": [],
     "visibility": [],
     "busy": [],
-    "rendering": ["--sizes", "64", "128", "200", "400"],
+    "rendering": [],
     "small": [],
     "splats": [],
     "steps": [],
