@@ -338,6 +338,6 @@ def test_the_loss_of_few_rays_by_contrast_varies_less():
 
 
 def test_a_fine_tuned_lamp_is_shown_better_with_the_hull_beside_it():
-    """By 0.5 dB; docs/image-based.md has means over many objects."""
-    tuned = coarse("small").fine_tune(few(lamp(), 12), 30)
-    assert quality(tuned, lamp()) > quality(replace(tuned, gate=None), lamp()) + 0.2
+    """By 0.6 dB; docs/image-based.md has means over many objects."""
+    tuned = coarse("small").fine_tune(few(lamp(), 10), 8)
+    assert quality(tuned, lamp()) > quality(replace(tuned, gate=None), lamp()) + 0.3
