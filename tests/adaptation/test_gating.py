@@ -1,5 +1,6 @@
 """Source of truth: shares that are set by hand, means of pictures, and which picture is right by construction."""
 
+import queue
 from dataclasses import replace
 
 import pytest
@@ -9,6 +10,8 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes
 from hyperplanes.adaptation.gating import GatingNetwork, readings
 from hyperplanes.adaptation.held_out import FEWEST
 from hyperplanes.adaptation.stacking import StackedField, stack
+from hyperplanes.commands import view
+from hyperplanes.commands.console import Console
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.geometry.rays import cast
 from hyperplanes.geometry.reflections import Plane, Symmetry
@@ -89,6 +92,22 @@ def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
     alone, hull = replace(tuned, gate=None), HullBlend().adapt_to(adapter.prepare(support).planes)
     one, other, mixed = (each.render(cameras).images for each in (alone, hull, tuned))
     torch.testing.assert_close(mixed, torch.lerp(one, other, 0.3))
+
+
+def test_view_shows_the_pictures_that_render_writes(tmp_path):
+    class Viewer:
+        def show(self, field, _):
+            self.field = field
+
+    adapter, support, cameras = (
+        HyperPlanes(replace(CONFIG, gated=True)),
+        ball_views(ring(MANY_VIEWS, (24, 24))),
+        ring(1),
+    )
+    arguments, viewer = view.Arguments(tmp_path, steps=1, fit=0), Viewer()
+    view._adapt(adapter, support, arguments, viewer, queue.SimpleQueue(), Console(silent=True))
+    expected = adapter.fine_tune(support, 1).render(cameras).images
+    torch.testing.assert_close(viewer.field.render(cameras).images, expected)
 
 
 def test_a_fitted_gate_takes_the_picture_that_is_right():
