@@ -209,7 +209,7 @@ class Views:
         flat = flat if among is None else among[flat]
         if among is not None and flat.device.type == "cpu":  # elsewhere it would be waited for
             check_indices(flat, len(self) * height * width, "among", f"pixels of {len(self)} views")
-        return self.rays_at(flat, near_far=near_far, subpixels=subpixels)
+        return self._rays_through(flat, near_far, subpixels)
 
     @checked
     def rays_at(
@@ -233,6 +233,12 @@ class Views:
         height, width = self.size
         if pixels.device.type == "cpu":  # elsewhere it would be waited for
             check_indices(pixels, len(self) * height * width, "pixels", f"pixels of {len(self)} views")
+        return self._rays_through(pixels, near_far, subpixels)
+
+    def _rays_through(
+        self, pixels: Int[Tensor, " pixel"], near_far: str, subpixels: Sequence[tuple[float, float]]
+    ) -> tuple[Rays, Float[Tensor, "pixel 3"], Float[Tensor, "pixel 1"]]:
+        height, width = self.size
         view, pixel = pixels // (height * width), pixels % (height * width)
         row, column = pixel // width, pixel % width
         places = torch.stack([column, row], -1).to(self.images)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d, pad
+from torch.nn.functional import max_pool2d
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.gradients import summed_gradients
@@ -58,8 +58,7 @@ def contrast(images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "vie
     Returns:
         In [0, 1], for each pixel.
     """
-    around = pad(images, (1, 1, 1, 1), mode="replicate")
-    return (max_pool2d(around, 3, 1) + max_pool2d(-around, 3, 1)).mean(1)
+    return (max_pool2d(images, 3, 1, 1) + max_pool2d(-images, 3, 1, 1)).mean(1)
 
 
 def draw_pixels(
@@ -68,7 +67,7 @@ def draw_pixels(
     """Pixels drawn in proportion to an importance, and the weights by which their mean is that over all pixels.
 
     This is importance sampling (Kahn & Marshall 1953). The closer the importance is to the error, the less the loss of
-    few rays varies: by contrast its standard deviation is half of that of uniform draws (`tests/test_trained.py`).
+    few rays varies (`tests/test_trained.py`).
 
     Args:
         importance: above 0.
