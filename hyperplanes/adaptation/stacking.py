@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import TypeVar
 
 import torch
@@ -17,6 +18,7 @@ from hyperplanes.adaptation.held_out import FEWEST, Trial, hold_out
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
+from hyperplanes.geometry.kernels.threads import at_once
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.parameters import Parameters
@@ -79,10 +81,11 @@ class StackedField(AdaptedField):
         self, cameras: PinholeCamera, sampling: Sampler | None = None, antialias: bool | None = None
     ) -> Pictures:
         """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the field's alone."""
-        own = super().render(cameras, sampling, antialias)
+        own = partial(super().render, cameras, sampling, antialias)
         if not self.share and self.gate is None:
-            return own
-        return self._mean(own, self.other.render(cameras, antialias=antialias))
+            return own()
+        other = partial(self.other.render, cameras, antialias=antialias)
+        return self._mean(*at_once(own, other, self.occupancy.occupied.device))
 
     def _mean(self, own: Pixels, other: Pixels) -> Pixels:
         """The mean of colours and opacities, and the expected distance of what both show."""

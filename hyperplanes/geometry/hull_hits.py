@@ -44,7 +44,7 @@ def hull_hits(
     arrays = [each.contiguous().numpy() for each in (rays.origins, rays.directions, first, rays.far)]
     fixed = (
         *arrays, np.float32(step), np.array([*bounds.centre, bounds.radius], np.float32),
-        voxels.occupied.contiguous().numpy().view(np.uint8),
+        np.array(voxels.box, np.float32), voxels.occupied.contiguous().numpy().view(np.uint8),
         *(each.contiguous().flatten().numpy() for each in (cameras, planes.depth_opacity)),
         (*shape[:3], cameras.shape[1]), np.array([planes.colours.nearest, opacity], np.float32),
     )  # fmt: skip

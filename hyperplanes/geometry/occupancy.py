@@ -64,6 +64,17 @@ class Occupancy:
         unit = (cells.float() + 0.5) * (2 / self.occupied.shape[0]) - 1
         return unit * self.bounds.radius + unit.new_tensor(self.bounds.centre)
 
+    @cached_property
+    def box(self) -> tuple[float, ...]:
+        """Lower and upper corner of the box around all occupied voxels, in the world; of no size without any."""
+        corner, centre = [], self.bounds.centre
+        for axis in range(3):
+            others = [each for each in range(3) if each != axis]
+            found = self.occupied.any(others[1]).any(others[0]).nonzero()
+            ends = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, 0)
+            corner.append([centre[axis] - self.bounds.radius + end * self.voxel for end in ends])
+        return tuple(end for side in zip(*corner, strict=True) for end in side)
+
     def surface(self) -> Occupancy:
         """The occupied voxels with a face at an empty one or at the border of the grid: what every ray enters by."""
         padded = pad(self.occupied, (1, 1, 1, 1, 1, 1))

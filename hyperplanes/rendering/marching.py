@@ -136,13 +136,14 @@ def _walk_compiled(
         each.detach().contiguous().numpy() for each in (rays.origins, rays.directions, start, rays.far)
     )
     number, bounds = first.dtype.type, occupancy.bounds
-    sphere, occupied = np.array([*bounds.centre, bounds.radius], number), occupancy.occupied.contiguous()
+    sphere, box = np.array([*bounds.centre, bounds.radius], number), np.array(occupancy.box, number)
+    occupied = occupancy.occupied.contiguous()
     kernel = compile_kernel("marching.march", start.dtype)
 
     def part(begin: int, end: int) -> tuple[Tensor, Tensor]:
         room, found = (end - begin) * (count + 1), np.zeros(1, np.int64)
         ray, distances = np.empty(room, np.int64), np.empty(room, number)
-        arrays = (sphere, occupied.numpy().view(np.uint8), ray, distances, found)
+        arrays = (sphere, box, occupied.numpy().view(np.uint8), ray, distances, found)
         kernel(origins, directions, first, far, number(step), *arrays, begin, end)
         return torch.from_numpy(ray[: found[0]].copy()), torch.from_numpy(distances[: found[0]].copy())
 

@@ -99,6 +99,19 @@ def test_pictures_and_pixels_are_the_mean_of_both_fields(share):
     torch.testing.assert_close(mixed.colour, torch.lerp(one.colour, other.colour, share))
 
 
+def test_two_threads_make_the_pictures_of_one():
+    support, found = ball_views(ring(6, (40, 40))), []
+    field, before = stack(*both(support), 0.4), torch.get_num_threads()
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            found.append(field.render(support.cameras))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(found[0].images, found[1].images)
+    assert torch.equal(found[0].depth, found[1].depth)
+
+
 def test_a_model_in_double_precision_is_stacked_too():
     support, cameras = ball_views(ring(6, (24, 24))), ring(1, (10, 13), shift=1)
     adapter = model()

@@ -14,7 +14,7 @@ from numba.core.dispatcher import Dispatcher
 
 from hyperplanes.geometry import ImagePlanes, cameras, kernels
 from hyperplanes.geometry.kernels import threads
-from hyperplanes.geometry.kernels.threads import parallel_for, parallel_map
+from hyperplanes.geometry.kernels.threads import at_once, parallel_for, parallel_map
 
 PREFIX = "hyperplanes.geometry.kernels."
 
@@ -71,6 +71,48 @@ def test_an_error_in_a_part_is_raised_and_the_parts_after_it_are_left_out(three_
     with pytest.raises(ValueError, match="part 0"):
         list(parallel_map(work, range(10_000)))
     assert len(ran) < 10_000
+
+
+CPU = torch.device("cpu")
+
+
+def test_two_computations_at_once_wait_for_each_other(three_threads):
+    barrier = threading.Barrier(2, timeout=20)
+
+    def work(name):
+        barrier.wait()
+        return name, sum(parallel_map(lambda part: part, range(5))), torch.is_grad_enabled()
+
+    with torch.no_grad():
+        assert at_once(lambda: work("one"), lambda: work("other"), CPU) == (("one", 10, False), ("other", 10, False))
+
+
+def test_two_computations_follow_each_other_where_there_is_one_thread_or_two_run_already(three_threads):
+    def ran():
+        return threading.get_ident()
+
+    inner = at_once(lambda: at_once(ran, ran, CPU), ran, CPU)
+    assert inner[0] == (ran(), ran())
+    assert inner[1] != ran()
+    assert at_once(ran, ran, torch.device("meta")) == (ran(), ran())
+    torch.set_num_threads(1)
+    assert at_once(ran, ran, CPU) == (ran(), ran())
+
+
+@pytest.mark.parametrize("wrong", ["one", "other"])
+def test_an_error_in_one_of_two_computations_is_raised_when_both_have_ended(wrong, three_threads):
+    ended = []
+
+    def work(name):
+        time.sleep(0.0 if name == wrong else 0.05)
+        ended.append(name)
+        if name == wrong:
+            raise ValueError(name)
+
+    with pytest.raises(ValueError, match=wrong):
+        at_once(lambda: work("one"), lambda: work("other"), CPU)
+    assert sorted(ended) == ["one", "other"]
+    assert at_once(lambda: 1, lambda: 2, CPU) == (1, 2)
 
 
 @pytest.mark.parametrize(("size", "exact"), [(8, False), (8, True), (150, True)])

@@ -1,5 +1,7 @@
 """Source of truth: a walk along each ray, step by step, that asks the grid at every one."""
 
+import math
+
 import pytest
 import torch
 
@@ -53,6 +55,24 @@ def test_the_kernel_finds_what_plain_pytorch_does(dtype):
     assert abs(float(distances.sum() - expected.sum())) < 10
 
 
+def test_the_kernel_loses_no_sample_of_few_voxels():
+    """It begins and ends at the box around them; rays along the axes go through it, beside it and along its sides."""
+    grid = Occupancy(torch.zeros(8, 8, 8, dtype=torch.bool), Sphere())
+    grid.occupied[2:4, 5, 1] = grid.occupied[3, 6, 2] = True
+    assert grid.box == (-0.5, 0.25, -0.75, 0.0, 0.75, -0.25)
+    places = torch.cartesian_prod(*2 * [torch.arange(-19, 20, dtype=torch.float64) / 20])  # -0.5 is one of them
+    origins = torch.cat([places, torch.full_like(places[:, :1], -3.0)], 1)
+    origins, others = torch.cat([origins.roll(axis, 1) for axis in range(3)]), some_rays(700)
+    along = torch.eye(3, dtype=torch.float64)[[2, 0, 1]].repeat_interleave(len(places), 0)
+    origins = torch.cat([origins, -origins, others.origins])
+    near = torch.full_like(origins[:, 0], 2.0)
+    rays = Rays(origins, torch.cat([along, -along, others.directions]), near, near + 2)
+    found, expected = (walk(rays, rays.near + 0.011, grid, 0.03, 67) for walk in (_walk_compiled, _walk_torch))
+    assert torch.equal(found[0], expected[0])
+    torch.testing.assert_close(found[1], expected[1])
+    assert len(found[0]) > 1000
+
+
 def test_samples_stand_ray_by_ray_near_ones_first():
     found = march(some_rays(50), full(Sphere(), 4), 0.1, torch.Generator().manual_seed(0))
     same = found.ray.diff() == 0
@@ -89,6 +109,14 @@ def test_what_misses_has_no_samples():
     assert len(march(straight([2.0], [4.0]), nothing, 0.1)) == 0
     both = march(straight([3.0, 2.0, 3.0], [3.0, 4.0, 3.0]), grid, 0.5)
     assert both.ray.tolist() == [1] * 4
+
+
+@pytest.mark.parametrize("slope", [1e-38, -1e-38, math.nan, math.inf])
+def test_rays_that_never_reach_the_voxels_end(slope):
+    grid = full(Sphere(), 4)
+    grid.occupied[:2] = False
+    origins, directions = torch.tensor([[-0.5, 0.0, 3.0]]), torch.tensor([[slope, 0.0, -1.0]])
+    assert len(march(Rays(origins, directions, torch.tensor([2.0]), torch.tensor([4.0])), grid, 0.1)) == 0
 
 
 def test_a_ray_from_inside_looks_only_ahead():

@@ -46,12 +46,12 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
         "T[::1], T[:, ::1], T[::1], T[:, ::1], T[:, ::1], T[:, :, ::1], int64, int64"
     ),
     "marching.march": (
-        "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], uint8[:, :, ::1], int64[::1], T[::1], int64[::1], "
+        "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T[::1], uint8[:, :, ::1], int64[::1], T[::1], int64[::1], "
         "int64, int64"
     ),
     "hull_hits.hull_hits": (
-        "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], uint8[:, :, ::1], T[::1], T[::1], UniTuple(int64, 4), "
-        "T[::1], T[::1], int64, int64"
+        "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T[::1], uint8[:, :, ::1], T[::1], T[::1], "
+        "UniTuple(int64, 4), T[::1], T[::1], int64, int64"
     ),
     "first_hits.first_hits": (
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T, uint8[:, :, ::1], T[::1], int64, int64"

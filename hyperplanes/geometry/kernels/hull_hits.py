@@ -7,6 +7,7 @@ from typing import no_type_check
 import numpy as np
 
 from hyperplanes.geometry.kernels.blocks import inlined
+from hyperplanes.geometry.kernels.boxes import samples_within
 from hyperplanes.geometry.lookup_torch import BORDER
 
 __all__ = ["hull_hits"]
@@ -43,14 +44,15 @@ def _opacity(cameras, pitch, view, x, y, z, maps, shape, min_z):
 
 @no_type_check
 def hull_hits(
-    origins, directions, first, far, step, sphere, occupied, cameras, maps, shape, limits, nearest, start, stop
+    origins, directions, first, far, step, sphere, box, occupied, cameras, maps, shape, limits, nearest, start, stop
 ):
     """Writes into `nearest` the distance of the first sample of rays start..stop in the hull, infinity where none is.
 
     Samples lie at first + i step, before far, in occupied voxels, as `marching.march` has them. One lies in the hull
     where every view that shows it has at least an opacity there; the view that cut the last sample away is asked first.
     `cameras` and `maps` are those of `visibility.choose`, `shape` the number of views, height, width and the pitch of
-    `cameras`; `limits` are min_z and the opacity, `sphere` the centre and the radius of the scene.
+    `cameras`; `limits` are min_z and the opacity, `sphere` the centre and the radius of the scene, `box` the
+    corners around its occupied voxels.
     """
     number = first.dtype.type
     side, half, one = occupied.shape[0], number(occupied.shape[0]) / number(2), number(1)
@@ -58,8 +60,9 @@ def hull_hits(
     cutting = 0
     for ray in range(start, stop):
         nearest[ray] = np.inf
-        place, t = 0, first[ray]
-        while t < far[ray]:
+        place, end = samples_within(origins, directions, first, far, ray, step, box)
+        t = first[ray] + number(place) * step
+        while t < end:
             px, py, pz = (
                 origins[ray, 0] + t * directions[ray, 0],
                 origins[ray, 1] + t * directions[ray, 1],

@@ -6,22 +6,26 @@ from typing import no_type_check
 
 import numpy as np
 
+from hyperplanes.geometry.kernels.boxes import samples_within
+
 __all__ = ["march"]
 
 
 @no_type_check
-def march(origins, directions, first, far, step, sphere, occupied, ray, distances, found, start, stop):
+def march(origins, directions, first, far, step, sphere, box, occupied, ray, distances, found, start, stop):
     """Writes the samples of rays start..stop in occupied voxels, ray after ray, and into found[0] their number.
 
-    Samples lie at first + i step, before far. `sphere` is the centre and the radius of the scene. `ray` gets the index
+    Samples lie at first + i step, before far. `sphere` is the centre and the radius of the scene, `box` the corners
+    around its occupied voxels. `ray` gets the index
     of the ray of each sample, `distances` its distance; both have room for all of them.
     """
     number = first.dtype.type
     side, half, one = occupied.shape[0], number(occupied.shape[0]) / number(2), number(1)
     count = 0
     for index in range(start, stop):
-        place, t = 0, first[index]
-        while t < far[index]:
+        place, end = samples_within(origins, directions, first, far, index, step, box)
+        t = first[index] + number(place) * step
+        while t < end:
             # the sample in the cube around the unit sphere
             x = (origins[index, 0] + t * directions[index, 0] - sphere[0]) / sphere[3]
             y = (origins[index, 1] + t * directions[index, 1] - sphere[1]) / sphere[3]

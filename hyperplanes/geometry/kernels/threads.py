@@ -9,20 +9,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from threading import Barrier, Lock
 from typing import TypeVar
 
 import torch
 
-__all__ = ["parallel_for", "parallel_map", "side_by_side"]
+__all__ = ["at_once", "parallel_for", "parallel_map", "side_by_side"]
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
+Other = TypeVar("Other")
 
-_pools: dict[int, ThreadPoolExecutor] = {}
+_pools: dict[tuple[int, str], ThreadPoolExecutor] = {}
 _single: dict[int, ThreadPoolExecutor] = {}  # whose threads run operations of PyTorch alone
 _making = Lock()
+_second = Lock()  # held while `at_once` runs two computations
 
 
 def parallel_for(work: Callable[[int, int], Result], total: int, chunk: int) -> list[Result]:
@@ -99,6 +101,30 @@ def side_by_side(work: Callable[[Part], Result], parts: Sequence[Part], device: 
     return list(map(work, parts) if alone else parallel_map(work, parts))
 
 
+def at_once(one: Callable[[], Result], other: Callable[[], Other], device: torch.device) -> tuple[Result, Other]:
+    """The results of two computations in several steps each, whose parts `parallel_map` runs.
+
+    While one of them waits for its last part, or does what no thread shares, parts of the other run. On another device
+    than the CPU, with one thread, and where two such computations run already, one follows the other.
+
+    Args:
+        one: as the work of `parallel_map`; run by the calling thread.
+        other: likewise; run by another one.
+        device: where both are done.
+    """
+    alone = device.type != "cpu" or torch.get_num_threads() < 2 or torch.is_autocast_enabled("cpu")
+    if alone or not _second.acquire(blocking=False):
+        return one(), other()
+    try:
+        future = _pool(1, "second").submit(torch.no_grad()(other))
+        try:
+            return one(), future.result()
+        finally:
+            wait([future])
+    finally:
+        _second.release()
+
+
 def _single_pool(size: int) -> ThreadPoolExecutor:
     with _making:
         if size not in _single:
@@ -117,15 +143,15 @@ def _run_operations_alone() -> None:
     torch.set_num_threads(1)
 
 
-def _pool(size: int) -> ThreadPoolExecutor:
-    if size not in _pools:
-        _pools[size] = ThreadPoolExecutor(size, thread_name_prefix="hyperplanes-kernels")
-    return _pools[size]
+def _pool(size: int, purpose: str = "kernels") -> ThreadPoolExecutor:
+    if (size, purpose) not in _pools:
+        _pools[size, purpose] = ThreadPoolExecutor(size, f"hyperplanes-{purpose}")
+    return _pools[size, purpose]
 
 
 def _forget() -> None:
-    global _making
-    _making = Lock()
+    global _making, _second
+    _making, _second = Lock(), Lock()
     _pools.clear()
     _single.clear()
 

@@ -1,0 +1,33 @@
+"""Which samples of a ray may lie in the box around all occupied voxels; most of the scene's sphere lies beside it."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+
+from hyperplanes.geometry.kernels.blocks import inlined
+
+__all__ = ["samples_within"]
+
+
+@inlined
+@no_type_check
+def samples_within(origins, directions, first, far, ray, step, box):
+    """The index of a sample of a ray before the box, and a distance behind it, at most far.
+
+    Samples lie at first + i step. `box` are the lower and the upper corner, in the world. Samples beside the box may be
+    among those between, so that rounding loses none within it.
+    """
+    enters, leaves = first[ray], far[ray]
+    for axis in range(3):
+        low, high = box[axis] - origins[ray, axis], box[3 + axis] - origins[ray, axis]
+        slope = directions[ray, axis]
+        if slope != 0:
+            enters = max(enters, min(low / slope, high / slope))
+            leaves = min(leaves, max(low / slope, high / slope))
+        elif low > 0 or high < 0:  # it goes beside the box
+            leaves = first[ray] - step
+    if not enters <= far[ray]:  # behind the end of the ray, or no number
+        enters = far[ray]
+    return np.int64(max(enters - first[ray], first.dtype.type(0)) / step), min(leaves + step, far[ray])
