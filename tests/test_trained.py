@@ -111,10 +111,13 @@ def lamp():
     return held_out(2, 64, kind="lamp")[1]
 
 
-def coarse(name):
-    """A packaged model with a hull of 64 voxels a side in place of 96: the same gaps in a third of the time."""
+def coarse(name, *, symmetric=False):
+    """A packaged model with a hull of 64 voxels a side in place of 96: the same gaps in a third of the time.
+
+    It looks for no symmetry, which takes longer than to adapt, where a test is not about reflections.
+    """
     model = HyperPlanes.from_pretrained(name)
-    model.config = replace(model.config, hull_resolution=64)
+    model.config = replace(model.config, hull_resolution=64, symmetric=symmetric)
     return model
 
 
@@ -202,7 +205,6 @@ def test_a_car_that_faces_another_way_costs_little(count, most):
     By the views alone: where reflections help, the plane of another heading is found from five views on.
     """
     model, found = coarse("small"), {}
-    model.config = replace(model.config, symmetric=False)
     for degrees in (0, 45):
         rotation = Rotation(math.radians(degrees))
         values = []
@@ -234,7 +236,7 @@ def mean_psnr(adapter, task, count):
 
 @pytest.mark.parametrize("car", [0, 1])
 def test_three_rays_at_edges_bring_decibels_from_many_views(car):
-    """2.7 and 2.2 dB at 64x64; `benchmarks views --methods one_ray` has the mean over many at 128x128."""
+    """2.4 and 1.9 dB at 64x64; `benchmarks views --methods one_ray` has the mean over many at 128x128."""
     task = cars()[car]
     field = coarse("small").adapt(few(task, 25))
     assert quality(field, task) > quality(field, task, antialias=False) + 0.5
@@ -248,7 +250,7 @@ def test_an_object_that_means_nothing_is_shown_better_than_by_its_hull(count, le
 
 @pytest.mark.parametrize(("kind", "count", "least"), [("car", 3, 0.5), ("lamp", 5, 1.0)])
 def test_reflections_bring_decibels_on_symmetric_objects(kind, count, least):
-    model, tasks = coarse("small"), cars() if kind == "car" else [lamp()]
+    model, tasks = coarse("small", symmetric=True), cars() if kind == "car" else [lamp()]
     both = sum(mean_psnr(model, task, count) for task in tasks)
     model.config = replace(model.config, symmetric=False)
     assert both > sum(mean_psnr(model, task, count) for task in tasks) + least * len(tasks)
@@ -257,7 +259,7 @@ def test_reflections_bring_decibels_on_symmetric_objects(kind, count, least):
 def with_symmetry(symmetry):
     """The packaged model, told that objects are symmetric so, without the pictures of the hull."""
     model = coarse("small")
-    model.config = replace(model.config, symmetric=False, symmetry=symmetry, stacked=False)
+    model.config = replace(model.config, symmetry=symmetry, stacked=False)
     return model
 
 
@@ -272,7 +274,7 @@ def test_the_handicap_of_reflections_brings_decibels_where_light_falls_from_one_
 @pytest.mark.parametrize("count", [1, 3])
 def test_reflections_about_several_planes_bring_decibels_on_a_lamp(count):
     """4.4 and 4.3 dB over those about one plane, which bring 0.6 over none from three views."""
-    found = coarse("small").find_symmetry(few(lamp(), count))
+    found = coarse("small", symmetric=True).find_symmetry(few(lamp(), count))
     assert found is not None
     assert found.order == 8
     several, one = (mean_psnr(with_symmetry(each), lamp(), count) for each in (found, replace(found, order=1)))
@@ -280,21 +282,21 @@ def test_reflections_about_several_planes_bring_decibels_on_a_lamp(count):
 
 
 def test_reflections_about_a_wrong_plane_do_harm_and_that_one_is_not_found():
-    model, task = coarse("small"), cars()[0]
+    model, task = coarse("small", symmetric=True), cars()[0]
     views, along = few(task, 5), Symmetry(Plane((0.0, 0.0, 1.0)))
     across = model.find_symmetry(views)
     assert across is not None
     assert across.plane.normal == (1.0, 0.0, 0.0)
     wrongly, alone = (quality(model.adapt_to(model.prepare(views, symmetry=each)), task) for each in (along, None))
     assert wrongly < alone - 1
-    assert model.find_symmetry(few(task, 12)) is not None
-    assert _judged(model, few(task, 12), along).symmetry is None  # as held-out views say
+    judged = [_judged(model, few(task, 12), each).symmetry for each in (across, along)]
+    assert judged == [across, None]  # as held-out views say
 
 
 def by_parts(task, count, model):
     """PSNR by the field alone, by its mean with the hull by one share, and by a share of every pixel."""
     found, gate, views = [], model.gate, few(task, count)
-    context = model.prepare(views, symmetry=model.find_symmetry(views))
+    context = model.prepare(views)
     for stacked, model.gate in ((False, None), (True, None), (True, gate)):
         model.config = replace(model.config, stacked=stacked)
         found.append(quality(model.adapt_to(context), task))
@@ -312,7 +314,7 @@ def test_views_that_are_held_out_find_out_what_is_wrong_for_an_object():
 
 @pytest.mark.parametrize(("kind", "count"), [("lamp", 10), ("random", 25)])
 def test_a_mean_with_the_hull_is_better_than_either_and_one_by_pixel_better_still(kind, count):
-    """By 0.23 and 0.24 dB, and by 0.34 and 0.06 more; docs/image-based.md has means over many objects."""
+    """By 0.31 and 0.24 dB, and by 0.12 and 0.06 more; docs/image-based.md has means over many objects."""
     model, task = coarse("small"), {"lamp": lamp, "random": shape}[kind]()
     alone, by_object, by_pixel = by_parts(task, count, model)
     assert by_object > max(alone, mean_psnr(HullBlend(), task, count)) + 0.1
@@ -339,5 +341,5 @@ def test_the_loss_of_few_rays_by_contrast_varies_less():
 
 def test_a_fine_tuned_lamp_is_shown_better_with_the_hull_beside_it():
     """By 0.6 dB; docs/image-based.md has means over many objects."""
-    tuned = coarse("small").fine_tune(few(lamp(), 10), 8)
+    tuned = with_symmetry(Symmetry(Plane((1.0, 0.0, 0.0)))).fine_tune(few(lamp(), 10), 8)
     assert quality(tuned, lamp()) > quality(replace(tuned, gate=None), lamp()) + 0.3
