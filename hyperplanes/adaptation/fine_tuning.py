@@ -209,6 +209,7 @@ def _variables(
         return Variables.of_hypernetwork(network.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
     if start is None:
         start = _refreshed(network, network.adapted_weights(context), settings)
+        start = network.finer(start, settings.cells or 0)
     return Variables.of_weights(start)
 
 

@@ -125,11 +125,12 @@ class HyperPlanes(HyperPlanesNetwork):
         learned = learned_part(adapted)
         beside = {"hull_share": learned.share, "gated": learned.gate is not None}
         beside |= {"symmetric": False, "symmetry": adapted.symmetry}
-        result = HyperPlanes(replace(self.config.target_alone(), **beside))
+        found = {"fine": learned.field.field, "coarse": learned.field.proposal}
+        network = self.target.config_of(self.target.parameters_of(found["fine"]))
+        result = HyperPlanes(replace(self.config.target_alone(), network=network, **beside))
         if result.gate is not None and learned.gate is not None:
             result.gate.load_state_dict(learned.gate.state_dict())
         result.rig.copy_(self.rig)
-        found = {"fine": learned.field.field, "coarse": learned.field.proposal}
         for name, network in result.targets.items():
             network.load_state_dict(network.parameters_of(found[name]))
         return result.eval()

@@ -153,6 +153,14 @@ class HyperPlanesNetwork(nn.Module):
             symmetry=context.symmetry,
         )
 
+    def finer(self, weights: Parameters, cells: int) -> Parameters:
+        """The same fields by weights that have room for more detail (`Target.finer`)."""
+        result = Parameters(weights)
+        for name, network in self.targets.items():
+            found = network.finer(weights.under(name), cells)
+            result.update({f"{name}.{key}": value for key, value in found.items()})
+        return result
+
     def rendering_field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
         """As `field`; one that judges what views see takes colours from those that see the surface of its density.
 

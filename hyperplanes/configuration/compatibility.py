@@ -50,6 +50,9 @@ def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
             )
         if not getattr(config.network, "grid", 0):
             raise ValueError("network.grid: expected features of a grid for hypernetwork.kind 'volume' to write, got 0")
+        cells = target.volume_size[1]
+        if (given := getattr(config.network, "cells", cells)) != cells:
+            raise ValueError(f"network.cells: expected {cells} for hypernetwork.kind 'volume', got {given}")
         return
     reader = hypernetwork or config.autoencoder
     if reader is None:

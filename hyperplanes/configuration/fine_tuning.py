@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.utilities.arguments import checked_fields
 
-__all__ = ["FRESH", "MANY_VIEWS", "RATES", "FineTuning", "Steps"]
+__all__ = ["CELLS", "FINE_VIEWS", "FRESH", "MANY_VIEWS", "RATES", "FineTuning", "Steps"]
 
 Steps: TypeAlias = int | Literal["auto"]
 
@@ -24,6 +24,10 @@ docs/adaptation.md."""
 
 FRESH = 0.5
 """Share of random weights that fine-tuning a field with a grid of features begins with; docs/small-training.md."""
+
+CELLS, FINE_VIEWS = 64, 20
+"""Cells an axis of the grid of features that fine-tuning optimises with so many support views or more; hypernetworks
+write half as many (docs/adaptation.md)."""
 
 MANY_VIEWS = 10
 """Support views of a field of any number of them from which on fine-tuning begins with weights that are partly random,
@@ -55,6 +59,9 @@ class FineTuning:
             features: trained weights interpolated with random ones learn more in the same steps (Ash & Adams 2020, "On
             warm-starting neural network training"). Where None, FRESH with MANY_VIEWS or more, else none.
         seed: of rays and samples, and of random weights.
+        cells: an axis of the grid of features that the steps optimise, where a field has one: the weights that they
+            begin with are interpolated to so many. Fewer than it has change nothing. Where None, CELLS for the weights
+            of a field that takes any number of views, with FINE_VIEWS or more of them, else as many as it has.
         draw: the pixels of rays: all with the same probability ("uniform"), or those more often around which colours
             differ ("contrast"), which count less in the loss by as much. Where None, "contrast" for the weights of a
             field that takes any number of views, with MANY_VIEWS or more of them, else "uniform", as in the paper.
@@ -77,6 +84,7 @@ class FineTuning:
     fresh: float | None = None
     seed: int = 0
     draw: Literal["uniform", "contrast"] | None = None
+    cells: Annotated[int, range(257)] | None = None
 
     def __post_init__(self) -> None:
         choices = {"trainable": RATES, "optimiser": (None, "adam", "muon", "sgd"), "decay": ("cosine", "exponential")}
@@ -98,15 +106,17 @@ class FineTuning:
         return (FRESH if views >= MANY_VIEWS else 0.0) if self.fresh is None else self.fresh
 
     def for_views(self, views: int, any_number: bool) -> FineTuning:
-        """The settings with the `fresh` and the `draw` that so many support views have, where they state none.
+        """The settings with what so many support views have for `fresh`, `draw` and `cells`, where they state none.
 
         Args:
             views: how many there are.
             any_number: whether the field takes any number of them.
         """
-        by_contrast = any_number and views >= MANY_VIEWS and self.trainable == "weights"
-        draw = self.draw or ("contrast" if by_contrast else "uniform")
-        return replace(self, fresh=self.fresh_share(views), draw=draw)
+        many = any_number and views >= MANY_VIEWS and self.trainable == "weights"
+        draw = self.draw or ("contrast" if many else "uniform")
+        finer = CELLS if many and views >= FINE_VIEWS else 0
+        cells = finer if self.cells is None else self.cells
+        return replace(self, fresh=self.fresh_share(views), draw=draw, cells=cells)
 
     def with_rates(self, rates: Mapping[str, float]) -> FineTuning:
         """The settings with these rates where they state none; `rates` are fields of the settings by name."""

@@ -50,8 +50,9 @@ class TargetConfig:
 class Target(nn.Module):
     """F(x, z, d; theta) = (c, sigma): colour depends on the direction, density does not.
 
-    The module holds theta; `bind` evaluates the network with any parameters of the same names and shapes. Subclasses
-    say what the first layer reads, and where they treat support views otherwise than the paper's fields do.
+    The module holds theta; `bind` evaluates the network with any parameters of the same names and shapes, and with what
+    `finer` makes of them. Subclasses say what the first layer reads, and where they treat support views otherwise than
+    the paper's fields do.
 
     Attributes:
         config_type: the dataclass of its shape.
@@ -162,6 +163,23 @@ class Target(nn.Module):
         if planes is not None and len(planes) != self.config.planes:
             raise ValueError(f"planes: expected {self.config.planes}, got {len(planes)}")
         return MLPField(self, parameters, planes, bounds or Sphere())
+
+    def finer(self, parameters: Parameters, cells: int) -> Parameters:
+        """The same field by weights that have room for more detail; here as they are.
+
+        Args:
+            parameters: theta or theta + delta.
+            cells: an axis of a grid of features, where there is one.
+        """
+        return parameters
+
+    def config_of(self, parameters: Parameters) -> TargetConfig:
+        """The shape of the network that these parameters are of: this one, but for what `finer` changes.
+
+        Args:
+            parameters: that `bind` takes.
+        """
+        return self.config
 
     def parameters_of(self, field: object) -> Parameters:
         """The parameters that a field of this network was bound with.

@@ -15,7 +15,7 @@ from typing import Annotated, ClassVar
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import pad, relu, softplus
+from torch.nn.functional import interpolate, pad, relu, softplus
 
 from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.encoding import encode, encoded_size
@@ -55,11 +55,12 @@ class FeatureGrid(nn.Module):
 
     Args:
         channels: features of a cell.
+        cells: an axis.
     """
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, cells: int) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.zeros(channels, SIDE, SIDE, SIDE))
+        self.weight = nn.Parameter(torch.zeros(channels, cells, cells, cells))
 
 
 @checked_fields
@@ -70,10 +71,12 @@ class ImageBasedConfig(TargetConfig):
     Attributes:
         blended: views whose colours are blended.
         grid: features of the cells of a grid over the scene that are read beside the views; 0 is no grid.
+        cells: of this grid, an axis.
     """
 
     blended: Annotated[int, range(1, 65)] = 4
     grid: Annotated[int, range(65)] = 0
+    cells: Annotated[int, range(1, 257)] = SIDE
 
 
 class ImageBasedNeRF(Target):
@@ -93,7 +96,7 @@ class ImageBasedNeRF(Target):
         super().__init__(config)
         width, blended = config.width, config.blended
         if config.grid:
-            self.grid = FeatureGrid(config.grid)
+            self.grid = FeatureGrid(config.grid, config.cells)
         self.density = nn.Linear(width + 1, 1)
         self.view = nn.Linear(width + encoded_size(config.direction_frequencies) + BLENDED * blended, width // 2)
         self.colour = nn.Linear(width // 2, blended + 3)
@@ -151,6 +154,18 @@ class ImageBasedNeRF(Target):
     def with_surface(self, planes: VisibilityPlanes, voxels: Occupancy) -> VisibilityPlanes:
         """The planes, whose colours come from those that see the surface of these voxels, and no longer the hull's."""
         return planes.with_surface(voxels)
+
+    def finer(self, parameters: Parameters, cells: int) -> Parameters:
+        """The grid of features interpolated to more cells, where it has fewer."""
+        grid = parameters.get("grid.weight")
+        if grid is None or grid.shape[-1] >= cells:
+            return parameters
+        finer = interpolate(grid[None], (cells,) * 3, mode="trilinear", align_corners=False)[0]
+        return Parameters({**parameters, "grid.weight": finer})
+
+    def config_of(self, parameters: Parameters) -> ImageBasedConfig:
+        """This one, with the cells of the grid."""
+        return replace(self.config, cells=parameters["grid.weight"].shape[-1]) if self.config.grid else self.config
 
     def bind(
         self, parameters: Parameters, planes: VisibilityPlanes | None, bounds: Sphere | None = None

@@ -277,6 +277,15 @@ def test_steps_from_nothing_but_fresh_weights_are_those_from_random_ones():
         FineTuning(fresh=1.5)
 
 
+@pytest.mark.parametrize(
+    ("changed", "expected"), [({"grid": 0}, "network.grid: "), ({"cells": 64}, "network.cells: expected 32")]
+)
+def test_what_a_hypernetwork_cannot_write_is_refused(changed, expected):
+    config = model(**READERS["volume"]).config
+    with pytest.raises(ValueError, match=expected):
+        HyperPlanes(replace(config, network=replace(config.network, **changed)))
+
+
 def test_no_step_is_the_field_of_one_step_whatever_the_share_of_fresh_weights():
     adapter, support = model(**READERS["volume"]), views(6)
     cameras, done = ring(2, (10, 13), shift=1), []

@@ -14,11 +14,14 @@ from hyperplanes.adaptation.descent import contrast, draw_pixels, ray_loss, spli
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
-from hyperplanes.fields import ImageBasedConfig
+from hyperplanes.configuration.fine_tuning import FINE_VIEWS, MANY_VIEWS, FineTuning
+from hyperplanes.fields import ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.volume import interpolate_grid
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
+from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.utilities.metrics import psnr
@@ -83,15 +86,17 @@ def test_a_loss_counts_each_ray_by_its_weight():
 
 
 @pytest.mark.parametrize(
-    ("target", "trainable", "count", "draw"),
+    ("target", "trainable", "count", "draw", "cells"),
     [
-        ("image_based", "weights", MANY_VIEWS, "contrast"),
-        ("image_based", "weights", MANY_VIEWS - 1, "uniform"),
-        ("image_based", "hypernetwork", MANY_VIEWS, "uniform"),
-        ("point_multiplane", "weights", MANY_VIEWS, "uniform"),
+        ("image_based", "weights", FINE_VIEWS, "contrast", 64),
+        ("image_based", "weights", FINE_VIEWS - 1, "contrast", 0),
+        ("image_based", "weights", MANY_VIEWS, "contrast", 0),
+        ("image_based", "weights", MANY_VIEWS - 1, "uniform", 0),
+        ("image_based", "hypernetwork", FINE_VIEWS, "uniform", 0),
+        ("point_multiplane", "weights", FINE_VIEWS, "uniform", 0),
     ],
 )
-def test_pixels_are_drawn_by_contrast_for_the_weights_of_a_field_of_any_number_of_views(target, trainable, count, draw):
+def test_many_views_decide_how_the_weights_of_a_field_of_any_number_are_tuned(target, trainable, count, draw, cells):
     many = ball_views(ring(count))
     if target == "image_based":
         network = ImageBasedConfig(depth=2, width=16, grid=2)
@@ -102,9 +107,41 @@ def test_pixels_are_drawn_by_contrast_for_the_weights_of_a_field_of_any_number_o
     settings = FineTuning(trainable, rays=8)
     context = model.prepare(many)
     assert len(context.given) == count
-    assert make_descent(model, context, settings)[0].settings.draw == draw
+    found = make_descent(model, context, settings)[0].settings
+    assert (found.draw, found.cells) == (draw, cells)
     for stated in ("uniform", "contrast"):
         assert make_descent(model, context, replace(settings, draw=stated))[0].settings.draw == stated
+
+
+@pytest.mark.parametrize(("cells", "optimised"), [(None, 64), (0, 32), (16, 32), (48, 48)])
+def test_steps_optimise_a_grid_of_more_cells_which_is_kept_with_the_field(cells, optimised, tmp_path):
+    network = ImageBasedConfig(depth=2, width=16, grid=2)
+    model = small_model(target="image_based", network=network, hypernetwork=VolumeHyperNetworkConfig())
+    views = ball_views(ring(FINE_VIEWS, (12, 12)))
+    tuned = model.fine_tune(views, 2, FineTuning(rays=32, learning_rate=1e-3, cells=cells))
+    assert tuned.field.parameters["grid.weight"].shape == (2, optimised, optimised, optimised)
+    assert model.theta["fine.grid.weight"].shape[-1] == 32
+    model.with_weights_of(tuned).save(tmp_path)
+    kept = HyperPlanes.from_pretrained(tmp_path)
+    assert kept.config.network.cells == optimised
+    assert torch.equal(kept.adapt(views).render(views.cameras).images, tuned.render(views.cameras).images)
+    further = kept.fine_tune(views, 1, FineTuning(rays=32, learning_rate=1e-3, cells=64))
+    assert further.field.parameters["grid.weight"].shape[-1] == 64
+
+
+def test_a_grid_of_more_cells_is_the_same_field_where_it_is_even():
+    """Features that grow evenly along an axis are the same when they are interpolated."""
+    network = ImageBasedNeRF(ImageBasedConfig(depth=2, width=16, planes=2, grid=3))
+    places = (torch.arange(32.0) + 0.5) / 16 - 1
+    ramps = torch.stack(torch.meshgrid(places, places, places, indexing="ij"))
+    weights = Parameters({**Parameters.of(network), "grid.weight": ramps})
+    points = (2 * torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) - 1) * (places[-2])
+    for cells in (32, 64, 48):
+        finer = network.finer(weights, cells)
+        assert finer["grid.weight"].shape == (3, cells, cells, cells)
+        torch.testing.assert_close(interpolate_grid(finer["grid.weight"], points, Sphere()), points)
+        assert network.config_of(finer).cells == cells
+    assert network.finer(weights, 16) is weights
 
 
 def test_the_draw_of_pixels_decides(model, support):
@@ -273,6 +310,7 @@ def test_from_scratch_nothing_that_was_trained_is_used(support):
         ({"max_steps": 0}, "max_steps: expected at least 1, got 0"),
         ({"learning_rate": -1.0}, "learning_rate: expected a finite number of 0 or more, got -1.0"),
         ({"muon_learning_rate": float("nan")}, "muon_learning_rate: expected a finite number"),
+        ({"cells": 300}, "cells: expected"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings, message):
@@ -285,16 +323,16 @@ def test_auto_tries_what_it_goes_on_with(monkeypatch):
 
     def noting(*given):
         descent = made(*given)
-        decided.append((descent[0].settings.fresh, descent[0].settings.draw))
+        decided.append((descent[0].settings.fresh, descent[0].settings.draw, descent[0].settings.cells))
         return descent
 
     monkeypatch.setattr(fine_tuning, "make_descent", noting)
     model = small_model(target="image_based", hypernetwork=None, network=ImageBasedConfig(depth=2, width=16))
-    for count in (9, 10, 12):
+    for count in (9, 10, 23, 24):
         decided.clear()
         model.fine_tune(ball_views(ring(count, (8, 8))), "auto", FineTuning(rays=16, max_steps=4, learning_rate=1e-4))
         assert len(decided) == 2
-        assert set(decided) == {(0.5, "contrast") if count >= 10 else (0.0, "uniform")}
+        assert set(decided) == {(0.5, "contrast", 64 * (count >= 20)) if count >= 10 else (0.0, "uniform", 0)}
 
 
 def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
