@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeVar
 
 import torch
@@ -189,6 +190,8 @@ def make_descent(
     """
     views, any_views = context.views if views is None else views, network.target.permutation_invariant
     settings = settings.for_views(len(context.given), any_views)
+    if start is not None:  # which keeps its shape
+        settings = replace(settings, cells=0)
     if settings.trainable == "weights":
         settings = settings.with_rates(network.target.fine_tuning_rates)
     variables = _variables(network, context, settings, start)

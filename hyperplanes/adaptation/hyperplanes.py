@@ -86,8 +86,9 @@ class HyperPlanes(HyperPlanesNetwork):
 
         It begins at theta + delta, of which `settings.fresh` is replaced by random weights. Either these weights
         themselves are optimised, or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes,
-        section 3, fine-tuning). No step is the field of `adapt`. Where the model has a gating network, pictures from
-        ten views on are means with those of the visual hull (`stacking.tuned_field`).
+        section 3, fine-tuning). No step is the field of `adapt`. From 20 views on the weights' grid of features
+        gets more cells (`settings.cells`). Where the model has a gating network, pictures from ten views on are
+        means with those of the visual hull (`stacking.tuned_field`).
 
         Args:
             support: the views of the object.
@@ -119,20 +120,25 @@ class HyperPlanes(HyperPlanesNetwork):
             adapted: what this model made of the object.
 
         Returns:
-            A model that makes the same field of the same views, without looking at them twice. A field that is
-            no network of this model is a ValueError.
+            A model that makes the same field of the same views, without looking at them twice.
+
+        Raises:
+            ValueError: a field that is no network of this model.
         """
         learned = learned_part(adapted)
         beside = {"hull_share": learned.share, "gated": learned.gate is not None}
         beside |= {"symmetric": False, "symmetry": adapted.symmetry}
         found = {"fine": learned.field.field, "coarse": learned.field.proposal}
-        network = self.target.config_of(self.target.parameters_of(found["fine"]))
-        result = HyperPlanes(replace(self.config.target_alone(), network=network, **beside))
+        shape = self.target.config_of(self.target.parameters_of(found["fine"]))
+        result = HyperPlanes(replace(self.config.target_alone(), network=shape, **beside))
         if result.gate is not None and learned.gate is not None:
             result.gate.load_state_dict(learned.gate.state_dict())
         result.rig.copy_(self.rig)
         for name, network in result.targets.items():
-            network.load_state_dict(network.parameters_of(found[name]))
+            try:
+                network.load_state_dict(network.parameters_of(found[name]))
+            except RuntimeError as error:
+                raise ValueError(f"adapted: expected a field of this model, got {adapted!r}") from error
         return result.eval()
 
     @checked

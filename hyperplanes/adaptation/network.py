@@ -154,7 +154,7 @@ class HyperPlanesNetwork(nn.Module):
         )
 
     def finer(self, weights: Parameters, cells: int) -> Parameters:
-        """The same fields by weights that have room for more detail (`Target.finer`)."""
+        """Nearly the same fields by weights that have room for more detail (`Target.finer`)."""
         result = Parameters(weights)
         for name, network in self.targets.items():
             found = network.finer(weights.under(name), cells)

@@ -85,6 +85,8 @@ class StackedField(AdaptedField):
         if not self.share and self.gate is None:
             return own()
         other = partial(self.other.render, cameras, antialias=antialias)
+        if not (self.thread_safe and self.other.thread_safe):
+            return self._mean(own(), other())
         return self._mean(*at_once(own, other, self.occupancy.occupied.device))
 
     def _mean(self, own: Pixels, other: Pixels) -> Pixels:

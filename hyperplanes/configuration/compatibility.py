@@ -85,6 +85,10 @@ def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: Mo
     """
     if settings.trainable == "hypernetwork" and config.hypernetwork is None and config.autoencoder is None:
         raise ValueError("fine_tune: expected a model with a hypernetwork, got one without")
+    if settings.trainable == "hypernetwork" and settings.cells:
+        raise ValueError(
+            f"cells: expected None or 0 for a hypernetwork, whose grid has its cells, got {settings.cells}"
+        )
     if steps != "auto" and steps < 0:
         raise ValueError(f"steps: expected 0 or more, or 'auto', got {steps}")
     if steps and views == 1 and target.permutation_invariant and settings.mask_views:

@@ -59,9 +59,9 @@ class FineTuning:
             features: trained weights interpolated with random ones learn more in the same steps (Ash & Adams 2020, "On
             warm-starting neural network training"). Where None, FRESH with MANY_VIEWS or more, else none.
         seed: of rays and samples, and of random weights.
-        cells: an axis of the grid of features that the steps optimise, where a field has one: the weights that they
-            begin with are interpolated to so many. Fewer than it has change nothing. Where None, CELLS for the weights
-            of a field that takes any number of views, with FINE_VIEWS or more of them, else as many as it has.
+        cells: an axis of the grid of features that the steps optimise, where the weights of a field with one are
+            trained: those that they begin with are interpolated to so many. Fewer than it has change nothing. Where
+            None, CELLS for a field that takes any number of views, with FINE_VIEWS or more of them, else 0.
         draw: the pixels of rays: all with the same probability ("uniform"), or those more often around which colours
             differ ("contrast"), which count less in the loss by as much. Where None, "contrast" for the weights of a
             field that takes any number of views, with MANY_VIEWS or more of them, else "uniform", as in the paper.

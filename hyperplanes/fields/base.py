@@ -165,7 +165,7 @@ class Target(nn.Module):
         return MLPField(self, parameters, planes, bounds or Sphere())
 
     def finer(self, parameters: Parameters, cells: int) -> Parameters:
-        """The same field by weights that have room for more detail; here as they are.
+        """Nearly the same field by weights that have room for more detail; here as they are.
 
         Args:
             parameters: theta or theta + delta.

@@ -156,7 +156,7 @@ class ImageBasedNeRF(Target):
         return planes.with_surface(voxels)
 
     def finer(self, parameters: Parameters, cells: int) -> Parameters:
-        """The grid of features interpolated to more cells, where it has fewer."""
+        """The grid of features interpolated to more cells, where it has fewer, which smooths it."""
         grid = parameters.get("grid.weight")
         if grid is None or grid.shape[-1] >= cells:
             return parameters
@@ -165,7 +165,8 @@ class ImageBasedNeRF(Target):
 
     def config_of(self, parameters: Parameters) -> ImageBasedConfig:
         """This one, with the cells of the grid."""
-        return replace(self.config, cells=parameters["grid.weight"].shape[-1]) if self.config.grid else self.config
+        grid = parameters.get("grid.weight")
+        return self.config if grid is None else replace(self.config, cells=grid.shape[-1])
 
     def bind(
         self, parameters: Parameters, planes: VisibilityPlanes | None, bounds: Sphere | None = None

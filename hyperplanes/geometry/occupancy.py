@@ -66,14 +66,18 @@ class Occupancy:
 
     @cached_property
     def box(self) -> tuple[float, ...]:
-        """Lower and upper corner of the box around all occupied voxels, in the world; of no size without any."""
-        corner, centre = [], self.bounds.centre
-        for axis in range(3):
-            others = [each for each in range(3) if each != axis]
-            found = self.occupied.any(others[1]).any(others[0]).nonzero()
-            ends = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, 0)
-            corner.append([centre[axis] - self.bounds.radius + end * self.voxel for end in ends])
-        return tuple(end for side in zip(*corner, strict=True) for end in side)
+        """Lower and upper corner, in the world, of the box around all occupied voxels and half a voxel more.
+
+        What rounding moves across a face is in it. Without any voxels it has no size.
+        """
+        cells = self.occupied.view(torch.uint8)  # whose maximum takes a fifth of the time of `any`
+        across = cells.amax(2)
+        corners = []
+        for axis, found in enumerate((across.amax(1), across.amax(0), cells.amax(0).amax(0))):
+            places, start = found.nonzero()[:, 0], self.bounds.centre[axis] - self.bounds.radius
+            ends = (float(places[0]) - 0.5, float(places[-1]) + 1.5) if len(places) else (0.0, 0.0)
+            corners.append([start + end * self.voxel for end in ends])
+        return tuple(end for side in zip(*corners, strict=True) for end in side)
 
     def surface(self) -> Occupancy:
         """The occupied voxels with a face at an empty one or at the border of the grid: what every ray enters by."""

@@ -129,6 +129,21 @@ def test_steps_optimise_a_grid_of_more_cells_which_is_kept_with_the_field(cells,
     assert further.field.parameters["grid.weight"].shape[-1] == 64
 
 
+def test_weights_that_are_given_and_hypernetworks_keep_their_cells():
+    network = ImageBasedConfig(depth=2, width=16, grid=2)
+    model = small_model(target="image_based", network=network, hypernetwork=VolumeHyperNetworkConfig())
+    views = ball_views(ring(FINE_VIEWS, (12, 12)))
+    context = model.prepare(views)
+    descent, variables = make_descent(model, context, FineTuning(cells=48), start=model.theta)
+    assert descent.settings.cells == 0
+    assert variables.weights()["fine.grid.weight"].shape[-1] == 32
+    with pytest.raises(ValueError, match="cells: expected None or 0 for a hypernetwork"):
+        model.fine_tune(views, 2, FineTuning("hypernetwork", cells=64))
+    other = small_model(target="image_based", network=replace(network, width=8), hypernetwork=None)
+    with pytest.raises(ValueError, match="adapted: expected a field of this model"):
+        other.with_weights_of(model.adapt(views))
+
+
 def test_a_grid_of_more_cells_is_the_same_field_where_it_is_even():
     """Features that grow evenly along an axis are the same when they are interpolated."""
     network = ImageBasedNeRF(ImageBasedConfig(depth=2, width=16, planes=2, grid=3))

@@ -11,7 +11,7 @@ from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry import Sphere, visibility
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
 from hyperplanes.geometry.chosen_views import ANGLE
-from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering import RayMarching
 from hyperplanes.utilities.metrics import psnr
@@ -137,6 +137,20 @@ def test_the_first_sample_in_the_hull_is_all_that_is_seen(monkeypatch):
     torch.testing.assert_close(first.images, every.images, atol=1e-4, rtol=0)
     torch.testing.assert_close(first.depth, every.depth, atol=1e-4, rtol=0)
     assert first.samples < every.samples / 4
+
+
+def test_rays_begin_at_the_box_of_the_hull_and_lose_nothing(monkeypatch):
+    views, grid, cameras = ball_views(ring(8)), full(Sphere(), 20), ring(3, (30, 30), shift=1)
+    near = (grid.centres().norm(dim=1) < 0.8).reshape(20, 20, 20)  # without the corners, which no view shows
+    planes = VisibilityPlanes(views.images, views.cameras, views.masks, Occupancy(near, Sphere()))
+    field = SMALL.adapt_to(planes)
+    assert max(field.refined_occupancy.box) < 0.9
+    found = field.render(cameras)
+    for scale, same in ((2.0, True), (0.3, False)):
+        monkeypatch.setitem(vars(field.refined_occupancy), "box", (-scale,) * 3 + (scale,) * 3)
+        rendered = field.render(cameras)
+        assert torch.equal(found.depth, rendered.depth) == same
+        assert (found.samples == rendered.samples) == same
 
 
 def test_a_view_that_is_hidden_cuts_nothing_away(monkeypatch):

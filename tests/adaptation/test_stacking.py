@@ -1,11 +1,12 @@
 """Source of truth: the minimum of a quadratic function by a grid, means of pictures, and which views may decide."""
 
+import threading
 from dataclasses import replace
 
 import pytest
 import torch
 
-from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, held_out, stacking
+from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig, held_out, stacking
 from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.fine_tuned import random_model
 from hyperplanes.adaptation.fine_tuning import fine_tune
@@ -27,8 +28,9 @@ from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.base import Field
 from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.cameras import centres
+from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.poses import outermost_first
-from hyperplanes.geometry.rays import cast
+from hyperplanes.geometry.rays import Sphere, cast
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.rendering import RayMarching
 from hyperplanes.training import TrainingConfig
@@ -110,6 +112,26 @@ def test_two_threads_make_the_pictures_of_one():
         torch.set_num_threads(before)
     assert torch.equal(found[0].images, found[1].images)
     assert torch.equal(found[0].depth, found[1].depth)
+
+
+@pytest.mark.parametrize("safe", [True, False])
+def test_fields_that_are_not_safe_in_threads_are_rendered_by_one(safe):
+    ran, before = set(), torch.get_num_threads()
+
+    class Plain:
+        thread_safe = safe
+
+        def __call__(self, points, directions):
+            ran.add(threading.get_ident())
+            return torch.zeros_like(points), torch.ones(len(points))
+
+    plain = AdaptedField(Plain(), full(Sphere(), 4), RayMarching(8))
+    try:
+        torch.set_num_threads(2)
+        stack(plain, plain, 0.4).render(ring(1, (16, 16)))
+    finally:
+        torch.set_num_threads(before)
+    assert (ran == {threading.get_ident()}) == (not safe)
 
 
 def test_a_model_in_double_precision_is_stacked_too():

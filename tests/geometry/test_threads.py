@@ -99,6 +99,15 @@ def test_two_computations_follow_each_other_where_there_is_one_thread_or_two_run
     assert at_once(ran, ran, CPU) == (ran(), ran())
 
 
+@pytest.mark.parametrize("count", [2, 5, 3])
+def test_both_of_two_computations_have_as_many_threads_as_are_set(count, three_threads):
+    torch.set_num_threads(count)
+    state = at_once(*2 * [lambda: (torch.get_num_threads(), torch.is_grad_enabled())], CPU)
+    assert state == ((count, False), (count, False))
+    assert torch.get_num_threads() == count
+    assert torch.is_grad_enabled()
+
+
 @pytest.mark.parametrize("wrong", ["one", "other"])
 def test_an_error_in_one_of_two_computations_is_raised_when_both_have_ended(wrong, three_threads):
     ended = []

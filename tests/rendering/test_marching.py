@@ -1,6 +1,7 @@
 """Source of truth: a walk along each ray, step by step, that asks the grid at every one."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -59,7 +60,7 @@ def test_the_kernel_loses_no_sample_of_few_voxels():
     """It begins and ends at the box around them; rays along the axes go through it, beside it and along its sides."""
     grid = Occupancy(torch.zeros(8, 8, 8, dtype=torch.bool), Sphere())
     grid.occupied[2:4, 5, 1] = grid.occupied[3, 6, 2] = True
-    assert grid.box == (-0.5, 0.25, -0.75, 0.0, 0.75, -0.25)
+    assert grid.box == (-0.625, 0.125, -0.875, 0.125, 0.875, -0.125)  # and half a voxel more
     places = torch.cartesian_prod(*2 * [torch.arange(-19, 20, dtype=torch.float64) / 20])  # -0.5 is one of them
     origins = torch.cat([places, torch.full_like(places[:, :1], -3.0)], 1)
     origins, others = torch.cat([origins.roll(axis, 1) for axis in range(3)]), some_rays(700)
@@ -109,6 +110,19 @@ def test_what_misses_has_no_samples():
     assert len(march(straight([2.0], [4.0]), nothing, 0.1)) == 0
     both = march(straight([3.0, 2.0, 3.0], [3.0, 4.0, 3.0]), grid, 0.5)
     assert both.ray.tolist() == [1] * 4
+
+
+@pytest.mark.parametrize("beside", [0.0, -1e-9, -1e-8])
+def test_the_kernel_loses_no_sample_that_rounding_moves_across_a_face(beside):
+    """A camera that looks along the first face of the voxels, and rays beside it that the grid rounds into them."""
+    grid = full(Sphere(), 64)
+    grid.occupied[:32] = False
+    rays = cast(camera_at((0.0, 0.0, -3.0), (65, 65)), torch.zeros(65 * 65, dtype=torch.long), pixel_grid(65, 65))
+    rays = replace(rays, origins=rays.origins + torch.tensor([beside, 0.0, 0.0]))
+    found, expected = (walk(rays, rays.near + 0.011, grid, 0.013, 160) for walk in (_walk_compiled, _walk_torch))
+    counts = [torch.bincount(each[0], minlength=65 * 65) for each in (found, expected)]
+    assert (counts[0] - counts[1]).abs().max() <= 2
+    assert len(expected[0]) > 10_000
 
 
 @pytest.mark.parametrize("slope", [1e-38, -1e-38, math.nan, math.inf])

@@ -1,4 +1,4 @@
-"""Which samples of a ray may lie in the box around all occupied voxels; most of the scene's sphere lies beside it."""
+"""Which samples of a ray may lie in a box around all occupied voxels; most of the scene's sphere lies beside it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ __all__ = ["samples_within"]
 def samples_within(origins, directions, first, far, ray, step, box):
     """The index of a sample of a ray before the box, and a distance behind it, at most far.
 
-    Samples lie at first + i step. `box` are the lower and the upper corner, in the world. Samples beside the box may be
-    among those between, so that rounding loses none within it.
+    Samples lie at first + i step. `box` are the lower and the upper corner, in the world (`Occupancy.box`). Samples
+    beside the box may be among those between.
     """
     enters, leaves = first[ray], far[ray]
     for axis in range(3):

@@ -51,8 +51,8 @@ def hull_hits(
     Samples lie at first + i step, before far, in occupied voxels, as `marching.march` has them. One lies in the hull
     where every view that shows it has at least an opacity there; the view that cut the last sample away is asked first.
     `cameras` and `maps` are those of `visibility.choose`, `shape` the number of views, height, width and the pitch of
-    `cameras`; `limits` are min_z and the opacity, `sphere` the centre and the radius of the scene, `box` the
-    corners around its occupied voxels.
+    `cameras`; `limits` are min_z and the opacity, `sphere` the centre and the radius of the scene, `box` the corners
+    around its occupied voxels.
     """
     number = first.dtype.type
     side, half, one = occupied.shape[0], number(occupied.shape[0]) / number(2), number(1)

@@ -16,8 +16,8 @@ def march(origins, directions, first, far, step, sphere, box, occupied, ray, dis
     """Writes the samples of rays start..stop in occupied voxels, ray after ray, and into found[0] their number.
 
     Samples lie at first + i step, before far. `sphere` is the centre and the radius of the scene, `box` the corners
-    around its occupied voxels. `ray` gets the index
-    of the ray of each sample, `distances` its distance; both have room for all of them.
+    around its occupied voxels. `ray` gets the index of the ray of each sample, `distances` its distance; both have room
+    for all of them.
     """
     number = first.dtype.type
     side, half, one = occupied.shape[0], number(occupied.shape[0]) / number(2), number(1)

@@ -101,22 +101,32 @@ def side_by_side(work: Callable[[Part], Result], parts: Sequence[Part], device: 
     return list(map(work, parts) if alone else parallel_map(work, parts))
 
 
+@torch.no_grad()
 def at_once(one: Callable[[], Result], other: Callable[[], Other], device: torch.device) -> tuple[Result, Other]:
-    """The results of two computations in several steps each, whose parts `parallel_map` runs.
+    """The results of two computations in several steps each, whose parts `parallel_map` runs; without gradients.
 
     While one of them waits for its last part, or does what no thread shares, parts of the other run. On another device
-    than the CPU, with one thread, and where two such computations run already, one follows the other.
+    than the CPU, with one thread, and where two such computations run already, one follows the other. An error in one
+    is raised when the other has ended, too.
 
     Args:
         one: as the work of `parallel_map`; run by the calling thread.
         other: likewise; run by another one.
         device: where both are done.
     """
-    alone = device.type != "cpu" or torch.get_num_threads() < 2 or torch.is_autocast_enabled("cpu")
+    threads = torch.get_num_threads()
+    alone = device.type != "cpu" or threads < 2 or torch.is_autocast_enabled("cpu")
     if alone or not _second.acquire(blocking=False):
         return one(), other()
+
+    @torch.no_grad()  # as all such settings one of the thread
+    def beside() -> Other:
+        torch.get_num_threads()  # a thread that has not asked yet takes the number of all, later
+        torch.set_num_threads(threads)
+        return other()
+
     try:
-        future = _pool(1, "second").submit(torch.no_grad()(other))
+        future = _pool(1, "second").submit(beside)
         try:
             return one(), future.result()
         finally:
