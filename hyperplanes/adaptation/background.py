@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate, softplus
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
-from hyperplanes.geometry.volume import interpolate_grid
+from hyperplanes.geometry.volume import interpolate_grid, resampled_grid
 from hyperplanes.utilities.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
 
@@ -109,7 +109,10 @@ def separate_background(
     for pixels, *sides, steps in LEVELS:
         # the same grids in smaller cells, and larger pictures
         small = views.resized(pixels)
-        inner, outer = (_enlarged(grid, side) for grid, side in zip((inner, outer), sides, strict=True))
+        inner, outer = (
+            resampled_grid(grid.detach(), side).requires_grad_(True)  # optical depth of a cell stays that of a cell
+            for grid, side in zip((inner, outer), sides, strict=True)
+        )
         descent = Adam([inner, outer], lr=RATE, betas=(0.9, 0.99))
         for _ in range(steps):
             descent.param_groups[0]["lr"] = RATE * (LAST_RATE / RATE) ** (done / total)
@@ -126,12 +129,6 @@ def separate_background(
             if on_step is not None:
                 on_step(done, total)
     return Separated(inner.detach(), outer.detach(), views.bounds)
-
-
-def _enlarged(grid: Grid, side: int) -> Grid:
-    """The same in smaller cells; optical depth of a cell stays that of a cell."""
-    grid = interpolate(grid.detach()[None], (side,) * 3, mode="trilinear", align_corners=False)[0]
-    return grid.requires_grad_(True)
 
 
 def _composited(

@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, max_pool2d, softplus
+from torch.nn.functional import max_pool2d, softplus
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Rays, Sphere
-from hyperplanes.geometry.volume import interpolate_grid
+from hyperplanes.geometry.volume import interpolate_grid, resampled_grid
 from hyperplanes.rendering.compositing import composite
 from hyperplanes.utilities.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
@@ -119,7 +119,7 @@ def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], N
         # the same object in larger pictures and smaller cells
         small = views.resized(pixels)
         among = _near_masks(small)
-        grid = interpolate(grid.detach()[None], (side,) * 3, mode="trilinear", align_corners=False)[0]
+        grid = resampled_grid(grid.detach(), side)
         occupancy = Occupancy(softplus(grid[0]) > EMPTY, views.bounds).dilated(2)
         grid = grid.clone().requires_grad_(True)
         content = Adam([grid], lr=GRID_RATE, betas=(0.9, 0.99))

@@ -15,7 +15,7 @@ from typing import Annotated, ClassVar
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, pad, relu, softplus
+from torch.nn.functional import pad, relu, softplus
 
 from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.encoding import encode, encoded_size
@@ -25,7 +25,7 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility import VisibilityPlanes
-from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
+from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, resampled_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.views import Views
@@ -160,8 +160,7 @@ class ImageBasedNeRF(Target):
         grid = parameters.get("grid.weight")
         if grid is None or grid.shape[-1] >= cells:
             return parameters
-        finer = interpolate(grid[None], (cells,) * 3, mode="trilinear", align_corners=False)[0]
-        return Parameters({**parameters, "grid.weight": finer})
+        return Parameters({**parameters, "grid.weight": resampled_grid(grid, cells)})
 
     def config_of(self, parameters: Parameters) -> ImageBasedConfig:
         """This one, with the cells of the grid."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d, grid_sample
+from torch.nn.functional import adaptive_avg_pool3d, grid_sample, interpolate
 
 from hyperplanes.geometry.chosen_views import Reading
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility import VisibilityPlanes
 
-__all__ = ["CHANNELS", "SIDE", "interpolate_grid", "volume_of"]
+__all__ = ["CHANNELS", "SIDE", "interpolate_grid", "resampled_grid", "volume_of"]
 
 SIDE = 32  # cells an axis
 CHANNELS = 5  # of a cell: occupied share, mean colour, number of views
@@ -68,3 +68,13 @@ def interpolate_grid(
     """
     where = bounds.normalise(points).flip(-1)[None, None, None]
     return grid_sample(grid[None], where, padding_mode="border", align_corners=False)[0, :, 0, 0].T
+
+
+def resampled_grid(grid: Float[Tensor, "channel x y z"], side: int) -> Float[Tensor, "channel side side side"]:
+    """The values of a grid at the centres of other cells over the same cube, by trilinear interpolation.
+
+    Args:
+        grid: as in `interpolate_grid`.
+        side: cells an axis of the other one.
+    """
+    return interpolate(grid[None], (side,) * 3, mode="trilinear", align_corners=False)[0]

@@ -14,10 +14,9 @@ __all__ = ["samples_within"]
 @inlined
 @no_type_check
 def samples_within(origins, directions, first, far, ray, step, box):
-    """The index of a sample of a ray before the box, and a distance behind it, at most far.
+    """The index of a sample of a ray before the box, and the distance at which the ray leaves it, at most far.
 
-    Samples lie at first + i step. `box` are the lower and the upper corner, in the world (`Occupancy.box`). Samples
-    beside the box may be among those between.
+    Samples lie at first + i step. `box` are the lower and the upper corner, in the world (`Occupancy.box`).
     """
     enters, leaves = first[ray], far[ray]
     for axis in range(3):
@@ -27,7 +26,7 @@ def samples_within(origins, directions, first, far, ray, step, box):
             enters = max(enters, min(low / slope, high / slope))
             leaves = min(leaves, max(low / slope, high / slope))
         elif low > 0 or high < 0:  # it goes beside the box
-            leaves = first[ray] - step
+            leaves = first[ray]
     if not enters <= far[ray]:  # behind the end of the ray, or no number
         enters = far[ray]
-    return np.int64(max(enters - first[ray], first.dtype.type(0)) / step), min(leaves + step, far[ray])
+    return np.int64(max(enters - first[ray], first.dtype.type(0)) / step), min(leaves, far[ray])
