@@ -40,6 +40,7 @@ from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.adaptation.symmetry import ReflectedHullBlend
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Inputs, Shown
 from hyperplanes.evaluation import ObjectScore, Score, evaluate
@@ -69,6 +70,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 3, 5, 10, 25], help="numbers of support views")
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="of fine-tuning, and of the same field "
                         "from random weights")  # fmt: skip
+    parser.add_argument("--coarse", action="store_true", help="these by the grid of features as it is, too")
     parser.add_argument("--objects", type=int, default=3, help="of each data set")
     parser.add_argument("--inputs", type=int, nargs="+", metavar="VIEW", help="instead of --counts: these views by "
                         "their place, from 0")  # fmt: skip
@@ -104,7 +106,7 @@ def main(arguments: list[str]) -> int:
             shown = _Rotated(inputs or Shown(data, count, chosen.query or 3), chosen.rotated)
             steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
             plain: Score | None = None
-            for method, adapter in adapters(model, shown, names, chosen.methods, steps).items():
+            for method, adapter in adapters(model, shown, names, chosen.methods, steps, coarse=chosen.coarse).items():
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
                 row |= {"suite": suite} if suite else {}
                 row |= {"rotated": chosen.rotated} if chosen.rotated else {}
@@ -230,7 +232,7 @@ def _best_median_worst(seen: Mapping[int, Sequence[tuple[Tensor, Tensor]]]) -> l
 
 
 def adapters(
-    model: HyperPlanes, shown: Tasks, names: list[str], wanted: list[str], steps: list[int]
+    model: HyperPlanes, shown: Tasks, names: list[str], wanted: list[str], steps: list[int], *, coarse: bool = False
 ) -> Mapping[str, Adapter]:
     """The rows by name."""
     found: dict[str, Adapter] = {}
@@ -244,6 +246,10 @@ def adapters(
         if "ungated" in wanted:
             found[f"{each}_steps_ungated"] = _Ungated(tuned)
         found[f"scratch_{each}"] = FromScratch(model, each)
+        if coarse:
+            settings = FineTuning(cells=0)
+            found[f"{each}_steps_coarse"] = FineTuned(model, each, settings)
+            found[f"scratch_{each}_coarse"] = FromScratch(model, each, settings)
     return found
 
 

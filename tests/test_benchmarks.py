@@ -69,11 +69,12 @@ def test_a_model_without_its_gate_is_stacked_by_one_share(monkeypatch):
 def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     HyperPlanes(MODEL).save(tmp_path / "model")
     options = ["--checkpoint", str(tmp_path / "model"), "--data", str(demo_folder() / "data"), "--objects", "1"]
-    options += ["--query", "1", "--methods", "ungated", "--counts", "1", "2", "--steps", "1"]
+    options += ["--query", "1", "--methods", "ungated", "--counts", "1", "2", "--steps", "1", "--coarse"]
     assert views.main([*options, "--json", str(tmp_path / "rows.json")]) == 0
     rows = [(row["views"], row["name"]) for row in json.loads((tmp_path / "rows.json").read_text())["rows"]]
     both = ["ungated", "one_step"]
-    expected = {1: both, 2: [*both, "1_steps", "1_steps_ungated", "scratch_1"]}
+    tuned = ["1_steps", "1_steps_ungated", "scratch_1", "1_steps_coarse", "scratch_1_coarse"]
+    expected = {1: both, 2: [*both, *tuned]}
     assert rows == [(count, name) for count, names in expected.items() for name in names]
 
 
