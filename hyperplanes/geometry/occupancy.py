@@ -22,7 +22,7 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.arguments import checked
 
-__all__ = ["Occupancy", "ball_extent", "carve", "dilate", "full"]
+__all__ = ["Occupancy", "ball_extent", "carve", "dilate", "full", "ranges"]
 
 LARGEST_SIDE = 1024  # voxels an axis: 1 GiB
 
@@ -70,13 +70,10 @@ class Occupancy:
 
         What rounding moves across a face is in it. Without any voxels it has no size.
         """
-        cells = self.occupied.view(torch.uint8)  # whose maximum takes a fifth of the time of `any`
-        across = cells.amax(2)
         corners = []
-        for axis, found in enumerate((across.amax(1), across.amax(0), cells.amax(0).amax(0))):
-            places, start = found.nonzero()[:, 0], self.bounds.centre[axis] - self.bounds.radius
-            ends = (float(places[0]) - 0.5, float(places[-1]) + 1.5) if len(places) else (0.0, 0.0)
-            corners.append([start + end * self.voxel for end in ends])
+        for (first, last), middle in zip(ranges(self.occupied), self.bounds.centre, strict=True):
+            ends = (first - 0.5, last + 0.5) if last else (0.0, 0.0)
+            corners.append([middle - self.bounds.radius + end * self.voxel for end in ends])
         return tuple(end for side in zip(*corners, strict=True) for end in side)
 
     def surface(self) -> Occupancy:
@@ -106,6 +103,18 @@ def dilate(occupied: Bool[Tensor, "x y z"], voxels: int = 1) -> Bool[Tensor, "x 
         grown.narrow(axis, 1, last).logical_or_(before.narrow(axis, 0, last))
         grown.narrow(axis, 0, last).logical_or_(before.narrow(axis, 1, last))
     return grown
+
+
+def ranges(occupied: Bool[Tensor, "x y z"]) -> list[tuple[int, int]]:
+    """Where the occupied voxels begin and end along each axis; (0, 0) where there are none.
+
+    >>> ranges(torch.tensor([[[False, True, True, False]]]))
+    [(0, 1), (0, 1), (1, 3)]
+    """
+    cells = occupied.view(torch.uint8)  # whose maximum takes a fifth of the time of `any`
+    across = cells.amax(2)
+    found = [each.nonzero()[:, 0] for each in (across.amax(1), across.amax(0), cells.amax(0).amax(0))]
+    return [(int(each[0]), int(each[-1]) + 1) if len(each) else (0, 0) for each in found]
 
 
 def _middle(axis: int) -> tuple[slice, ...]:

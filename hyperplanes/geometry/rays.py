@@ -126,9 +126,9 @@ def cast(
     if view.device.type == "cpu":
         check_indices(view, cameras.batch_size, "view", "cameras")
     pixels = pixels.to(cameras.extrinsics)
-    # of a single camera, the numbers stand for all of its rays
-    row = slice(None) if cameras.batch_size == 1 else view
-    rotation, matrix = camera.camera_from_world(cameras)[row, :3, :3], camera.intrinsics(cameras)[row]
+    rotation, matrix = camera.camera_from_world(cameras)[:, :3, :3], camera.intrinsics(cameras)
+    if cameras.batch_size != 1:  # of a single camera, the numbers stand for all of its rays
+        rotation, matrix = (each.contiguous().index_select(0, view) for each in (rotation, matrix))
     shown = None
     if isinstance(cameras, DistortedCamera):
         pixels, shown = undistorted_pixels(cameras, view, pixels)
@@ -137,7 +137,7 @@ def cast(
     local = torch.stack([x, y, torch.ones_like(x)], -1)
     along = local @ rotation[0] if len(rotation) == 1 else (rotation.mT @ local[..., None]).squeeze(-1)
     directions = torch.nn.functional.normalize(along, dim=-1)
-    origins = camera.centres(cameras)[view]
+    origins = camera.centres(cameras).index_select(0, view)
     to_centre = origins.new_tensor(bounds.centre) - origins
     if near_far == "constant":
         distance = to_centre.norm(dim=-1)

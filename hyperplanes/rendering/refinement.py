@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hyperplanes.geometry.occupancy import Occupancy, dilate
+from hyperplanes.geometry.occupancy import Occupancy, dilate, ranges
 from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["RefinedOccupancy", "refine"]
@@ -154,8 +154,7 @@ def _from_outside(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Te
 
 def _box_of(occupied: Tensor) -> tuple[tuple[slice, ...], Tensor]:
     """The smallest box around the occupied voxels, and its first voxel."""
-    ranges = [occupied.any(dim=axes[0]).any(dim=axes[1]).nonzero()[:, 0] for axes in ((2, 1), (2, 0), (0, 0))]
-    ends = [(int(each[0]), int(each[-1]) + 1) if len(each) else (0, 0) for each in ranges]
+    ends = ranges(occupied)
     return tuple(slice(*each) for each in ends), torch.tensor([each[0] for each in ends], device=occupied.device)
 
 

