@@ -5,9 +5,9 @@
 
 Of a procedural car that no training saw, or of a posed scene: the time to a field with its voxels and its surface, a
 view at several sizes, and PSNR. The reference is the same field, whose
-inputs PyTorch looks up, gathers and concatenates, and which is asked for the colour of every sample in every voxel of
-the visual hull that is not empty and in those around them, until rays are as opaque as in training. Both run in turn,
-in one process.
+inputs PyTorch looks up, gathers and concatenates, whose layers it multiplies, and which is asked for the colour of
+every sample in every voxel of the visual hull that is not empty and in those around them, until rays are as opaque as
+in training. Both run in turn, in one process, and the view with PyTorch's layers alone beside them.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.data import read_task
+from hyperplanes.fields.layers import PackedLayers
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.marching import RayMarching
@@ -74,10 +75,12 @@ def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
     assert isinstance(adapted.sampling, RayMarching)
     every = RayMarching(adapted.sampling.steps * 5 // 3, adapted.sampling.stop)
     views = [(7 * number + 3) % len(task.query) for number in range(repeats)]
-    seconds, reference, found, expected = [], [], [], []
+    seconds, reference, multiplied, found, expected = [], [], [], [], []
     for view in views:
         one = camera.select(task.query.cameras, [view])
         time, pictures = timed(lambda one=one: adapted.render(one))
+        with _without(PackedLayers, "takes"):
+            multiplied.append(timed(lambda one=one: adapted.render(one))[0])
         with _plainly():
             plain_time, plain = timed(lambda one=one: _unsplit(adapted, voxels).render(one, every))
         seconds.append(time)
@@ -90,6 +93,7 @@ def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
         "threads": torch.get_num_threads(),
         "seconds": statistics.median(seconds),
         "reference_seconds": statistics.median(reference),
+        "layers_by_pytorch_seconds": statistics.median(multiplied),
         "speedup": statistics.median(plain / ours for plain, ours in zip(reference, seconds, strict=True)),
         "psnr": statistics.fmean(found),
         "psnr_loss": statistics.fmean(expected) - statistics.fmean(found),
@@ -114,10 +118,17 @@ def _unsplit(adapted: AdaptedField, voxels: RefinedOccupancy) -> AdaptedField:
 
 @contextmanager
 def _plainly() -> Generator[None]:
-    """The time in which no kernel describes points to the network."""
-    before = VisibilityPlanes.can_describe
-    VisibilityPlanes.can_describe = lambda planes, points: False  # type: ignore[method-assign]
+    """The time in which no kernel describes points to the network, and none multiplies its layers."""
+    with _without(VisibilityPlanes, "can_describe"), _without(PackedLayers, "takes"):
+        yield
+
+
+@contextmanager
+def _without(kind: type, takes: str) -> Generator[None]:
+    """The time in which a kernel says that it takes nothing."""
+    before = getattr(kind, takes)
+    setattr(kind, takes, lambda *_: False)
     try:
         yield
     finally:
-        VisibilityPlanes.can_describe = before  # type: ignore[method-assign]
+        setattr(kind, takes, before)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear, relu, softplus
 
 from hyperplanes.fields.encoding import encode, encoded_size
+from hyperplanes.fields.layers import PackedLayers
 from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
@@ -232,6 +234,8 @@ class Field:
 
     def trunk(self, inputs: Float[Tensor, "point input"]) -> Float[Tensor, "point width"]:
         """The layers before the heads, with the skip connection of NeRF in their middle."""
+        if not self._is_learned(inputs) and self._packed is not None and self._packed.takes(inputs):
+            return self._packed(inputs)
         value = inputs
         for index in range(self.target.config.depth):
             name = f"layers.{index}"
@@ -243,6 +247,17 @@ class Field:
                 value = self.layer(name, value)
             value = relu(value, inplace=True)
         return value
+
+    def _is_learned(self, inputs: Tensor) -> bool:
+        """Whether a gradient goes through the layers before the heads."""
+        names = [f"layers.{index}.{kind}" for index in range(self.target.config.depth) for kind in ("weight", "bias")]
+        given = (inputs, *(self.parameters[name] for name in names))
+        return torch.compiler.is_compiling() or (torch.is_grad_enabled() and any(each.requires_grad for each in given))
+
+    @cached_property
+    def _packed(self) -> PackedLayers | None:
+        """The layers before the heads, for the kernel."""
+        return PackedLayers.of(self.parameters, self.target.config.depth, self.target.skip)
 
     def viewed(self, hidden: Float[Tensor, "point width"], seen: Float[Tensor, "point number"]) -> Tensor:
         """The layer "view" of the layer "feature" and what depends on the direction, side by side; before its ReLU."""

@@ -56,6 +56,7 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
     "first_hits.first_hits": (
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T, uint8[:, :, ::1], T[::1], int64, int64"
     ),
+    "layers.layers": "T[:, ::1], T[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
 }
 
 

@@ -1,0 +1,152 @@
+"""The CPU kernel of fully connected layers with ReLU: all layers of a block of points, one block after the other.
+
+What a layer writes stays in the caches until the next one reads it. TILE points by COLUMNS values are computed at once,
+in registers: each number of the weights and of the points that is loaded is used several times. The weights of COLUMNS
+values lie one input after the other (`pack_weights`).
+"""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from torch import Tensor
+
+__all__ = ["COLUMNS", "layers", "pack_weights"]
+
+TILE, LANES, VECTORS = 6, 16, 4  # 24 of the 32 registers of AVX-512 hold sums, four weights
+COLUMNS = LANES * VECTORS
+BLOCK = 10 * TILE
+
+_FUSED = {"flags": ("contract",)}
+
+
+def pack_weights(weight: Float[Tensor, "output input"]) -> Float[Tensor, " number"]:
+    """The weights of a layer in the order in which the kernel reads them.
+
+    Args:
+        weight: with a multiple of COLUMNS outputs.
+    """
+    return weight.unflatten(0, (-1, COLUMNS)).transpose(1, 2).flatten()
+
+
+def _sums(builder, sums, values, weights, count):
+    """The sums of TILE times VECTORS vectors, after products of so many inputs and their weights are added.
+
+    `values` are pointers to the first input of each point, `weights` one to the first of the weights.
+    """
+    kind, index = sums[0].type, count.type
+    before = builder.block
+    body, after = builder.append_basic_block("multiply"), builder.append_basic_block("multiplied")
+    builder.cbranch(builder.icmp_signed(">", count, index(0)), body, after)
+    builder.position_at_end(body)
+    place = builder.phi(index)
+    place.add_incoming(index(0), before)
+    held = []
+    for value in sums:
+        held.append(builder.phi(kind))
+        held[-1].add_incoming(value, before)
+    first = builder.gep(weights, [builder.mul(place, index(COLUMNS))])
+    vectors = [_vector(builder, first, index(LANES * vector)) for vector in range(VECTORS)]
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    added = []
+    for point, pointer in enumerate(values):
+        value = builder.load(builder.gep(pointer, [place]), align=4)
+        single = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
+        spread = builder.shuffle_vector(single, single, zeros)
+        for vector, weight in enumerate(vectors):
+            product = builder.fmul(spread, weight, **_FUSED)
+            added.append(builder.fadd(held[VECTORS * point + vector], product, **_FUSED))
+    following = builder.add(place, index(1))
+    place.add_incoming(following, body)
+    for value, new in zip(held, added, strict=True):
+        value.add_incoming(new, body)
+    builder.cbranch(builder.icmp_signed("<", following, count), body, after)
+    builder.position_at_end(after)
+    result = []
+    for old, new in zip(sums, added, strict=True):
+        result.append(builder.phi(kind))
+        result[-1].add_incoming(old, before)
+        result[-1].add_incoming(new, body)
+    return result
+
+
+def _vector(builder, pointer, at):
+    wide = ir.VectorType(pointer.type.pointee, LANES).as_pointer()
+    return builder.load(builder.bitcast(builder.gep(pointer, [at]), wide), align=4)
+
+
+@intrinsic
+def _tile(  # noqa: PLR0913
+    typing_context, given, at, inputs, used, hidden, row, width, also, weights, first, biases, bias, out, to
+):
+    """COLUMNS values of a layer at TILE points, after ReLU, into `out` from `to` on, `width` apart.
+
+    They are sums over `used` numbers in `given` from `at` on, `inputs` apart, over `also` ones in `hidden` from `row`
+    on, `width` apart, and biases.
+    """
+
+    def generate(context, builder, signature, arguments):
+        def pointer(array, offset):
+            data = context.make_array(signature.args[array])(context, builder, arguments[array]).data
+            return builder.gep(data, [arguments[offset]])
+
+        inputs, used, width, also = (arguments[place] for place in (2, 3, 6, 7))
+        index = used.type
+        weights, biases, out = pointer(8, 9), pointer(10, 11), pointer(12, 13)
+        start = [_vector(builder, biases, index(LANES * vector)) for vector in range(VECTORS)]
+        sums = start * TILE
+        rows = [builder.gep(pointer(0, 1), [builder.mul(inputs, index(point))]) for point in range(TILE)]
+        sums = _sums(builder, sums, rows, weights, used)
+        rows = [builder.gep(pointer(4, 5), [builder.mul(width, index(point))]) for point in range(TILE)]
+        rest = builder.gep(weights, [builder.mul(used, index(COLUMNS))])
+        sums = _sums(builder, sums, rows, rest, also)
+        zero = ir.Constant(sums[0].type, [0.0] * LANES)
+        for place, value in enumerate(sums):
+            point, vector = divmod(place, VECTORS)
+            kept = builder.select(builder.fcmp_ordered("<=", value, zero), zero, value)  # NaN stays
+            there = builder.add(builder.mul(width, index(point)), index(LANES * vector))
+            builder.store(kept, builder.bitcast(builder.gep(out, [there]), value.type.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    index = types.int64
+    return types.void(
+        given, index, index, index, hidden, index, index, index, weights, index, biases, index, out, index
+    ), generate
+
+
+@no_type_check
+def layers(given, weights, biases, shape, out, start, stop):
+    """The values of points start..stop after all layers, into `out`.
+
+    `given` are the inputs of points, `weights` those of all layers as `pack_weights` makes them, `biases` theirs.
+    `shape` is the number of layers, their width, and the layer that reads the inputs and then the values of the layer
+    before; 0 for none.
+    """
+    depth, width, skip = shape
+    size = given.shape[1]
+    inputs = np.zeros(BLOCK * size, np.float32)
+    one, other = np.zeros(BLOCK * width, np.float32), np.zeros(BLOCK * width, np.float32)
+    for first in range(start, stop, BLOCK):
+        count = min(BLOCK, stop - first)
+        for point in range(count):
+            for number in range(size):
+                inputs[point * size + number] = given[first + point, number]
+        read = 0
+        for layer in range(depth):
+            one, other = other, one  # `one` is written, `other` read
+            used, also = size if layer == 0 or layer == skip else 0, width if layer > 0 else 0
+            for column in range(0, width, COLUMNS):
+                for point in range(0, count, TILE):
+                    _tile(
+                        inputs, point * size, size, used, other, point * width, width, also, weights, read, biases,
+                        layer * width + column, one, point * width + column,
+                    )  # fmt: skip
+                read += COLUMNS * (used + also)
+        for point in range(count):
+            for number in range(width):
+                out[first + point, number] = one[point * width + number]
