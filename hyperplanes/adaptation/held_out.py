@@ -26,7 +26,7 @@ FEWEST = 5  # views, of which some can be held out
 HELD_OUT = 2  # of them at least
 ONE_IN = 12  # is held out where that is more: 3 of 47 for 2 bring 0.16 ± 0.14 dB (20 objects), all by two of them
 PIXELS = 2048  # of the views that are held out, at whose edges pictures differ most
-EVEN = 0.2  # contrast up to which one ray through a pixel shows what three do: half the rays, the same shares
+EVEN = 0.2  # contrast up to which one ray through a pixel shows what three do: half the rays
 SIZE = 128  # of all of them, along the longer side, at most: 256 pixels find no better shares, in three times the time
 
 

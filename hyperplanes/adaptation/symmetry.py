@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hull_blend import HullBlend
@@ -76,14 +75,14 @@ def symmetry_of(support: Views) -> Symmetry | None:
         return None
     centre = support.bounds.centre
     chosen = farthest_first(camera_directions(support.cameras, centre).cpu(), 0, min(MOST, len(support)))
-    judge = _Judge.of(support[sorted(chosen)])
-    errors = judge.planes(_planes(support.bounds, AXES))
+    judge, errors = _Judge.of(support[sorted(chosen)], _planes(support.bounds, AXES))
     found = min(errors, key=errors.__getitem__, default=None)
     if len(support) >= (FEWEST_TO_SEARCH if found is None else FEWEST_TO_REFINE):
         voxels = _hull(support)
         if voxels.occupied.any():
             more = most_symmetric_plane(voxels) if found is None else more_symmetric_plane(voxels, found)
-            errors |= judge.planes([more])
+            error = judge.error(Symmetry(more))
+            errors |= {more: error} if error <= TOLERANCE else {}
             found = min(errors, key=errors.__getitem__, default=None)
     if found is None:
         return None
@@ -102,8 +101,7 @@ def possible_symmetries(view: Views) -> list[Symmetry]:
         The most likely one where there are several planes through one axis: few other objects look like such a one.
         Else those about one plane, of which a single view tells nothing more.
     """
-    judge = _Judge.of(view)
-    errors = judge.planes(_planes(view.bounds, VERTICAL), most=math.inf)
+    judge, errors = _Judge.of(view, _planes(view.bounds, VERTICAL), most=math.inf)
     several = [judge.several(plane, errors[plane], view, SINGLE_VIEW_ORDER) for plane in errors]
     likely = [each for each in several if each is not None]
     if likely:
@@ -138,18 +136,16 @@ class _Judge:
     floor: float
 
     @classmethod
-    def of(cls, support: Views) -> _Judge:
-        """The judge of some views with masks."""
+    def of(cls, support: Views, planes: Sequence[Plane], most: float = TOLERANCE) -> tuple[_Judge, dict[Plane, float]]:
+        """The judge of some views with masks, and the errors of those planes by which they are at most so large."""
         views = support.resized(SIZE)
         assert views.masks is not None
         floor = FLOOR * float((views.masks >= SHOWN).sum())
-        every = torch.ones_like(views.masks, dtype=torch.bool)
-        return cls(views, _error(views, views, _hull(views), every) + floor, floor)
-
-    def planes(self, planes: Sequence[Plane], most: float = TOLERANCE) -> dict[Plane, float]:
-        """The errors, relative to that without reflections, of planes by which they are at most so large."""
-        errors = side_by_side(self.error, [Symmetry(plane) for plane in planes], self.views.images.device)
-        return {plane: e for plane, e in zip(planes, errors, strict=True) if e <= most and math.isfinite(e)}
+        symmetries = [None, *(Symmetry(plane) for plane in planes)]
+        alone, *errors = side_by_side(partial(_squared_error, views), symmetries, views.images.device)
+        judge = cls(views, alone + floor, floor)
+        relative = zip(planes, map(judge._relative, errors), strict=True)
+        return judge, {plane: error for plane, error in relative if error <= most and math.isfinite(error)}
 
     def several(self, plane: Plane, error: float, given: Views, least: int = 2) -> tuple[Symmetry, float] | None:
         """The most likely order of symmetries of several planes, one of which is known, and its error over its worth.
@@ -184,13 +180,10 @@ class _Judge:
 
     def error(self, symmetry: Symmetry) -> float:
         """That of the hull of views and reflections; infinite where it loses too many pixels."""
-        assert self.views.masks is not None
-        shown = images_by(self.views, symmetry)
-        seen, hull = self.views.masks >= SHOWN, _hull(shown)
-        held = footprint(hull, self.views.cameras)[:, None]
-        if not hull.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
-            return math.inf
-        return (_error(self.views, shown, hull, held | ~seen) + self.floor) / self.alone
+        return self._relative(_squared_error(self.views, symmetry))
+
+    def _relative(self, error: float) -> float:
+        return (error + self.floor) / self.alone
 
 
 def _hull(views: Views) -> Occupancy:
@@ -199,12 +192,20 @@ def _hull(views: Views) -> Occupancy:
     return carve(views.masks, views.cameras, views.bounds, HULL_SIDE)
 
 
-def _error(support: Views, shown: Views, hull: Occupancy, among: Bool[Tensor, "view 1 height width"]) -> float:
-    """The squared error of some pixels of support views by the hull of the views that are shown, and their colours."""
+def _squared_error(views: Views, symmetry: Symmetry | None) -> float:
+    """That of views by `HullBlend` of them and their reflections; infinite where their hull loses too many pixels."""
+    assert views.masks is not None
+    shown = views if symmetry is None else images_by(views, symmetry)
+    among, hull = torch.ones_like(views.masks, dtype=torch.bool), _hull(shown)
+    if symmetry is not None:
+        seen, held = views.masks >= SHOWN, footprint(hull, views.cameras)[:, None]
+        if not hull.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
+            return math.inf
+        among = held | ~seen
     assert shown.masks is not None
     blend = HullBlend().adapt_to(VisibilityPlanes(shown.images, shown.cameras, shown.masks, hull))
-    found = blend.render(support.cameras)
-    return float((found.images - support.images).square().mean(1, keepdim=True)[among].sum())
+    found = blend.render(views.cameras)
+    return float((found.images - views.images).square().mean(1, keepdim=True)[among].sum())
 
 
 def _planes(bounds: Sphere, normals: Sequence[tuple[float, float, float]]) -> list[Plane]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear, relu, softplus
 
 from hyperplanes.fields.encoding import encode, encoded_size
-from hyperplanes.fields.layers import PackedLayers
+from hyperplanes.fields.layers import Layer, PackedLayers, wants_values_alone
 from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
@@ -234,30 +233,35 @@ class Field:
 
     def trunk(self, inputs: Float[Tensor, "point input"]) -> Float[Tensor, "point width"]:
         """The layers before the heads, with the skip connection of NeRF in their middle."""
-        if not self._is_learned(inputs) and self._packed is not None and self._packed.takes(inputs):
-            return self._packed(inputs)
+        names = [f"layers.{index}" for index in range(self.target.config.depth)]
+        layers = [(self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"]) for name in names]
+        if wants_values_alone(inputs, layers):
+            packed = self._packed(layers)
+            if packed is not None and packed.takes(inputs):
+                return packed(inputs)
         value = inputs
-        for index in range(self.target.config.depth):
-            name = f"layers.{index}"
+        for index, (weight, bias) in enumerate(layers):
             if index == self.target.skip > 0:  # of inputs and values side by side, without putting them there
-                weight, size = self.parameters[f"{name}.weight"], inputs.shape[-1]
-                given = linear(inputs, weight[:, :size], self.parameters[f"{name}.bias"])
-                value = torch.addmm(given, value, weight[:, size:].T)
+                size = inputs.shape[-1]
+                value = torch.addmm(linear(inputs, weight[:, :size], bias), value, weight[:, size:].T)
             else:
-                value = self.layer(name, value)
+                value = linear(value, weight, bias)
             value = relu(value, inplace=True)
         return value
 
-    def _is_learned(self, inputs: Tensor) -> bool:
-        """Whether a gradient goes through the layers before the heads."""
-        names = [f"layers.{index}.{kind}" for index in range(self.target.config.depth) for kind in ("weight", "bias")]
-        given = (inputs, *(self.parameters[name] for name in names))
-        return torch.compiler.is_compiling() or (torch.is_grad_enabled() and any(each.requires_grad for each in given))
+    def _packed(self, layers: Sequence[Layer]) -> PackedLayers | None:
+        """The layers for the kernel: packed once, and anew where weights have changed in place."""
+        values = [value for layer in layers for value in layer]
+        state = [(value.data_ptr(), 0 if value.is_inference() else value._version) for value in values]
+        kept = self.__dict__.get("_kept")
+        if kept is None or kept[0] != state:
+            kept = state, PackedLayers.of(layers, self.target.skip)
+            self.__dict__["_kept"] = kept  # threads that come at once pack the same
+        return kept[1]
 
-    @cached_property
-    def _packed(self) -> PackedLayers | None:
-        """The layers before the heads, for the kernel."""
-        return PackedLayers.of(self.parameters, self.target.config.depth, self.target.skip)
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is computed from the rest: for copies and pickles."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def viewed(self, hidden: Float[Tensor, "point width"], seen: Float[Tensor, "point number"]) -> Tensor:
         """The layer "view" of the layer "feature" and what depends on the direction, side by side; before its ReLU."""

@@ -207,7 +207,7 @@ def test_held_out_pixels_are_the_mean_of_three_rays_where_they_are_not_even(monk
     order = outermost_first(camera_directions(support), len(support))
     held = support[order[-HELD_OUT:]]
     trial = hold_out(adapter, support)
-    among, generators = live_pixels(trial.context.occupancy, held), [torch.Generator().manual_seed(0) for _ in "12"]
+    among, generators = live_pixels(trial.context.occupancy, held), [torch.Generator().manual_seed(0) for _ in range(2)]
     rays, truth, _ = held.sample_masked_rays(PIXELS, generator=generators[0], among=among, subpixels=SUBPIXELS)
     torch.testing.assert_close(trial.pixels.truth, truth)
     chosen = among[torch.randint(len(among), (PIXELS,), generator=generators[1])]

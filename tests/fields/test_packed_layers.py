@@ -1,12 +1,17 @@
 """Sources of truth: PyTorch's layers in float64, and properties: neither batches nor threads change a bit."""
 
+import copy
+import pickle
+
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from hyperplanes.fields import TARGETS, TargetConfig
 from hyperplanes.fields import layers as packed_layers
-from hyperplanes.fields.layers import PackedLayers
+from hyperplanes.fields.layers import WIDEST, PackedLayers
 from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.kernels import compiling
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.parameters import Parameters
 from tests.reference_rendering import ring
@@ -15,24 +20,23 @@ from tests.reference_rendering import ring
 @pytest.fixture(autouse=True)
 def kernel_anywhere(monkeypatch):
     """It is right on every processor, and only used where it is fast."""
-    monkeypatch.setattr(packed_layers, "has_kernel", lambda: True)
+    monkeypatch.setattr(packed_layers, "has_wide_vectors", lambda: True)
 
 
-def weights(depth, width, inputs, skip, seed=0):
+def layers_of(depth, width, inputs, skip, seed=0):
     generator = torch.Generator().manual_seed(seed)
     sizes = [inputs if not index else width + inputs * (index == skip) for index in range(depth)]
-    drawn = {}
-    for index, size in enumerate(sizes):
-        drawn[f"layers.{index}.weight"] = torch.randn(width, size, generator=generator) * (2 / size) ** 0.5
-        drawn[f"layers.{index}.bias"] = torch.randn(width, generator=generator)
-    return drawn
+    return [
+        (torch.randn(width, size, generator=generator) * (2 / size) ** 0.5, torch.randn(width, generator=generator))
+        for size in sizes
+    ]
 
 
-def by_pytorch(drawn, given, depth, skip):
+def by_pytorch(layers, given, skip):
     value = given
-    for index in range(depth):
+    for index, (weight, bias) in enumerate(layers):
         value = torch.cat([given, value], 1) if index == skip > 0 else value
-        value = (value @ drawn[f"layers.{index}.weight"].T + drawn[f"layers.{index}.bias"]).clamp_min(0)
+        value = (value @ weight.T + bias).clamp_min(0)
     return value
 
 
@@ -40,17 +44,17 @@ def by_pytorch(drawn, given, depth, skip):
 @pytest.mark.parametrize("count", [0, 1, 59, 61, 500])
 def test_values_are_those_of_pytorch(depth, width, inputs, count):
     skip = depth // 2
-    drawn = weights(depth, width, inputs, skip)
+    layers = layers_of(depth, width, inputs, skip)
     given = torch.randn(count, inputs, generator=torch.Generator().manual_seed(1))
-    expected = by_pytorch({name: value.double() for name, value in drawn.items()}, given.double(), depth, skip)
-    found = PackedLayers.of(drawn, depth, skip)(given)
+    expected = by_pytorch([(weight.double(), bias.double()) for weight, bias in layers], given.double(), skip)
+    found = PackedLayers.of(layers, skip)(given)
     torch.testing.assert_close(found, expected.float(), rtol=1e-5, atol=1e-5)
     assert not count or (found > 0).any()
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_neither_the_batch_nor_threads_change_a_bit(threads):
-    layers = PackedLayers.of(weights(4, 128, 130, 2), 4, 2)
+    layers = PackedLayers.of(layers_of(4, 128, 130, 2), 2)
     given = torch.randn(1500, 130, generator=torch.Generator().manual_seed(2))
     alone = torch.cat([layers(part) for part in given.split(7)])
     before = torch.get_num_threads()
@@ -62,54 +66,148 @@ def test_neither_the_batch_nor_threads_change_a_bit(threads):
         torch.set_num_threads(before)
 
 
-def test_what_is_no_number_stays_none():
+def test_nan_of_a_point_stays_with_it():
     given = torch.zeros(9, 5)
     given[3, 2] = torch.nan
-    found = PackedLayers.of(weights(2, 64, 5, 1), 2, 1)(given).isnan()
+    found = PackedLayers.of(layers_of(2, 64, 5, 1), 1)(given).isnan()
     assert found[3].all()
     assert not found[[0, 1, 2, 4, 5, 6, 7, 8]].any()
 
 
-@pytest.mark.parametrize(("width", "dtype"), [(63, torch.float32), (96, torch.float32), (64, torch.float64)])
+@pytest.mark.parametrize(
+    ("width", "dtype"),
+    [(63, torch.float32), (96, torch.float32), (WIDEST + 64, torch.float32), (64, torch.float64)],
+)
 def test_other_widths_and_precisions_are_left_to_pytorch(width, dtype):
-    drawn = {name: value.to(dtype) for name, value in weights(2, width, 5, 1).items()}
-    assert PackedLayers.of(drawn, 2, 1) is None
+    layers = [(weight.to(dtype), bias.to(dtype)) for weight, bias in layers_of(2, width, 5, 1)]
+    assert PackedLayers.of(layers, 1) is None
+
+
+def test_shapes_that_do_not_go_together_are_left_to_pytorch():
+    layers = layers_of(3, 64, 5, 1)
+    assert PackedLayers.of(layers, 1) is not None
+    assert PackedLayers.of(layers, 2) is None  # the other one reads the inputs
+    assert PackedLayers.of([*layers[:2], (layers[2][0], torch.zeros(63))], 1) is None
+    packed = PackedLayers.of(layers, 1)
+    assert packed.takes(torch.zeros(2, 5))
+    assert not any(map(packed.takes, (torch.zeros(2, 6), torch.zeros(5), torch.zeros(2, 5, dtype=torch.float64))))
+
+
+@pytest.mark.parametrize(("found", "features"), [(None, {}), (1, {}), (1, {"avx512f": False}), (1, {"avx512f": True})])
+def test_the_kernel_is_used_where_there_are_a_compiler_and_wide_vectors(monkeypatch, found, features):
+    import llvmlite.binding
+
+    monkeypatch.setattr(compiling, "find_spec", lambda name: found)
+    monkeypatch.setattr(llvmlite.binding, "get_host_cpu_features", lambda: features)
+    expected = bool(found and features.get("avx512f"))
+    assert compiling.has_wide_vectors.__wrapped__() is expected
+    monkeypatch.setattr(packed_layers, "has_wide_vectors", compiling.has_wide_vectors.__wrapped__)
+    assert (PackedLayers.of(layers_of(2, 64, 5, 1), 1) is not None) is expected
 
 
 def field_of(config):
+    """A field of weights that can be trained."""
     torch.manual_seed(0)
     network = TARGETS["point_multiplane"](config)
     images = torch.rand(3, 3, 9, 11, generator=torch.Generator().manual_seed(0))
     return network.bind(Parameters.of(network), ImagePlanes(images, ring(3, (9, 11))), Sphere())
 
 
-def test_a_field_has_the_same_values_with_gradients_and_without(monkeypatch):
+@pytest.fixture
+def used(monkeypatch):
+    """How many points the kernel has taken, call by call."""
+    counts, call = [], PackedLayers.__call__
+    monkeypatch.setattr(PackedLayers, "__call__", lambda self, given: counts.append(len(given)) or call(self, given))
+    return counts
+
+
+CONFIG = TargetConfig(depth=4, width=64, planes=3, point_frequencies=2, direction_frequencies=1)
+POINTS = torch.rand(20, 3, generator=torch.Generator().manual_seed(1)) - 0.5
+
+
+def test_a_field_has_the_same_values_with_gradients_and_without(used):
     """With gradients PyTorch multiplies; the same numbers in another order."""
-    used, call = [], PackedLayers.__call__
-    monkeypatch.setattr(PackedLayers, "__call__", lambda self, given: used.append(len(given)) or call(self, given))
-    field = field_of(TargetConfig(depth=4, width=64, planes=3, point_frequencies=2, direction_frequencies=1))
-    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(1)) - 0.5
-    learned = field(points, torch.nn.functional.normalize(points, dim=1))
-    assert not used
+    field, directions = field_of(CONFIG), torch.nn.functional.normalize(POINTS, dim=1)
+    learned = field(POINTS, directions)
     learned[0].sum().backward()
     assert all(value.grad is not None for name, value in field.parameters.items() if name.startswith("layers"))
+    assert not used
     with torch.no_grad():
-        found = field(points, torch.nn.functional.normalize(points, dim=1))
+        found = field(POINTS, directions)
     assert used == [20]
     for one, other in zip(found, learned, strict=True):
         torch.testing.assert_close(one, other)
-    moved = points.clone().requires_grad_(True)
-    frozen = type(field)(field.target, Parameters(field.parameters).detach(), field.planes, field.bounds)
+
+
+def test_gradients_of_points_go_through_frozen_layers(used):
+    field = field_of(CONFIG)
+    frozen = type(field)(field.target, field.parameters.detach(), field.planes, field.bounds)
+    moved = POINTS.clone().requires_grad_(True)
     frozen.density(moved).sum().backward()
-    assert used == [20]
+    assert not used
     assert moved.grad.abs().sum() > 0
 
 
-def test_transforms_go_through_pytorch():
-    field = field_of(TargetConfig(depth=2, width=64, planes=3, point_frequencies=1, direction_frequencies=1))
-    points = torch.rand(6, 3, generator=torch.Generator().manual_seed(3)) - 0.5
-    with torch.no_grad():
-        given = field.target.inputs(points, field.planes, field.bounds)
-        assert not torch.func.vmap(lambda row: torch.tensor(field._packed.takes(row)))(given).any()
-        one_by_one = torch.func.vmap(lambda row: field.trunk(row[None])[0])(given)
-        torch.testing.assert_close(one_by_one, field.trunk(given))
+@torch.no_grad()
+def test_weights_that_change_in_place_change_the_field(used):
+    field = field_of(CONFIG)
+    before = field.density(POINTS)
+    field.parameters["layers.1.bias"].add_(0.5)
+    changed = field.density(POINTS)
+    assert (changed - before).abs().max() > 1e-3
+    fresh = type(field)(field.target, field.parameters, field.planes, field.bounds)
+    assert torch.equal(fresh.density(POINTS), changed)
+    assert used == [20, 20, 20]
+
+
+@torch.no_grad()
+def test_copies_and_pickles_hold_no_packed_weights(used):
+    field = field_of(CONFIG)
+    expected = field.density(POINTS)
+    assert set(vars(field)) > {"target", "parameters", "planes", "bounds"}
+    for copied in (copy.deepcopy(field), pickle.loads(pickle.dumps(field))):
+        assert set(vars(copied)) == {"target", "parameters", "planes", "bounds"}
+        assert torch.equal(copied.density(POINTS), expected)
+    assert len(used) == 3
+
+
+def test_inputs_of_another_size_are_refused_by_pytorch():
+    field = field_of(CONFIG)
+    with torch.no_grad(), pytest.raises(RuntimeError, match="shapes cannot be multiplied"):
+        field.trunk(torch.rand(5, field.target.input_size + 3))
+
+
+@torch.no_grad()
+def test_the_result_has_the_precision_of_the_inputs_whatever_the_default():
+    field = field_of(CONFIG)
+    given = field.target.inputs(POINTS, field.planes, field.bounds)
+    expected = field.trunk(given)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(field.trunk(given), expected)
+    finally:
+        torch.set_default_dtype(before)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # by forward_ad
+@torch.no_grad()
+def test_transforms_traces_and_autocast_go_through_pytorch(used, monkeypatch):
+    field = field_of(CONFIG)
+    given = field.target.inputs(POINTS, field.planes, field.bounds)
+    by_rows = torch.func.vmap(lambda row: field.trunk(row[None])[0])(given)
+    with monkeypatch.context() as patched:
+        patched.setattr(torch.jit, "is_tracing", lambda: True)
+        traced = field.trunk(given)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert field.trunk(given).dtype == torch.bfloat16
+    with forward_ad.dual_level():
+        weights = field.parameters["layers.1.weight"]
+        dual = forward_ad.make_dual(weights, torch.ones_like(weights))
+        moved = Parameters({**field.parameters, "layers.1.weight": dual})
+        tangent = forward_ad.unpack_dual(type(field)(field.target, moved, field.planes, field.bounds).trunk(given))[1]
+    assert not used
+    assert tangent.abs().max() > 0
+    torch.testing.assert_close(by_rows, field.trunk(given))
+    torch.testing.assert_close(traced, field.trunk(given))
+    assert used == [20, 20]

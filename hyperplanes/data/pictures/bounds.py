@@ -192,8 +192,8 @@ def smallest_ball(points: Float[Tensor, "point 3"]) -> Sphere:
     """
     # between its neighbours on a line along z no point is farthest
     step = points.diff(dim=0)
-    along, up = (step[:, :2] == 0).all(1), step[:, 2] > 0
-    between = along[1:] & along[:-1] & (up[1:] == up[:-1])
+    along, up, down = (step[:, :2] == 0).all(1), step[:, 2] > 0, step[:, 2] < 0
+    between = along[1:] & along[:-1] & (up[1:] & up[:-1] | down[1:] & down[:-1])
     points = torch.cat([points[:1], points[1:-1][~between], points[1:][-1:]])
     centre = (points.amin(0) + points.amax(0)) / 2
     for step in range(1, 100):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.compiling import compile_kernel, has_wide_vectors
 
 __all__ = ["RENDERING"]
 
@@ -22,4 +22,5 @@ RENDERING = {
 
 if __name__ == "__main__":
     for name, points in RENDERING.items():
-        compile_kernel(name, torch.float32, points)
+        if name != "layers.layers" or has_wide_vectors():  # which is used there alone
+            compile_kernel(name, torch.float32, points)
