@@ -11,6 +11,7 @@ from pathlib import Path
 __all__ = ["cache_folder", "environment", "find_commit", "find_processor", "usable_cores"]
 
 ROOT = Path(__file__).resolve().parents[2]
+RESULTS = "benchmarks/results"  # of a checkout
 
 
 def cache_folder() -> Path:
@@ -27,7 +28,10 @@ def cache_folder() -> Path:
 
 
 def find_commit() -> str:
-    """The commit of this code as `git describe` puts it, or the version of the installed package."""
+    """The commit of this code as `git describe --dirty` puts it, or the version of the installed package.
+
+    Files of RESULTS that have changed are not counted: one benchmark writes them after the other.
+    """
     from importlib.metadata import PackageNotFoundError, version
 
     def ask(*words: str) -> str:
@@ -36,7 +40,8 @@ def find_commit() -> str:
 
     try:
         if Path(ask("rev-parse", "--show-toplevel") or os.sep).resolve() == ROOT:
-            return ask("describe", "--always", "--dirty") or "unknown"
+            changed = ask("diff", "--name-only", "HEAD", "--", ".", f":(exclude){RESULTS}")
+            return (ask("describe", "--always") or "unknown") + ("-dirty" if changed else "")
     except OSError:  # no git here
         pass
     try:

@@ -1,16 +1,37 @@
+"""Source of truth: git, asked in the folder of a project; outside of a checkout the package's version."""
+
 import subprocess
 from importlib.metadata import version
 from pathlib import Path
 
-from hyperplanes.utilities.environment import find_commit
+from hyperplanes.utilities import environment
+from hyperplanes.utilities.environment import RESULTS, find_commit
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
+def git(folder, *words):
+    return subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True, check=False).stdout.strip()
+
+
 def test_the_commit_is_that_of_this_checkout():
-    """Another implementation: git, asked in the folder of the project; outside of a checkout the package's version."""
-    asked = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    commit = asked.stdout.strip() if (ROOT / ".git").exists() else f"version {version('hyperplanes')}"
+    commit = git(ROOT, "describe", "--always") if (ROOT / ".git").exists() else f"version {version('hyperplanes')}"
+    assert find_commit().removesuffix("-dirty") == commit
+
+
+def test_changed_code_is_named_and_changed_results_are_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(environment, "ROOT", tmp_path.resolve())
+    files = [tmp_path / "code.py", tmp_path / RESULTS / "rows.json"]
+    files[1].parent.mkdir(parents=True)
+    for file in files:
+        file.write_text("1")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", "-A")
+    git(tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "first")
+    commit = git(tmp_path, "describe", "--always", "--dirty")
+    assert len(commit) >= 7
     assert find_commit() == commit
+    files[1].write_text("2")
+    assert find_commit() == commit
+    files[0].write_text("2")
+    assert find_commit() == git(tmp_path, "describe", "--always", "--dirty") == f"{commit}-dirty"
