@@ -30,8 +30,9 @@ def wants_values_alone(inputs: Tensor, layers: Sequence[Layer]) -> bool:
         layers: that they go through.
     """
     given = (inputs, *(value for layer in layers for value in layer))
-    traced = torch.jit.is_tracing()  # pyright: ignore[reportPrivateImportUsage]
-    if traced or torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu"):
+    if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu"):
+        return False
+    if torch.jit.is_tracing():  # pyright: ignore[reportPrivateImportUsage]
         return False
     if torch.is_grad_enabled() and any(value.requires_grad for value in given):
         return False
