@@ -199,7 +199,7 @@ def test_a_second_picture_is_made_only_where_it_is_worth_it(monkeypatch, other):
     assert worth_it == (other < 5)
 
 
-@pytest.mark.parametrize("even", [-1.0, EVEN, 1.0])
+@pytest.mark.parametrize("even", [-1.0, 0.02, EVEN, 1.0])
 def test_held_out_pixels_are_the_mean_of_three_rays_where_they_are_not_even(monkeypatch, even):
     """Brute force: all three rays of every pixel."""
     monkeypatch.setattr(held_out, "EVEN", even)
@@ -215,6 +215,7 @@ def test_held_out_pixels_are_the_mean_of_three_rays_where_they_are_not_even(monk
     found = render(field.field, rays, finer, occupancy=field.occupancy, differentiable=False)
     three, one = found.pooled(3).colour, found.colour[:PIXELS]
     uneven = contrast(held.images).flatten()[chosen, None] > even
+    assert torch.equal(trial.pixels.uneven, uneven[:, 0].nonzero()[:, 0])
     errors = trial.pixels.errors(field)
     torch.testing.assert_close(errors, torch.where(uneven, three, one) - truth)
     assert uneven.all() == (even < 0)
