@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
@@ -35,17 +35,15 @@ class HeldOutPixels:
     """Some pixels of the views that are held out.
 
     Attributes:
-        rays: through their centres.
-        truth: their colours.
-        uneven: those that differ from pixels around them, so that they are the mean of three rays.
-        more: the two others of each, all first ones first.
+        even: rays through the centres of those that differ little from pixels around them.
+        uneven: rays through the others, as many of each pixel as there are SUBPIXELS.
+        truth: the colours of all, even ones first.
         across: pixels along a diameter of the scene.
     """
 
-    rays: Rays
+    even: Rays
+    uneven: Rays
     truth: Float[Tensor, "pixel 3"]
-    uneven: Int[Tensor, " uneven"]
-    more: Rays
     across: float
 
     def errors(self, adapted: AdaptedField) -> Float[Tensor, "pixel 3"]:
@@ -54,17 +52,10 @@ class HeldOutPixels:
         Args:
             adapted: what is made of the other views.
         """
-
-        def colours(rays: Rays) -> Tensor:
-            sampling, occupancy = adapted.sampling.for_rendering(self.across), adapted.occupancy
-            found = render(
-                adapted.field, rays, sampling, occupancy=occupancy, proposal=adapted.proposal, differentiable=False
-            )
-            return found.colour
-
-        found, more = colours(self.rays), colours(self.more).unflatten(0, (len(SUBPIXELS) - 1, -1))
-        found[self.uneven] = (found[self.uneven] + more.sum(0)) / len(SUBPIXELS)
-        return found - self.truth
+        sampling = adapted.sampling.for_rendering(self.across)
+        options = {"occupancy": adapted.occupancy, "proposal": adapted.proposal, "differentiable": False}
+        one, three = (render(adapted.field, rays, sampling, **options) for rays in (self.even, self.uneven))
+        return torch.cat([one.colour, three.pooled(len(SUBPIXELS)).colour]) - self.truth
 
 
 @dataclass(frozen=True)
@@ -110,9 +101,9 @@ def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | N
         return None
     near_far = network.config.sampling.near_far
     pixels = among[torch.randint(len(among), (PIXELS,), generator=torch.Generator().manual_seed(0)).to(among.device)]
-    uneven = (contrast(held_out.images).flatten()[pixels] > EVEN).nonzero()[:, 0]
-    rays, truth, _ = held_out.rays_at(pixels, near_far=near_far)
-    more, _, _ = held_out.rays_at(pixels[uneven], near_far=near_far, subpixels=SUBPIXELS[1:])
+    uneven = contrast(held_out.images).flatten()[pixels] > EVEN
+    one, colours, _ = held_out.rays_at(pixels[~uneven], near_far=near_far)
+    three, others, _ = held_out.rays_at(pixels[uneven], near_far=near_far, subpixels=SUBPIXELS)
     across = pixels_across(held_out.cameras, held_out.bounds)
     learned = network.rendering_field(context, network.adapted_weights(context))
-    return Trial(context, learned, HeldOutPixels(rays, truth, uneven, more, across))
+    return Trial(context, learned, HeldOutPixels(one, three, torch.cat([colours, others]), across))
