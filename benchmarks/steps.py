@@ -2,9 +2,9 @@
 
     OMP_NUM_THREADS=1 python -m benchmarks steps --data data/cars --json FILE
 
-Steps of the packaged weights in turn: as they are taken, and the reference, which differentiates every sample that lies
-in the hull and convolves by PyTorch's modules. Both take the same episodes. Beside them, what it takes to make one
-episode ready whose pictures are in memory.
+Steps of the packaged weights in turn: as they are taken, in single precision alone, and the reference, in single
+precision, which differentiates every sample that lies in the hull and convolves by PyTorch's modules. All take the same
+episodes. Beside them, what it takes to make one episode ready whose pictures are in memory.
 """
 
 from __future__ import annotations
@@ -53,37 +53,47 @@ def main(arguments: list[str]) -> int:
     chosen = parser.parse_args(arguments)
     size, views, repeats = (64, 8, 1) if chosen.quick else (128, 50, chosen.repeats)
     data: Tasks = Objects(held_out(4, size, views)) if chosen.data is None else open_dataset(chosen.data)
-    ours, reference = (_trainer(data, stop, chosen.untrained) for stop in (RayMarching().stop, 0.0))
-    reference.loader.get = ours.loader.get  # type: ignore[method-assign]
+    ways = {
+        "ours": (RayMarching().stop, "automatic"),
+        "single": (RayMarching().stop, "single"),
+        "reference": (0.0, "single"),
+    }
+    trainers = {name: _trainer(data, stop, way, chosen.untrained) for name, (stop, way) in ways.items()}
+    ours = trainers["ours"]
+    for other in (trainers["single"], trainers["reference"]):
+        other.loader.get = ours.loader.get  # type: ignore[method-assign]
     names = [name for step in range(repeats + 2) for name in ours.loader.names_of(step)]
     for name in names:
         ours.loader.get(name)
     again = [timed(lambda name=name: ours.loader._load(name))[0] for name in names[: max(1, repeats)]]
-    rows = _compare(ours, reference, repeats)
+    rows = _compare(trainers, repeats)
     rows.append({"name": "an episode, its pictures in memory", "seconds": statistics.median(again)})
     return finish("steps", rows, chosen.json)
 
 
-def _trainer(data: Tasks, stop: float, untrained: bool) -> Trainer:
+def _trainer(data: Tasks, stop: float, precision: str, untrained: bool) -> Trainer:
     """A training that stays where it is; `stop` 0 differentiates every sample."""
     settings = preset("small")
     model = HyperPlanes(settings.model) if untrained else HyperPlanes.from_pretrained("small")
     model.config = replace(model.config, sampling=replace(settings.model.sampling, stop=stop))
     rates = {f"{name}learning_rate": RATE for name in ("", "muon_", "hypernetwork_")}
-    return Trainer(model, data, replace(settings.training, prefetch=0, **rates))
+    return Trainer(model, data, replace(settings.training, prefetch=0, precision=precision, **rates))
 
 
-def _compare(ours: Trainer, reference: Trainer, repeats: int) -> list[Row]:
+def _compare(trainers: dict[str, Trainer], repeats: int) -> list[Row]:
     """Seconds of a step of each, in turn, and of its parts."""
+    ours, single, reference = trainers.values()
 
     def plain_step() -> None:
         with _plainly():
             reference.take_step()
 
-    times = interleaved({"ours": ours.take_step, "reference": plain_step}, repeats, seconds=120)
+    ways = {"ours": ours.take_step, "single": single.take_step, "reference": plain_step}
+    times = interleaved(ways, repeats, seconds=180)
     config = ours.config
     row: Row = {"name": f"step of small, {config.tasks} x {config.rays} rays", "threads": torch.get_num_threads()}
     row["seconds"] = statistics.median(times["ours"].wall)
+    row["single_precision_seconds"] = statistics.median(times["single"].wall)
     row["reference_seconds"] = statistics.median(times["reference"].wall)
     row |= ratio(times["reference"].wall, times["ours"].wall)
     rows = [row, *step_parts("ours", ours)]

@@ -197,7 +197,7 @@ def _steps(result: Result) -> str:
     found = {row["name"]: row["seconds"] for row in result["rows"]}
     step = next(row for row in result["rows"] if row["name"].startswith("step of small"))
     times = f"**{_seconds(step['seconds'])}**", _seconds(step["reference_seconds"]), f"{step['speedup']:.2f}"
-    lines = [["a step", *times]]
+    lines = [["a step", *times], ["a step in single precision", _seconds(step["single_precision_seconds"]), "", ""]]
     for part, name in PARTS.items():
         seconds = [found[f"part of a step, {way}: {part}"] for way in ("ours", "reference")]
         lines.append([name, *map(_seconds, seconds), f"{seconds[1] / seconds[0]:.2f}"])

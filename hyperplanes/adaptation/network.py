@@ -131,11 +131,21 @@ class HyperPlanesNetwork(nn.Module):
         """The update of theta, in one forward pass (HyperPlanes, Eq. 7); empty without a hypernetwork."""
         return self.updates([context])[0]
 
-    def updates(self, contexts: Sequence[SupportContext]) -> list[Parameters]:
-        """The updates of several objects, which are read in one batch; as `update`."""
+    def updates(self, contexts: Sequence[SupportContext], *, mixed_precision: bool = False) -> list[Parameters]:
+        """The updates of several objects, which are read in one batch; as `update`.
+
+        Args:
+            contexts: of the objects.
+            mixed_precision: the hypernetwork's convolutions and matrix products are computed in bfloat16
+                (`torch.autocast`). Its weights and the updates keep their precision.
+        """
         if self.hypernetwork is None:
             return [Parameters() for _ in contexts]
-        return self.hypernetwork(observe(contexts, self.hypernetwork.resolution), self.theta)
+        observed = observe(contexts, self.hypernetwork.resolution)
+        with torch.autocast(self.rig.device.type, torch.bfloat16, enabled=mixed_precision):
+            found = self.hypernetwork(observed, self.theta)
+        precision = self.rig.dtype
+        return [Parameters((name, value.to(precision)) for name, value in update.items()) for update in found]
 
     def field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
         """The field of given weights on the planes of an object (HyperPlanes, Eq. 5)."""

@@ -44,7 +44,8 @@ class ImagePlanes:
         Args:
             images: (view, channel, height, width), any number of channels; 8-bit ones are divided by 255. Three
                 channels in [0, 1] that need no gradient may be read from a copy packed into 32 bits a pixel, exact for
-                8-bit images and within 1/2046 for others.
+                8-bit images and within 1/2046 for others. Those that are not contiguous are copied, so that changes in
+                place do not reach the planes.
             cameras: one an image, of the images' size.
             background: colour of points outside an image.
             backend: of the lookup; the fastest available where absent.
@@ -60,7 +61,7 @@ class ImagePlanes:
             raise ValueError(
                 f"images: expected the cameras' size {camera.image_size(cameras)}, got {tuple(images.shape[2:])}"
             )
-        self.images = images
+        self.images = images.contiguous()  # as kernels read them
         self.cameras = cameras
         self.background = background
         self.backend = backend

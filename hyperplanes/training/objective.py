@@ -18,6 +18,7 @@ from hyperplanes.parameters import Parameters
 from hyperplanes.training.episodes import Batch
 from hyperplanes.training.forward import forward
 from hyperplanes.training.losses import losses_of
+from hyperplanes.utilities.environment import has_amx
 from hyperplanes.views import Tasks
 
 __all__ = ["Objective", "RenderingObjective"]
@@ -67,12 +68,15 @@ class RenderingObjective(Objective):
     def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
         super().__init__(model, config)
         self.losses = losses_of(config)
+        automatic = model.reads_volume and model.rig.device.type == "cpu" and has_amx()
+        self.mixed_precision = {"automatic": automatic, "single": False, "bfloat16": True}[config.precision]
 
     def gradients(self, batch: Batch) -> float:
         """Backpropagate the mean over the rendered objects of the sum of the losses."""
         # the HyperPlanes of all objects in one batch, which batch statistics are taken over (Eq. 7)
         with record_function("step:update"):
-            updates = self.model.updates([each.episode.prepared for each in (*batch.rendered, *batch.reference)])
+            read = [each.episode.prepared for each in (*batch.rendered, *batch.reference)]
+            updates = self.model.updates(read, mixed_precision=self.mixed_precision)
         self.updates = [update.detach() for update in updates]
         weights = [value for value in self.model.parameters() if value.requires_grad]
         leaves = [Parameters((name, value.requires_grad_()) for name, value in each.items()) for each in self.updates]

@@ -11,16 +11,24 @@ from hyperplanes.fields import TARGETS, TargetConfig
 from hyperplanes.fields import layers as packed_layers
 from hyperplanes.fields.layers import WIDEST, PackedLayers
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.kernels import compiling
+from hyperplanes.geometry.kernels import compiling, layers_amx
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.parameters import Parameters
 from tests.reference_rendering import ring
 
+HAS_AMX = compiling.layers_module() == "layers_amx"
+ERRORS = {"layers": 1e-5, "layers_amx": 1e-4}
+"""Kernels, and how far their values may be from those of float64; by AMX products have 16 bits."""
 
-@pytest.fixture(autouse=True)
-def kernel_anywhere(monkeypatch):
-    """It is right on every processor, and only used where it is fast."""
-    monkeypatch.setattr(packed_layers, "has_wide_vectors", lambda: True)
+
+@pytest.fixture(
+    params=["layers", pytest.param("layers_amx", marks=pytest.mark.skipif(not HAS_AMX, reason="needs AMX"))],
+    autouse=True,
+)
+def module(request, monkeypatch):
+    """Each kernel; that of AVX-512 is right on every processor, and only used where it is fast."""
+    monkeypatch.setattr(packed_layers, "layers_module", lambda: request.param)
+    return request.param
 
 
 def layers_of(depth, width, inputs, skip, seed=0):
@@ -42,13 +50,14 @@ def by_pytorch(layers, given, skip):
 
 @pytest.mark.parametrize(("depth", "width", "inputs"), [(1, 64, 7), (2, 128, 1), (4, 128, 130), (5, 192, 33)])
 @pytest.mark.parametrize("count", [0, 1, 59, 61, 500])
-def test_values_are_those_of_pytorch(depth, width, inputs, count):
+def test_values_are_those_of_pytorch(module, depth, width, inputs, count):
     skip = depth // 2
     layers = layers_of(depth, width, inputs, skip)
     given = torch.randn(count, inputs, generator=torch.Generator().manual_seed(1))
     expected = by_pytorch([(weight.double(), bias.double()) for weight, bias in layers], given.double(), skip)
     found = PackedLayers.of(layers, skip)(given)
-    torch.testing.assert_close(found, expected.float(), rtol=1e-5, atol=1e-5)
+    error = ERRORS[module]
+    torch.testing.assert_close(found, expected.float(), rtol=error, atol=error)
     assert not count or (found > 0).any()
 
 
@@ -76,7 +85,7 @@ def test_nan_of_a_point_stays_with_it():
 
 @pytest.mark.parametrize(
     ("width", "dtype"),
-    [(63, torch.float32), (96, torch.float32), (WIDEST + 64, torch.float32), (64, torch.float64)],
+    [(63, torch.float32), (80, torch.float32), (WIDEST + 64, torch.float32), (64, torch.float64)],
 )
 def test_other_widths_and_precisions_are_left_to_pytorch(width, dtype):
     layers = [(weight.to(dtype), bias.to(dtype)) for weight, bias in layers_of(2, width, 5, 1)]
@@ -93,16 +102,32 @@ def test_shapes_that_do_not_go_together_are_left_to_pytorch():
     assert not any(map(packed.takes, (torch.zeros(2, 6), torch.zeros(5), torch.zeros(2, 5, dtype=torch.float64))))
 
 
-@pytest.mark.parametrize(("found", "features"), [(None, {}), (1, {}), (1, {"avx512f": False}), (1, {"avx512f": True})])
-def test_the_kernel_is_used_where_there_are_a_compiler_and_wide_vectors(monkeypatch, found, features):
+AMX = {"avx512f": True, "avx512bf16": True, "amx-bf16": True}
+
+
+@pytest.mark.parametrize(
+    ("found", "features", "allowed", "expected"),
+    [
+        (None, AMX, True, None),
+        (1, {}, True, None),
+        (1, {"avx512f": False}, True, None),
+        (1, {"avx512f": True}, True, "layers"),
+        (1, AMX, True, "layers_amx"),
+        (1, AMX, False, "layers"),
+    ],
+)
+def test_the_kernel_is_that_of_the_processor(monkeypatch, found, features, allowed, expected):
     import llvmlite.binding
 
     monkeypatch.setattr(compiling, "find_spec", lambda name: found)
     monkeypatch.setattr(llvmlite.binding, "get_host_cpu_features", lambda: features)
-    expected = bool(found and features.get("avx512f"))
-    assert compiling.has_wide_vectors.__wrapped__() is expected
-    monkeypatch.setattr(packed_layers, "has_wide_vectors", compiling.has_wide_vectors.__wrapped__)
-    assert (PackedLayers.of(layers_of(2, 64, 5, 1), 1) is not None) is expected
+    monkeypatch.setattr(layers_amx, "allow_tiles", lambda: allowed)
+    assert compiling.layers_module.__wrapped__() == expected
+
+
+def test_without_a_kernel_layers_are_left_to_pytorch(monkeypatch):
+    monkeypatch.setattr(packed_layers, "layers_module", lambda: None)
+    assert PackedLayers.of(layers_of(2, 64, 5, 1), 1) is None
 
 
 def field_of(config):
@@ -125,8 +150,8 @@ CONFIG = TargetConfig(depth=4, width=64, planes=3, point_frequencies=2, directio
 POINTS = torch.rand(20, 3, generator=torch.Generator().manual_seed(1)) - 0.5
 
 
-def test_a_field_has_the_same_values_with_gradients_and_without(used):
-    """With gradients PyTorch multiplies; the same numbers in another order."""
+def test_a_field_has_the_same_values_with_gradients_and_without(module, used):
+    """With gradients PyTorch multiplies: the same numbers in another order."""
     field, directions = field_of(CONFIG), torch.nn.functional.normalize(POINTS, dim=1)
     learned = field(POINTS, directions)
     learned[0].sum().backward()
@@ -136,7 +161,7 @@ def test_a_field_has_the_same_values_with_gradients_and_without(used):
         found = field(POINTS, directions)
     assert used == [20]
     for one, other in zip(found, learned, strict=True):
-        torch.testing.assert_close(one, other)
+        torch.testing.assert_close(one, other, rtol=ERRORS[module], atol=ERRORS[module])
 
 
 def test_gradients_of_points_go_through_frozen_layers(used):
@@ -192,7 +217,7 @@ def test_the_result_has_the_precision_of_the_inputs_whatever_the_default():
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # by forward_ad
 @torch.no_grad()
-def test_transforms_traces_and_autocast_go_through_pytorch(used, monkeypatch):
+def test_transforms_traces_and_autocast_go_through_pytorch(module, used, monkeypatch):
     field = field_of(CONFIG)
     given = field.target.inputs(POINTS, field.planes, field.bounds)
     by_rows = torch.func.vmap(lambda row: field.trunk(row[None])[0])(given)
@@ -208,6 +233,7 @@ def test_transforms_traces_and_autocast_go_through_pytorch(used, monkeypatch):
         tangent = forward_ad.unpack_dual(type(field)(field.target, moved, field.planes, field.bounds).trunk(given))[1]
     assert not used
     assert tangent.abs().max() > 0
-    torch.testing.assert_close(by_rows, field.trunk(given))
-    torch.testing.assert_close(traced, field.trunk(given))
+    error = ERRORS[module]
+    torch.testing.assert_close(by_rows, field.trunk(given), rtol=error, atol=error)
+    torch.testing.assert_close(traced, field.trunk(given), rtol=error, atol=error)
     assert used == [20, 20]

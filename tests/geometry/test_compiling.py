@@ -46,7 +46,8 @@ def test_setup_compiles_every_kernel_without_gradients():
     from hyperplanes.geometry.kernels.__main__ import RENDERING
     from hyperplanes.geometry.kernels.compiling import _SIGNATURES
 
-    assert set(RENDERING) == {name for name in _SIGNATURES if "backward" not in name}
+    layers = {"layers.layers", "layers_amx.layers"}  # of which it compiles that of the processor
+    assert set(RENDERING) == {name for name in _SIGNATURES if "backward" not in name} - layers
 
 
 def test_threads_that_ask_at_once_compile_once_and_into_the_folder(tmp_path, monkeypatch):

@@ -33,7 +33,9 @@ from hyperplanes.utilities.metrics import psnr
 from tests.reference_rendering import Balls, awaken, small_model
 from tests.training.test_volume_loss import MODEL
 
-FAST = TrainingConfig(steps=6, tasks=2, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
+FAST = TrainingConfig(
+    steps=6, tasks=2, rays=32, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3, precision="single"
+)
 
 
 def with_(config=FAST, **changes):
@@ -112,6 +114,49 @@ def test_gradients_object_by_object_are_those_of_one_loss_of_all(make, training)
         assert loss == pytest.approx(float(expected.detach()))
         for name, value in model.named_parameters():
             torch.testing.assert_close(gradients[name], value.grad)
+
+
+def test_bfloat16_moves_updates_and_gradients_little_and_keeps_their_precision():
+    found = {}
+    for precision in ("single", "bfloat16"):
+        torch.manual_seed(0)
+        trainer = Trainer(awaken(HyperPlanes(MODEL)), Balls(), with_(precision=precision))
+        trainer.model.train()
+        trainer.objective.gradients(trainer.loader.batch(0))
+        gradients = {name: value.grad for name, value in trainer.model.named_parameters() if value.grad is not None}
+        found[precision] = [value for update in trainer.objective.updates for value in update.values()], gradients
+    for single, half in zip(*(updates for updates, _ in found.values()), strict=True):
+        assert half.dtype == torch.float32
+        assert 0 < (half - single).norm() < 0.02 * single.norm()
+    single, half = (torch.cat([value.flatten() for value in each.values()]) for _, each in found.values())
+    assert half.dtype == torch.float32
+    assert 0 < (half - single).norm() < 0.05 * single.norm()
+
+
+@pytest.mark.parametrize(
+    ("precision", "amx", "volumes", "expected"),
+    [
+        ("automatic", True, True, True),
+        ("automatic", True, False, False),
+        ("automatic", False, True, False),
+        ("single", True, True, False),
+        ("bfloat16", False, False, True),
+    ],
+)
+def test_bfloat16_is_taken_where_it_is_fast_and_exact_enough_or_asked_for(
+    monkeypatch, precision, amx, volumes, expected
+):
+    monkeypatch.setattr(objective, "has_amx", lambda: amx)
+    model, asked = HyperPlanes(MODEL) if volumes else small_model(), []
+    trainer, updates = Trainer(model, Balls(), with_(precision=precision)), model.updates
+    model.updates = lambda *given, **named: asked.append(named) or updates(*given, **named)
+    trainer.take_step()
+    assert asked == [{"mixed_precision": expected}]
+
+
+def test_an_unknown_precision_is_refused():
+    with pytest.raises(ValueError, match="precision: expected one of automatic, single, bfloat16, got 'half'"):
+        with_(precision="half")
 
 
 @pytest.mark.parametrize("safe", [True, False])
@@ -389,7 +434,7 @@ def test_epochs_are_steps_in_which_every_object_is_drawn_so_often():
 def test_norms_are_those_of_gradients_and_updates():
     model, made = awaken(small_model()), []
     updates = model.updates
-    model.updates = lambda *given: made.extend(updates(*given)) or list(made)
+    model.updates = lambda *given, **named: made.extend(updates(*given, **named)) or list(made)
     trainer = Trainer(model, Balls(), with_(tasks=2))
     trainer.take_step()
     found = trainer.norms()

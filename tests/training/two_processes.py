@@ -71,7 +71,7 @@ OPTIONS = """
     --model.network.depth 2 --model.network.width 24 --model.network.planes 4 --model.network.point-frequencies 3
     --model.hypernetwork.views 2 --model.hypernetwork.code 8 --model.hypernetwork.width 16 --model.hypernetwork.depth 2
     --model.sampling.steps 24 --model.hull-resolution 16 --training.tasks 2 --training.rays 16 --training.warmup 0
-    --training.evaluate-every 2 --training.checkpoint-every 2 --training.held-out 1
+    --training.evaluate-every 2 --training.checkpoint-every 2 --training.held-out 1 --training.precision single
 """.split()
 
 

@@ -60,6 +60,7 @@ def other(value):
         "matched": "file",
         "mv_meta": "maml",
         "nerf": "multiplane",
+        "automatic": "single",
     }
     if isinstance(value, bool):
         return json.dumps(not value)

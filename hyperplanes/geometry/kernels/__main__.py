@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from hyperplanes.geometry.kernels.compiling import compile_kernel, has_wide_vectors
+from hyperplanes.geometry.kernels.compiling import compile_kernel, layers_module
 
 __all__ = ["RENDERING"]
 
@@ -16,11 +16,11 @@ RENDERING = {
     "hull_hits.hull_hits": "",
     "marching.march": "",
     "first_hits.first_hits": "",
-    "layers.layers": "",
 }
 """Names of kernels, and what they take as points."""
 
 if __name__ == "__main__":
     for name, points in RENDERING.items():
-        if name != "layers.layers" or has_wide_vectors():  # which is used there alone
-            compile_kernel(name, torch.float32, points)
+        compile_kernel(name, torch.float32, points)
+    if module := layers_module():
+        compile_kernel(f"{module}.layers", torch.float32)

@@ -22,7 +22,7 @@ import torch
 
 from hyperplanes.utilities.environment import cache_folder
 
-__all__ = ["FASTMATH", "compile_function", "compile_kernel", "has_wide_vectors"]
+__all__ = ["FASTMATH", "compile_function", "compile_kernel", "layers_module"]
 
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}  # all flags but those that assume neither NaN nor infinity
 
@@ -57,21 +57,32 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
     "first_hits.first_hits": (
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T, uint8[:, :, ::1], T[::1], int64, int64"
     ),
-    "layers.layers": "T[:, ::1], T[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
+    "layers.layers": "T[:, :], T[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
+    "layers_amx.layers": "T[:, :], int16[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
 }
 
 
 @functools.cache
-def has_wide_vectors() -> bool:
-    """Whether there are numba and AVX-512: where a kernel of our own multiplies matrices faster than PyTorch."""
+def layers_module() -> str | None:
+    """The module of this folder whose kernel multiplies layers faster than PyTorch does on this processor.
+
+    Returns:
+        "layers_amx" or "layers", for AMX and AVX-512; None without these or numba.
+    """
     if not find_spec("numba"):
-        return False
+        return None
     from llvmlite.binding import get_host_cpu_features
 
     try:
-        return bool(get_host_cpu_features().get("avx512f"))
+        features = get_host_cpu_features()
     except RuntimeError:  # a processor that LLVM does not know
-        return False
+        return None
+    if features.get("amx-bf16") and features.get("avx512bf16"):
+        from hyperplanes.geometry.kernels.layers_amx import allow_tiles
+
+        if allow_tiles():
+            return "layers_amx"
+    return "layers" if features.get("avx512f") else None
 
 
 @functools.cache

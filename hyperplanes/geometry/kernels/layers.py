@@ -16,7 +16,9 @@ from numba import types
 from numba.extending import intrinsic
 from torch import Tensor
 
-__all__ = ["COLUMNS", "layers", "pack_weights"]
+from hyperplanes.geometry.kernels.blocks import inlined
+
+__all__ = ["COLUMNS", "copy_block", "layers", "pack_weights"]
 
 TILE, LANES, VECTORS = 6, 16, 4  # 24 of the 32 registers of AVX-512 hold sums, four weights
 COLUMNS = LANES * VECTORS
@@ -25,11 +27,12 @@ BLOCK = 10 * TILE
 _FUSED = {"flags": ("contract",)}
 
 
-def pack_weights(weight: Float[Tensor, "output input"]) -> Float[Tensor, " number"]:
+def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Float[Tensor, " number"]:
     """The weights of a layer in the order in which the kernel reads them.
 
     Args:
         weight: with a multiple of COLUMNS outputs.
+        first: how many of the inputs come first, which makes no difference here.
     """
     return weight.unflatten(0, (-1, COLUMNS)).transpose(1, 2).flatten()
 
@@ -119,6 +122,20 @@ def _tile(  # noqa: PLR0913
     ), generate
 
 
+@inlined
+@no_type_check
+def copy_block(given, first, count, block, size):
+    """Numbers of the points from `first` on, `size` apart in `block`; in the order in which they lie in memory."""
+    if given.strides[0] > given.strides[1]:
+        for point in range(count):
+            for number in range(given.shape[1]):
+                block[point * size + number] = given[first + point, number]
+    else:
+        for number in range(given.shape[1]):
+            for point in range(count):
+                block[point * size + number] = given[first + point, number]
+
+
 @no_type_check
 def layers(given, weights, biases, shape, out, start, stop):
     """The values of points start..stop after all layers, into `out`.
@@ -133,9 +150,7 @@ def layers(given, weights, biases, shape, out, start, stop):
     one, other = np.zeros(BLOCK * width, np.float32), np.zeros(BLOCK * width, np.float32)
     for first in range(start, stop, BLOCK):
         count = min(BLOCK, stop - first)
-        for point in range(count):
-            for number in range(size):
-                inputs[point * size + number] = given[first + point, number]
+        copy_block(given, first, count, inputs, size)
         read = 0
         for layer in range(depth):
             one, other = other, one  # `one` is written, `other` read

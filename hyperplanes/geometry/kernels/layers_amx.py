@@ -1,0 +1,269 @@
+"""The kernel of `layers` for Intel's AMX, whose instructions multiply tiles of 16 rows in bfloat16.
+
+A number of single precision is the sum of two of bfloat16, but for 2**-17 of it. Of the four products of two such sums
+the three largest are added up, in single precision: values differ from those of single precision by some 1e-5 of the
+largest terms, and take a third of the products' time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from typing import no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int16
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from torch import Tensor
+from torch.nn.functional import pad
+
+from hyperplanes.geometry.kernels.layers import copy_block
+
+__all__ = ["COLUMNS", "allow_tiles", "layers", "pack_weights"]
+
+ROWS = 16  # of a tile, which are vectors of as many numbers of single precision
+TILE = COLUMNS = 2 * ROWS  # points and columns of four tiles, and inputs of one product
+BLOCK = 5 * TILE  # points that go through all layers together
+
+_BYTE, _LONG = ir.IntType(8), ir.IntType(64)
+_POINTER = _BYTE.as_pointer()
+
+
+def allow_tiles() -> bool:
+    """Whether the system lets this process, and all its threads, use the tile registers: Linux wants to be asked."""
+    if not sys.platform.startswith("linux"):
+        return False
+    arch_prctl, request, tile_data = 158, 0x1023, 18  # ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
+    return ctypes.CDLL(None).syscall(arch_prctl, request, tile_data) == 0
+
+
+def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Int16[Tensor, " number"]:
+    """The weights of a layer in the order in which the kernel reads them.
+
+    Args:
+        weight: with a multiple of TILE outputs.
+        first: how many of the inputs come first, and are filled up with zeros to a multiple of TILE; as many as are
+            left have to be one.
+    """
+    filled = torch.cat([pad(weight[:, :first], (0, -first % TILE)), weight[:, first:]], 1)
+    # blocks of TILE columns, two tiles of columns, and of their inputs pairs side by side
+    tiles = filled.reshape(len(weight) // TILE, 2, ROWS, -1, ROWS, 2).permute(0, 3, 1, 4, 2, 5)
+    high = tiles.bfloat16()
+    return torch.stack([high, (tiles - high).bfloat16()], 2).flatten().view(torch.int16)
+
+
+class _BFloat(ir.Type):
+    """The type bfloat of LLVM, which llvmlite does not know."""
+
+    def _to_string(self):
+        return "bfloat"
+
+
+def _call(builder, name, *arguments):
+    """An instruction on tile registers: those are given by number."""
+    numbers = [ir.Constant(_BYTE, each) if isinstance(each, int) else each for each in arguments]
+    kind = ir.FunctionType(ir.VoidType(), [each.type for each in numbers])
+    builder.call(builder.module.declare_intrinsic(f"llvm.x86.{name}", (), kind), numbers)
+
+
+def _address(context, builder, kind, array, offset=None):
+    """Of an element of an array, as bytes."""
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(data if offset is None else builder.gep(data, [offset]), _POINTER)
+
+
+@intrinsic
+def _configure(typing_context, shapes):
+    """Take the tile registers into use, with the shapes that the processor's manual describes."""
+
+    def generate(context, builder, signature, arguments):
+        _call(builder, "ldtilecfg", _address(context, builder, signature.args[0], arguments[0]))
+        return context.get_dummy_value()
+
+    return types.void(shapes), generate
+
+
+@intrinsic
+def _release(typing_context):
+    """Give the tile registers back."""
+
+    def generate(context, builder, signature, arguments):
+        _call(builder, "tilerelease")
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@intrinsic
+def _begin(typing_context, biases, bias):
+    """TILE points by TILE columns, tiles 0 to 3, become the biases of these columns."""
+
+    def generate(context, builder, signature, arguments):
+        address = _address(context, builder, signature.args[0], *arguments)
+        for tile in range(4):
+            column = builder.gep(address, [_LONG(tile % 2 * ROWS * 4)])
+            _call(builder, "tileloadd64", tile, column, _LONG(0))  # every row the same
+        return context.get_dummy_value()
+
+    return types.void(biases, types.int64), generate
+
+
+@intrinsic
+def _multiply(typing_context, values, at, size, weights, first):
+    """Add the products of TILE points, from TILE inputs on, with weights.
+
+    The high halves of a point lie from `at` on, the low ones `size` further, and the next point after 2 * `size`.
+    """
+
+    def generate(context, builder, signature, arguments):
+        size = arguments[2]
+        address = _address(context, builder, signature.args[0], *arguments[:2])
+        weights = _address(context, builder, signature.args[3], *arguments[3:])
+        pitch, low = builder.mul(size, _LONG(4)), builder.mul(size, _LONG(2))
+
+        def load_values(start):
+            for tile in range(2):
+                rows = builder.mul(pitch, _LONG(tile * ROWS))
+                _call(builder, "tileloadd64", 4 + tile, builder.gep(start, [rows]), pitch)
+
+        def load_weights(half):
+            for tile in range(2):
+                place = builder.gep(weights, [_LONG((2 * half + tile) * 1024)])
+                _call(builder, "tileloadd64", 6 + tile, place, _LONG(64))
+
+        def add():
+            for tile in range(4):
+                _call(builder, "tdpbf16ps", tile, 4 + tile // 2, 6 + tile % 2)
+
+        load_values(address)
+        load_weights(1)
+        add()
+        load_weights(0)
+        add()
+        load_values(builder.gep(address, [low]))
+        add()
+        return context.get_dummy_value()
+
+    index = types.int64
+    return types.void(values, index, index, weights, index), generate
+
+
+@intrinsic
+def _end(typing_context, sums):
+    """Write tiles 0 to 3 as TILE rows of TILE."""
+
+    def generate(context, builder, signature, arguments):
+        address = _address(context, builder, signature.args[0], arguments[0])
+        for tile in range(4):
+            place = tile // 2 * ROWS * TILE + tile % 2 * ROWS
+            _call(builder, "tilestored64", tile, builder.gep(address, [_LONG(place * 4)]), _LONG(TILE * 4))
+        return context.get_dummy_value()
+
+    return types.void(sums), generate
+
+
+def _numbers(context, builder, kind, array, at, least):
+    """A vector of numbers of an array from `at` on, or `least` where that is more; NaN stays."""
+    floats = ir.VectorType(ir.FloatType(), ROWS)
+    address = _address(context, builder, kind, array, at)
+    value = builder.load(builder.bitcast(address, floats.as_pointer()), align=4)
+    if least is None:
+        return value
+    least = ir.Constant(floats, [least] * ROWS)
+    return builder.select(builder.fcmp_ordered("<=", value, least), least, value)
+
+
+def _write(context, builder, kind, array, at, value):
+    address = _address(context, builder, kind, array, at)
+    builder.store(value, builder.bitcast(address, value.type.as_pointer()), align=2)
+
+
+def _halving(least):
+    @intrinsic
+    def halve(typing_context, numbers, at, halves, high, low):
+        """A vector of numbers from `at` on, not below `least`, as bfloat16 from `high` and from `low` on."""
+
+        def generate(context, builder, signature, arguments):
+            value = _numbers(context, builder, signature.args[0], arguments[0], arguments[1], least)
+            narrow, wide = (ir.VectorType(ir.IntType(bits), ROWS) for bits in (16, 32))
+            brain = ir.VectorType(_BFloat(), ROWS)
+            upper = builder.bitcast(builder.fptrunc(value, brain), narrow)
+            _write(context, builder, signature.args[2], arguments[2], arguments[3], upper)
+            again = builder.shl(builder.zext(upper, wide), ir.Constant(wide, [16] * ROWS))
+            rest = builder.fsub(value, builder.bitcast(again, value.type))
+            rest = builder.bitcast(builder.fptrunc(rest, brain), narrow)
+            _write(context, builder, signature.args[2], arguments[2], arguments[4], rest)
+            return context.get_dummy_value()
+
+        index = types.int64
+        return types.void(numbers, index, halves, index, index), generate
+
+    return halve
+
+
+_halve, _halve_activated = _halving(None), _halving(0.0)
+
+
+@intrinsic
+def _activate(typing_context, numbers, at, out, place):
+    """A vector of numbers from `at` on, after ReLU, into `out` from `place` on."""
+
+    def generate(context, builder, signature, arguments):
+        value = _numbers(context, builder, signature.args[0], arguments[0], arguments[1], 0.0)
+        _write(context, builder, signature.args[2], arguments[2], arguments[3], value)
+        return context.get_dummy_value()
+
+    return types.void(numbers, types.int64, out, types.int64), generate
+
+
+@no_type_check
+def layers(given, weights, biases, shape, out, start, stop):
+    """The values of points start..stop after all layers, into `out`; arguments as those of the kernel in `layers`.
+
+    `weights` are those of all layers as `pack_weights` makes them.
+    """
+    depth, width, skip = shape
+    size = (given.shape[1] + TILE - 1) // TILE * TILE
+    inputs = np.zeros(BLOCK * 2 * size, np.int16)
+    one, other = np.zeros(BLOCK * 2 * width, np.int16), np.zeros(BLOCK * 2 * width, np.int16)
+    values, sums = np.zeros(BLOCK * size, np.float32), np.zeros(TILE * TILE, np.float32)
+    shapes = np.zeros(64, np.uint8)
+    shapes[0] = 1
+    for tile in range(8):
+        shapes[16 + 2 * tile] = 4 * ROWS  # bytes of a row
+        shapes[48 + tile] = ROWS
+    _configure(shapes)
+    for first in range(start, stop, BLOCK):
+        count = min(BLOCK, stop - first)
+        copy_block(given, first, count, values, size)
+        for number in range(0, count * size, ROWS):
+            at = number + number // size * size  # after the low halves of the points before
+            _halve(values, number, inputs, at, at + size)
+        read = 0
+        for layer in range(depth):
+            one, other = other, one  # `one` is written, `other` read
+            used, also = size if layer == 0 or layer == skip else 0, width if layer > 0 else 0
+            for column in range(0, width, TILE):
+                for point in range(0, count, TILE):
+                    _begin(biases, layer * width + column)
+                    place = read
+                    for number in range(0, used, TILE):
+                        _multiply(inputs, 2 * point * size + number, size, weights, place)
+                        place += 2 * TILE * TILE
+                    for number in range(0, also, TILE):
+                        _multiply(other, 2 * point * width + number, width, weights, place)
+                        place += 2 * TILE * TILE
+                    _end(sums)
+                    for line in range(min(TILE, count - point)):
+                        for number in range(0, TILE, ROWS):
+                            at = line * TILE + number
+                            if layer < depth - 1:
+                                place = 2 * (point + line) * width + column + number
+                                _halve_activated(sums, at, one, place, place + width)
+                            else:
+                                _activate(sums, at, out, (first + point + line) * width + column + number)
+                read += 2 * TILE * (used + also)
+    _release()
