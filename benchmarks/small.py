@@ -21,7 +21,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks._timing import timed
+from benchmarks._timing import timed, without
 from benchmarks.objects import held_out
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
@@ -79,7 +79,7 @@ def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
     for view in views:
         one = camera.select(task.query.cameras, [view])
         time, pictures = timed(lambda one=one: adapted.render(one))
-        with _without(PackedLayers, "takes"):
+        with without(PackedLayers, "takes"):
             multiplied.append(timed(lambda one=one: adapted.render(one))[0])
         with _plainly():
             plain_time, plain = timed(lambda one=one: _unsplit(adapted, voxels).render(one, every))
@@ -119,16 +119,5 @@ def _unsplit(adapted: AdaptedField, voxels: RefinedOccupancy) -> AdaptedField:
 @contextmanager
 def _plainly() -> Generator[None]:
     """While it lasts, no kernel describes points to the network, and none multiplies its layers."""
-    with _without(VisibilityPlanes, "can_describe"), _without(PackedLayers, "takes"):
+    with without(VisibilityPlanes, "can_describe"), without(PackedLayers, "takes"):
         yield
-
-
-@contextmanager
-def _without(owner: type, check: str) -> Generator[None]:
-    """While it lasts, the check of what a kernel takes is false."""
-    before = getattr(owner, check)
-    setattr(owner, check, lambda *_: False)
-    try:
-        yield
-    finally:
-        setattr(owner, check, before)

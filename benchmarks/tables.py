@@ -162,12 +162,14 @@ def _rendering(result: Result) -> str:
         baked = None if size[1] else named.get(f"baked, {size[2]}")
         over = f"{row['speedup']:.0f} ({row['speedup_lowest']:.0f} to {row['speedup_highest']:.0f})"
         adapting = _seconds(row["adapt_seconds"] + row["refine_seconds"])
-        times = [_seconds(row["reference_seconds"]), _seconds(row["seconds"]), over]
+        times = [_seconds(row[name]) for name in ("plain_seconds", "reference_seconds", "seconds")]
         last = [_seconds(baked["seconds"]), f"{baked['psnr_loss']:.2f} dB"] if baked else ["-", "-"]
         other = f", commit {row['commit']}" if "commit" in row else ""
         how = f", {size[1]}" if size[1] else ""
-        lines.append([f"{size[2]}{how}{other}", *times, f"{row['psnr_loss']:.2f} dB", adapting, *last])
-    headings = ["`paper`", "`ray_marching`", "ratio", "PSNR lost", "adapting and refining", "baked"]
+        ratios = [f"{row['speedup_over_plain']:.0f}", over]
+        lines.append([f"{size[2]}{how}{other}", *times, *ratios, f"{row['psnr_loss']:.2f} dB", adapting, *last])
+    headings = ["`paper` by PyTorch", "`paper`", "`ray_marching`", "ratio to PyTorch", "ratio", "PSNR lost"]
+    headings += ["adapting and refining", "baked"]
     return markdown_table(["one view", *headings, "PSNR lost by baking"], lines)
 
 
