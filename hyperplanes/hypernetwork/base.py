@@ -35,7 +35,7 @@ class HyperNetwork(nn.Module):
     """H(observed, theta; delta) -> one tensor for each named parameter that is updated (HyperPlanes, Eq. 7).
 
     Attributes:
-        reads_volume: it reads `Observed.volume`, and otherwise images with their directions.
+        reads_volume: it reads `Observed.volume`, each object alone, and otherwise images with their directions.
         views: k, how many images it reads of an object.
         choice: which of the planes they are: the "farthest" apart, or the "first".
         resolution: pixels a side that it wants images to have; 0 takes them as they are.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
@@ -14,6 +15,7 @@ from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.training import TrainingConfig
+from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.episodes import Batch
 from hyperplanes.training.forward import forward
@@ -73,11 +75,11 @@ class RenderingObjective(Objective):
 
     def gradients(self, batch: Batch) -> float:
         """Backpropagate the mean over the rendered objects of the sum of the losses."""
-        # the HyperPlanes of all objects in one batch, which batch statistics are taken over (Eq. 7)
+        # the updates of all objects (Eq. 7)
+        groups = self._groups([each.episode.prepared for each in (*batch.rendered, *batch.reference)])
         with record_function("step:update"):
-            read = [each.episode.prepared for each in (*batch.rendered, *batch.reference)]
-            updates = self.model.updates(read, mixed_precision=self.mixed_precision)
-        self.updates = [update.detach() for update in updates]
+            written = list(parallel_map(self._write, groups))
+        self.updates = [update.detach() for group in written for update in group]
         weights = [value for value in self.model.parameters() if value.requires_grad]
         leaves = [Parameters((name, value.requires_grad_()) for name, value in each.items()) for each in self.updates]
         thread_safe = self.model.field(batch.rendered[0].episode.prepared, self.model.theta).thread_safe
@@ -92,14 +94,42 @@ class RenderingObjective(Objective):
         of_weights, of_updates = found[: len(weights)], found[len(weights) :]
         for value, gradient in zip(weights, of_weights, strict=True):
             value.grad = gradient
-        # and from all updates, if a hypernetwork wrote any, through it
-        written = zip((value for update in updates for value in update.values()), of_updates, strict=True)
-        ends = [(value, gradient) for value, gradient in written if gradient is not None]
-        if ends:
-            with record_function("step:gradients"):
-                torch.autograd.backward([value for value, _ in ends], [gradient for _, gradient in ends])
+        # and from the updates, if a hypernetwork wrote any, through it
+        gradients = iter(of_updates)
+        ends = [[(value, next(gradients)) for update in group for value in update.values()] for group in written]
+
+        def written_loss(part: int) -> Tensor:
+            """Of a group, with the gradients of the loss at its updates."""
+            products = [(value * gradient).sum() for value, gradient in ends[part] if gradient is not None]
+            return torch.stack(products).sum()
+
+        if any(ends):
+            _, of_network = summed_gradients(written_loss, len(groups), weights)
+            for value, gradient in zip(weights, of_network, strict=True):
+                value.grad = _sum(value.grad, gradient)
         return float(total)
+
+    def _groups(self, objects: list[SupportContext]) -> list[list[SupportContext]]:
+        """The objects that go through the hypernetwork together: all of them, since it may compare them.
+
+        One that reads volumes reads each alone. There every thread has a group, of two at least: single volumes take
+        three times as long to convolve.
+        """
+        threads, size = torch.get_num_threads(), len(objects)
+        if self.model.reads_volume and self.model.rig.device.type == "cpu" and threads <= size // 2:
+            size = math.ceil(size / threads)
+        return [objects[first : first + size] for first in range(0, len(objects), size)]
+
+    @torch.enable_grad()
+    def _write(self, objects: list[SupportContext]) -> list[Parameters]:
+        """The updates of a group."""
+        return self.model.updates(objects, mixed_precision=self.mixed_precision)
 
     def adapt(self, prepared: SupportContext) -> AdaptedField:
         """The field of a held-out object, in a single step."""
         return self.model.adapt_to(prepared)
+
+
+def _sum(one: Tensor | None, other: Tensor | None) -> Tensor | None:
+    """Of gradients, where there are any."""
+    return other if one is None else one if other is None else one + other

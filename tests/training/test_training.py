@@ -87,7 +87,8 @@ def test_the_loss_falls(parts):
     ids=["hypernetwork", "target alone", "volumes"],
 )
 def test_gradients_object_by_object_are_those_of_one_loss_of_all(make, training):
-    config = with_(tasks=3, empty_points=50, **training)
+    tasks = 4
+    config = with_(tasks=tasks, empty_points=50, **training)
 
     def begun():
         torch.manual_seed(0)  # of what lets the hypernetwork say something
@@ -108,7 +109,7 @@ def test_gradients_object_by_object_are_those_of_one_loss_of_all(make, training)
     model, batch = trainer.model.train(), trainer.loader.batch(0)
     updates = model.updates([each.episode.prepared for each in (*batch.rendered, *batch.reference)])
     outputs = [forward(model, draw, update, config) for draw, update in zip(batch.rendered, updates, strict=False)]
-    expected = torch.stack([each(output) for output in outputs for each in losses_of(config)]).sum() / 3
+    expected = torch.stack([each(output) for output in outputs for each in losses_of(config)]).sum() / tasks
     expected.backward()
     for loss, gradients in found:
         assert loss == pytest.approx(float(expected.detach()))
@@ -177,6 +178,32 @@ def test_objects_have_threads_of_their_own_where_the_field_is_thread_safe(safe, 
         torch.set_num_threads(before)
     here = threading.get_ident()
     assert here not in callers if safe else callers == {here}
+
+
+@pytest.mark.parametrize(
+    ("volumes", "threads", "tasks", "expected"),
+    [
+        (True, 1, 4, [4]),
+        (True, 2, 4, [2, 2]),
+        (True, 2, 5, [3, 2]),
+        (True, 2, 3, [3]),
+        (True, 3, 4, [4]),
+        (False, 2, 4, [4]),
+    ],
+)
+def test_objects_that_are_read_alone_go_through_the_hypernetwork_in_groups_of_two_at_least(
+    volumes, threads, tasks, expected
+):
+    model, sizes = HyperPlanes(MODEL) if volumes else small_model(), []
+    trainer, updates = Trainer(model, Balls(), with_(tasks=tasks)), model.updates
+    model.updates = lambda objects, **named: sizes.append(len(objects)) or updates(objects, **named)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        trainer.take_step()
+    finally:
+        torch.set_num_threads(before)
+    assert sorted(sizes, reverse=True) == expected
 
 
 def test_the_same_seed_makes_the_same_curve_and_the_same_weights():
