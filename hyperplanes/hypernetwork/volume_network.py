@@ -18,7 +18,9 @@ class _Convolution(nn.Conv3d):
 
     The zeros before and behind are put there by hand, the others by the convolution: oneDNN, which PyTorch convolves
     with on CPUs, has a fast gradient of the weights of 3D convolutions only where their depth is not padded. Those of
-    32 channels on four grids of 16 cells an axis take 13 ms in place of 24 (one thread, AVX2).
+    32 channels on four grids of 16 cells an axis take 13 ms in place of 24 (one thread, AVX2). PyTorch convolves a
+    single small volume without oneDNN, which is asked for by name here: 1.2 ms in place of 6.0 for 32 channels on 16
+    cells an axis (one thread, AVX-512).
 
     Args:
         before: channels of the input.
@@ -33,7 +35,16 @@ class _Convolution(nn.Conv3d):
         """The convolution."""
         if torch.is_autocast_enabled("cpu"):  # in bfloat16 both gradients are as fast
             return super().forward(input)
-        return conv3d(pad(input, (0, 0, 0, 0, 1, 1)), self.weight, self.bias, self.stride, (0, 1, 1))
+        padded = pad(input, (0, 0, 0, 0, 1, 1))
+        if len(input) == 1 and _has_onednn(input):
+            return torch.mkldnn_convolution(padded, self.weight, self.bias, (0, 1, 1), self.stride, self.dilation, 1)
+        return conv3d(padded, self.weight, self.bias, self.stride, (0, 1, 1))
+
+
+def _has_onednn(value: Tensor) -> bool:
+    """Whether oneDNN may be asked for by name: in single precision on a CPU, and not while a graph is compiled."""
+    plain = (value.device.type, value.dtype) == ("cpu", torch.float32) and torch.backends.mkldnn.is_available()
+    return plain and not torch.compiler.is_compiling()
 
 
 class _Pointwise(nn.Conv3d):

@@ -112,8 +112,8 @@ class RenderingObjective(Objective):
     def _groups(self, objects: list[SupportContext]) -> list[list[SupportContext]]:
         """The objects that go through the hypernetwork together: all of them, since it may compare them.
 
-        One that reads volumes reads each alone. There every thread has a group, of two at least: single volumes take
-        three times as long to convolve.
+        One that reads volumes reads each alone. There every thread has a group, of two at least: PyTorch's convolutions
+        of single volumes take three times as long.
         """
         threads, size = torch.get_num_threads(), len(objects)
         if self.model.reads_volume and self.model.rig.device.type == "cpu" and threads <= size // 2:
