@@ -132,7 +132,7 @@ def without(owner: type, check: str) -> Generator[None]:
 
     Args:
         owner: the class that uses it.
-        check: its method that says what the kernel takes; it says nothing.
+        check: its method that says whether the kernel takes something; it says no.
     """
     before = getattr(owner, check)
     setattr(owner, check, lambda *_: False)

@@ -25,7 +25,8 @@ def held_out(
     with MeshRenderer() as renderer:
         for seed in range(FIRST_SEED, FIRST_SEED + count):
             mesh = prepare_scene(make(kind, seed), f"{kind}-{seed}")
-            pixels = torch.tensor(renderer.render(mesh_parts(mesh), rig).rgba).permute(0, 3, 1, 2).float() / 255
+            pixels = torch.tensor(renderer.render(mesh_parts(mesh), rig).rgba).permute(0, 3, 1, 2)
+            pixels = pixels.contiguous().float() / 255  # as what is read from files
             masks = pixels[:, 3:]
             seen = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks).to(device)
             even = torch.arange(0, views, 2)

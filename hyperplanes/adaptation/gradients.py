@@ -10,7 +10,7 @@ from torch.profiler import record_function
 
 from hyperplanes.geometry.kernels.threads import parallel_map
 
-__all__ = ["summed_gradients"]
+__all__ = ["sum_present", "summed_gradients"]
 
 
 def summed_gradients(
@@ -45,10 +45,10 @@ def summed_gradients(
 
     run = parallel_map if thread_safe and all(value.device.type == "cpu" for value in variables) else map
     values, gradients = zip(*run(of_part, range(parts)), strict=True)
-    return torch.stack(values).sum(), [_sum(found) for found in zip(*gradients, strict=True)]
+    return torch.stack(values).sum(), [sum_present(found) for found in zip(*gradients, strict=True)]
 
 
-def _sum(gradients: Sequence[Tensor | None]) -> Tensor | None:
-    """The sum of those that there are."""
+def sum_present(gradients: Sequence[Tensor | None]) -> Tensor | None:
+    """The sum of those that there are; None where there is none."""
     found = [each for each in gradients if each is not None]
     return sum(found[1:], found[0]) if found else None

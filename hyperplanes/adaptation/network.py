@@ -136,16 +136,18 @@ class HyperPlanesNetwork(nn.Module):
 
         Args:
             contexts: of the objects.
-            mixed_precision: the hypernetwork's convolutions and matrix products are computed in bfloat16
-                (`torch.autocast`). Its weights and the updates keep their precision.
+            mixed_precision: the convolutions and matrix products of a hypernetwork in single precision are computed
+                in bfloat16 (`torch.autocast`). Its weights and the updates keep their precision.
         """
         if self.hypernetwork is None:
             return [Parameters() for _ in contexts]
         observed = observe(contexts, self.hypernetwork.resolution)
-        with torch.autocast(self.rig.device.type, torch.bfloat16, enabled=mixed_precision):
-            found = self.hypernetwork(observed, self.theta)
-        precision = self.rig.dtype
-        return [Parameters((name, value.to(precision)) for name, value in update.items()) for update in found]
+        if not mixed_precision:
+            return self.hypernetwork(observed, self.theta)
+        theta = self.theta
+        with torch.autocast(self.rig.device.type, torch.bfloat16, cache_enabled=False):  # threads would share the cache
+            found = self.hypernetwork(observed, theta)
+        return [Parameters((name, value.to(theta[name].dtype)) for name, value in update.items()) for update in found]
 
     def field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
         """The field of given weights on the planes of an object (HyperPlanes, Eq. 5)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from typing import NoReturn
 
 import torch
 from jaxtyping import Float, Shaped
@@ -12,15 +13,14 @@ from torch import Tensor
 
 from hyperplanes.geometry.kernels.compiling import compile_kernel, layers_module
 from hyperplanes.geometry.kernels.threads import parallel_for
-from hyperplanes.geometry.lookup_torch import transform_of
+from hyperplanes.utilities.transforms import transform_of
 
 __all__ = ["Layer", "PackedLayers", "wants_values_alone"]
 
 Layer = tuple[Tensor, Tensor]
 """Weights (width, input) and biases (width,)."""
 
-POINTS = 480  # that one call of the kernel works on: eight of its blocks
-WIDEST = 512  # wider layers are as fast by PyTorch
+POINTS = 480  # that one call of a kernel works on: eight blocks of that for AVX-512, three of that for AMX
 
 
 def wants_values_alone(inputs: Tensor, layers: Sequence[Layer]) -> bool:
@@ -46,7 +46,8 @@ class PackedLayers:
 
     Four layers of 128 values take 0.67 to 0.83 of the time of PyTorch's by AVX-512 and 0.36 to 0.50 by AMX, with 64 to
     4,096 points (one thread of an Intel processor, the only one they were measured on). The kernels do not hold the
-    interpreter's lock. By AMX, values differ from those of PyTorch by 1e-5 of the largest.
+    interpreter's lock. By AMX, values differ from those of PyTorch by some 1e-5 to 3e-5 of the largest. What is packed
+    is for this process: it cannot be pickled.
 
     Attributes:
         module: of the kernel (`layers_module`).
@@ -72,7 +73,7 @@ class PackedLayers:
 
         Returns:
             None where no kernel is faster or takes them: without numba, or AVX-512 or AMX, on other devices, in
-            other precisions, with widths above WIDEST or no multiple of its columns, and with shapes that do not go
+            other precisions, with widths above its widest or no multiple of its columns, and with shapes that do not go
             together.
         """
         kinds = {(value.device.type, value.dtype) for layer in layers for value in layer}
@@ -83,12 +84,15 @@ class PackedLayers:
         width, inputs = layers[0][0].shape
         own = [inputs if index in (0, skip) else 0 for index in range(len(layers))]
         shapes = [((width, size + width * (index > 0)), (width,)) for index, size in enumerate(own)]
-        fits = width % kernel.COLUMNS == 0 and width <= WIDEST
+        fits = width % kernel.COLUMNS == 0 and width <= kernel.WIDEST
         if not fits or [(weight.shape, bias.shape) for weight, bias in layers] != shapes:
             return None
         packed = [kernel.pack_weights(weight.detach(), size) for (weight, _), size in zip(layers, own, strict=True)]
         biases = torch.cat([bias.detach() for _, bias in layers])
         return cls(module, torch.cat(packed), biases, (len(layers), width, skip), inputs)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("packed layers: expected to be packed anew in each process, which may have another kernel")
 
     def takes(self, inputs: Tensor) -> bool:
         """Whether the kernel takes these inputs: of single precision, on the CPU, and as many as the first layer reads.

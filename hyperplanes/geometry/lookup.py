@@ -22,6 +22,7 @@ from hyperplanes.geometry.inputs import (
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.packed_images import PackedImages
 from hyperplanes.utilities.arguments import kind_of
+from hyperplanes.utilities.transforms import transform_of
 
 __all__ = ["Backend", "Lookup", "backends", "choose", "lookup", "sample"]
 
@@ -140,7 +141,7 @@ def lookup(
     matrices, images = as_matrices(matrices, len(images)).to(points), images.to(points)
     views = None if views is None else as_indices(views, points)
     name = backend or choose(points, images)
-    if name != "torch" and (unknown := lookup_torch.transform_of(points, matrices, images)):
+    if name != "torch" and (unknown := transform_of(points, matrices, images)):
         if backend is not None:
             raise ValueError(f"backend: {backend} has no {unknown}; use backend='torch'")
         name = "torch"
@@ -204,7 +205,7 @@ def sample(
     images = images.to(coordinates)
     fastest = choose(coordinates, images)
     name = backend or ("cpu" if fastest == "cpu" else "torch")
-    if name == "cpu" and (unknown := lookup_torch.transform_of(images, coordinates)):
+    if name == "cpu" and (unknown := transform_of(images, coordinates)):
         if backend is not None:
             raise ValueError(f"backend: cpu has no {unknown}; use backend='torch'")
         name = "torch"

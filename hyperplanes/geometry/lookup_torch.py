@@ -4,24 +4,14 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 from torch.nn.functional import grid_sample
 
-__all__ = ["BORDER", "MIN_Z", "interpolate", "lookup", "place", "project", "sample", "transform_of"]
+from hyperplanes.utilities.transforms import transform_of
+
+__all__ = ["BORDER", "MIN_Z", "interpolate", "lookup", "place", "project", "sample"]
 
 MIN_Z = 1e-4  # z in the camera's frame, in units of the scene's scale; points below it count as behind the camera
 BORDER = 0.01  # pixels by which a point may miss the centres of the outermost pixels, since projections are rounded
-
-
-def transform_of(*tensors: Tensor) -> str | None:
-    """Which of PyTorch's function transforms these tensors are under: neither kernels nor grid_sample know them."""
-    if torch.compiler.is_compiling():
-        return None
-    if torch._C._are_functorch_transforms_active():
-        return "torch.func transforms"
-    if any(forward_ad.unpack_dual(value).tangent is not None for value in tensors):
-        return "forward-mode derivatives"
-    return None
 
 
 def project(points: Tensor, matrices: Tensor, views: Tensor | None, nearest: float = MIN_Z) -> tuple[Tensor, Tensor]:

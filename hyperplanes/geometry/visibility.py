@@ -34,9 +34,9 @@ from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
-from hyperplanes.geometry.lookup_torch import transform_of
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.transforms import transform_of
 
 __all__ = ["VisibilityPlanes", "fading", "margins"]
 

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
-from hyperplanes.geometry.lookup_torch import transform_of
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples
 from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.transforms import transform_of
 
 __all__ = ["RayMarching", "march"]
 

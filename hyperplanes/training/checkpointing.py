@@ -11,12 +11,37 @@ from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes import EpisodeLoader
 from hyperplanes.training.optimisation import Optimisation
 from hyperplanes.training.state import Curve, check_model, check_whole, load_state, save_state
+from hyperplanes.utilities.checkpoints import read_json
+from hyperplanes.utilities.environment import has_fast_bfloat16
 from hyperplanes.utilities.writing import write_json
 
-__all__ = ["Checkpointing"]
+__all__ = ["Checkpointing", "choose_precision"]
 
 MAY_DIFFER = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every", "keep_last", "memory", "prefetch")
 """Settings that may be others in a training that is resumed."""
+
+OLD_PRECISION = "single"
+"""Of trainings of earlier versions, which do not state it."""
+
+
+def choose_precision(config: TrainingConfig, model: HyperPlanes, folder: Path | None) -> str:
+    """What `config.precision` "automatic" is: what the training in the folder began with, or what is fast and exact.
+
+    Args:
+        config: of the training.
+        model: that is trained.
+        folder: of the training.
+
+    Returns:
+        "single" or "bfloat16".
+    """
+    if config.precision != "automatic":
+        return config.precision
+    if folder is not None and (folder / "training.json").exists():
+        before = read_json(folder / "training.json").get("config")
+        return before.get("precision", OLD_PRECISION) if isinstance(before, dict) else OLD_PRECISION
+    suits = model.reads_volume and model.rig.device.type == "cpu" and has_fast_bfloat16()
+    return "bfloat16" if suits else "single"
 
 
 class Checkpointing:
@@ -58,7 +83,7 @@ class Checkpointing:
         """
         if self.folder is None or not self.resumable:
             return 0, []
-        config, defaults = asdict(self.config), asdict(TrainingConfig())
+        config, defaults = asdict(self.config), asdict(TrainingConfig(precision=OLD_PRECISION))
         optimisers, data = self.optimisation.optimisers, loader.fingerprint
         step, curve = load_state(self.folder, self.model, optimisers, config, MAY_DIFFER, defaults, data)
         if self._writes and not (self.folder / "model.safetensors").exists():

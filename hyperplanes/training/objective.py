@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from torch.profiler import record_function
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.adaptation.gradients import summed_gradients
+from hyperplanes.adaptation.gradients import sum_present, summed_gradients
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry.kernels.threads import parallel_map
@@ -20,7 +20,6 @@ from hyperplanes.parameters import Parameters
 from hyperplanes.training.episodes import Batch
 from hyperplanes.training.forward import forward
 from hyperplanes.training.losses import losses_of
-from hyperplanes.utilities.environment import has_amx
 from hyperplanes.views import Tasks
 
 __all__ = ["Objective", "RenderingObjective"]
@@ -70,8 +69,7 @@ class RenderingObjective(Objective):
     def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
         super().__init__(model, config)
         self.losses = losses_of(config)
-        automatic = model.reads_volume and model.rig.device.type == "cpu" and has_amx()
-        self.mixed_precision = {"automatic": automatic, "single": False, "bfloat16": True}[config.precision]
+        self.mixed_precision = config.precision == "bfloat16"
 
     def gradients(self, batch: Batch) -> float:
         """Backpropagate the mean over the rendered objects of the sum of the losses."""
@@ -94,42 +92,39 @@ class RenderingObjective(Objective):
         of_weights, of_updates = found[: len(weights)], found[len(weights) :]
         for value, gradient in zip(weights, of_weights, strict=True):
             value.grad = gradient
-        # and from the updates, if a hypernetwork wrote any, through it
+        # and from those updates that the losses depend on, if a hypernetwork wrote any, through it
         gradients = iter(of_updates)
         ends = [[(value, next(gradients)) for update in group for value in update.values()] for group in written]
+        ends = [[(value, found) for value, found in group if found is not None] for group in ends]
+        ends = [group for group in ends if group]
 
         def written_loss(part: int) -> Tensor:
-            """Of a group, with the gradients of the loss at its updates."""
-            products = [(value * gradient).sum() for value, gradient in ends[part] if gradient is not None]
-            return torch.stack(products).sum()
+            """Whose gradients are those of the losses at the updates of a group."""
+            return torch.stack([(value * found).sum() for value, found in ends[part]]).sum()
 
-        if any(ends):
-            _, of_network = summed_gradients(written_loss, len(groups), weights)
+        if ends:
+            _, of_network = summed_gradients(written_loss, len(ends), weights)
             for value, gradient in zip(weights, of_network, strict=True):
-                value.grad = _sum(value.grad, gradient)
+                value.grad = sum_present([value.grad, gradient])
         return float(total)
 
     def _groups(self, objects: list[SupportContext]) -> list[list[SupportContext]]:
         """The objects that go through the hypernetwork together: all of them, since it may compare them.
 
-        One that reads volumes reads each alone. There every thread has a group, of two at least: PyTorch's convolutions
-        of single volumes take three times as long.
+        One that reads volumes reads each alone. There every thread has a group, where there are two objects for each:
+        PyTorch's convolutions of single volumes, back and forth, take three times as long.
         """
-        threads, size = torch.get_num_threads(), len(objects)
-        if self.model.reads_volume and self.model.rig.device.type == "cpu" and threads <= size // 2:
-            size = math.ceil(size / threads)
-        return [objects[first : first + size] for first in range(0, len(objects), size)]
+        threads, total = torch.get_num_threads(), len(objects)
+        apart = self.model.reads_volume and self.model.rig.device.type == "cpu" and threads <= total // 2
+        count = threads if apart else 1
+        bounds = [total * group // count for group in range(count + 1)]
+        return [objects[first:last] for first, last in pairwise(bounds)]
 
     @torch.enable_grad()
     def _write(self, objects: list[SupportContext]) -> list[Parameters]:
-        """The updates of a group."""
+        """The updates of a group, with their graph, in whatever thread."""
         return self.model.updates(objects, mixed_precision=self.mixed_precision)
 
     def adapt(self, prepared: SupportContext) -> AdaptedField:
         """The field of a held-out object, in a single step."""
         return self.model.adapt_to(prepared)
-
-
-def _sum(one: Tensor | None, other: Tensor | None) -> Tensor | None:
-    """Of gradients, where there are any."""
-    return other if one is None else one if other is None else one + other

@@ -14,7 +14,7 @@ from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.compatibility import check_training
 from hyperplanes.configuration.training import TrainingConfig
-from hyperplanes.training.checkpointing import Checkpointing
+from hyperplanes.training.checkpointing import Checkpointing, choose_precision
 from hyperplanes.training.distributed import ProcessEnded, Processes, check_shares, other_processes
 from hyperplanes.training.episodes import EpisodeLoader
 from hyperplanes.training.episodes.loader import reference_objects, training_names
@@ -71,7 +71,8 @@ class Trainer:
         self._stopped = False  # what the processes agreed on in the last step
         names = training_names(data)
         check_training(config, model.config)
-        self.config = config = replace(config, steps=config.steps_for(len(names)))
+        precision = choose_precision(config, model, folder)
+        self.config = config = replace(config, steps=config.steps_for(len(names)), precision=precision)
         check_shares(config.tasks, reference_objects(model, config), self.processes.count)
         self.folder = folder if self.processes.first else None
         self.optimisation = Optimisation(model, config)

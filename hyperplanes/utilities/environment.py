@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import os
 import platform
 import subprocess
 import tempfile
 from pathlib import Path
 
-__all__ = ["cache_folder", "environment", "find_commit", "find_processor", "has_amx", "usable_cores"]
+__all__ = [
+    "cache_folder",
+    "environment",
+    "find_commit",
+    "find_processor",
+    "has_amx",
+    "has_fast_bfloat16",
+    "usable_cores",
+]
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = "benchmarks/results"  # of a checkout
@@ -60,12 +70,29 @@ def find_processor() -> str:
     return named[0] if named else platform.processor() or platform.machine()
 
 
+@functools.cache
 def has_amx() -> bool:
-    """Whether the CPU multiplies matrices in bfloat16 (Intel's AMX): some ten times faster than in single precision."""
-    import torch
+    """Whether this process may multiply matrices in bfloat16 by Intel's AMX: the CPU can, and Linux lets it."""
+    try:
+        flags = Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
+    except OSError:  # no Linux
+        return False
+    return {"amx_bf16", "avx512_bf16"} <= set(flags) and _allow_tiles()
 
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # since PyTorch 2.10
-    return bool(capabilities.get("amx_bf16"))
+
+def _allow_tiles() -> bool:
+    """Ask Linux for the tile registers of AMX, for all threads of this process: those that did not ask have none."""
+    arch_prctl, request, tile_data = 158, 0x1023, 18  # ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
+    return ctypes.CDLL(None).syscall(arch_prctl, request, tile_data) == 0
+
+
+def has_fast_bfloat16() -> bool:
+    """Whether PyTorch's convolutions and matrix products are faster in bfloat16 than in single precision on this CPU.
+
+    That is so by AMX alone; `ONEDNN_MAX_CPU_ISA` may keep oneDNN from it.
+    """
+    limit = os.environ.get("ONEDNN_MAX_CPU_ISA", "ALL").upper()
+    return has_amx() and (limit in ("ALL", "DEFAULT") or "AMX" in limit)
 
 
 def usable_cores() -> int:

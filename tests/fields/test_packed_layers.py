@@ -9,14 +9,15 @@ from torch.autograd import forward_ad
 
 from hyperplanes.fields import TARGETS, TargetConfig
 from hyperplanes.fields import layers as packed_layers
-from hyperplanes.fields.layers import WIDEST, PackedLayers
+from hyperplanes.fields.layers import PackedLayers
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.kernels import compiling, layers_amx
+from hyperplanes.geometry.kernels import compiling, layers, layers_amx
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.parameters import Parameters
 from tests.reference_rendering import ring
 
 HAS_AMX = compiling.layers_module() == "layers_amx"
+WIDEST = {"layers": layers.WIDEST, "layers_amx": layers_amx.WIDEST}
 ERRORS = {"layers": 1e-5, "layers_amx": 1e-4}
 """Kernels, and how far their values may be from those of float64; by AMX products have 16 bits."""
 
@@ -75,6 +76,28 @@ def test_neither_the_batch_nor_threads_change_a_bit(threads):
         torch.set_num_threads(before)
 
 
+@pytest.mark.skipif(not HAS_AMX, reason="needs AMX")
+@pytest.mark.parametrize("width", [32, 96, 160])
+def test_amx_takes_widths_that_are_no_multiples_of_64(width, monkeypatch):
+    monkeypatch.setattr(packed_layers, "layers_module", lambda: "layers_amx")
+    layers, given = layers_of(3, width, 35, 1), torch.randn(50, 35, generator=torch.Generator().manual_seed(1))
+    expected = by_pytorch([(weight.double(), bias.double()) for weight, bias in layers], given.double(), 1)
+    torch.testing.assert_close(PackedLayers.of(layers, 1)(given), expected.float(), rtol=1e-4, atol=1e-4)
+
+
+def test_inputs_of_any_layout_are_read():
+    layers = PackedLayers.of(layers_of(3, 64, 5, 1), 1)
+    given = torch.randn(40, 10, generator=torch.Generator().manual_seed(1))
+    for view in (
+        given[:, ::2],
+        given[::3, 2:7],
+        given.T[:5, :].T,
+        given[:1, :5].expand(7, 5),
+        given[:, :1].expand(40, 5),
+    ):
+        assert torch.equal(layers(view), layers(view.contiguous()))
+
+
 def test_nan_of_a_point_stays_with_it():
     given = torch.zeros(9, 5)
     given[3, 2] = torch.nan
@@ -85,9 +108,10 @@ def test_nan_of_a_point_stays_with_it():
 
 @pytest.mark.parametrize(
     ("width", "dtype"),
-    [(63, torch.float32), (80, torch.float32), (WIDEST + 64, torch.float32), (64, torch.float64)],
+    [(63, torch.float32), (80, torch.float32), (None, torch.float32), (64, torch.float64)],
 )
-def test_other_widths_and_precisions_are_left_to_pytorch(width, dtype):
+def test_other_widths_and_precisions_are_left_to_pytorch(module, width, dtype):
+    width = width or WIDEST[module] + 64
     layers = [(weight.to(dtype), bias.to(dtype)) for weight, bias in layers_of(2, width, 5, 1)]
     assert PackedLayers.of(layers, 1) is None
 
@@ -102,27 +126,37 @@ def test_shapes_that_do_not_go_together_are_left_to_pytorch():
     assert not any(map(packed.takes, (torch.zeros(2, 6), torch.zeros(5), torch.zeros(2, 5, dtype=torch.float64))))
 
 
-AMX = {"avx512f": True, "avx512bf16": True, "amx-bf16": True}
-
-
 @pytest.mark.parametrize(
-    ("found", "features", "allowed", "expected"),
+    ("found", "wide", "amx", "compiler", "settings", "expected"),
     [
-        (None, AMX, True, None),
-        (1, {}, True, None),
-        (1, {"avx512f": False}, True, None),
-        (1, {"avx512f": True}, True, "layers"),
-        (1, AMX, True, "layers_amx"),
-        (1, AMX, False, "layers"),
+        (None, True, True, (22, 1, 0), {}, None),
+        (1, False, False, (22, 1, 0), {}, None),
+        (1, True, False, (22, 1, 0), {}, "layers"),
+        (1, True, True, (22, 1, 0), {}, "layers_amx"),
+        (1, True, True, (15, 0, 7), {}, "layers"),  # compiles the kernel, and the process ends at its first call
+        (1, True, True, (22, 1, 0), {"CPU_NAME": "generic"}, "layers"),  # cannot compile it
+        (1, True, True, (22, 1, 0), {"CPU_FEATURES": "+avx2"}, "layers"),
     ],
 )
-def test_the_kernel_is_that_of_the_processor(monkeypatch, found, features, allowed, expected):
+def test_the_kernel_is_that_of_the_processor_and_the_compiler(
+    monkeypatch, found, wide, amx, compiler, settings, expected
+):
     import llvmlite.binding
+    from numba.core import config
 
     monkeypatch.setattr(compiling, "find_spec", lambda name: found)
-    monkeypatch.setattr(llvmlite.binding, "get_host_cpu_features", lambda: features)
-    monkeypatch.setattr(layers_amx, "allow_tiles", lambda: allowed)
+    monkeypatch.setattr(compiling, "has_amx", lambda: amx)
+    monkeypatch.setattr(llvmlite.binding, "get_host_cpu_features", lambda: {"avx512f": wide})
+    monkeypatch.setattr(llvmlite.binding, "llvm_version_info", compiler)
+    for name, value in settings.items():
+        monkeypatch.setattr(config, name, value)
     assert compiling.layers_module.__wrapped__() == expected
+
+
+def test_packed_layers_stay_in_their_process():
+    """Another one may have another kernel, and to Linux has to ask for the registers of AMX itself."""
+    with pytest.raises(TypeError, match="packed layers: expected to be packed anew in each process"):
+        pickle.dumps(PackedLayers.of(layers_of(2, 64, 5, 1), 1))
 
 
 def test_without_a_kernel_layers_are_left_to_pytorch(monkeypatch):

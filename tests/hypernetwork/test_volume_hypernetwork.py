@@ -62,14 +62,30 @@ def test_a_side_that_cannot_be_halved_three_times_is_refused():
         VolumeNetwork(CHANNELS, 12, 4)
 
 
+@pytest.mark.parametrize("count", [1, 2])  # a single volume goes another way
 @pytest.mark.parametrize(("layer", "plain"), [(_Convolution(3, 5, 2), (2, 1)), (_Pointwise(3, 5), (1, 0))])
-def test_convolutions_and_their_gradients_are_those_of_pytorch(layer, plain):
+def test_convolutions_and_their_gradients_are_those_of_pytorch(layer, plain, count):
     stride, padding = plain
-    given = torch.randn(2, 3, 6, 6, 6, generator=torch.Generator().manual_seed(3), requires_grad=True)
+    given = torch.randn(count, 3, 6, 6, 6, generator=torch.Generator().manual_seed(3), requires_grad=True)
     found, expected = layer(given), conv3d(given, layer.weight, layer.bias, stride, padding)
     torch.testing.assert_close(found, expected)
     variables = [given, layer.weight, layer.bias]
     torch.testing.assert_close(*(torch.autograd.grad((2 * each).sin().sum(), variables) for each in (found, expected)))
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # by jvp
+@pytest.mark.filterwarnings("ignore:TF32 acceleration on top of oneDNN:UserWarning")  # by flags
+def test_a_single_volume_is_convolved_under_transforms_in_double_precision_and_without_onednn():
+    layer = _Convolution(3, 5)
+    given = torch.randn(1, 3, 6, 6, 6, generator=torch.Generator().manual_seed(3))
+    expected = conv3d(given, layer.weight, layer.bias, 1, 1)
+    value, tangent = torch.func.jvp(layer, (given,), (given,))
+    torch.testing.assert_close(value, expected)
+    torch.testing.assert_close(tangent, expected - layer.bias[:, None, None, None])
+    torch.testing.assert_close(layer.double()(given.double()).float(), expected)
+    layer.float()
+    with torch.backends.mkldnn.flags(enabled=False):
+        torch.testing.assert_close(layer(given), expected)
 
 
 def test_a_pointwise_convolution_reads_several_inputs_as_if_they_were_one():

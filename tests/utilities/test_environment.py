@@ -4,8 +4,10 @@ import subprocess
 from importlib.metadata import version
 from pathlib import Path
 
+import pytest
+
 from hyperplanes.utilities import environment
-from hyperplanes.utilities.environment import RESULTS, find_commit
+from hyperplanes.utilities.environment import RESULTS, find_commit, has_amx, has_fast_bfloat16
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -35,3 +37,35 @@ def test_changed_code_is_named_and_changed_results_are_not(tmp_path, monkeypatch
     assert find_commit() == commit
     files[0].write_text("2")
     assert find_commit() == git(tmp_path, "describe", "--always", "--dirty") == f"{commit}-dirty"
+
+
+@pytest.mark.parametrize(
+    ("flags", "allowed", "expected"),
+    [
+        ("avx512_bf16 amx_bf16 amx_tile", True, True),
+        ("avx512_bf16 amx_bf16", False, False),
+        ("avx512_bf16", True, False),
+        (None, True, False),
+    ],
+)
+def test_amx_is_what_the_processor_has_and_linux_allows(monkeypatch, flags, allowed, expected):
+    def read_text(path, encoding):
+        if flags is None:
+            raise FileNotFoundError
+        return f"flags : fpu {flags} sse"
+
+    monkeypatch.setattr(Path, "read_text", read_text)
+    monkeypatch.setattr(environment, "_allow_tiles", lambda: allowed)
+    assert has_amx.__wrapped__() is expected
+
+
+@pytest.mark.parametrize(
+    ("limit", "amx", "expected"),
+    [(None, True, True), ("avx512_core_amx", True, True), ("AVX512_CORE_BF16", True, False), (None, False, False)],
+)
+def test_bfloat16_is_fast_where_onednn_may_use_amx(monkeypatch, limit, amx, expected):
+    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
+    if limit:
+        monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", limit)
+    monkeypatch.setattr(environment, "has_amx", lambda: amx)
+    assert has_fast_bfloat16() is expected

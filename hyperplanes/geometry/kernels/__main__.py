@@ -6,7 +6,7 @@ import torch
 
 from hyperplanes.geometry.kernels.compiling import compile_kernel, layers_module
 
-__all__ = ["RENDERING"]
+__all__ = ["RENDERING", "rendering_kernels"]
 
 RENDERING = {
     "described.describe": "",
@@ -17,10 +17,15 @@ RENDERING = {
     "marching.march": "",
     "first_hits.first_hits": "",
 }
-"""Names of kernels, and what they take as points."""
+"""Names of kernels, and what they take as points; those of layers are the processor's."""
+
+
+def rendering_kernels() -> dict[str, str]:
+    """As RENDERING, with the kernel of layers that is used on this processor."""
+    module = layers_module()
+    return {**RENDERING, **({f"{module}.layers": ""} if module else {})}
+
 
 if __name__ == "__main__":
-    for name, points in RENDERING.items():
+    for name, points in rendering_kernels().items():
         compile_kernel(name, torch.float32, points)
-    if module := layers_module():
-        compile_kernel(f"{module}.layers", torch.float32)

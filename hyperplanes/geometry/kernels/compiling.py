@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 
-from hyperplanes.utilities.environment import cache_folder
+from hyperplanes.utilities.environment import cache_folder, has_amx
 
 __all__ = ["FASTMATH", "compile_function", "compile_kernel", "layers_module"]
 
@@ -28,6 +28,9 @@ FASTMATH = {"contract", "reassoc", "arcp", "nsz"}  # all flags but those that as
 
 ROOM = 2**21
 """Bytes that the machine code of all kernels takes, about."""
+
+LLVM_OF_AMX = (20, 0, 0)
+"""The first version that was tried and compiles the kernel of AMX; 15 leaves a call of a function that there is not."""
 
 _STRIDED = "T[::1], UniTuple(int64, 3)"  # a tensor of three dimensions as its memory and strides
 _POINTS = "T[::1], int64, T[:, :, ::1], none, none"  # points, their pitch, matrices
@@ -67,22 +70,21 @@ def layers_module() -> str | None:
     """The module of this folder whose kernel multiplies layers faster than PyTorch does on this processor.
 
     Returns:
-        "layers_amx" or "layers", for AMX and AVX-512; None without these or numba.
+        "layers_amx" or "layers", for AMX and AVX-512; None without these or numba. Compilers before LLVM 20, and numba
+        where the environment says what processor it compiles for, do not know the instructions of AMX.
     """
     if not find_spec("numba"):
         return None
-    from llvmlite.binding import get_host_cpu_features
+    from llvmlite.binding import get_host_cpu_features, llvm_version_info
+    from numba.core import config
 
+    for_this_processor = not (getattr(config, "CPU_NAME", None) or getattr(config, "CPU_FEATURES", None))
+    if has_amx() and for_this_processor and llvm_version_info >= LLVM_OF_AMX:
+        return "layers_amx"
     try:
-        features = get_host_cpu_features()
+        return "layers" if get_host_cpu_features().get("avx512f") else None
     except RuntimeError:  # a processor that LLVM does not know
         return None
-    if features.get("amx-bf16") and features.get("avx512bf16"):
-        from hyperplanes.geometry.kernels.layers_amx import allow_tiles
-
-        if allow_tiles():
-            return "layers_amx"
-    return "layers" if features.get("avx512f") else None
 
 
 @functools.cache

@@ -18,11 +18,12 @@ from torch import Tensor
 
 from hyperplanes.geometry.kernels.blocks import inlined
 
-__all__ = ["COLUMNS", "copy_block", "layers", "pack_weights"]
+__all__ = ["COLUMNS", "WIDEST", "copy_block", "layers", "pack_weights"]
 
 TILE, LANES, VECTORS = 6, 16, 4  # 24 of the 32 registers of AVX-512 hold sums, four weights
 COLUMNS = LANES * VECTORS
 BLOCK = 10 * TILE
+WIDEST = 512  # wider layers are as fast by PyTorch
 
 _FUSED = {"flags": ("contract",)}
 
