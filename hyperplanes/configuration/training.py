@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
+from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = ["TrainingConfig"]
@@ -81,7 +82,7 @@ class TrainingConfig:
     learning_rate: float = 1e-4
     muon_learning_rate: float = 0.02
     hypernetwork_learning_rate: float = 1e-4
-    precision: Literal["automatic", "single", "bfloat16"] = "automatic"
+    precision: str = "automatic"
     warmup: Annotated[int, range(10**10)] = 0
     final_rate_factor: float = 1.0
     clip: float = 0.0
@@ -95,6 +96,7 @@ class TrainingConfig:
     seed: Annotated[int, range(2**40)] = 0
 
     def __post_init__(self) -> None:
+        check_choices(self, {"precision": ("automatic", "single", "bfloat16")})
         for name in (
             *("learning_rate", "muon_learning_rate", "hypernetwork_learning_rate"),
             *("final_rate_factor", "volume_loss", "clip"),

@@ -30,6 +30,7 @@ from hyperplanes.utilities import checkpoints, writing
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.interrupts import HungUp, Terminated
 from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.settings import SettingsError, structure
 from tests.reference_rendering import Balls, awaken, small_model
 from tests.training.test_volume_loss import MODEL
 
@@ -188,9 +189,12 @@ def test_a_resumed_training_keeps_its_precision(monkeypatch, tmp_path, begun):
         Trainer(HyperPlanes(MODEL), Balls(), with_(precision=other), tmp_path)
 
 
-def test_an_unknown_precision_is_refused():
-    with pytest.raises(ValueError, match="precision: expected one of .*'bfloat16'.*, got 'half'"):
+def test_an_unknown_precision_is_refused_in_code_and_in_settings():
+    expected = "expected one of 'automatic', 'single', 'bfloat16', got 'half'"
+    with pytest.raises(ValueError, match=f"precision: {expected}"):
         with_(precision="half")
+    with pytest.raises(SettingsError, match=expected):
+        structure(TrainingConfig, {"precision": "half"})
 
 
 @pytest.mark.parametrize("safe", [True, False])
