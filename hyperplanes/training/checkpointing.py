@@ -39,7 +39,8 @@ def choose_precision(config: TrainingConfig, model: HyperPlanes, folder: Path | 
         return config.precision
     if folder is not None and (folder / "training.json").exists():
         before = read_json(folder / "training.json").get("config")
-        return before.get("precision", OLD_PRECISION) if isinstance(before, dict) else OLD_PRECISION
+        found = before.get("precision") if isinstance(before, dict) else None
+        return found if found in ("single", "bfloat16") else OLD_PRECISION  # others are refused where the state is read
     suits = model.reads_volume and model.rig.device.type == "cpu" and has_fast_bfloat16()
     return "bfloat16" if suits else "single"
 

@@ -187,6 +187,11 @@ def test_a_resumed_training_keeps_its_precision(monkeypatch, tmp_path, begun):
     other = "single" if begun == "bfloat16" else "bfloat16"
     with pytest.raises(CheckpointError, match="found other precision"):
         Trainer(HyperPlanes(MODEL), Balls(), with_(precision=other), tmp_path)
+    document = json.loads((tmp_path / "training.json").read_text())
+    document["config"]["precision"] = 5
+    (tmp_path / "training.json").write_text(json.dumps(document))
+    with pytest.raises(CheckpointError, match=r"training\.json: .* found other precision"):
+        Trainer(HyperPlanes(MODEL), Balls(), with_(precision="automatic"), tmp_path)
 
 
 def test_an_unknown_precision_is_refused_in_code_and_in_settings():
