@@ -7,7 +7,7 @@ other processes keep more than `load.LIMIT` cores busy, unless `--under-load` is
 import sys
 from importlib import import_module
 
-from benchmarks.load import LIMIT, load_at_start
+from benchmarks.load import LIMIT, OF_SPEED, load_at_start
 from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.files import DataError
 
@@ -29,19 +29,6 @@ NAMES = (
     "tables",
     "training",
     "views",
-    "visibility",
-)
-OF_SPEED = (
-    "adapting",
-    "baked",
-    "busy",
-    "generation",
-    "lookup",
-    "rendering",
-    "small",
-    "splats",
-    "steps",
-    "training",
     "visibility",
 )
 UNDER_LOAD = "--under-load"

@@ -1,21 +1,26 @@
-"""Every benchmark, one after the other: rows and figures in benchmarks/results, and the tables of the pages.
+"""Every benchmark: rows and figures in benchmarks/results, and the tables of the pages.
 
     python -m benchmarks all
     python -m benchmarks all --root data --data data/cars data/chairs --scene chair --meshes miner.glb taxi.glb
 
-Each runs in a process of its own, and writes the commit, the hardware and the load beside its rows. Those that judge or
-train models need data sets: the suites of `benchmarks/views.py` below --root, others --data. Without --scene and
---meshes, procedural objects are adapted to and photographed in place of those of the pages.
+Each runs in a process of its own, and writes the commit, the hardware and the load beside its rows. Those of speed run
+one after the other, then those of quality several at once. Those that judge or train models need data sets: the suites
+of `benchmarks/views.py` below --root, others --data. Without --scene and --meshes, procedural objects are adapted to
+and photographed in place of those of the pages.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from benchmarks import tables
+from benchmarks.load import OF_SPEED
+from hyperplanes.utilities.environment import usable_cores
 
 __all__ = ["COMMANDS", "OF_DATA", "OF_SUITES", "main"]
 
@@ -78,14 +83,14 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--meshes", type=Path, nargs="+", help="objects of the captures")
     parser.add_argument("--quick", action="store_true", help="the short way of each: to see that they run")
     parser.add_argument("--under-load", action="store_true", help="measure beside other work, too")
+    parser.add_argument("--workers", type=int, default=usable_cores(), help="how many of those that judge quality run "
+                        "at once; those of speed run alone, before (default: %(default)s)")  # fmt: skip
     chosen = parser.parse_args(arguments)
-    failed, commands = [], _commands(chosen)
-    kept = not chosen.quick or chosen.out != RESULTS  # the rows of pages are none of the short way
-    for name, (benchmark, options) in commands.items():
-        command = [sys.executable, "-m", "benchmarks", *(["--under-load"] if chosen.under_load else []), benchmark]
-        command += [*options, *(["--json", str(chosen.out / f"{name}.json")] if kept else [])]
-        if subprocess.run(command, check=False).returncode:
-            failed.append(name)
+    commands, workers = _commands(chosen), max(1, chosen.workers)
+    of_speed = {name: options for name, (benchmark, options) in commands.items() if benchmark in OF_SPEED}
+    others = {name: options for name, (_, options) in commands.items() if name not in of_speed}
+    threads = {"OMP_NUM_THREADS": str(max(1, usable_cores() // workers))} if workers > 1 else {}
+    failed = _run(of_speed, 1, {}) + _run(others, workers, threads)
     print(f"benchmarks all: {len(commands) - len(failed)} of {len(commands)} done", *failed, sep="; failed: ")
     if not chosen.data:
         print(f"benchmarks all: without --data none of {', '.join(OF_DATA)}")
@@ -94,8 +99,27 @@ def main(arguments: list[str]) -> int:
     return 1 if failed else 0
 
 
+def _run(commands: dict[str, list[str]], workers: int, settings: dict[str, str]) -> list[str]:
+    """Run commands, so many at once, and return the names of those that failed.
+
+    Args:
+        commands: by the names of their results.
+        workers: how many run at once.
+        settings: of their environment, beside what it has.
+    """
+
+    def failed(command: list[str]) -> bool:
+        return subprocess.run(command, check=False, env=os.environ | settings).returncode != 0
+
+    pool = ThreadPoolExecutor(workers)
+    try:
+        return [name for name, bad in zip(commands, pool.map(failed, commands.values()), strict=True) if bad]
+    finally:
+        pool.shutdown(cancel_futures=True)  # the rest, after an interrupt
+
+
 def _commands(chosen: argparse.Namespace) -> dict[str, tuple[str, list[str]]]:
-    """The benchmark of each result and its options."""
+    """The benchmark of each result and its command."""
     data = ["--data", *map(str, chosen.data)]
     given = {"adapting": ["--views", str(chosen.scene)] if chosen.scene else []}
     given["captures"] = ["--meshes", *map(str, chosen.meshes)] if chosen.meshes else []
@@ -109,5 +133,9 @@ def _commands(chosen: argparse.Namespace) -> dict[str, tuple[str, list[str]]]:
     result = {}
     for name, (benchmark, source, more) in commands.items():
         plot = ["--plot", str(chosen.out / PLOTTED[name])] if name in PLOTTED else []
-        result[name] = benchmark, [*source, *(["--quick"] if chosen.quick else [*more, *plot])]
+        command = [sys.executable, "-m", "benchmarks", *(["--under-load"] if chosen.under_load else []), benchmark]
+        command += [*source, *(["--quick"] if chosen.quick else [*more, *plot])]
+        if not chosen.quick or chosen.out != RESULTS:  # the rows of pages are none of the short way
+            command += ["--json", str(chosen.out / f"{name}.json")]
+        result[name] = benchmark, command
     return result

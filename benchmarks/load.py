@@ -7,9 +7,26 @@ import time
 from functools import cache
 from pathlib import Path
 
-__all__ = ["LIMIT", "load_at_start", "measure_load"]
+__all__ = ["LIMIT", "OF_SPEED", "load_at_start", "measure_load"]
 
 LIMIT = 0.3  # cores that others may use beside a measurement that is kept
+OF_SPEED = frozenset(
+    {
+        "adapting",
+        "baked",
+        "busy",
+        "generation",
+        "lookup",
+        "rendering",
+        "small",
+        "splats",
+        "steps",
+        "training",
+        "visibility",
+    }
+)
+"""Benchmarks whose figures depend on the load."""
+
 STATISTICS = Path("/proc/stat")
 
 

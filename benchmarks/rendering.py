@@ -127,8 +127,12 @@ class PaperView:
         return float((pictures.images[0].flatten(1).T[self.chosen] - self.truth).square().mean())
 
 
-PROTOCOLS = {"default protocol": True, "one ray a pixel": False}
-"""Ours by name, and whether pixels at edges are the mean of three rays; the paper's has one ray a pixel."""
+PROTOCOLS = {
+    "default protocol": {},
+    "one ray a pixel": {"antialias": False},
+    "one ray a pixel in single precision": {"antialias": False, "mixed_precision": False},
+}
+"""Ours by name, and options of `AdaptedField.render`; the paper's has one ray a pixel, in single precision."""
 
 
 def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
@@ -142,7 +146,7 @@ def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
         pixels = task.query.size[0] * task.query.size[1]
 
         def ours(name: str, adapted: AdaptedField = adapted, one: PinholeCamera = one) -> tuple[float, Pictures]:
-            return timed(lambda: adapted.render(one, antialias=PROTOCOLS[name]))
+            return timed(lambda: adapted.render(one, **PROTOCOLS[name]))
 
         before = {name: ours(name) for name in PROTOCOLS}
         paper = PaperView.of(adapted, task.query, view)

@@ -84,11 +84,16 @@ def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
             plain_time, plain = timed(lambda one=one: _unsplit(adapted, voxels).render(one, every))
         seconds.append(time)
         reference.append(plain_time)
-        found.append(_quality(pictures, task, view))
-        expected.append(_quality(plain, task, view))
+        found += _quality(pictures, task, [view])
+        expected += _quality(plain, task, [view])
     several = camera.select(task.query.cameras, views)
-    ways = {"ours": lambda: adapted.render(several), "PyTorch's layers": lambda: _multiplied(adapted, several)}
+    ways = {
+        "ours": lambda: adapted.render(several),
+        "single precision": lambda: adapted.render(several, mixed_precision=False),
+        "PyTorch's layers": lambda: _multiplied(adapted, several),
+    }
     layers = interleaved(ways, repeats)
+    rounded, single = (statistics.fmean(_quality(ways[way](), task, views)) for way in ("ours", "single precision"))
     height, width = task.query.size
     return {
         "name": f"small, {task.name}, {width}x{height}, {len(task.support)} views",
@@ -96,6 +101,8 @@ def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
         "seconds": statistics.median(seconds),
         "reference_seconds": statistics.median(reference),
         "speedup_of_layers": ratio(layers["PyTorch's layers"].wall, layers["ours"].wall)["speedup"],
+        "speedup_of_mixed_precision": ratio(layers["single precision"].wall, layers["ours"].wall)["speedup"],
+        "psnr_loss_of_mixed_precision": single - rounded,
         "speedup": statistics.median(plain / ours for plain, ours in zip(reference, seconds, strict=True)),
         "psnr": statistics.fmean(found),
         "psnr_loss": statistics.fmean(expected) - statistics.fmean(found),
@@ -114,8 +121,8 @@ def _shown(task: Task, count: int) -> Task:
     return replace(task, support=task.support[:: max(1, len(task.support) // count)][:count])
 
 
-def _quality(pictures: Pictures, task: Task, view: int) -> float:
-    return float(psnr(pictures.images, task.query.images[view : view + 1]).mean())
+def _quality(pictures: Pictures, task: Task, views: list[int]) -> list[float]:
+    return psnr(pictures.images, task.query.images[views]).tolist()
 
 
 def _unsplit(adapted: AdaptedField, voxels: RefinedOccupancy) -> AdaptedField:

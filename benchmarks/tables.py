@@ -157,7 +157,7 @@ def _rendering(result: Result) -> str:
     named = {row["name"]: row for row in result["rows"]}
     lines = []
     for name, row in named.items():
-        if not (size := re.fullmatch(r"(?:default protocol|(one ray a pixel)), (\d+x\d+), one view", name)):
+        if not (size := re.fullmatch(r"(?:default protocol|(one ray a pixel.*)), (\d+x\d+), one view", name)):
             continue
         baked = None if size[1] else named.get(f"baked, {size[2]}")
         over = f"{row['speedup']:.0f} ({row['speedup_lowest']:.0f} to {row['speedup_highest']:.0f})"

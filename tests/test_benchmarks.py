@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+import threading
 import time
 import types
 from dataclasses import replace
@@ -17,9 +18,11 @@ from small_demo import demo_folder
 from benchmarks import __main__ as benchmarks_main
 from benchmarks import all as all_benchmarks
 from benchmarks import image_based, tables, views
+from benchmarks.load import OF_SPEED
 from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes, stacking
 from hyperplanes.training import Trainer, TrainingConfig
+from hyperplanes.utilities.environment import usable_cores
 from hyperplanes.utilities.files import DataError
 from tests.reference_rendering import Balls
 from tests.training.test_volume_loss import MODEL
@@ -92,7 +95,7 @@ def test_the_parts_of_a_step_are_those_that_its_table_names(threads):
     assert all(found[part]["seconds"] > 0 for part in tables.PARTS)
 
 
-@pytest.mark.parametrize("name", benchmarks_main.OF_SPEED)
+@pytest.mark.parametrize("name", sorted(OF_SPEED))
 def test_rows_of_speed_are_not_kept_beside_other_work(name, tmp_path, monkeypatch, capsys):
     """Property: with more than 0.3 cores busy nothing is measured or written; the message says how to do it anyway."""
     ran = []
@@ -113,7 +116,7 @@ def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch
     """
     ran, without_rows = [], {"all", "tables", "gating"}
     run = types.SimpleNamespace(returncode=0)
-    monkeypatch.setattr(subprocess, "run", lambda command, check: ran.append(command[3:]) or run)
+    monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
     assert all_benchmarks.main(["--out", str(tmp_path)]) == 0
     assert {name for name, *_ in ran} == set(benchmarks_main.NAMES) - {*without_rows, *all_benchmarks.OF_DATA}
     assert "without --data none of views, " in capsys.readouterr().out
@@ -128,6 +131,28 @@ def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch
         module = importlib.import_module(f"benchmarks.{words[1]}")
         options = {word for word in words[1:] if word.startswith("--")}
         assert options <= set(re.findall(r"--[\w-]+", inspect.getsource(module) + inspect.getsource(views)))
+
+
+def test_all_runs_those_of_speed_alone_and_those_of_quality_several_at_once(tmp_path, monkeypatch, capsys):
+    running, beside, lock = [], {True: set(), False: set()}, threading.Lock()
+
+    def run(command, check, env):
+        name = command[3]
+        with lock:
+            running.append(name)
+            beside[name in OF_SPEED].add(tuple(running))
+            assert name in OF_SPEED or env["OMP_NUM_THREADS"] == str(max(1, usable_cores() // 2))
+        time.sleep(0.01)
+        with lock:
+            running.remove(name)
+        return types.SimpleNamespace(returncode=int(name in ("small", "views")))
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert all_benchmarks.main(["--out", str(tmp_path), "--data", "cars", "--workers", "2"]) == 1
+    assert "failed: small; failed: views" in capsys.readouterr().out
+    assert beside[True] == {(name,) for name in OF_SPEED}
+    assert max(map(len, beside[False])) == 2
+    assert not any(OF_SPEED & set(names) for names in beside[False])
 
 
 @pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)

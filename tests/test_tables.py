@@ -15,7 +15,7 @@ def commands(monkeypatch):
     """What `all` runs where everything is given."""
     ran = []
     run = types.SimpleNamespace(returncode=0)
-    monkeypatch.setattr(subprocess, "run", lambda command, check: ran.append(command[3:]) or run)
+    monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
     monkeypatch.setattr(tables, "main", lambda arguments: 0)
     assert all_benchmarks.main(["--root", "data", "--data", "cars", "--scene", "chair", "--meshes", "a.glb"]) == 0
     return ran
@@ -37,6 +37,6 @@ def test_the_short_way_leaves_the_rows_of_the_pages_alone(monkeypatch):
     """Property: with --quick nothing goes to the folder of results."""
     ran = []
     run = types.SimpleNamespace(returncode=0)
-    monkeypatch.setattr(subprocess, "run", lambda command, check: ran.append(command[3:]) or run)
+    monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
     assert all_benchmarks.main(["--quick"]) == 0
     assert all("--quick" in words and "--json" not in words and "--plot" not in words for words in ran)

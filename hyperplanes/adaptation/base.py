@@ -12,6 +12,7 @@ from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from hyperplanes.fields.base import Field
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.notebooks import show_views
@@ -139,7 +140,12 @@ class AdaptedField:
     @checked
     @torch.no_grad()
     def render(
-        self, cameras: PinholeCamera, sampling: Sampler | None = None, antialias: bool | None = None
+        self,
+        cameras: PinholeCamera,
+        sampling: Sampler | None = None,
+        antialias: bool | None = None,
+        *,
+        mixed_precision: bool = True,
     ) -> Pictures:
         """The pictures of cameras, without gradients; rays and pixels in single precision, whatever the field's.
 
@@ -147,26 +153,27 @@ class AdaptedField:
             cameras: any number, one image size, on any device and in any precision.
             sampling: another sampler than that of the field, whose samples are denser for pictures where it marches.
             antialias: three rays through each pixel at an edge; where absent, where it marches.
+            mixed_precision: a network of single precision may multiply numbers of bfloat16 (`Field.mixed_precision`).
 
         Returns:
             One picture a camera, on the device of the field.
         """
         sampling = sampling or self.sampling.for_rendering(pixels_across(cameras, self.occupancy.bounds))
         return render(
-            self._in_single_precision(self.field),
+            self._of_pictures(self.field, mixed_precision),
             camera.to(cameras, self.occupancy.occupied.device),
             sampling,
             bounds=self.occupancy.bounds,
             occupancy=self.refined_occupancy if sampling.needs_occupancy else None,
-            proposal=self.proposal and self._in_single_precision(self.proposal),
+            proposal=self.proposal and self._of_pictures(self.proposal, mixed_precision),
             antialias=antialias,
         )
 
-    def _in_single_precision(self, field: FieldFunction) -> FieldFunction:
-        """The function of single-precision points that a field of another precision is."""
-        if self.dtype == torch.float32:
-            return field
-        return _SplitCast(field, self.dtype) if isinstance(field, SplitField) else _Cast(field, self.dtype)
+    def _of_pictures(self, field: FieldFunction, mixed_precision: bool) -> FieldFunction:
+        """A field as a function of single-precision points, whatever its own precision."""
+        if self.dtype != torch.float32:
+            return _SplitCast(field, self.dtype) if isinstance(field, SplitField) else _Cast(field, self.dtype)
+        return field.in_mixed_precision if mixed_precision and isinstance(field, Field) else field
 
 
 @dataclass(frozen=True)

@@ -78,13 +78,18 @@ class StackedField(AdaptedField):
     @checked
     @torch.no_grad()
     def render(
-        self, cameras: PinholeCamera, sampling: Sampler | None = None, antialias: bool | None = None
+        self,
+        cameras: PinholeCamera,
+        sampling: Sampler | None = None,
+        antialias: bool | None = None,
+        *,
+        mixed_precision: bool = True,
     ) -> Pictures:
         """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the field's alone."""
-        own = partial(super().render, cameras, sampling, antialias)
+        own = partial(super().render, cameras, sampling, antialias, mixed_precision=mixed_precision)
         if not self.share and self.gate is None:
             return own()
-        other = partial(self.other.render, cameras, antialias=antialias)
+        other = partial(self.other.render, cameras, antialias=antialias, mixed_precision=mixed_precision)
         if not (self.thread_safe and self.other.thread_safe):
             return self._mean(own(), other())
         return self._mean(*at_once(own, other, self.occupancy.occupied.device))

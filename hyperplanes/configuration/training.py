@@ -49,9 +49,9 @@ class TrainingConfig:
         hypernetwork_learning_rate: of the hypernetwork.
         precision: of a hypernetwork's convolutions and matrix products: "single", or "bfloat16" beside weights and
             updates of single precision (`torch.autocast`). "automatic" is bfloat16 for hypernetworks that read volumes
-            on CPUs with AMX, where a step of `small` takes three quarters of the time, and single elsewhere. Those that
-            read images standardise codes over the few objects of a step, and rounding grows with that. A training that
-            is resumed keeps the precision that it began with.
+            on CPUs with AMX and on those of AMD with AVX512_BF16, where a step of `small` takes three quarters of the
+            time, and single elsewhere. Those that read images standardise codes over the few objects of a step, and
+            rounding grows with that. A training that is resumed keeps the precision that it began with.
         warmup: steps in which the learning rates rise from zero.
         final_rate_factor: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
         clip: the norm to which the gradient of all weights that a step moves is cut where it is longer; 0 leaves it.

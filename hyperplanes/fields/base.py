@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from jaxtyping import Float, Int
@@ -202,12 +203,15 @@ class Field:
         parameters: its weights for this object.
         planes: the support images of this object, as `Target.planes_of` made them.
         bounds: the sphere of the scene.
+        mixed_precision: the layers before the heads may multiply numbers of bfloat16, where no gradient is wanted and
+            that is faster; by default they are of single precision.
     """
 
     target: Target
     parameters: Parameters
     planes: Any
     bounds: Sphere
+    mixed_precision: bool = False
 
     thread_safe: ClassVar[bool] = True  # nothing changes while it is evaluated: several threads share a picture
 
@@ -215,6 +219,11 @@ class Field:
         weights = sum(value.numel() for value in self.parameters.values())
         planes = "" if self.planes is None else f", {len(self.planes)} planes"
         return f"{type(self).__name__}({type(self.target).__name__}, {weights:,} weights{planes})"
+
+    @cached_property
+    def in_mixed_precision(self) -> Self:
+        """The same field, whose layers may multiply numbers of bfloat16."""
+        return replace(self, mixed_precision=True)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -255,7 +264,7 @@ class Field:
         state = [(value.data_ptr(), 0 if value.is_inference() else value._version) for value in values]
         kept = self.__dict__.get("_kept")
         if kept is None or kept[0] != state:
-            kept = state, PackedLayers.of(layers, self.target.skip)
+            kept = state, PackedLayers.of(layers, self.target.skip, mixed_precision=self.mixed_precision)
             self.__dict__["_kept"] = kept  # threads that come at once pack the same
         return kept[1]
 

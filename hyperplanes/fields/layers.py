@@ -20,7 +20,7 @@ __all__ = ["Layer", "PackedLayers", "wants_values_alone"]
 Layer = tuple[Tensor, Tensor]
 """Weights (width, input) and biases (width,)."""
 
-POINTS = 480  # that one call of a kernel works on: eight blocks of that for AVX-512, three of that for AMX
+POINTS = 480  # that one call of a kernel works on: eight blocks of those for AVX-512, three of that for AMX
 
 
 def wants_values_alone(inputs: Tensor, layers: Sequence[Layer]) -> bool:
@@ -45,9 +45,10 @@ class PackedLayers:
     """Fully connected layers with ReLU, of which one reads the inputs once more, as the kernel reads them.
 
     Four layers of 128 values take 0.67 to 0.83 of the time of PyTorch's by AVX-512 and 0.36 to 0.50 by AMX, with 64 to
-    4,096 points (one thread of an Intel processor, the only one they were measured on). The kernels do not hold the
-    interpreter's lock. By AMX, values differ from those of PyTorch by some 1e-5 to 3e-5 of the largest. What is packed
-    is for this process: it cannot be pickled.
+    4,096 points (one thread of an Intel processor), and 0.64 to 0.79 by AVX-512 and 0.37 to 0.46 by its instructions
+    for bfloat16 on a Zen 4. The kernels do not hold the interpreter's lock. By AMX, values differ from those of PyTorch
+    by some 1e-5 to 3e-5 of the largest, in mixed precision by 0.1 to 1 %. What is packed is for this process: it cannot
+    be pickled.
 
     Attributes:
         module: of the kernel (`layers_module`).
@@ -64,12 +65,13 @@ class PackedLayers:
     inputs: int
 
     @classmethod
-    def of(cls, layers: Sequence[Layer], skip: int) -> PackedLayers | None:
+    def of(cls, layers: Sequence[Layer], skip: int, *, mixed_precision: bool = False) -> PackedLayers | None:
         """Those of a network.
 
         Args:
             layers: in their order.
             skip: index of the layer that reads the inputs and the values of the layer before; 0 for none.
+            mixed_precision: the factors of products may be rounded to bfloat16, where that is faster.
 
         Returns:
             None where no kernel is faster or takes them: without numba, or AVX-512 or AMX, on other devices, in
@@ -77,7 +79,7 @@ class PackedLayers:
             together.
         """
         kinds = {(value.device.type, value.dtype) for layer in layers for value in layer}
-        module = layers_module()
+        module = layers_module(mixed_precision=mixed_precision)
         if module is None or kinds != {("cpu", torch.float32)}:
             return None
         kernel = import_module(f"hyperplanes.geometry.kernels.{module}")

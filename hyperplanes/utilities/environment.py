@@ -16,6 +16,7 @@ __all__ = [
     "find_commit",
     "find_processor",
     "has_amx",
+    "has_bfloat16_products",
     "has_fast_bfloat16",
     "usable_cores",
 ]
@@ -73,11 +74,15 @@ def find_processor() -> str:
 @functools.cache
 def has_amx() -> bool:
     """Whether this process may multiply matrices in bfloat16 by Intel's AMX: the CPU can, and Linux lets it."""
+    return {"amx_bf16", "avx512_bf16"} <= _features() and _allow_tiles()
+
+
+def _features() -> set[str]:
+    """What Linux says of the processor, word by word: its vendor and flags among them."""
     try:
-        flags = Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
+        return set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
     except OSError:  # no Linux
-        return False
-    return {"amx_bf16", "avx512_bf16"} <= set(flags) and _allow_tiles()
+        return set()
 
 
 def _allow_tiles() -> bool:
@@ -86,13 +91,26 @@ def _allow_tiles() -> bool:
     return ctypes.CDLL(None).syscall(arch_prctl, request, tile_data) == 0
 
 
+def has_bfloat16_products() -> bool:
+    """Whether AVX-512 multiplies numbers of bfloat16 faster than those of single precision.
+
+    That is so on AMD's processors that have such instructions; on Intel's it was not measured.
+    """
+    return {"AuthenticAMD", "avx512_bf16"} <= _features()
+
+
 def has_fast_bfloat16() -> bool:
     """Whether PyTorch's convolutions and matrix products are faster in bfloat16 than in single precision on this CPU.
 
-    That is so by AMX alone; `ONEDNN_MAX_CPU_ISA` may keep oneDNN from it.
+    That is so by AMX and where `has_bfloat16_products` (convolutions take 0.54 to 0.58 of the time on a Zen 4);
+    `ONEDNN_MAX_CPU_ISA` may keep oneDNN from either.
     """
     limit = os.environ.get("ONEDNN_MAX_CPU_ISA", "ALL").upper()
-    return has_amx() and (limit in ("ALL", "DEFAULT") or "AMX" in limit)
+    unlimited = limit in ("ALL", "DEFAULT")
+    if has_amx() and (unlimited or "AMX" in limit):
+        return True
+    by_avx512 = unlimited or limit.startswith(("AVX512_CORE_BF16", "AVX512_CORE_FP16", "AVX10"))
+    return by_avx512 and has_bfloat16_products()
 
 
 def usable_cores() -> int:

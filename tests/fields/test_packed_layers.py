@@ -7,28 +7,38 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
+from hyperplanes.adaptation import AdaptedField
+from hyperplanes.adaptation.stacking import stack
 from hyperplanes.fields import TARGETS, TargetConfig
 from hyperplanes.fields import layers as packed_layers
 from hyperplanes.fields.layers import PackedLayers
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.kernels import compiling, layers, layers_amx
-from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.kernels import compiling, layers, layers_amx, layers_bfloat16
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere, cast
 from hyperplanes.parameters import Parameters
+from hyperplanes.rendering import RayMarching
+from hyperplanes.rendering.refinement import RefinedOccupancy
 from tests.reference_rendering import ring
 
 HAS_AMX = compiling.layers_module() == "layers_amx"
-WIDEST = {"layers": layers.WIDEST, "layers_amx": layers_amx.WIDEST}
-ERRORS = {"layers": 1e-5, "layers_amx": 1e-4}
-"""Kernels, and how far their values may be from those of float64; by AMX products have 16 bits."""
+HAS_BFLOAT16 = HAS_AMX or compiling.layers_module(mixed_precision=True) == "layers_bfloat16"
+WIDEST = {"layers": layers.WIDEST, "layers_bfloat16": layers_bfloat16.WIDEST, "layers_amx": layers_amx.WIDEST}
+ERRORS = {"layers": 1e-5, "layers_bfloat16": 5e-2, "layers_amx": 1e-4}
+"""Kernels, and how far their values may be from those of float64: products have 8 bits, or 16 by AMX."""
 
 
 @pytest.fixture(
-    params=["layers", pytest.param("layers_amx", marks=pytest.mark.skipif(not HAS_AMX, reason="needs AMX"))],
+    params=[
+        "layers",
+        pytest.param("layers_bfloat16", marks=pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AVX512_BF16")),
+        pytest.param("layers_amx", marks=pytest.mark.skipif(not HAS_AMX, reason="needs AMX")),
+    ],
     autouse=True,
 )
 def module(request, monkeypatch):
     """Each kernel; that of AVX-512 is right on every processor, and only used where it is fast."""
-    monkeypatch.setattr(packed_layers, "layers_module", lambda: request.param)
+    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision=False: request.param)
     return request.param
 
 
@@ -41,11 +51,11 @@ def layers_of(depth, width, inputs, skip, seed=0):
     ]
 
 
-def by_pytorch(layers, given, skip):
+def by_pytorch(layers, given, skip, factor=lambda value: value):
     value = given
     for index, (weight, bias) in enumerate(layers):
         value = torch.cat([given, value], 1) if index == skip > 0 else value
-        value = (value @ weight.T + bias).clamp_min(0)
+        value = (factor(value) @ factor(weight).T + bias).clamp_min(0)
     return value
 
 
@@ -76,10 +86,25 @@ def test_neither_the_batch_nor_threads_change_a_bit(threads):
         torch.set_num_threads(before)
 
 
+@pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AVX512_BF16")
+@pytest.mark.parametrize(("depth", "inputs"), [(1, 64), (1, 7), (4, 33)])
+def test_mixed_precision_rounds_the_factors_of_products_alone(depth, inputs, monkeypatch):
+    """Sums and biases have single precision; a number between two of bfloat16 may become either, layers later."""
+    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision: "layers_bfloat16")
+    layers, given = layers_of(depth, 64, inputs, depth // 2), torch.randn(70, inputs, generator=torch.Generator())
+    doubles = [(weight.double(), bias.double()) for weight, bias in layers]
+    exact = by_pytorch(doubles, given.double(), depth // 2)
+    rounded = by_pytorch(doubles, given.double(), depth // 2, lambda value: value.bfloat16().double())
+    found = PackedLayers.of(layers, depth // 2, mixed_precision=True)(given).double()
+    if depth == 1:
+        torch.testing.assert_close(found, rounded, rtol=1e-5, atol=1e-5)
+    assert (found - rounded).square().mean() < 0.1 * (rounded - exact).square().mean()
+
+
 @pytest.mark.skipif(not HAS_AMX, reason="needs AMX")
 @pytest.mark.parametrize("width", [32, 96, 160])
 def test_amx_takes_widths_that_are_no_multiples_of_64(width, monkeypatch):
-    monkeypatch.setattr(packed_layers, "layers_module", lambda: "layers_amx")
+    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision: "layers_amx")
     layers, given = layers_of(3, width, 35, 1), torch.randn(50, 35, generator=torch.Generator().manual_seed(1))
     expected = by_pytorch([(weight.double(), bias.double()) for weight, bias in layers], given.double(), 1)
     torch.testing.assert_close(PackedLayers.of(layers, 1)(given), expected.float(), rtol=1e-4, atol=1e-4)
@@ -127,30 +152,33 @@ def test_shapes_that_do_not_go_together_are_left_to_pytorch():
 
 
 @pytest.mark.parametrize(
-    ("found", "wide", "amx", "compiler", "settings", "expected"),
+    ("found", "wide", "amx", "products", "compiler", "settings", "expected"),
     [
-        (None, True, True, (22, 1, 0), {}, None),
-        (1, False, False, (22, 1, 0), {}, None),
-        (1, True, False, (22, 1, 0), {}, "layers"),
-        (1, True, True, (22, 1, 0), {}, "layers_amx"),
-        (1, True, True, (15, 0, 7), {}, "layers"),  # compiles the kernel, and the process ends at its first call
-        (1, True, True, (22, 1, 0), {"CPU_NAME": "generic"}, "layers"),  # cannot compile it
-        (1, True, True, (22, 1, 0), {"CPU_FEATURES": "+avx2"}, "layers"),
+        (None, True, True, True, (22, 1, 0), {}, [None, None]),
+        (1, False, False, False, (22, 1, 0), {}, [None, None]),
+        (1, True, False, False, (22, 1, 0), {}, ["layers", "layers"]),
+        (1, True, False, True, (22, 1, 0), {}, ["layers", "layers_bfloat16"]),
+        (1, True, True, True, (22, 1, 0), {}, ["layers_amx", "layers_amx"]),
+        (1, True, True, True, (15, 0, 7), {}, ["layers", "layers"]),  # at the first call of AMX the process ends
+        (1, True, True, True, (22, 1, 0), {"CPU_NAME": "generic"}, ["layers", "layers"]),  # cannot compile it
+        (1, True, True, True, (22, 1, 0), {"CPU_FEATURES": "+avx2"}, ["layers", "layers"]),
     ],
 )
-def test_the_kernel_is_that_of_the_processor_and_the_compiler(
-    monkeypatch, found, wide, amx, compiler, settings, expected
+def test_the_kernel_is_that_of_the_processor_and_the_compiler(  # noqa: PLR0913
+    monkeypatch, found, wide, amx, products, compiler, settings, expected
 ):
     import llvmlite.binding
     from numba.core import config
 
     monkeypatch.setattr(compiling, "find_spec", lambda name: found)
     monkeypatch.setattr(compiling, "has_amx", lambda: amx)
+    monkeypatch.setattr(compiling, "has_bfloat16_products", lambda: products)
     monkeypatch.setattr(llvmlite.binding, "get_host_cpu_features", lambda: {"avx512f": wide})
     monkeypatch.setattr(llvmlite.binding, "llvm_version_info", compiler)
     for name, value in settings.items():
         monkeypatch.setattr(config, name, value)
-    assert compiling.layers_module.__wrapped__() == expected
+    choose = compiling.layers_module.__wrapped__
+    assert [choose(), choose(mixed_precision=True)] == expected
 
 
 def test_packed_layers_stay_in_their_process():
@@ -160,7 +188,7 @@ def test_packed_layers_stay_in_their_process():
 
 
 def test_without_a_kernel_layers_are_left_to_pytorch(monkeypatch):
-    monkeypatch.setattr(packed_layers, "layers_module", lambda: None)
+    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision: None)
     assert PackedLayers.of(layers_of(2, 64, 5, 1), 1) is None
 
 
@@ -223,11 +251,35 @@ def test_weights_that_change_in_place_change_the_field(used):
 def test_copies_and_pickles_hold_no_packed_weights(used):
     field = field_of(CONFIG)
     expected = field.density(POINTS)
-    assert set(vars(field)) > {"target", "parameters", "planes", "bounds"}
+    names = {"target", "parameters", "planes", "bounds", "mixed_precision"}
+    assert set(vars(field)) > names
     for copied in (copy.deepcopy(field), pickle.loads(pickle.dumps(field))):
-        assert set(vars(copied)) == {"target", "parameters", "planes", "bounds"}
+        assert set(vars(copied)) == names
         assert torch.equal(copied.density(POINTS), expected)
     assert len(used) == 3
+
+
+@torch.no_grad()
+def test_pictures_are_in_mixed_precision_unless_told_otherwise_and_values_never(monkeypatch):
+    asked, cameras = [], ring(1, (8, 8))
+    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision: asked.append(mixed_precision))
+
+    def asked_by(compute):
+        field, grid = field_of(CONFIG), full(Sphere(), 4)
+        voxels = RefinedOccupancy(grid.occupied, grid.bounds, grid.occupied.float())
+        asked.clear()
+        compute(AdaptedField(field, grid, RayMarching(8), refined=voxels))
+        return set(asked)
+
+    def stacked(field):
+        return stack(field, field, 0.4)
+
+    assert asked_by(lambda field: field.render(cameras)) == {True}
+    assert asked_by(lambda field: stacked(field).render(cameras)) == {True}
+    assert asked_by(lambda field: field.render(cameras, mixed_precision=False)) == {False}
+    assert asked_by(lambda field: stacked(field).render(cameras, mixed_precision=False)) == {False}
+    assert asked_by(lambda field: (field.density(POINTS), field(POINTS, POINTS))) == {False}
+    assert asked_by(lambda field: field.trace(cast(cameras, torch.zeros(1).long(), torch.ones(1, 2)))) == {False}
 
 
 def test_inputs_of_another_size_are_refused_by_pytorch():

@@ -60,12 +60,22 @@ def test_amx_is_what_the_processor_has_and_linux_allows(monkeypatch, flags, allo
 
 
 @pytest.mark.parametrize(
-    ("limit", "amx", "expected"),
-    [(None, True, True), ("avx512_core_amx", True, True), ("AVX512_CORE_BF16", True, False), (None, False, False)],
+    ("limit", "amx", "processor", "expected"),
+    [
+        (None, True, "GenuineIntel avx512_bf16", True),
+        ("avx512_core_amx", True, "GenuineIntel avx512_bf16", True),
+        ("AVX512_CORE_BF16", True, "GenuineIntel avx512_bf16", False),
+        (None, False, "GenuineIntel avx512_bf16", False),
+        (None, False, "AuthenticAMD avx512_bf16", True),
+        ("AVX512_CORE_BF16", False, "AuthenticAMD avx512_bf16", True),
+        ("AVX512_CORE_VNNI", False, "AuthenticAMD avx512_bf16", False),
+        (None, False, "AuthenticAMD avx512f", False),
+    ],
 )
-def test_bfloat16_is_fast_where_onednn_may_use_amx(monkeypatch, limit, amx, expected):
+def test_bfloat16_is_fast_where_onednn_may_use_what_the_processor_has(monkeypatch, limit, amx, processor, expected):
     monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
     if limit:
         monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", limit)
     monkeypatch.setattr(environment, "has_amx", lambda: amx)
+    monkeypatch.setattr(environment, "_features", lambda: set(processor.split()))
     assert has_fast_bfloat16() is expected

@@ -21,9 +21,9 @@ RENDERING = {
 
 
 def rendering_kernels() -> dict[str, str]:
-    """As RENDERING, with the kernel of layers that is used on this processor."""
-    module = layers_module()
-    return {**RENDERING, **({f"{module}.layers": ""} if module else {})}
+    """As RENDERING, with the kernels of layers that are used on this processor."""
+    modules = {layers_module(), layers_module(mixed_precision=True)} - {None}
+    return {**RENDERING, **{f"{module}.layers": "" for module in modules}}
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 
-from hyperplanes.utilities.environment import cache_folder, has_amx
+from hyperplanes.utilities.environment import cache_folder, has_amx, has_bfloat16_products
 
 __all__ = ["FASTMATH", "compile_function", "compile_kernel", "layers_module"]
 
@@ -29,8 +29,8 @@ FASTMATH = {"contract", "reassoc", "arcp", "nsz"}  # all flags but those that as
 ROOM = 2**21
 """Bytes that the machine code of all kernels takes, about."""
 
-LLVM_OF_AMX = (20, 0, 0)
-"""The first version that was tried and compiles the kernel of AMX; 15 leaves a call of a function that there is not."""
+LLVM_OF_BFLOAT16 = (20, 0, 0)
+"""The first version that was tried and compiles bfloat16; 15 leaves a call of a function of AMX that there is not."""
 
 _STRIDED = "T[::1], UniTuple(int64, 3)"  # a tensor of three dimensions as its memory and strides
 _POINTS = "T[::1], int64, T[:, :, ::1], none, none"  # points, their pitch, matrices
@@ -61,17 +61,22 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T, uint8[:, :, ::1], T[::1], int64, int64"
     ),
     "layers.layers": "T[:, :], T[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
+    "layers_bfloat16.layers": "T[:, :], int32[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
     "layers_amx.layers": "T[:, :], int16[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
 }
 
 
 @functools.cache
-def layers_module() -> str | None:
+def layers_module(*, mixed_precision: bool = False) -> str | None:
     """The module of this folder whose kernel multiplies layers faster than PyTorch does on this processor.
 
+    Args:
+        mixed_precision: whether it may round the factors of products to bfloat16.
+
     Returns:
-        "layers_amx" or "layers", for AMX and AVX-512; None without these or numba. Compilers before LLVM 20, and numba
-        where the environment says what processor it compiles for, do not know the instructions of AMX.
+        "layers_amx", "layers_bfloat16" or "layers", for AMX, for AVX-512's instructions for bfloat16 and for AVX-512
+        alone; None without these or numba. Compilers before LLVM 20, and numba where the environment says what
+        processor it compiles for, do not know the instructions of the first two.
     """
     if not find_spec("numba"):
         return None
@@ -79,8 +84,11 @@ def layers_module() -> str | None:
     from numba.core import config
 
     for_this_processor = not (getattr(config, "CPU_NAME", None) or getattr(config, "CPU_FEATURES", None))
-    if has_amx() and for_this_processor and llvm_version_info >= LLVM_OF_AMX:
-        return "layers_amx"
+    if for_this_processor and llvm_version_info >= LLVM_OF_BFLOAT16:
+        if has_amx():
+            return "layers_amx"
+        if mixed_precision and has_bfloat16_products():
+            return "layers_bfloat16"
     try:
         return "layers" if get_host_cpu_features().get("avx512f") else None
     except RuntimeError:  # a processor that LLVM does not know

@@ -18,7 +18,19 @@ from torch import Tensor
 
 from hyperplanes.geometry.kernels.blocks import inlined
 
-__all__ = ["COLUMNS", "WIDEST", "copy_block", "layers", "pack_weights"]
+__all__ = [
+    "BLOCK",
+    "COLUMNS",
+    "LANES",
+    "TILE",
+    "WIDEST",
+    "BFloat",
+    "copy_block",
+    "layers",
+    "multiply_tile",
+    "pack_weights",
+    "rounded",
+]
 
 TILE, LANES, VECTORS = 6, 16, 4  # 24 of the 32 registers of AVX-512 hold sums, four weights
 COLUMNS = LANES * VECTORS
@@ -38,12 +50,43 @@ def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Float[Ten
     return weight.unflatten(0, (-1, COLUMNS)).transpose(1, 2).flatten()
 
 
+class BFloat(ir.Type):
+    """The type bfloat of LLVM, which llvmlite does not know."""
+
+    def _to_string(self):
+        return "bfloat"
+
+    def __eq__(self, other):
+        return isinstance(other, BFloat)
+
+    def __hash__(self):
+        return hash(BFloat)
+
+
+def rounded(builder, value):
+    """A vector of single precision rounded to bfloat16, as integers of 16 bits."""
+    count = value.type.count
+    halves = builder.fptrunc(value, ir.VectorType(BFloat(), count))
+    return builder.bitcast(halves, ir.VectorType(ir.IntType(16), count))
+
+
+def _add_product(builder, total, one, other):
+    """A vector of sums after products of single precision, or of pairs of bfloat16, are added."""
+    if one.type == total.type:
+        return builder.fadd(total, builder.fmul(one, other, **_FUSED), **_FUSED)
+    pairs = ir.VectorType(BFloat(), 2 * LANES)
+    kind = ir.FunctionType(total.type, [total.type, pairs, pairs])
+    instruction = builder.module.declare_intrinsic("llvm.x86.avx512bf16.dpbf16ps.512", (), kind)
+    return builder.call(instruction, [total, builder.bitcast(one, pairs), builder.bitcast(other, pairs)])
+
+
 def _sums(builder, sums, values, weights, count):
     """The sums of TILE times VECTORS vectors, after products of so many inputs and their weights are added.
 
-    `values` are pointers to the first input of each point, `weights` one to the first of the weights.
+    `values` are pointers to the first input of each point, `weights` one to the first of the weights. An input is a
+    number of single precision, or a pair of bfloat16.
     """
-    kind, index = sums[0].type, count.type
+    kind, index, loaded = sums[0].type, count.type, ir.VectorType(weights.type.pointee, LANES)
     before = builder.block
     body, after = builder.append_basic_block("multiply"), builder.append_basic_block("multiplied")
     builder.cbranch(builder.icmp_signed(">", count, index(0)), body, after)
@@ -60,11 +103,10 @@ def _sums(builder, sums, values, weights, count):
     added = []
     for point, pointer in enumerate(values):
         value = builder.load(builder.gep(pointer, [place]), align=4)
-        single = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
+        single = builder.insert_element(ir.Constant(loaded, ir.Undefined), value, ir.IntType(32)(0))
         spread = builder.shuffle_vector(single, single, zeros)
         for vector, weight in enumerate(vectors):
-            product = builder.fmul(spread, weight, **_FUSED)
-            added.append(builder.fadd(held[VECTORS * point + vector], product, **_FUSED))
+            added.append(_add_product(builder, held[VECTORS * point + vector], spread, weight))
     following = builder.add(place, index(1))
     place.add_incoming(following, body)
     for value, new in zip(held, added, strict=True):
@@ -85,13 +127,15 @@ def _vector(builder, pointer, at):
 
 
 @intrinsic
-def _tile(  # noqa: PLR0913
+def multiply_tile(  # noqa: PLR0913
     typing_context, given, at, inputs, used, hidden, row, width, also, weights, first, biases, bias, out, to
 ):
     """COLUMNS values of a layer at TILE points, after ReLU, into `out` from `to` on, `width` apart.
 
-    They are sums over `used` numbers in `given` from `at` on, `inputs` apart, over `also` ones in `hidden` from `row`
-    on, `width` apart, and biases.
+    They are sums over `used` inputs in `given` from `at` on, `inputs` apart, over `also` ones in `hidden` from `row`
+    on, `width` apart, and biases. Where `given`, `hidden` and `weights` are of int32, an input is a pair of bfloat16;
+    where `out` is, values are rounded to bfloat16 and `to` counts pairs. Points are as many values apart in `out` as in
+    `hidden`.
     """
 
     def generate(context, builder, signature, arguments):
@@ -101,7 +145,7 @@ def _tile(  # noqa: PLR0913
 
         inputs, used, width, also = (arguments[place] for place in (2, 3, 6, 7))
         index = used.type
-        weights, biases, out = pointer(8, 9), pointer(10, 11), pointer(12, 13)
+        weights, biases = pointer(8, 9), pointer(10, 11)
         start = [_vector(builder, biases, index(LANES * vector)) for vector in range(VECTORS)]
         sums = start * TILE
         rows = [builder.gep(pointer(0, 1), [builder.mul(inputs, index(point))]) for point in range(TILE)]
@@ -110,11 +154,15 @@ def _tile(  # noqa: PLR0913
         rest = builder.gep(weights, [builder.mul(used, index(COLUMNS))])
         sums = _sums(builder, sums, rows, rest, also)
         zero = ir.Constant(sums[0].type, [0.0] * LANES)
+        target, pairs = pointer(12, 13), signature.args[12].dtype == types.int32
+        of_pairs = signature.args[4].dtype == types.int32
+        pitch = builder.mul(width, index(2)) if of_pairs and not pairs else width
         for place, value in enumerate(sums):
             point, vector = divmod(place, VECTORS)
             kept = builder.select(builder.fcmp_ordered("<=", value, zero), zero, value)  # NaN stays
-            there = builder.add(builder.mul(width, index(point)), index(LANES * vector))
-            builder.store(kept, builder.bitcast(builder.gep(out, [there]), value.type.as_pointer()), align=4)
+            kept = rounded(builder, kept) if pairs else kept
+            there = builder.add(builder.mul(pitch, index(point)), index((LANES // 2 if pairs else LANES) * vector))
+            builder.store(kept, builder.bitcast(builder.gep(target, [there]), kept.type.as_pointer()), align=4)
         return context.get_dummy_value()
 
     index = types.int64
@@ -158,7 +206,7 @@ def layers(given, weights, biases, shape, out, start, stop):
             used, also = size if layer == 0 or layer == skip else 0, width if layer > 0 else 0
             for column in range(0, width, COLUMNS):
                 for point in range(0, count, TILE):
-                    _tile(
+                    multiply_tile(
                         inputs, point * size, size, used, other, point * width, width, also, weights, read, biases,
                         layer * width + column, one, point * width + column,
                     )  # fmt: skip

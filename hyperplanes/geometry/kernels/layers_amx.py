@@ -18,7 +18,7 @@ from numba.extending import intrinsic
 from torch import Tensor
 from torch.nn.functional import pad
 
-from hyperplanes.geometry.kernels.layers import copy_block
+from hyperplanes.geometry.kernels.layers import copy_block, rounded
 
 __all__ = ["COLUMNS", "WIDEST", "layers", "pack_weights"]
 
@@ -44,13 +44,6 @@ def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Int16[Ten
     tiles = filled.reshape(len(weight) // TILE, 2, ROWS, -1, ROWS, 2).permute(0, 3, 1, 4, 2, 5)
     high = tiles.bfloat16()
     return torch.stack([high, (tiles - high).bfloat16()], 2).flatten().view(torch.int16)
-
-
-class _BFloat(ir.Type):
-    """The type bfloat of LLVM, which llvmlite does not know."""
-
-    def _to_string(self):
-        return "bfloat"
 
 
 def _call(builder, name, *arguments):
@@ -179,13 +172,11 @@ def _halving(least):
 
         def generate(context, builder, signature, arguments):
             value = _numbers(context, builder, signature.args[0], arguments[0], arguments[1], least)
-            narrow, wide = (ir.VectorType(ir.IntType(bits), ROWS) for bits in (16, 32))
-            halves = ir.VectorType(_BFloat(), ROWS)
-            upper = builder.bitcast(builder.fptrunc(value, halves), narrow)
+            wide = ir.VectorType(ir.IntType(32), ROWS)
+            upper = rounded(builder, value)
             _write(context, builder, signature.args[2], arguments[2], arguments[3], upper)
             again = builder.shl(builder.zext(upper, wide), ir.Constant(wide, [16] * ROWS))
-            rest = builder.fsub(value, builder.bitcast(again, value.type))
-            rest = builder.bitcast(builder.fptrunc(rest, halves), narrow)
+            rest = rounded(builder, builder.fsub(value, builder.bitcast(again, value.type)))
             _write(context, builder, signature.args[2], arguments[2], arguments[4], rest)
             return context.get_dummy_value()
 

@@ -1,0 +1,95 @@
+"""The kernel of `layers` in mixed precision: products of bfloat16 by AVX-512, added up in single precision.
+
+Numbers between layers, and weights, are rounded to bfloat16: values differ from those of single precision by some 0.1
+to 1 % of the largest. Numbers below 1e-38 count as zero.
+"""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int32
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from torch import Tensor
+from torch.nn.functional import pad
+
+from hyperplanes.geometry.kernels.layers import BLOCK, COLUMNS, LANES, TILE, copy_block, multiply_tile, rounded
+
+__all__ = ["COLUMNS", "WIDEST", "layers", "pack_weights"]
+
+WIDEST = 512  # no wider layers were measured
+
+
+def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Int32[Tensor, " pair"]:
+    """The weights of a layer in the order in which the kernel reads them.
+
+    Args:
+        weight: with a multiple of COLUMNS outputs.
+        first: how many of the inputs come first, and are filled up with a zero to an even number. The number of the
+            others has to be even.
+    """
+    filled = torch.cat([pad(weight[:, :first], (0, first % 2)), weight[:, first:]], 1)
+    pairs = filled.bfloat16().reshape(len(weight) // COLUMNS, COLUMNS, -1, 2).transpose(1, 2)
+    return pairs.flatten().view(torch.int32)
+
+
+@intrinsic
+def _round(typing_context, numbers, at, pairs, place):
+    """A vector of numbers from `at` on as pairs of bfloat16 from `place` on."""
+
+    def generate(context, builder, signature, arguments):
+        def address(array, offset, kind):
+            data = context.make_array(signature.args[array])(context, builder, arguments[array]).data
+            return builder.bitcast(builder.gep(data, [arguments[offset]]), kind.as_pointer())
+
+        value = builder.load(address(0, 1, ir.VectorType(ir.FloatType(), LANES)), align=4)
+        value = rounded(builder, value)
+        builder.store(value, address(2, 3, value.type), align=4)
+        return context.get_dummy_value()
+
+    return types.void(numbers, types.int64, pairs, types.int64), generate
+
+
+@no_type_check
+def layers(given, weights, biases, shape, out, start, stop):
+    """The values of points start..stop after all layers, into `out`; arguments as those of the kernel in `layers`.
+
+    `weights` are those of all layers as `pack_weights` makes them.
+    """
+    depth, width, skip = shape
+    size, half = (given.shape[1] + 1) // 2, width // 2  # pairs of a point
+    values, last = np.zeros(BLOCK * 2 * size + LANES, np.float32), np.zeros(BLOCK * width, np.float32)
+    inputs = np.zeros(BLOCK * size + LANES, np.int32)
+    one, other = np.zeros(BLOCK * half, np.int32), np.zeros(BLOCK * half, np.int32)
+    for first in range(start, stop, BLOCK):
+        count = min(BLOCK, stop - first)
+        copy_block(given, first, count, values, 2 * size)
+        for number in range(0, count * 2 * size, LANES):
+            _round(values, number, inputs, number // 2)
+        read = 0
+        for layer in range(depth):
+            one, other = other, one  # `one` is written, `other` read
+            used, also = size if layer == 0 or layer == skip else 0, half if layer > 0 else 0
+            for column in range(0, width, COLUMNS):
+                for point in range(0, count, TILE):
+                    bias = layer * width + column
+                    if layer < depth - 1:
+                        to = point * half + column // 2
+                        multiply_tile(
+                            inputs, point * size, size, used, other, point * half, half, also, weights, read, biases,
+                            bias, one, to,
+                        )  # fmt: skip
+                    else:
+                        to = point * width + column
+                        multiply_tile(
+                            inputs, point * size, size, used, other, point * half, half, also, weights, read, biases,
+                            bias, last, to,
+                        )  # fmt: skip
+                read += COLUMNS * (used + also)
+        for point in range(count):
+            for number in range(width):
+                out[first + point, number] = last[point * width + number]
