@@ -4,9 +4,9 @@
     python -m benchmarks all --root data --data data/cars data/chairs --scene chair --meshes miner.glb taxi.glb
 
 Each runs in a process of its own, and writes the commit, the hardware and the load beside its rows. Those of speed run
-one after the other, then those of quality several at once. Those that judge or train models need data sets: the suites
-of `benchmarks/views.py` below --root, others --data. Without --scene and --meshes, procedural objects are adapted to
-and photographed in place of those of the pages.
+one after the other, then those of quality several at once; the seconds in the rows of these say little. Those that
+judge or train models need data sets: the suites of `benchmarks/views.py` below --root, others --data. Without --scene
+and --meshes, procedural objects are adapted to and photographed in place of those of the pages.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import argparse
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -86,11 +87,13 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--workers", type=int, default=usable_cores(), help="how many of those that judge quality run "
                         "at once; those of speed run alone, before (default: %(default)s)")  # fmt: skip
     chosen = parser.parse_args(arguments)
-    commands, workers = _commands(chosen), max(1, chosen.workers)
+    if chosen.workers < 1:
+        parser.error(f"--workers: expected at least 1, got {chosen.workers}")
+    commands = _commands(chosen)
     of_speed = {name: options for name, (benchmark, options) in commands.items() if benchmark in OF_SPEED}
     others = {name: options for name, (_, options) in commands.items() if name not in of_speed}
-    threads = {"OMP_NUM_THREADS": str(max(1, usable_cores() // workers))} if workers > 1 else {}
-    failed = _run(of_speed, 1, {}) + _run(others, workers, threads)
+    threads = {"OMP_NUM_THREADS": str(max(1, usable_cores() // chosen.workers))}
+    failed = _run(of_speed, 1, {}) + _run(others, chosen.workers, threads)
     print(f"benchmarks all: {len(commands) - len(failed)} of {len(commands)} done", *failed, sep="; failed: ")
     if not chosen.data:
         print(f"benchmarks all: without --data none of {', '.join(OF_DATA)}")
@@ -100,20 +103,23 @@ def main(arguments: list[str]) -> int:
 
 
 def _run(commands: dict[str, list[str]], workers: int, settings: dict[str, str]) -> list[str]:
-    """Run commands, so many at once, and return the names of those that failed.
+    """Run commands, so many at once, print how long each took, and return the names of those that failed.
 
     Args:
         commands: by the names of their results.
         workers: how many run at once.
-        settings: of their environment, beside what it has.
+        settings: of their environment, where it does not say otherwise.
     """
 
-    def failed(command: list[str]) -> bool:
-        return subprocess.run(command, check=False, env=os.environ | settings).returncode != 0
+    def failed(name: str) -> bool:
+        begun = time.perf_counter()
+        found = subprocess.run(commands[name], check=False, env=settings | os.environ)
+        print(f"benchmarks all: {name} took {time.perf_counter() - begun:.0f} s", flush=True)
+        return found.returncode != 0
 
     pool = ThreadPoolExecutor(workers)
     try:
-        return [name for name, bad in zip(commands, pool.map(failed, commands.values()), strict=True) if bad]
+        return [name for name, bad in zip(commands, pool.map(failed, commands), strict=True) if bad]
     finally:
         pool.shutdown(cancel_futures=True)  # the rest, after an interrupt
 

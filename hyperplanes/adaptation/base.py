@@ -153,24 +153,25 @@ class AdaptedField:
             cameras: any number, one image size, on any device and in any precision.
             sampling: another sampler than that of the field, whose samples are denser for pictures where it marches.
             antialias: three rays through each pixel at an edge; where absent, where it marches.
-            mixed_precision: a network of single precision may multiply numbers of bfloat16 (`Field.mixed_precision`).
+            mixed_precision: a network of single precision may multiply numbers of bfloat16 (`Field.mixed_precision`);
+                otherwise the field decides.
 
         Returns:
             One picture a camera, on the device of the field.
         """
         sampling = sampling or self.sampling.for_rendering(pixels_across(cameras, self.occupancy.bounds))
         return render(
-            self._of_pictures(self.field, mixed_precision),
+            self._for_pictures(self.field, mixed_precision),
             camera.to(cameras, self.occupancy.occupied.device),
             sampling,
             bounds=self.occupancy.bounds,
             occupancy=self.refined_occupancy if sampling.needs_occupancy else None,
-            proposal=self.proposal and self._of_pictures(self.proposal, mixed_precision),
+            proposal=self.proposal and self._for_pictures(self.proposal, mixed_precision),
             antialias=antialias,
         )
 
-    def _of_pictures(self, field: FieldFunction, mixed_precision: bool) -> FieldFunction:
-        """A field as a function of single-precision points, whatever its own precision."""
+    def _for_pictures(self, field: FieldFunction, mixed_precision: bool) -> FieldFunction:
+        """A field as a function of single-precision points; in mixed precision, if it is a network of single one."""
         if self.dtype != torch.float32:
             return _SplitCast(field, self.dtype) if isinstance(field, SplitField) else _Cast(field, self.dtype)
         return field.in_mixed_precision if mixed_precision and isinstance(field, Field) else field

@@ -49,7 +49,7 @@ class TrainingConfig:
         hypernetwork_learning_rate: of the hypernetwork.
         precision: of a hypernetwork's convolutions and matrix products: "single", or "bfloat16" beside weights and
             updates of single precision (`torch.autocast`). "automatic" is bfloat16 for hypernetworks that read volumes
-            on CPUs with AMX and on those of AMD with AVX512_BF16, where a step of `small` takes three quarters of the
+            on CPUs with AMX and, on Linux, AMD's with AVX512_BF16, where a step of `small` takes three quarters of the
             time, and single elsewhere. Those that read images standardise codes over the few objects of a step, and
             rounding grows with that. A training that is resumed keeps the precision that it began with.
         warmup: steps in which the learning rates rise from zero.

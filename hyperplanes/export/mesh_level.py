@@ -123,7 +123,7 @@ def _pixel_rays(cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
 
 def _rendered(field: AdaptedField, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
     """What a field's pictures cover, and how far away it is along the rays; both (view, pixel), on the CPU."""
-    pictures = field.render(cameras, antialias=False)
+    pictures = field.render(cameras, antialias=False, mixed_precision=False)
     return pictures.opacity.flatten(1).cpu() > 0.5, pictures.depth.flatten(1).cpu()
 
 

@@ -53,7 +53,7 @@ def render_guide(adapted: AdaptedField, views: Views) -> Views | None:
     around = camera.pinhole(matrix, camera.look_at(eyes, bounds.centre), *views.size)
     height, width = (max(8, side // 2) for side in views.size)
     around = camera.resized(around, height, width)
-    return Views(adapted.render(around).images.clamp(0, 1).cpu(), around, bounds=bounds)
+    return Views(adapted.render(around, mixed_precision=False).images.clamp(0, 1).cpu(), around, bounds=bounds)
 
 
 def fit_voxels(

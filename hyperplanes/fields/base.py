@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear, relu, softplus
 
 from hyperplanes.fields.encoding import encode, encoded_size
-from hyperplanes.fields.layers import Layer, PackedLayers, wants_values_alone
+from hyperplanes.fields.layers import Layer, PackedLayers, has_mixed_precision, wants_values_alone
 from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
@@ -222,8 +222,8 @@ class Field:
 
     @cached_property
     def in_mixed_precision(self) -> Self:
-        """The same field, whose layers may multiply numbers of bfloat16."""
-        return replace(self, mixed_precision=True)
+        """The same field, whose layers may multiply numbers of bfloat16; itself where that is no faster."""
+        return replace(self, mixed_precision=True) if has_mixed_precision() and not self.mixed_precision else self
 
     @property
     def dtype(self) -> torch.dtype:

@@ -15,7 +15,7 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel, layers_module
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.utilities.transforms import transform_of
 
-__all__ = ["Layer", "PackedLayers", "wants_values_alone"]
+__all__ = ["Layer", "PackedLayers", "has_mixed_precision", "wants_values_alone"]
 
 Layer = tuple[Tensor, Tensor]
 """Weights (width, input) and biases (width,)."""
@@ -40,12 +40,17 @@ def wants_values_alone(inputs: Tensor, layers: Sequence[Layer]) -> bool:
     return not transform_of(*given)
 
 
+def has_mixed_precision() -> bool:
+    """Whether another kernel multiplies layers in mixed precision than in single precision on this processor."""
+    return layers_module(mixed_precision=True) != layers_module()
+
+
 @dataclass(frozen=True)
 class PackedLayers:
     """Fully connected layers with ReLU, of which one reads the inputs once more, as the kernel reads them.
 
     Four layers of 128 values take 0.67 to 0.83 of the time of PyTorch's by AVX-512 and 0.36 to 0.50 by AMX, with 64 to
-    4,096 points (one thread of an Intel processor), and 0.64 to 0.79 by AVX-512 and 0.37 to 0.46 by its instructions
+    4,096 points (one thread of an Intel processor), and 0.64 to 0.77 by AVX-512 and 0.37 to 0.45 by its instructions
     for bfloat16 on a Zen 4. The kernels do not hold the interpreter's lock. By AMX, values differ from those of PyTorch
     by some 1e-5 to 3e-5 of the largest, in mixed precision by 0.1 to 1 %. What is packed is for this process: it cannot
     be pickled.

@@ -94,7 +94,7 @@ def _allow_tiles() -> bool:
 def has_bfloat16_products() -> bool:
     """Whether AVX-512 multiplies numbers of bfloat16 faster than those of single precision.
 
-    That is so on AMD's processors that have such instructions; on Intel's it was not measured.
+    That is so on AMD's processors that have such instructions, as far as Linux tells; on Intel's it was not measured.
     """
     return {"AuthenticAMD", "avx512_bf16"} <= _features()
 
@@ -109,7 +109,7 @@ def has_fast_bfloat16() -> bool:
     unlimited = limit in ("ALL", "DEFAULT")
     if has_amx() and (unlimited or "AMX" in limit):
         return True
-    by_avx512 = unlimited or limit.startswith(("AVX512_CORE_BF16", "AVX512_CORE_FP16", "AVX10"))
+    by_avx512 = unlimited or limit.startswith(("AVX512_CORE_BF16", "AVX512_CORE_FP16", "AVX512_CORE_AMX", "AVX10"))
     return by_avx512 and has_bfloat16_products()
 
 

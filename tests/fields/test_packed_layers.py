@@ -9,6 +9,8 @@ from torch.autograd import forward_ad
 
 from hyperplanes.adaptation import AdaptedField
 from hyperplanes.adaptation.stacking import stack
+from hyperplanes.export import mesh_level
+from hyperplanes.export.voxel_fitting import render_guide
 from hyperplanes.fields import TARGETS, TargetConfig
 from hyperplanes.fields import layers as packed_layers
 from hyperplanes.fields.layers import PackedLayers
@@ -17,8 +19,9 @@ from hyperplanes.geometry.kernels import compiling, layers, layers_amx, layers_b
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast
 from hyperplanes.parameters import Parameters
-from hyperplanes.rendering import RayMarching
+from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.rendering.refinement import RefinedOccupancy
+from hyperplanes.views import Views
 from tests.reference_rendering import ring
 
 HAS_AMX = compiling.layers_module() == "layers_amx"
@@ -162,6 +165,7 @@ def test_shapes_that_do_not_go_together_are_left_to_pytorch():
         (1, True, True, True, (15, 0, 7), {}, ["layers", "layers"]),  # at the first call of AMX the process ends
         (1, True, True, True, (22, 1, 0), {"CPU_NAME": "generic"}, ["layers", "layers"]),  # cannot compile it
         (1, True, True, True, (22, 1, 0), {"CPU_FEATURES": "+avx2"}, ["layers", "layers"]),
+        (1, True, False, True, (22, 1, 0), {"ENABLE_AVX": 0}, ["layers", "layers"]),
     ],
 )
 def test_the_kernel_is_that_of_the_processor_and_the_compiler(  # noqa: PLR0913
@@ -262,24 +266,37 @@ def test_copies_and_pickles_hold_no_packed_weights(used):
 @torch.no_grad()
 def test_pictures_are_in_mixed_precision_unless_told_otherwise_and_values_never(monkeypatch):
     asked, cameras = [], ring(1, (8, 8))
-    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision: asked.append(mixed_precision))
+    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision=False: mixed_precision)
+    monkeypatch.setattr(PackedLayers, "of", lambda *_, mixed_precision: asked.append(mixed_precision))
 
-    def asked_by(compute):
+    def asked_by(compute, **changes):
         field, grid = field_of(CONFIG), full(Sphere(), 4)
         voxels = RefinedOccupancy(grid.occupied, grid.bounds, grid.occupied.float())
         asked.clear()
-        compute(AdaptedField(field, grid, RayMarching(8), refined=voxels))
-        return set(asked)
+        compute(AdaptedField(field, grid, RayMarching(8), refined=voxels, **changes))
+        return asked
 
     def stacked(field):
         return stack(field, field, 0.4)
 
-    assert asked_by(lambda field: field.render(cameras)) == {True}
-    assert asked_by(lambda field: stacked(field).render(cameras)) == {True}
-    assert asked_by(lambda field: field.render(cameras, mixed_precision=False)) == {False}
-    assert asked_by(lambda field: stacked(field).render(cameras, mixed_precision=False)) == {False}
-    assert asked_by(lambda field: (field.density(POINTS), field(POINTS, POINTS))) == {False}
-    assert asked_by(lambda field: field.trace(cast(cameras, torch.zeros(1).long(), torch.ones(1, 2)))) == {False}
+    assert asked_by(lambda field: [field.render(cameras) for _ in range(2)]) == [True]  # packed once
+    assert set(asked_by(lambda field: stacked(field).render(cameras))) == {True}
+    assert asked_by(lambda field: field.render(cameras, Hierarchical(4, 4)), proposal=field_of(CONFIG)) == [True, True]
+    assert asked_by(lambda field: field.render(cameras, mixed_precision=False)) == [False]
+    assert set(asked_by(lambda field: stacked(field).render(cameras, mixed_precision=False))) == {False}
+    assert asked_by(lambda field: (field.density(POINTS), field(POINTS, POINTS))) == [False]
+    assert asked_by(lambda field: field.trace(cast(cameras, torch.zeros(1).long(), torch.ones(1, 2)))) == [False]
+    assert asked_by(lambda field: mesh_level._rendered(field, cameras)) == [False]
+    assert asked_by(lambda field: render_guide(field, Views(torch.zeros(1, 3, 8, 8), cameras))) == [False]
+
+
+def test_there_is_no_other_field_where_mixed_precision_is_no_faster(monkeypatch):
+    field = field_of(CONFIG)
+    assert field.in_mixed_precision is field
+    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision=False: mixed_precision)
+    mixed = field_of(CONFIG).in_mixed_precision
+    assert mixed.mixed_precision
+    assert mixed.in_mixed_precision is mixed
 
 
 def test_inputs_of_another_size_are_refused_by_pytorch():

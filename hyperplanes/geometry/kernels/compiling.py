@@ -76,14 +76,15 @@ def layers_module(*, mixed_precision: bool = False) -> str | None:
     Returns:
         "layers_amx", "layers_bfloat16" or "layers", for AMX, for AVX-512's instructions for bfloat16 and for AVX-512
         alone; None without these or numba. Compilers before LLVM 20, and numba where the environment says what
-        processor it compiles for, do not know the instructions of the first two.
+        processor it compiles for or forbids AVX, do not know the instructions of the first two.
     """
     if not find_spec("numba"):
         return None
     from llvmlite.binding import get_host_cpu_features, llvm_version_info
     from numba.core import config
 
-    for_this_processor = not (getattr(config, "CPU_NAME", None) or getattr(config, "CPU_FEATURES", None))
+    told_otherwise = getattr(config, "CPU_NAME", None) or getattr(config, "CPU_FEATURES", None)
+    for_this_processor = not told_otherwise and getattr(config, "ENABLE_AVX", True)
     if for_this_processor and llvm_version_info >= LLVM_OF_BFLOAT16:
         if has_amx():
             return "layers_amx"

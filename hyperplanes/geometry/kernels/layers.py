@@ -25,11 +25,14 @@ __all__ = [
     "TILE",
     "WIDEST",
     "BFloat",
+    "address_of",
     "copy_block",
     "layers",
     "multiply_tile",
     "pack_weights",
+    "read_vector",
     "rounded",
+    "write_vector",
 ]
 
 TILE, LANES, VECTORS = 6, 16, 4  # 24 of the 32 registers of AVX-512 hold sums, four weights
@@ -68,6 +71,30 @@ def rounded(builder, value):
     count = value.type.count
     halves = builder.fptrunc(value, ir.VectorType(BFloat(), count))
     return builder.bitcast(halves, ir.VectorType(ir.IntType(16), count))
+
+
+def address_of(context, builder, kind, array, offset=None):
+    """Of an element of an array, as bytes."""
+    data = context.make_array(kind)(context, builder, array).data
+    place = data if offset is None else builder.gep(data, [offset])
+    return builder.bitcast(place, ir.IntType(8).as_pointer())
+
+
+def read_vector(context, builder, kind, array, at, least=None):
+    """LANES numbers of an array from `at` on, or `least` where that is more; NaN stays."""
+    floats = ir.VectorType(ir.FloatType(), LANES)
+    address = address_of(context, builder, kind, array, at)
+    value = builder.load(builder.bitcast(address, floats.as_pointer()), align=4)
+    if least is None:
+        return value
+    least = ir.Constant(floats, [least] * LANES)
+    return builder.select(builder.fcmp_ordered("<=", value, least), least, value)
+
+
+def write_vector(context, builder, kind, array, at, value):
+    """Write a vector into an array from `at` on."""
+    address = address_of(context, builder, kind, array, at)
+    builder.store(value, builder.bitcast(address, value.type.as_pointer()), align=2)
 
 
 def _add_product(builder, total, one, other):

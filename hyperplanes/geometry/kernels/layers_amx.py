@@ -18,17 +18,16 @@ from numba.extending import intrinsic
 from torch import Tensor
 from torch.nn.functional import pad
 
-from hyperplanes.geometry.kernels.layers import copy_block, rounded
+from hyperplanes.geometry.kernels.layers import LANES, address_of, copy_block, read_vector, rounded, write_vector
 
 __all__ = ["COLUMNS", "WIDEST", "layers", "pack_weights"]
 
-ROWS = 16  # of a tile, which are vectors of as many numbers of single precision
+ROWS = LANES  # of a tile, which are vectors of as many numbers of single precision
 TILE = COLUMNS = 2 * ROWS  # points and columns of four tiles, and inputs of one product
 BLOCK = 5 * TILE  # points that go through all layers together
 WIDEST = 2048  # no wider layers were measured
 
 _BYTE, _LONG = ir.IntType(8), ir.IntType(64)
-_POINTER = _BYTE.as_pointer()
 
 
 def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Int16[Tensor, " number"]:
@@ -53,18 +52,12 @@ def _call(builder, name, *arguments):
     builder.call(builder.module.declare_intrinsic(f"llvm.x86.{name}", (), kind), numbers)
 
 
-def _address(context, builder, kind, array, offset=None):
-    """Of an element of an array, as bytes."""
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(data if offset is None else builder.gep(data, [offset]), _POINTER)
-
-
 @intrinsic
 def _configure(typing_context, shapes):
     """Take the tile registers into use, with the shapes that the processor's manual describes."""
 
     def generate(context, builder, signature, arguments):
-        _call(builder, "ldtilecfg", _address(context, builder, signature.args[0], arguments[0]))
+        _call(builder, "ldtilecfg", address_of(context, builder, signature.args[0], arguments[0]))
         return context.get_dummy_value()
 
     return types.void(shapes), generate
@@ -86,7 +79,7 @@ def _begin(typing_context, biases, bias):
     """TILE points by TILE columns, tiles 0 to 3, become the biases of these columns."""
 
     def generate(context, builder, signature, arguments):
-        address = _address(context, builder, signature.args[0], *arguments)
+        address = address_of(context, builder, signature.args[0], *arguments)
         for tile in range(4):
             column = builder.gep(address, [_LONG(tile % 2 * ROWS * 4)])
             _call(builder, "tileloadd64", tile, column, _LONG(0))  # every row the same
@@ -104,8 +97,8 @@ def _multiply(typing_context, values, at, size, weights, first):
 
     def generate(context, builder, signature, arguments):
         size = arguments[2]
-        address = _address(context, builder, signature.args[0], *arguments[:2])
-        weights = _address(context, builder, signature.args[3], *arguments[3:])
+        address = address_of(context, builder, signature.args[0], *arguments[:2])
+        weights = address_of(context, builder, signature.args[3], *arguments[3:])
         pitch, low = builder.mul(size, _LONG(4)), builder.mul(size, _LONG(2))
 
         def load_values(start):
@@ -140,7 +133,7 @@ def _end(typing_context, sums):
     """Write tiles 0 to 3 as TILE rows of TILE."""
 
     def generate(context, builder, signature, arguments):
-        address = _address(context, builder, signature.args[0], arguments[0])
+        address = address_of(context, builder, signature.args[0], arguments[0])
         for tile in range(4):
             place = tile // 2 * ROWS * TILE + tile % 2 * ROWS
             _call(builder, "tilestored64", tile, builder.gep(address, [_LONG(place * 4)]), _LONG(TILE * 4))
@@ -149,35 +142,19 @@ def _end(typing_context, sums):
     return types.void(sums), generate
 
 
-def _numbers(context, builder, kind, array, at, least):
-    """A vector of numbers of an array from `at` on, or `least` where that is more; NaN stays."""
-    floats = ir.VectorType(ir.FloatType(), ROWS)
-    address = _address(context, builder, kind, array, at)
-    value = builder.load(builder.bitcast(address, floats.as_pointer()), align=4)
-    if least is None:
-        return value
-    least = ir.Constant(floats, [least] * ROWS)
-    return builder.select(builder.fcmp_ordered("<=", value, least), least, value)
-
-
-def _write(context, builder, kind, array, at, value):
-    address = _address(context, builder, kind, array, at)
-    builder.store(value, builder.bitcast(address, value.type.as_pointer()), align=2)
-
-
 def _halving(least):
     @intrinsic
     def halve(typing_context, numbers, at, parts, high, low):
         """A vector of numbers from `at` on, not below `least`, as bfloat16 from `high` and from `low` on."""
 
         def generate(context, builder, signature, arguments):
-            value = _numbers(context, builder, signature.args[0], arguments[0], arguments[1], least)
+            value = read_vector(context, builder, signature.args[0], arguments[0], arguments[1], least)
             wide = ir.VectorType(ir.IntType(32), ROWS)
             upper = rounded(builder, value)
-            _write(context, builder, signature.args[2], arguments[2], arguments[3], upper)
+            write_vector(context, builder, signature.args[2], arguments[2], arguments[3], upper)
             again = builder.shl(builder.zext(upper, wide), ir.Constant(wide, [16] * ROWS))
             rest = rounded(builder, builder.fsub(value, builder.bitcast(again, value.type)))
-            _write(context, builder, signature.args[2], arguments[2], arguments[4], rest)
+            write_vector(context, builder, signature.args[2], arguments[2], arguments[4], rest)
             return context.get_dummy_value()
 
         index = types.int64
@@ -194,8 +171,8 @@ def _activate(typing_context, numbers, at, out, place):
     """A vector of numbers from `at` on, after ReLU, into `out` from `place` on."""
 
     def generate(context, builder, signature, arguments):
-        value = _numbers(context, builder, signature.args[0], arguments[0], arguments[1], 0.0)
-        _write(context, builder, signature.args[2], arguments[2], arguments[3], value)
+        value = read_vector(context, builder, signature.args[0], arguments[0], arguments[1], 0.0)
+        write_vector(context, builder, signature.args[2], arguments[2], arguments[3], value)
         return context.get_dummy_value()
 
     return types.void(numbers, types.int64, out, types.int64), generate

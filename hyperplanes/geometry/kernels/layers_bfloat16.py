@@ -11,13 +11,22 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int32
-from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 from torch import Tensor
 from torch.nn.functional import pad
 
-from hyperplanes.geometry.kernels.layers import BLOCK, COLUMNS, LANES, TILE, copy_block, multiply_tile, rounded
+from hyperplanes.geometry.kernels.layers import (
+    BLOCK,
+    COLUMNS,
+    LANES,
+    TILE,
+    copy_block,
+    multiply_tile,
+    read_vector,
+    rounded,
+    write_vector,
+)
 
 __all__ = ["COLUMNS", "WIDEST", "layers", "pack_weights"]
 
@@ -42,13 +51,8 @@ def _round(typing_context, numbers, at, pairs, place):
     """A vector of numbers from `at` on as pairs of bfloat16 from `place` on."""
 
     def generate(context, builder, signature, arguments):
-        def address(array, offset, kind):
-            data = context.make_array(signature.args[array])(context, builder, arguments[array]).data
-            return builder.bitcast(builder.gep(data, [arguments[offset]]), kind.as_pointer())
-
-        value = builder.load(address(0, 1, ir.VectorType(ir.FloatType(), LANES)), align=4)
-        value = rounded(builder, value)
-        builder.store(value, address(2, 3, value.type), align=4)
+        value = read_vector(context, builder, signature.args[0], arguments[0], arguments[1])
+        write_vector(context, builder, signature.args[2], arguments[2], arguments[3], rounded(builder, value))
         return context.get_dummy_value()
 
     return types.void(numbers, types.int64, pairs, types.int64), generate
@@ -62,8 +66,9 @@ def layers(given, weights, biases, shape, out, start, stop):
     """
     depth, width, skip = shape
     size, half = (given.shape[1] + 1) // 2, width // 2  # pairs of a point
+    # the last vector that is rounded may begin at the last number
     values, last = np.zeros(BLOCK * 2 * size + LANES, np.float32), np.zeros(BLOCK * width, np.float32)
-    inputs = np.zeros(BLOCK * size + LANES, np.int32)
+    inputs = np.zeros(BLOCK * size + LANES // 2, np.int32)
     one, other = np.zeros(BLOCK * half, np.int32), np.zeros(BLOCK * half, np.int32)
     for first in range(start, stop, BLOCK):
         count = min(BLOCK, stop - first)
