@@ -18,7 +18,7 @@ from hyperplanes.adaptation.finding_symmetry import _judged
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import TargetConfig
-from hyperplanes.geometry.kernels.compiling import layers_module
+from hyperplanes.fields.layers import has_mixed_precision
 from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
@@ -243,7 +243,7 @@ def test_three_rays_at_edges_bring_decibels_from_many_views(car):
     assert quality(field, task) > quality(field, task, antialias=False) + 0.5
 
 
-@pytest.mark.skipif(layers_module(mixed_precision=True) != "layers_bfloat16", reason="needs AVX512_BF16 of AMD")
+@pytest.mark.skipif(not has_mixed_precision(), reason="needs AMX, or AVX512_BF16 of AMD")
 def test_products_of_bfloat16_cost_a_hundredth_of_a_decibel():
     """0.003 dB on average over 30 objects at 128x128, 0.023 at most (docs/benchmarks.md)."""
     task, pictures = cars()[0], []

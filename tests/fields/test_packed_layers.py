@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from importlib import import_module
 
 import pytest
 import torch
@@ -15,34 +16,40 @@ from hyperplanes.fields import TARGETS, TargetConfig
 from hyperplanes.fields import layers as packed_layers
 from hyperplanes.fields.layers import PackedLayers
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.kernels import compiling, layers, layers_amx, layers_bfloat16
+from hyperplanes.geometry.kernels import compiling
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.views import Views
+from tests.fields.tile_registers import emulated_kernel
 from tests.reference_rendering import ring
 
 HAS_AMX = compiling.layers_module() == "layers_amx"
 HAS_BFLOAT16 = HAS_AMX or compiling.layers_module(mixed_precision=True) == "layers_bfloat16"
-WIDEST = {"layers": layers.WIDEST, "layers_bfloat16": layers_bfloat16.WIDEST, "layers_amx": layers_amx.WIDEST}
-ERRORS = {"layers": 1e-5, "layers_bfloat16": 5e-2, "layers_amx": 1e-4}
-"""Kernels, and how far their values may be from those of float64: products have 8 bits, or 16 by AMX."""
+ERRORS = {"layers": 1e-5, "layers_bfloat16": 5e-2, "layers_amx": 1e-4, "layers_amx_bfloat16": 5e-2}
+"""Kernels, and how far their values may be from those of float64: factors have 8 bits, or 16 by two numbers."""
+of_bfloat16 = pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AVX512_BF16")
 
 
 @pytest.fixture(
-    params=[
-        "layers",
-        pytest.param("layers_bfloat16", marks=pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AVX512_BF16")),
-        pytest.param("layers_amx", marks=pytest.mark.skipif(not HAS_AMX, reason="needs AMX")),
-    ],
-    autouse=True,
+    params=[name if name == "layers" else pytest.param(name, marks=of_bfloat16) for name in ERRORS], autouse=True
 )
 def module(request, monkeypatch):
-    """Each kernel; that of AVX-512 is right on every processor, and only used where it is fast."""
-    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision=False: request.param)
+    """Each kernel; that of AVX-512 is right on every processor, and only used where it is fast.
+
+    Where there is no AMX, its instructions are emulated.
+    """
+    use(request.param, monkeypatch)
     return request.param
+
+
+def use(name, monkeypatch):
+    """Multiply layers by the kernel of a module."""
+    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision=False: name)
+    if "amx" in name and not HAS_AMX:
+        monkeypatch.setattr(packed_layers, "compile_kernel", lambda kernel, dtype: emulated_kernel(kernel))
 
 
 def layers_of(depth, width, inputs, skip, seed=0):
@@ -89,11 +96,12 @@ def test_neither_the_batch_nor_threads_change_a_bit(threads):
         torch.set_num_threads(before)
 
 
-@pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AVX512_BF16")
+@of_bfloat16
+@pytest.mark.parametrize("name", ["layers_bfloat16", "layers_amx_bfloat16"])
 @pytest.mark.parametrize(("depth", "inputs"), [(1, 64), (1, 7), (4, 33)])
-def test_mixed_precision_rounds_the_factors_of_products_alone(depth, inputs, monkeypatch):
+def test_mixed_precision_rounds_the_factors_of_products_alone(name, depth, inputs, monkeypatch):
     """Sums and biases have single precision; a number between two of bfloat16 may become either, layers later."""
-    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision: "layers_bfloat16")
+    use(name, monkeypatch)
     layers, given = layers_of(depth, 64, inputs, depth // 2), torch.randn(70, inputs, generator=torch.Generator())
     doubles = [(weight.double(), bias.double()) for weight, bias in layers]
     exact = by_pytorch(doubles, given.double(), depth // 2)
@@ -104,10 +112,10 @@ def test_mixed_precision_rounds_the_factors_of_products_alone(depth, inputs, mon
     assert (found - rounded).square().mean() < 0.1 * (rounded - exact).square().mean()
 
 
-@pytest.mark.skipif(not HAS_AMX, reason="needs AMX")
+@of_bfloat16
 @pytest.mark.parametrize("width", [32, 96, 160])
 def test_amx_takes_widths_that_are_no_multiples_of_64(width, monkeypatch):
-    monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision: "layers_amx")
+    use("layers_amx", monkeypatch)
     layers, given = layers_of(3, width, 35, 1), torch.randn(50, 35, generator=torch.Generator().manual_seed(1))
     expected = by_pytorch([(weight.double(), bias.double()) for weight, bias in layers], given.double(), 1)
     torch.testing.assert_close(PackedLayers.of(layers, 1)(given), expected.float(), rtol=1e-4, atol=1e-4)
@@ -139,7 +147,7 @@ def test_nan_of_a_point_stays_with_it():
     [(63, torch.float32), (80, torch.float32), (None, torch.float32), (64, torch.float64)],
 )
 def test_other_widths_and_precisions_are_left_to_pytorch(module, width, dtype):
-    width = width or WIDEST[module] + 64
+    width = width or import_module(f"hyperplanes.geometry.kernels.{module}").WIDEST + 64
     layers = [(weight.to(dtype), bias.to(dtype)) for weight, bias in layers_of(2, width, 5, 1)]
     assert PackedLayers.of(layers, 1) is None
 
@@ -161,7 +169,7 @@ def test_shapes_that_do_not_go_together_are_left_to_pytorch():
         (1, False, False, False, (22, 1, 0), {}, [None, None]),
         (1, True, False, False, (22, 1, 0), {}, ["layers", "layers"]),
         (1, True, False, True, (22, 1, 0), {}, ["layers", "layers_bfloat16"]),
-        (1, True, True, True, (22, 1, 0), {}, ["layers_amx", "layers_amx"]),
+        (1, True, True, True, (22, 1, 0), {}, ["layers_amx", "layers_amx_bfloat16"]),
         (1, True, True, True, (15, 0, 7), {}, ["layers", "layers"]),  # at the first call of AMX the process ends
         (1, True, True, True, (22, 1, 0), {"CPU_NAME": "generic"}, ["layers", "layers"]),  # cannot compile it
         (1, True, True, True, (22, 1, 0), {"CPU_FEATURES": "+avx2"}, ["layers", "layers"]),

@@ -62,6 +62,7 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
     ),
     "layers.layers": "T[:, :], T[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
     "layers_bfloat16.layers": "T[:, :], int32[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
+    "layers_amx_bfloat16.layers": "T[:, :], int16[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
     "layers_amx.layers": "T[:, :], int16[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
 }
 
@@ -74,9 +75,10 @@ def layers_module(*, mixed_precision: bool = False) -> str | None:
         mixed_precision: whether it may round the factors of products to bfloat16.
 
     Returns:
-        "layers_amx", "layers_bfloat16" or "layers", for AMX, for AVX-512's instructions for bfloat16 and for AVX-512
-        alone; None without these or numba. Compilers before LLVM 20, and numba where the environment says what
-        processor it compiles for or forbids AVX, do not know the instructions of the first two.
+        "layers_amx", "layers_amx_bfloat16", "layers_bfloat16" or "layers", for AMX, for AVX-512's instructions for
+        bfloat16 and for AVX-512 alone; None without these or numba. Compilers before LLVM 20, and numba where the
+        environment says what processor it compiles for or forbids AVX, do not know the instructions of all but the
+        last.
     """
     if not find_spec("numba"):
         return None
@@ -87,7 +89,7 @@ def layers_module(*, mixed_precision: bool = False) -> str | None:
     for_this_processor = not told_otherwise and getattr(config, "ENABLE_AVX", True)
     if for_this_processor and llvm_version_info >= LLVM_OF_BFLOAT16:
         if has_amx():
-            return "layers_amx"
+            return "layers_amx_bfloat16" if mixed_precision else "layers_amx"
         if mixed_precision and has_bfloat16_products():
             return "layers_bfloat16"
     try:

@@ -32,6 +32,7 @@ __all__ = [
     "pack_weights",
     "read_vector",
     "rounded",
+    "rounding",
     "write_vector",
 ]
 
@@ -95,6 +96,23 @@ def write_vector(context, builder, kind, array, at, value):
     """Write a vector into an array from `at` on."""
     address = address_of(context, builder, kind, array, at)
     builder.store(value, builder.bitcast(address, value.type.as_pointer()), align=2)
+
+
+def rounding(least):
+    """A function of kernels that rounds numbers to bfloat16, after those below `least`, if any, have become it."""
+
+    @intrinsic
+    def round_vector(typing_context, numbers, at, out, place):
+        """LANES numbers from `at` on, as bfloat16 from `place` on."""
+
+        def generate(context, builder, signature, arguments):
+            value = read_vector(context, builder, signature.args[0], arguments[0], arguments[1], least)
+            write_vector(context, builder, signature.args[2], arguments[2], arguments[3], rounded(builder, value))
+            return context.get_dummy_value()
+
+        return types.void(numbers, types.int64, out, types.int64), generate
+
+    return round_vector
 
 
 def _add_product(builder, total, one, other):

@@ -18,9 +18,18 @@ from numba.extending import intrinsic
 from torch import Tensor
 from torch.nn.functional import pad
 
-from hyperplanes.geometry.kernels.layers import LANES, address_of, copy_block, read_vector, rounded, write_vector
+from hyperplanes.geometry.kernels.blocks import inlined
+from hyperplanes.geometry.kernels.layers import (
+    LANES,
+    address_of,
+    copy_block,
+    read_vector,
+    rounded,
+    rounding,
+    write_vector,
+)
 
-__all__ = ["COLUMNS", "WIDEST", "layers", "pack_weights"]
+__all__ = ["COLUMNS", "WIDEST", "layers", "multiply_layers", "pack_weights"]
 
 ROWS = LANES  # of a tile, which are vectors of as many numbers of single precision
 TILE = COLUMNS = 2 * ROWS  # points and columns of four tiles, and inputs of one product
@@ -30,19 +39,20 @@ WIDEST = 2048  # no wider layers were measured
 _BYTE, _LONG = ir.IntType(8), ir.IntType(64)
 
 
-def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Int16[Tensor, " number"]:
+def pack_weights(weight: Float[Tensor, "output input"], first: int, parts: int = 2) -> Int16[Tensor, " number"]:
     """The weights of a layer in the order in which the kernel reads them.
 
     Args:
         weight: with a multiple of TILE outputs.
         first: how many of the inputs come first, and are filled up with zeros to a multiple of TILE. The number of the
             others has to be a multiple of it.
+        parts: how many numbers of bfloat16 a weight is the sum of, 1 or 2.
     """
     filled = torch.cat([pad(weight[:, :first], (0, -first % TILE)), weight[:, first:]], 1)
     # blocks of TILE columns, two tiles of columns, and of their inputs pairs side by side
     tiles = filled.reshape(len(weight) // TILE, 2, ROWS, -1, ROWS, 2).permute(0, 3, 1, 4, 2, 5)
     high = tiles.bfloat16()
-    return torch.stack([high, (tiles - high).bfloat16()], 2).flatten().view(torch.int16)
+    return torch.stack([high, (tiles - high).bfloat16()][:parts], 2).flatten().view(torch.int16)
 
 
 def _call(builder, name, *arguments):
@@ -88,44 +98,53 @@ def _begin(typing_context, biases, bias):
     return types.void(biases, types.int64), generate
 
 
-@intrinsic
-def _multiply(typing_context, values, at, size, weights, first):
-    """Add the products of TILE points, from TILE inputs on, with weights.
+def _multiplying(parts):
+    @intrinsic
+    def multiply(typing_context, values, at, size, weights, first):
+        """Add the products of TILE points, from TILE inputs on, with weights.
 
-    The high halves of a point lie from `at` on, the low ones `size` further, and the next point after 2 * `size`.
-    """
+        The high halves of a point lie from `at` on, the low ones, where there are two parts, `size` further, and the
+        next point after `parts * size`.
+        """
 
-    def generate(context, builder, signature, arguments):
-        size = arguments[2]
-        address = address_of(context, builder, signature.args[0], *arguments[:2])
-        weights = address_of(context, builder, signature.args[3], *arguments[3:])
-        pitch, low = builder.mul(size, _LONG(4)), builder.mul(size, _LONG(2))
+        def generate(context, builder, signature, arguments):
+            size = arguments[2]
+            address = address_of(context, builder, signature.args[0], *arguments[:2])
+            weights = address_of(context, builder, signature.args[3], *arguments[3:])
+            pitch, low = builder.mul(size, _LONG(2 * parts)), builder.mul(size, _LONG(2))
 
-        def load_values(start):
-            for tile in range(2):
-                rows = builder.mul(pitch, _LONG(tile * ROWS))
-                _call(builder, "tileloadd64", 4 + tile, builder.gep(start, [rows]), pitch)
+            def load_values(start):
+                for tile in range(2):
+                    rows = builder.mul(pitch, _LONG(tile * ROWS))
+                    _call(builder, "tileloadd64", 4 + tile, builder.gep(start, [rows]), pitch)
 
-        def load_weights(half):
-            for tile in range(2):
-                place = builder.gep(weights, [_LONG((2 * half + tile) * 1024)])
-                _call(builder, "tileloadd64", 6 + tile, place, _LONG(64))
+            def load_weights(half):
+                for tile in range(2):
+                    place = builder.gep(weights, [_LONG((2 * half + tile) * 1024)])
+                    _call(builder, "tileloadd64", 6 + tile, place, _LONG(64))
 
-        def add():
-            for tile in range(4):
-                _call(builder, "tdpbf16ps", tile, 4 + tile // 2, 6 + tile % 2)
+            def add():
+                for tile in range(4):
+                    _call(builder, "tdpbf16ps", tile, 4 + tile // 2, 6 + tile % 2)
 
-        load_values(address)
-        load_weights(1)
-        add()
-        load_weights(0)
-        add()
-        load_values(builder.gep(address, [low]))
-        add()
-        return context.get_dummy_value()
+            load_values(address)
+            if parts == 2:
+                load_weights(1)
+                add()
+            load_weights(0)
+            add()
+            if parts == 2:
+                load_values(builder.gep(address, [low]))
+                add()
+            return context.get_dummy_value()
 
-    index = types.int64
-    return types.void(values, index, index, weights, index), generate
+        index = types.int64
+        return types.void(values, index, index, weights, index), generate
+
+    return multiply
+
+
+_multiply, _multiply_rounded = _multiplying(2), _multiplying(1)
 
 
 @intrinsic
@@ -164,6 +183,7 @@ def _halving(least):
 
 
 _halve, _halve_activated = _halving(None), _halving(0.0)
+_round, _round_activated = rounding(None), rounding(0.0)
 
 
 @intrinsic
@@ -178,16 +198,14 @@ def _activate(typing_context, numbers, at, out, place):
     return types.void(numbers, types.int64, out, types.int64), generate
 
 
+@inlined
 @no_type_check
-def layers(given, weights, biases, shape, out, start, stop):
-    """The values of points start..stop after all layers, into `out`; arguments as those of the kernel in `layers`.
-
-    `weights` are those of all layers as `pack_weights` makes them.
-    """
+def multiply_layers(given, weights, biases, shape, out, start, stop, parts):  # noqa: PLR0913
+    """The kernel with factors that are the sums of two numbers of bfloat16, or with one part alone."""
     depth, width, skip = shape
     size = (given.shape[1] + TILE - 1) // TILE * TILE
-    inputs = np.zeros(BLOCK * 2 * size, np.int16)
-    one, other = np.zeros(BLOCK * 2 * width, np.int16), np.zeros(BLOCK * 2 * width, np.int16)
+    inputs = np.zeros(BLOCK * parts * size, np.int16)
+    one, other = np.zeros(BLOCK * parts * width, np.int16), np.zeros(BLOCK * parts * width, np.int16)
     values, sums = np.zeros(BLOCK * size, np.float32), np.zeros(TILE * TILE, np.float32)
     shapes = np.zeros(64, np.uint8)
     shapes[0] = 1
@@ -199,8 +217,11 @@ def layers(given, weights, biases, shape, out, start, stop):
         count = min(BLOCK, stop - first)
         copy_block(given, first, count, values, size)
         for number in range(0, count * size, ROWS):
-            at = number + number // size * size  # after the low halves of the points before
-            _halve(values, number, inputs, at, at + size)
+            at = number + number // size * size * (parts - 1)  # after the low halves of the points before
+            if parts == 2:
+                _halve(values, number, inputs, at, at + size)
+            else:
+                _round(values, number, inputs, at)
         read = 0
         for layer in range(depth):
             one, other = other, one  # `one` is written, `other` read
@@ -210,19 +231,36 @@ def layers(given, weights, biases, shape, out, start, stop):
                     _begin(biases, layer * width + column)
                     place = read
                     for number in range(0, used, TILE):
-                        _multiply(inputs, 2 * point * size + number, size, weights, place)
-                        place += 2 * TILE * TILE
+                        if parts == 2:
+                            _multiply(inputs, parts * point * size + number, size, weights, place)
+                        else:
+                            _multiply_rounded(inputs, parts * point * size + number, size, weights, place)
+                        place += parts * TILE * TILE
                     for number in range(0, also, TILE):
-                        _multiply(other, 2 * point * width + number, width, weights, place)
-                        place += 2 * TILE * TILE
+                        if parts == 2:
+                            _multiply(other, parts * point * width + number, width, weights, place)
+                        else:
+                            _multiply_rounded(other, parts * point * width + number, width, weights, place)
+                        place += parts * TILE * TILE
                     _end(sums)
                     for line in range(min(TILE, count - point)):
                         for number in range(0, TILE, ROWS):
                             at = line * TILE + number
-                            if layer < depth - 1:
-                                place = 2 * (point + line) * width + column + number
+                            place = parts * (point + line) * width + column + number
+                            if layer == depth - 1:
+                                _activate(sums, at, out, (first + point + line) * width + column + number)
+                            elif parts == 2:
                                 _halve_activated(sums, at, one, place, place + width)
                             else:
-                                _activate(sums, at, out, (first + point + line) * width + column + number)
-                read += 2 * TILE * (used + also)
+                                _round_activated(sums, at, one, place)
+                read += parts * TILE * (used + also)
     _release()
+
+
+@no_type_check
+def layers(given, weights, biases, shape, out, start, stop):
+    """The values of points start..stop after all layers, into `out`; arguments as those of the kernel in `layers`.
+
+    `weights` are those of all layers as `pack_weights` makes them.
+    """
+    multiply_layers(given, weights, biases, shape, out, start, stop, 2)

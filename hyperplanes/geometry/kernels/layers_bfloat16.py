@@ -11,26 +11,16 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int32
-from numba import types
-from numba.extending import intrinsic
 from torch import Tensor
 from torch.nn.functional import pad
 
-from hyperplanes.geometry.kernels.layers import (
-    BLOCK,
-    COLUMNS,
-    LANES,
-    TILE,
-    copy_block,
-    multiply_tile,
-    read_vector,
-    rounded,
-    write_vector,
-)
+from hyperplanes.geometry.kernels.layers import BLOCK, COLUMNS, LANES, TILE, copy_block, multiply_tile, rounding
 
 __all__ = ["COLUMNS", "WIDEST", "layers", "pack_weights"]
 
 WIDEST = 512  # no wider layers were measured
+
+_round = rounding(None)
 
 
 def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Int32[Tensor, " pair"]:
@@ -44,18 +34,6 @@ def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Int32[Ten
     filled = torch.cat([pad(weight[:, :first], (0, first % 2)), weight[:, first:]], 1)
     pairs = filled.bfloat16().reshape(len(weight) // COLUMNS, COLUMNS, -1, 2).transpose(1, 2)
     return pairs.flatten().view(torch.int32)
-
-
-@intrinsic
-def _round(typing_context, numbers, at, pairs, place):
-    """A vector of numbers from `at` on as pairs of bfloat16 from `place` on."""
-
-    def generate(context, builder, signature, arguments):
-        value = read_vector(context, builder, signature.args[0], arguments[0], arguments[1])
-        write_vector(context, builder, signature.args[2], arguments[2], arguments[3], rounded(builder, value))
-        return context.get_dummy_value()
-
-    return types.void(numbers, types.int64, pairs, types.int64), generate
 
 
 @no_type_check
