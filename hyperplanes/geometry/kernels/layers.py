@@ -17,26 +17,11 @@ from numba.extending import intrinsic
 from torch import Tensor
 
 from hyperplanes.geometry.kernels.blocks import inlined
+from hyperplanes.geometry.kernels.vectors import LANES, BFloat, rounded
 
-__all__ = [
-    "BLOCK",
-    "COLUMNS",
-    "LANES",
-    "TILE",
-    "WIDEST",
-    "BFloat",
-    "address_of",
-    "copy_block",
-    "layers",
-    "multiply_tile",
-    "pack_weights",
-    "read_vector",
-    "rounded",
-    "rounding",
-    "write_vector",
-]
+__all__ = ["BLOCK", "COLUMNS", "TILE", "WIDEST", "copy_block", "layers", "multiply_tile", "pack_weights"]
 
-TILE, LANES, VECTORS = 6, 16, 4  # 24 of the 32 registers of AVX-512 hold sums, four weights
+TILE, VECTORS = 6, 4  # 24 of the 32 registers of AVX-512 hold sums, four weights
 COLUMNS = LANES * VECTORS
 BLOCK = 10 * TILE
 WIDEST = 512  # wider layers are as fast by PyTorch
@@ -52,67 +37,6 @@ def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Float[Ten
         first: how many of the inputs come first, which makes no difference here.
     """
     return weight.unflatten(0, (-1, COLUMNS)).transpose(1, 2).flatten()
-
-
-class BFloat(ir.Type):
-    """The type bfloat of LLVM, which llvmlite does not know."""
-
-    def _to_string(self):
-        return "bfloat"
-
-    def __eq__(self, other):
-        return isinstance(other, BFloat)
-
-    def __hash__(self):
-        return hash(BFloat)
-
-
-def rounded(builder, value):
-    """A vector of single precision rounded to bfloat16, as integers of 16 bits."""
-    count = value.type.count
-    halves = builder.fptrunc(value, ir.VectorType(BFloat(), count))
-    return builder.bitcast(halves, ir.VectorType(ir.IntType(16), count))
-
-
-def address_of(context, builder, kind, array, offset=None):
-    """Of an element of an array, as bytes."""
-    data = context.make_array(kind)(context, builder, array).data
-    place = data if offset is None else builder.gep(data, [offset])
-    return builder.bitcast(place, ir.IntType(8).as_pointer())
-
-
-def read_vector(context, builder, kind, array, at, least=None):
-    """LANES numbers of an array from `at` on, or `least` where that is more; NaN stays."""
-    floats = ir.VectorType(ir.FloatType(), LANES)
-    address = address_of(context, builder, kind, array, at)
-    value = builder.load(builder.bitcast(address, floats.as_pointer()), align=4)
-    if least is None:
-        return value
-    least = ir.Constant(floats, [least] * LANES)
-    return builder.select(builder.fcmp_ordered("<=", value, least), least, value)
-
-
-def write_vector(context, builder, kind, array, at, value):
-    """Write a vector into an array from `at` on."""
-    address = address_of(context, builder, kind, array, at)
-    builder.store(value, builder.bitcast(address, value.type.as_pointer()), align=2)
-
-
-def rounding(least):
-    """A function of kernels that rounds numbers to bfloat16, after those below `least`, if any, have become it."""
-
-    @intrinsic
-    def round_vector(typing_context, numbers, at, out, place):
-        """LANES numbers from `at` on, as bfloat16 from `place` on."""
-
-        def generate(context, builder, signature, arguments):
-            value = read_vector(context, builder, signature.args[0], arguments[0], arguments[1], least)
-            write_vector(context, builder, signature.args[2], arguments[2], arguments[3], rounded(builder, value))
-            return context.get_dummy_value()
-
-        return types.void(numbers, types.int64, out, types.int64), generate
-
-    return round_vector
 
 
 def _add_product(builder, total, one, other):

@@ -19,15 +19,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from hyperplanes.geometry.kernels.blocks import inlined
-from hyperplanes.geometry.kernels.layers import (
-    LANES,
-    address_of,
-    copy_block,
-    read_vector,
-    rounded,
-    rounding,
-    write_vector,
-)
+from hyperplanes.geometry.kernels.layers import copy_block
+from hyperplanes.geometry.kernels.vectors import LANES, address_of, read_vector, rounded, rounding, write_vector
 
 __all__ = ["COLUMNS", "WIDEST", "layers", "multiply_layers", "pack_weights"]
 

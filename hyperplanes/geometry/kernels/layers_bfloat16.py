@@ -14,7 +14,8 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 from torch.nn.functional import pad
 
-from hyperplanes.geometry.kernels.layers import BLOCK, COLUMNS, LANES, TILE, copy_block, multiply_tile, rounding
+from hyperplanes.geometry.kernels.layers import BLOCK, COLUMNS, TILE, copy_block, multiply_tile
+from hyperplanes.geometry.kernels.vectors import LANES, rounding
 
 __all__ = ["COLUMNS", "WIDEST", "layers", "pack_weights"]
 
