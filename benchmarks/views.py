@@ -8,8 +8,8 @@ Of every held-out object some query views are kept back to be judged by; of all 
 are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
 (where there are masks), of views alone and with their reflections; the same field from random weights; the model
 without its hypernetwork, with the update of another object of the data set, with its own alone, averaged with the
-visual hull by one share an object, without reflections of views, with one ray a pixel, and as it is used; and
-fine-tuned. Beside each mean stands how far it lies above
+visual hull by one share an object, without reflections of views, with one ray a pixel, in single precision, and as it
+is used; and fine-tuned. Beside each mean stands how far it lies above
 `hull_blend`, with the 95 % interval of that difference over the objects (paired, Student's t).
 
 With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
@@ -304,26 +304,29 @@ class _Unreflected:
 
 
 @dataclass(frozen=True)
-class _OneRay:
-    """A model whose pictures are one ray a pixel, at edges too.
+class _Rendered:
+    """A model whose pictures are rendered by other options.
 
     Attributes:
         model: the model.
+        options: of `AdaptedField.render`.
     """
 
     model: HyperPlanes
+    options: Mapping[str, bool]
 
     def adapt(self, support: Views) -> Renderable:
         """The field, and its pictures so."""
-        return _Aliased(self.model.adapt(support))
+        return _RenderedField(self.model.adapt(support), self.options)
 
 
 @dataclass(frozen=True)
-class _Aliased:
+class _RenderedField:
     field: AdaptedField
+    options: Mapping[str, bool]
 
     def render(self, cameras: PinholeCamera) -> Pictures:
-        return self.field.render(cameras, antialias=False)
+        return self.field.render(cameras, **self.options)
 
 
 def _swapped(model: HyperPlanes, shown: Tasks, names: list[str]) -> Adapter:
@@ -340,7 +343,8 @@ METHODS = {
     "unstacked": lambda model, *_: _Partly(model),
     "ungated": lambda model, *_: _Ungated(model),
     "unreflected": lambda model, *_: _Unreflected(model),
-    "one_ray": lambda model, *_: _OneRay(model),
+    "one_ray": lambda model, *_: _Rendered(model, {"antialias": False}),
+    "single_precision": lambda model, *_: _Rendered(model, {"mixed_precision": False}),
 }
 
 PARTS = {

@@ -69,6 +69,13 @@ def test_a_model_without_its_gate_is_stacked_by_one_share(monkeypatch):
     assert torch.equal(found, model.adapt(task.support).render(task.query.cameras).images)
 
 
+@pytest.mark.parametrize(("method", "option"), [("one_ray", "antialias"), ("single_precision", "mixed_precision")])
+def test_pictures_by_another_option_are_those_of_the_same_field(method, option):
+    field = types.SimpleNamespace(render=lambda cameras, **options: (cameras, options))
+    model = types.SimpleNamespace(adapt=lambda support: field)
+    assert views.METHODS[method](model).adapt("views").render("cameras") == ("cameras", {option: False})
+
+
 def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     HyperPlanes(MODEL).save(tmp_path / "model")
     options = ["--checkpoint", str(tmp_path / "model"), "--data", str(demo_folder() / "data"), "--objects", "1"]

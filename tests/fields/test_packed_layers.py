@@ -30,7 +30,7 @@ HAS_AMX = compiling.layers_module() == "layers_amx"
 HAS_BFLOAT16 = HAS_AMX or compiling.layers_module(mixed_precision=True) == "layers_bfloat16"
 ERRORS = {"layers": 1e-5, "layers_bfloat16": 5e-2, "layers_amx": 1e-4, "layers_amx_bfloat16": 5e-2}
 """Kernels, and how far their values may be from those of float64: factors have 8 bits, or 16 by two numbers."""
-of_bfloat16 = pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AVX512_BF16")
+of_bfloat16 = pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AMX, or AVX512_BF16 of AMD")
 
 
 @pytest.fixture(
