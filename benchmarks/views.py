@@ -26,6 +26,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -313,7 +314,7 @@ class _Rendered:
     """
 
     model: HyperPlanes
-    options: Mapping[str, bool]
+    options: Mapping[str, Any]
 
     def adapt(self, support: Views) -> Renderable:
         """The field, and its pictures so."""
@@ -323,7 +324,7 @@ class _Rendered:
 @dataclass(frozen=True)
 class _RenderedField:
     field: AdaptedField
-    options: Mapping[str, bool]
+    options: Mapping[str, Any]
 
     def render(self, cameras: PinholeCamera) -> Pictures:
         return self.field.render(cameras, **self.options)
