@@ -78,7 +78,8 @@ def main(arguments: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks all", description=__doc__)
     parser.add_argument("--out", type=Path, default=RESULTS, help="the folder of the results (default: %(default)s)")
-    parser.add_argument("--data", type=Path, nargs="+", default=[], help="data sets for " + ", ".join(OF_DATA))
+    parser.add_argument("--data", type=Path, nargs="+", default=[],
+                        help=f"data sets for {', '.join(OF_DATA)}; the first one for steps")  # fmt: skip
     parser.add_argument("--root", type=Path, help="the folder of the data sets of suites")
     parser.add_argument("--scene", type=Path, help="posed images that are adapted to")
     parser.add_argument("--meshes", type=Path, nargs="+", help="objects of the captures")
@@ -128,6 +129,7 @@ def _commands(chosen: argparse.Namespace) -> dict[str, tuple[str, list[str]]]:
     """The benchmark of each result and its command."""
     data = ["--data", *map(str, chosen.data)]
     given = {"adapting": ["--views", str(chosen.scene)] if chosen.scene else []}
+    given["steps"] = data[:2] if chosen.data else []
     given["captures"] = ["--meshes", *map(str, chosen.meshes)] if chosen.meshes else []
     commands = {name: (name.removesuffix("_curves"), given.get(name, []), more) for name, more in COMMANDS.items()}
     if chosen.data:

@@ -1,6 +1,6 @@
 """Steps of training of the preset `small` on a data set, and where their time goes.
 
-    OMP_NUM_THREADS=1 python -m benchmarks steps --data data/cars --json FILE
+    python -m benchmarks steps --data data/cars --json FILE
 
 Steps of the packaged weights in turn: as they are taken, in single precision alone, and the reference, in single
 precision, which differentiates every sample that lies in the hull and convolves by PyTorch's modules. All take the same
@@ -48,9 +48,13 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--data", type=Path, help="a data set; procedural cars where absent")
     parser.add_argument("--untrained", action="store_true", help="begin with first weights, not the packaged ones")
     parser.add_argument("--repeats", type=int, default=12, help="steps of each (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="that take a step (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="two objects, one step of each")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)
+    if chosen.threads < 1:
+        parser.error(f"--threads: expected at least 1, got {chosen.threads}")
+    torch.set_num_threads(chosen.threads)
     size, views, repeats = (64, 8, 1) if chosen.quick else (128, 50, chosen.repeats)
     data: Tasks = Objects(held_out(4, size, views)) if chosen.data is None else open_dataset(chosen.data)
     ways = {
