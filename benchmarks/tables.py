@@ -342,7 +342,27 @@ def _captures_masks(result: Result) -> str:
     return markdown_table(["masks", *(row["name"] for row in rows)], lines)
 
 
-OF_QUALITY = ("views",)  # benchmarks without times
+VARIANTS = {
+    "whole": "whole",
+    "without_depth": "every view that shows a point sees it: without the depth of the hull",
+    "without_coverage": "without the coverage of the masks",
+    "without_order": "views of a point in the order of the object's, not sorted",
+    "without_blending": "colours by the network alone, not blended",
+    "random_start": "first weights at random, not those of the hull",
+    "pooled": "views of a point pooled: mean and variance of learned features, as in IBRNet",
+    "features": "with features of a convolutional encoder beside the colours",
+    "pooled_features": "pooled, with features",
+}
+"""What is changed, by the names in rows of image_based."""
+
+
+def _image_based(result: Result) -> str:
+    counts = [name for name in result["rows"][0] if re.fullmatch(r"psnr_\d+", name)]
+    lines = [[VARIANTS[row["name"]], *(f"{row[name]:.2f}" for name in counts)] for row in result["rows"]]
+    return markdown_table(["", *(f"{name.removeprefix('psnr_')} views" for name in counts)], lines)
+
+
+OF_QUALITY = ("views", "image_based")  # benchmarks without times
 SUMMARY = (3, 5, 25)  # numbers of views in README
 OF_VIEWS = ("views_procedural", "views_cc0", "views_random", "views_posed")
 SOURCES = {
@@ -361,6 +381,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "captures": _captures,
     "captures_masks": _captures_masks,
     "generation": _generation,
+    "image_based": _image_based,
     "lookup": _lookup,
     "rendering": _rendering,
     "small": _small,
