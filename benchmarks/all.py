@@ -81,7 +81,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--data", type=Path, nargs="+", default=[],
                         help=f"data sets for {', '.join(OF_DATA)}; the first one for steps")  # fmt: skip
     parser.add_argument("--root", type=Path, help="the folder of the data sets of suites")
-    parser.add_argument("--scene", type=Path, help="posed images that are adapted to, and baked")
+    parser.add_argument("--scene", type=Path, help="posed images that are adapted to and, with --data, baked")
     parser.add_argument("--meshes", type=Path, nargs="+", help="objects of the captures")
     parser.add_argument("--quick", action="store_true", help="the short way of each: to see that they run")
     parser.add_argument("--under-load", action="store_true", help="measure beside other work, too")
@@ -129,11 +129,11 @@ def _commands(chosen: argparse.Namespace) -> dict[str, tuple[str, list[str]]]:
     """The benchmark of each result and its command."""
     data, scene = ["--data", *map(str, chosen.data)], [str(chosen.scene)] if chosen.scene else []
     given = {"adapting": ["--views", *scene] if scene else [], "steps": data[:2] if chosen.data else []}
+    given["baked"] = [*data, *scene]
     given["captures"] = ["--meshes", *map(str, chosen.meshes)] if chosen.meshes else []
     commands = {name: (name.removesuffix("_curves"), given.get(name, []), more) for name, more in COMMANDS.items()}
     if chosen.data:
-        commands |= {name: (name, data, MORE.get(name, [])) for name in OF_DATA}
-        commands["baked"] = "baked", [*data, *scene], MORE["baked"]
+        commands |= {name: (name, given.get(name, data), MORE.get(name, [])) for name in OF_DATA}
     if chosen.root:
         commands.pop("views", None)
         for name, (suites, more) in OF_SUITES.items():

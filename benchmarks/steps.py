@@ -54,7 +54,16 @@ def main(arguments: list[str]) -> int:
     chosen = parser.parse_args(arguments)
     if chosen.threads < 1:
         parser.error(f"--threads: expected at least 1, got {chosen.threads}")
+    before = torch.get_num_threads()
     torch.set_num_threads(chosen.threads)
+    try:
+        return finish("steps", _measured(chosen), chosen.json)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _measured(chosen: argparse.Namespace) -> list[Row]:
+    """Steps of each way, their parts, and making an episode ready."""
     size, views, repeats = (64, 8, 1) if chosen.quick else (128, 50, chosen.repeats)
     data: Tasks = Objects(held_out(4, size, views)) if chosen.data is None else open_dataset(chosen.data)
     ways = {
@@ -72,7 +81,7 @@ def main(arguments: list[str]) -> int:
     again = [timed(lambda name=name: ours.loader._load(name))[0] for name in names[: max(1, repeats)]]
     rows = _compare(trainers, repeats)
     rows.append({"name": "an episode, its pictures in memory", "seconds": statistics.median(again)})
-    return finish("steps", rows, chosen.json)
+    return rows
 
 
 def _trainer(data: Tasks, stop: float, precision: str, untrained: bool) -> Trainer:
