@@ -358,7 +358,9 @@ VARIANTS = {
 
 def _image_based(result: Result) -> str:
     counts = [name for name in result["rows"][0] if re.fullmatch(r"psnr_\d+", name)]
-    lines = [[VARIANTS.get(row["name"], row["name"]), *(f"{row[name]:.2f}" for name in counts)] for row in result["rows"]]
+    lines = []
+    for row in result["rows"]:
+        lines.append([VARIANTS.get(row["name"], row["name"]), *(f"{row[name]:.2f}" for name in counts)])
     return markdown_table(["", *(f"{name.removeprefix('psnr_')} views" for name in counts)], lines)
 
 
