@@ -17,7 +17,7 @@ from small_demo import demo_folder
 
 from benchmarks import __main__ as benchmarks_main
 from benchmarks import all as all_benchmarks
-from benchmarks import image_based, tables, views
+from benchmarks import image_based, steps, tables, views
 from benchmarks.load import OF_SPEED
 from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes, stacking
@@ -138,6 +138,29 @@ def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch
         module = importlib.import_module(f"benchmarks.{words[1]}")
         options = {word for word in words[1:] if word.startswith("--")}
         assert options <= set(re.findall(r"--[\w-]+", inspect.getsource(module) + inspect.getsource(views)))
+
+
+def test_all_bakes_the_scene_that_it_adapts_to_beside_the_data(tmp_path, monkeypatch):
+    ran = {}
+    run = types.SimpleNamespace(returncode=0)
+    monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.setdefault(command[3], command[4:]) and run)
+    assert all_benchmarks.main(["--out", str(tmp_path), "--data", "cars", "chairs", "--scene", "chair"]) == 0
+    assert ran["adapting"][:2] == ["--views", "chair"]
+    assert ran["baked"][:4] == ["--data", "cars", "chairs", "chair"]
+    assert ran["steps"][:3] == ["--data", "cars", "--json"]  # takes one
+
+
+def test_training_steps_are_measured_by_the_threads_that_are_asked_for(monkeypatch, capsys):
+    before = torch.get_num_threads()
+    monkeypatch.setattr(steps, "_measured", lambda chosen: [{"name": "a step", "threads": torch.get_num_threads()}])
+    for options, threads in (([], 1), (["--threads", "3"], 3)):
+        assert steps.main(options) == 0
+        assert f"threads {threads}" in capsys.readouterr().out
+        assert torch.get_num_threads() == before
+
+
+def test_the_table_of_parts_names_every_variant():
+    assert tables.VARIANTS.keys() == image_based.VARIANTS.keys()
 
 
 def test_all_runs_those_of_speed_alone_and_those_of_quality_several_at_once(tmp_path, monkeypatch, capsys):
