@@ -20,6 +20,7 @@ NAMES = (
     "captures",
     "gating",
     "generation",
+    "gpu",
     "hypernetwork",
     "lookup",
     "rendering",

@@ -85,8 +85,18 @@ def ratio(reference: list[float], ours: list[float]) -> dict[str, float]:
     return dict(zip(("speedup_low", "speedup", "speedup_high"), quartiles, strict=True))
 
 
-def peak_bytes(run: Callable[[], object]) -> int:
-    """The most memory that PyTorch and NumPy held for one run, beyond what was there before, results included."""
+def peak_bytes(run: Callable[[], object], device: str = "cpu") -> int:
+    """The most memory that PyTorch and NumPy held for one run, beyond what was there before, results included.
+
+    Args:
+        run: what is called.
+        device: whose memory counts.
+    """
+    if device != "cpu":
+        torch.cuda.reset_peak_memory_stats()
+        held = torch.cuda.memory_allocated()
+        run()
+        return torch.cuda.max_memory_allocated() - held
     tracemalloc.start()
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
         tracemalloc.reset_peak()
@@ -105,9 +115,9 @@ def peak_bytes(run: Callable[[], object]) -> int:
     return peak + arrays
 
 
-def copy_bandwidth(megabytes: int = 512) -> float:
+def copy_bandwidth(megabytes: int = 512, device: str = "cpu") -> float:
     """Bytes a second, read and written together, of the best of five copies of a large array."""
-    source = torch.ones(megabytes << 18)
+    source = torch.ones(megabytes << 18, device=device)
     target = torch.empty_like(source)
     times = interleaved({"copy": lambda: target.copy_(source)}, 5)["copy"]
     return 2 * source.numel() * 4 / min(times.wall)

@@ -16,6 +16,7 @@ OF_SPEED = frozenset(
         "baked",
         "busy",
         "generation",
+        "gpu",
         "lookup",
         "rendering",
         "small",

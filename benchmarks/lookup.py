@@ -65,12 +65,12 @@ def measure(scene: Scene, part: str, gradient: bool, repeats: int, bandwidth: fl
             needed = needed_bytes(scene, part, gradient, name)
             row["needed_megabytes"] = needed / 1e6
             row["copy_fraction"] = needed / middle / bandwidth
-            row["peak_megabytes"] = peak_bytes(calls[name]) / 1e6
+            row["peak_megabytes"] = peak_bytes(calls[name], scene.points.device.type) / 1e6
         rows.append(row)
     return rows
 
 
-def sweep(repeats: int, quick: bool) -> list[Row]:
+def sweep(repeats: int, quick: bool, device: str) -> list[Row]:
     """Growth with planes, points and resolution, one at a time from the standard setting."""
     planes, points, size = STANDARD
     points //= 4
@@ -82,7 +82,7 @@ def sweep(repeats: int, quick: bool) -> list[Row]:
     settings += [("resolution", (planes, points, n)) for n in sizes]
     rows = []
     for axis, setting in settings:
-        rows += [row | {"sweep": axis} for row in measure(Scene.make(*setting), "both", False, repeats, None)]
+        rows += [row | {"sweep": axis} for row in measure(Scene.make(*setting, device), "both", False, repeats, None)]
     return rows
 
 
@@ -97,22 +97,24 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of them goes (PNG)")
     parser.add_argument("--threads", type=int, metavar="N", help="of PyTorch and of the kernels")
+    parser.add_argument("--device", default="cpu", help="what computes (default: %(default)s)")
     options = parser.parse_args(arguments)
     if options.threads:
         torch.set_num_threads(options.threads)
     about = environment() | {"load": round(load_at_start(), 2)}
-    bandwidth = copy_bandwidth(128 if options.quick else 512)
+    bandwidth = copy_bandwidth(128 if options.quick else 512, options.device)
     about["copy_gigabytes_per_second"] = bandwidth / 1e9
-    title = f"{about['processor']}, {about['threads']} threads, commit {about['commit']}, load {about['load']:.1f}"
+    where = f"{about['processor']}, {about['threads']} threads" if options.device == "cpu" else about["gpu"]
+    title = f"{where}, commit {about['commit']}, load {about['load']:.1f}"
     print(f"{title}; a copy moves {bandwidth / 1e9:.1f} GB/s")
     repeats = 3 if options.quick else 15
-    scene = Scene.make(*STANDARD)
+    scene = Scene.make(*STANDARD, options.device)
     rows: list[Row] = []
     for gradient in (False, True):
         for part in ("projection", "sampling", "both"):
             rows += measure(scene, part, gradient, repeats, bandwidth)
     print(table(rows, COLUMNS))
-    swept = sweep(2 if options.quick else 7, options.quick)
+    swept = sweep(2 if options.quick else 7, options.quick, options.device)
     print("\n" + table(swept, ["sweep", "planes", "points", "resolution", "way", "seconds", *COLUMNS[3:9]]))
     rows += swept
     if options.json:

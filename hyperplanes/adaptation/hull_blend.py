@@ -99,7 +99,7 @@ def blend_views(
         near = planes.describe(points, directions, Reading(0, nearest, 0, 0, 0.0), planes.occupancy.bounds)
         weights, colours = near.near_weights.softmax(1), near.near_colours
     else:
-        seen = planes.choose(points, directions, best=1, nearest=nearest).nearest
+        seen = planes.choose(points, directions, best=0, nearest=nearest).nearest
         assert seen is not None
         weights = seen.lumigraph_weights(seen.angles(directions), min(nearest, len(planes)))
         weights = weights / weights.sum(1, keepdim=True)
@@ -167,7 +167,7 @@ class _Blend:
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """High where every view that shows a point shows the object there, else 0."""
-        coverage = self.planes.choose(points, best=1).coverage
+        coverage = self.planes.choose(points, best=0).coverage
         return torch.where(coverage < SOLID - ROUNDING, 0.0, OPAQUE / self.bounds.radius)
 
     def hidden(self, points: Float[Tensor, "point 3"]) -> _HullPoints:

@@ -251,7 +251,7 @@ class ImageBasedField(Field):
         if self._is_described(points):
             near = self.planes.describe(points, directions, replace(self._reading, best=0), self.bounds)
             return self._coloured(hidden.values, near)
-        visibility = self.planes.choose(points, directions, best=1, nearest=config.blended)
+        visibility = self.planes.choose(points, directions, best=0, nearest=config.blended)
         return self._colour(hidden.values, visibility, self.planes.colours.lookup(points).colours, directions)
 
     @property

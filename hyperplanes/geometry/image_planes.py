@@ -6,7 +6,7 @@ import copy
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -90,6 +90,16 @@ class ImagePlanes:
         masked = torch.zeros(len(self), dtype=torch.bool).index_fill_(0, views.cpu(), True).to(self.images.device)
         result = copy.copy(self)
         result.masked = masked if self.masked is None else masked | self.masked
+        return result
+
+    def with_images(self, images: Float[Tensor, "view channel height width"]) -> ImagePlanes:
+        """Other images of the same cameras, which are looked up exactly; no view of them is masked.
+
+        Args:
+            images: of the same number and size, with any number of channels.
+        """
+        result = copy.copy(self)
+        result.images, result.exact, result.masked, result._packed = images.contiguous(), True, None, None
         return result
 
     def lookup(

@@ -50,7 +50,7 @@ def most_symmetric_plane(voxels: Occupancy) -> Plane:
     # all azimuths, and the best ones that are not neighbours
     angles = torch.arange(AZIMUTHS) * (math.pi / AZIMUTHS)
     normals = torch.stack([angles.cos(), torch.zeros_like(angles), angles.sin()], 1)
-    offsets = normals @ points.mean(0)
+    offsets = normals @ points.mean(0).cpu()  # planes stay on the CPU, points on their device
     planes = torch.cat([torch.cat([normals, (offsets + shift)[:, None]], 1) for shift in OFFSETS])
     order = _overlap(coarse, points, planes, "nearest").argsort(descending=True).tolist()
     followed: list[Tensor] = []
@@ -110,6 +110,7 @@ def _overlap(
     grid: Float[Tensor, "x y z"], points: Float[Tensor, "point 3"], planes: Float[Tensor, "plane 4"], mode: str
 ) -> Float[Tensor, " plane"]:
     """The share of points whose mirror images lie in occupied cells, for planes of a normal and an offset each."""
+    planes = planes.to(points)
     normals = planes[:, :3]
     heights = normals @ points.T - planes[:, 3:]  # (plane, point)
     mirrored = points - 2 * heights[..., None] * normals[:, None]

@@ -47,7 +47,8 @@ class Sphere:
 
     def normalise(self, points: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point 3"]:
         """Points with the sphere moved to the unit sphere."""
-        return (points - points.new_tensor(self.centre)) / self.radius
+        moved = points - points.new_tensor(self.centre) if any(self.centre) else points  # a copy to a GPU is waited for
+        return moved / self.radius
 
 
 @dataclass(frozen=True)

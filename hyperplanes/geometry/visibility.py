@@ -79,6 +79,7 @@ class VisibilityPlanes:
         self._masked = torch.zeros(len(images), dtype=torch.bool, device=images.device)
         self._handicaps = images.new_zeros(len(images))
         self._margins = images.new_zeros(len(images), 4) if masks is None else margins(masks).to(images)
+        self._are_cut = bool(self._margins.any())
         self._penalties = Penalties()
 
     def __len__(self) -> int:
@@ -146,7 +147,7 @@ class VisibilityPlanes:
         Args:
             points: in the world.
             directions: unit vectors along which the points are seen; without them there are no nearest views.
-            best: how many views of the least penalty, at most all.
+            best: how many views of the least penalty, at most all; 0 where only the others are wanted.
             nearest: how many views of the least sum of the angle between the direction and theirs, in radians, and
                 ANGLE times their penalty, where that is positive. One more is returned, where there is one.
 
@@ -157,8 +158,8 @@ class VisibilityPlanes:
         choose = self._choose_compiled if self.has_kernels(points) else self._choose_torch
         if self._surface is None or directions is None:
             return choose(points, directions, best, nearest, self.depth_opacity)
-        near = choose(points, directions, 1, nearest, self._surface).nearest
-        return replace(choose(points, None, best, 0, self.depth_opacity), nearest=near)
+        near = choose(points, directions, 0, nearest, self._surface)
+        return replace(choose(points, None, best, 0, self.depth_opacity), nearest=near.nearest) if best else near
 
     def has_kernels(self, points: Tensor) -> bool:
         """Whether the kernels take these points: single precision, on the CPU, pinhole cameras."""
@@ -255,7 +256,7 @@ class VisibilityPlanes:
     ) -> Visibility:
         """As `choose`, in plain PyTorch."""
         # depth and opacity of every view where the point falls: (point, view)
-        planes = ImagePlanes(depth_opacity.permute(0, 3, 1, 2), self.colours.cameras, exact=True)
+        planes = self.colours.with_images(depth_opacity.permute(0, 3, 1, 2))
         found = planes.lookup(points, return_directions=True)
         assert found.directions is not None
         assert found.distances is not None
@@ -267,14 +268,17 @@ class VisibilityPlanes:
         own = self._penalties
         penalty = (own.steep * (behind - self.tolerance)).clamp(own.least, own.deepest)
         penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self._handicaps
-        cut = fading(self._margins, found.coordinates, depth_opacity.shape[1:3])
-        penalty = torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
+        if self._are_cut:
+            cut = fading(self._margins, found.coordinates, depth_opacity.shape[1:3])
+            penalty = torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
         penalty = torch.where(valid, penalty, UNSEEN)
-        values = torch.cat([found.directions, torch.stack([behind, coverage, penalty], -1)], -1)
 
         def chosen(score: Tensor, count: int) -> ChosenViews:
+            if not count:
+                score = score[:, :0]  # nothing to sort
             index = score.sort(stable=True, dim=1).indices[:, :count]
-            return ChosenViews(index, *_split(values.gather(1, index[..., None].expand(-1, -1, 6))))
+            along = found.directions.gather(1, index[..., None].expand(-1, -1, 3))
+            return ChosenViews(index, along, *(each.gather(1, index) for each in (behind, coverage, penalty)))
 
         near = None
         if directions is not None:

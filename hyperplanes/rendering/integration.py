@@ -158,6 +158,10 @@ def _by_importance(
 
 def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: float) -> tuple[Tensor, Tensor]:
     """The densities of samples in front of what leaves less than `stop` of the light, and which samples these are."""
+    if rays.origins.device.type != "cpu":  # all, as in `_in_rounds`
+        points, _ = _packed_points(rays, samples)
+        found = torch.cat([field.density_of(each) for each in _in_batches(field.hidden, points)])
+        return found.to(samples.distances), torch.arange(len(samples), device=points.device)
     density = samples.distances.new_zeros(len(samples))
     rank, _ = _ranks(samples.ray, len(rays))
     optical_depth = density.new_zeros(len(rays))
@@ -239,6 +243,11 @@ def _in_rounds(
                 density = split.density_of(value)
             optical_depths[index] = (density * samples.step).to(optical_depths)
             found.append((index, value))
+
+    if ray.device.type != "cpu":  # a GPU is idle between rounds, and has all samples done in less time
+        evaluated = torch.arange(len(ray), device=ray.device)
+        visit(evaluated, 1)
+        return evaluated, optical_depths, found
 
     end = torch.bincount(ray, minlength=len(rays)).cumsum(0)
     first = torch.cat([end.new_zeros(1), end[:-1]])

@@ -72,7 +72,7 @@ class RayMarching:
 
     def rays_per_chunk(self, device: torch.device) -> int:
         """So many that few chunks make an image and the packed samples fit into memory; on a CPU one thread's part."""
-        return 1 << 16 if device.type == "cuda" else 1 << 12
+        return 1 << 12 if device.type == "cpu" else 1 << 16
 
     def place(self, rays: Rays, occupancy: Occupancy | None, generator: torch.Generator | None = None) -> PackedSamples:
         """One sample a step where the grid is occupied.

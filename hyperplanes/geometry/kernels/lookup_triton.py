@@ -203,6 +203,8 @@ def lookup(
             points, matrices, images, chosen, colours, coordinates, valid.view(torch.uint8), total, slots, height,
             width, background, nearest, CHANNELS=channels, CHOSEN=views is not None, BLOCK=_BLOCK,
         )  # fmt: skip
+        if points.dtype == torch.float64:  # Triton passes numbers in single precision
+            colours = torch.where(valid[:, None], colours, background)
     return colours.permute(2, 0, 1), coordinates.permute(2, 0, 1), valid.T
 
 

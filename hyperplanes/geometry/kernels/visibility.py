@@ -182,7 +182,7 @@ def choose(
     """
     number = limits.dtype.type
     total, best_count, near_count, pitch = shape[0], shape[3], shape[4], shape[5]
-    s, scores = np.empty(ROWS * pitch, limits.dtype), np.empty(max(best_count, near_count), limits.dtype)
+    s, scores = np.empty(ROWS * pitch, limits.dtype), np.empty(max(best_count, near_count, 1), limits.dtype)
     for point in range(start, stop):
         at = 3 * point
         # what each view shows of the point
@@ -195,8 +195,9 @@ def choose(
             seen += load(s, SHOWN * pitch + k)
         overall[2 * point], overall[2 * point + 1] = covered, seen
         # the views that see it best
-        least(s, pitch, total, PENALTY, best_count, best, scores, point * best_count)
-        _keep(s, pitch, best_count, best, best_values, point * best_count)
+        if best_count:
+            least(s, pitch, total, PENALTY, best_count, best, scores, point * best_count)
+            _keep(s, pitch, best_count, best, best_values, point * best_count)
         # those whose rays are closest to its direction
         if near_count:
             rank(s, pitch, total, directions[at], directions[at + 1], directions[at + 2], limits[7])

@@ -1,0 +1,306 @@
+"""Views, adapting and training on a GPU, and what each way of drawing a view there takes and loses.
+
+    python -m benchmarks gpu --json FILE
+    python -m benchmarks gpu --data data/cars --json FILE
+
+Views by `small` and by the paper's network, of a car that no training saw, 25 views shown. Beside the way they are
+drawn: lookups by PyTorch in place of the fused kernel; single precision without TF32; layers in bfloat16; and the
+function of the field, all colours included, as it is, replayed as a CUDA graph and, by --compile, compiled by
+`torch.compile`. All in turn, in one process, medians. The paper's protocol asks two networks at 64 + 192 places of
+every ray.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+from torch.nn.functional import pad
+
+from benchmarks._timing import interleaved, timed
+from benchmarks.objects import held_out
+from benchmarks.reporting import Row, finish
+from benchmarks.training import Objects
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.stacking import StackedField
+from hyperplanes.configuration.presets import preset
+from hyperplanes.data import open_dataset
+from hyperplanes.data.support import Shown
+from hyperplanes.fields.base import Field
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.rendering import renderer
+from hyperplanes.rendering.renderer import Hierarchical
+from hyperplanes.training import Trainer
+from hyperplanes.utilities.metrics import psnr
+from hyperplanes.views import Task, Tasks
+
+__all__ = ["main"]
+
+PAPER = Path(__file__).parent / "weights" / "paper-network"
+PAPER_SAMPLES = Hierarchical(64, 128)
+SHOWN, COMPARED = 25, 4
+SIZES = (128, 200, 400)
+COMPILED = 200  # pixels of a side at which the ways are compared
+SPAN = 1 << 14  # points by which graphs differ in size
+
+FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+def main(arguments: list[str]) -> int:
+    """Measure, print, and write the rows where asked.
+
+    Args:
+        arguments: see --help.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks gpu", description=__doc__)
+    parser.add_argument("--data", type=Path, help="a data set; a procedural car where absent")
+    parser.add_argument("--device", default="cuda", help="what computes (default: %(default)s)")
+    parser.add_argument("--steps", type=int, default=100, help="of fine-tuning (default: %(default)s)")
+    parser.add_argument("--repeats", type=int, default=7, help="of each view (default: %(default)s)")
+    parser.add_argument("--compile", action="store_true", help="compile the paper's network, too: a minute or two")
+    parser.add_argument("--quick", action="store_true", help="few and small views: to see that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    chosen = parser.parse_args(arguments)
+    device = torch.device(chosen.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        parser.error("--device: expected a CUDA device that PyTorch can see, got none; --device cpu shows that it runs")
+    sizes, repeats, steps = ((48,), 1, 1) if chosen.quick else (SIZES, chosen.repeats, chosen.steps)
+    data: Tasks = Objects(held_out(4, max(sizes), 50)) if chosen.data is None else open_dataset(chosen.data)
+    rows = adapting(data, device, steps) + training(data, device, repeats)
+    rows += views(str(PAPER), data, device, sizes, repeats) + views("small", data, device, sizes, repeats)
+    if chosen.compile:
+        rows += compiled(data, device, sizes[-2:][0], repeats)
+    return finish("gpu", rows, chosen.json)
+
+
+def views(checkpoint: str, data: Tasks, device: torch.device, sizes: tuple[int, ...], repeats: int) -> list[Row]:
+    """Views of each size as they are drawn, and of one size by all ways."""
+    model, name = HyperPlanes.from_pretrained(checkpoint).to(device), Path(checkpoint).name
+    rows: list[Row] = []
+    for size in sizes:
+        task = _task(data, size, device)
+        adapted = model.adapt(task.support)
+        drawn = {"default": _drawing(adapted), "one ray a pixel": _drawing(adapted, antialias=False)}
+        if size == COMPILED or len(sizes) == 1:
+            drawn |= _ways(adapted, device)
+        elif name != "small":
+            drawn["paper's protocol"] = _drawing(adapted, sampling=PAPER_SAMPLES)
+        rows += _compare(f"{name}, {size}x{size}", task, drawn, repeats)
+    return rows
+
+
+def _task(data: Tasks, size: int, device: torch.device) -> Task:
+    """The first held-out object: 25 views that are shown, and some that are not, of so many pixels."""
+    names = sorted(data.names("test") or data.names("train"))
+    task = Shown(data, SHOWN, COMPARED).task(names[0])
+    return Task(*(each.resized(size).to(device) for each in (task.support, task.query)), task.name)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A way of drawing views.
+
+    Attributes:
+        adapted: the field.
+        options: of its `render`.
+        around: a context in which it is drawn.
+    """
+
+    adapted: AdaptedField
+    options: dict[str, Any] = field(default_factory=dict)
+    around: Callable[[], Any] = nullcontext
+
+    def __call__(self, cameras: PinholeCamera) -> Tensor:
+        with self.around():
+            return self.adapted.render(cameras, **self.options).images
+
+
+def _drawing(adapted: AdaptedField, around: Callable[[], Any] = nullcontext, **options: Any) -> Drawing:
+    return Drawing(adapted, options, around)
+
+
+def _ways(adapted: AdaptedField, device: torch.device) -> dict[str, Drawing]:
+    """One ray a pixel: other ways, each in place of one thing, and other ways of evaluating the field."""
+    one = {"antialias": False}
+    found = {} if isinstance(adapted, StackedField) else {"paper's protocol": _drawing(adapted, sampling=PAPER_SAMPLES)}
+    found |= {
+        "lookups by PyTorch": _drawing(adapted, _lookups_by_pytorch, **one),
+        "no TF32": _drawing(adapted, _without_tf32, **one),
+        "layers in bfloat16": _drawing(adapted, partial(_layers_in_bfloat16, device.type), **one),
+        "field as a function": _drawing(_with_functions(adapted, lambda function: function), **one),
+    }
+    if device.type == "cuda":
+        found["CUDA graph of that"] = _drawing(_with_functions(adapted, Graphed), **one)
+    return found
+
+
+def compiled(data: Tasks, device: torch.device, size: int, repeats: int) -> list[Row]:
+    """A view by the paper's network, compiled for numbers of points that are rounded up."""
+
+    def change(function: FieldFunction) -> FieldFunction:
+        fast = torch.compile(function, dynamic=False)
+
+        def padded(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+            count, room = len(points), -(-max(1, len(points)) // SPAN) * SPAN
+            colour, density = fast(*(pad(each, (0, 0, 0, room - count)) for each in (points, directions)))
+            return colour[:count], density[:count]
+
+        return padded
+
+    task = _task(data, size, device)
+    adapted = HyperPlanes.from_pretrained(PAPER).to(device).adapt(task.support)
+    one = {"antialias": False}
+    drawn = {
+        "field as a function": _drawing(_with_functions(adapted, lambda function: function), **one),
+        "torch.compile of that": _drawing(_with_functions(adapted, change), **one),
+    }
+    return _compare(f"{PAPER.name}, {size}x{size}", task, drawn, repeats)
+
+
+def _with_functions(adapted: AdaptedField, change: Callable[[FieldFunction], FieldFunction]) -> AdaptedField:
+    """A field, and the one beside it if there is one, as functions of points and directions, changed in some way."""
+
+    def function(one: AdaptedField) -> FieldFunction:
+        return change(lambda points, directions: one.field(points, directions))
+
+    _ = adapted.refined_occupancy
+    if isinstance(adapted, StackedField):
+        other = replace(adapted.other, field=function(adapted.other))
+        return replace(adapted, field=function(adapted), other=other, refined=adapted.refined_occupancy)
+    return replace(adapted, field=function(adapted), refined=adapted.refined_occupancy)
+
+
+@contextmanager
+def _layers_in_bfloat16(device: str) -> Generator[None]:
+    """While it lasts, the layers before the heads multiply numbers of bfloat16."""
+    trunk = Field.trunk
+
+    def rounded(field: Field, inputs: Tensor) -> Tensor:
+        with torch.autocast(device, torch.bfloat16):
+            return trunk(field, inputs).float()
+
+    with patch.object(Field, "trunk", rounded):
+        yield
+
+
+class Graphed:
+    """A field whose work is recorded once for every number of points, rounded up, and replayed.
+
+    Args:
+        function: of points and directions, without gradients, that waits for nothing.
+    """
+
+    def __init__(self, function: FieldFunction) -> None:
+        self.function = function
+        self.graphs: dict[int, tuple[torch.cuda.CUDAGraph, list[Tensor]]] = {}
+
+    def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours and densities, in memory that the next call writes to."""
+        count = len(points)
+        room = -(-max(1, count) // SPAN) * SPAN
+        if room not in self.graphs:
+            self.graphs[room] = self._record(points, directions, room)
+        graph, tensors = self.graphs[room]
+        tensors[0][:count], tensors[1][:count] = points, directions
+        graph.replay()
+        return tensors[2][:count].clone(), tensors[3][:count].clone()
+
+    def _record(self, points: Tensor, directions: Tensor, room: int) -> tuple[torch.cuda.CUDAGraph, list[Tensor]]:
+        inputs = [torch.zeros(room, 3, device=points.device) for _ in range(2)]
+        inputs[1][:, 0] = 1
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(2):
+                self.function(*inputs)
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            colour, density = self.function(*inputs)
+        return graph, [*inputs, colour, density]
+
+
+@contextmanager
+def _lookups_by_pytorch() -> Generator[None]:
+    with patch("hyperplanes.geometry.lookup.choose", lambda *_: "torch"):
+        yield
+
+
+@contextmanager
+def _without_tf32() -> Generator[None]:
+    with patch.object(renderer, "allow_tf32", lambda _: nullcontext()):
+        yield
+
+
+def _compare(name: str, task: Task, drawn: dict[str, Drawing], repeats: int) -> list[Row]:
+    """All ways in turn, view by view; those that do not work say why in place of a row."""
+    one, several, working = camera.select(task.query.cameras, [1]), task.query.cameras, {}
+    rows: list[Row] = []
+    for way, draw in drawn.items():
+        try:
+            first, _ = timed(lambda draw=draw: draw(one))
+            images = draw(several)
+            draw(one)
+        except Exception as error:  # whatever a compiler raises
+            rows.append({"name": f"{name}, {way}", "error": f"{type(error).__name__}: {str(error)[:300]}"})
+            continue
+        working[way] = draw
+        quality = float(psnr(images.clamp(0, 1), task.query.images).mean())
+        rows.append({"name": f"{name}, {way}", "first_seconds": first, "psnr": quality})
+    times = interleaved({way: (lambda draw=draw: draw(one)) for way, draw in working.items()}, repeats)
+    measured = iter(times.values())
+    for row in rows:
+        if "error" not in row:
+            row["milliseconds"] = 1e3 * statistics.median(next(measured).wall)
+    for row in rows:
+        print(row, flush=True)
+    return rows
+
+
+def adapting(data: Tasks, device: torch.device, steps: int) -> list[Row]:
+    """Adapting `small` to an object, with and without the search for symmetry, and fine-tuning it."""
+    task = _task(data, 128, device)
+    model = HyperPlanes.from_pretrained("small").to(device)
+    plain = HyperPlanes.from_pretrained("small").to(device)
+    plain.config = replace(plain.config, symmetric=False)
+    ways = {
+        "adapting": lambda: model.adapt(task.support),
+        "adapting, no search for symmetry": lambda: plain.adapt(task.support),
+        f"{steps} steps": lambda: model.fine_tune(task.support, steps),
+    }
+    rows: list[Row] = []
+    for name, way in ways.items():
+        way() if not name.endswith("steps") else model.fine_tune(task.support, 2)
+        seconds, adapted = timed(way)
+        images = adapted.render(task.query.cameras).images.clamp(0, 1)
+        rows.append(
+            {"name": f"small, {name}", "seconds": seconds, "psnr": float(psnr(images, task.query.images).mean())}
+        )
+        print(rows[-1], flush=True)
+    return rows
+
+
+def training(data: Tasks, device: torch.device, repeats: int) -> list[Row]:
+    """Steps of training of `small`, whose objects are ready, with few and with many rays."""
+    settings, rows = preset("small").training, list[Row]()
+    for rays in (settings.rays, 16 * settings.rays):
+        model = HyperPlanes.from_pretrained("small").to(device)
+        rates = {f"{name}learning_rate": 1e-6 for name in ("", "muon_", "hypernetwork_")}
+        trainer = Trainer(model, data, replace(settings, prefetch=0, rays=rays, **rates))
+        batch = trainer.loader.batch(0)
+        trainer.loader.batch = lambda _, batch=batch: batch  # type: ignore[method-assign]
+        taken = interleaved({"step": trainer.take_step}, repeats)["step"].wall
+        rows.append({"name": f"small, step of {settings.tasks} x {rays} rays", "seconds": statistics.median(taken)})
+        print(rows[-1], flush=True)
+    return rows

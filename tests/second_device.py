@@ -1,0 +1,151 @@
+"""A device beside the CPU on a machine that has none, for tests: what a GPU refuses, it refuses.
+
+Its tensors lie in the CPU's memory. Operations on them compute there, but raise where operands lie on two devices, and
+NumPy cannot read them. Backends of PyTorch may be written in Python like this (`torch.utils.backend_registration`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils import backend_registration
+from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
+from torch.utils._pytree import tree_leaves, tree_map
+
+__all__ = ["AVAILABLE", "NAME", "second_device"]
+
+NAME = "second"
+AVAILABLE = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")
+"""Whether this PyTorch takes backends that are written in Python."""
+
+_ATEN = torch.ops.aten
+_MOVING = {_ATEN._to_copy.default, _ATEN.copy_.default}
+_INDEXING = {_ATEN.index.Tensor, _ATEN.index_put_.default, _ATEN.index_put.default, _ATEN._index_put_impl_.default}
+"""Indices may lie on the CPU."""
+
+
+@contextmanager
+def second_device() -> Generator[torch.device]:
+    """A device, as long as the context lasts."""
+    _register()
+    with _Operations(), _Functions():
+        yield torch.device(NAME, 0)
+
+
+class _Remote(Tensor):
+    """A tensor of the second device.
+
+    Attributes:
+        held: the same numbers as a tensor of the CPU.
+    """
+
+    held: Tensor
+
+    @staticmethod
+    def __new__(cls, held: Tensor) -> _Remote:
+        layout = {"strides": held.stride(), "storage_offset": held.storage_offset(), "dtype": held.dtype}
+        made = Tensor._make_wrapper_subclass(cls, held.size(), **layout, device=torch.device(NAME, 0))
+        made.held = held
+        return made
+
+    def __repr__(self) -> str:
+        return f"_Remote({self.held!r})"
+
+    @classmethod
+    def __torch_dispatch__(cls, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _computed(operator, args, dict(kwargs or {}))
+
+
+class _Operations(TorchDispatchMode):
+    """Sees those, too, that make a tensor of none."""
+
+    def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        if _is_second(kwargs.get("device")) or _remote(args, kwargs):
+            return _computed(operator, args, kwargs)
+        return operator(*args, **kwargs)
+
+
+class _Functions(TorchFunctionMode):
+    """Those that PyTorch computes without asking an operator."""
+
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        if function in (torch.tensor, torch.as_tensor) and _is_second(kwargs.get("device")):
+            device = kwargs.pop("device")
+            return function(*args, **kwargs).to(device)
+        first = args[0] if args and isinstance(args[0], _Remote) else None
+        if first is None:
+            return function(*args, **kwargs)
+        if function is Tensor.new_tensor:
+            return torch.tensor(args[1], dtype=kwargs.get("dtype", first.dtype)).to(first.device)
+        if function is Tensor.tolist:
+            return first.detach().cpu().tolist()
+        if function is Tensor.numpy:
+            raise TypeError(f"can't convert a tensor on {NAME} to numpy; use .cpu() first")
+        return function(*args, **kwargs)
+
+
+def _computed(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    """What an operator makes of tensors of the second device, or there."""
+    remote = _remote(args, kwargs)
+    if remote and operator not in _MOVING:
+        given = [args[0], *args[2:3]] if operator in _INDEXING else tree_leaves((args, kwargs))
+        for value in given:
+            if isinstance(value, Tensor) and value.ndim and not isinstance(value, _Remote):
+                raise RuntimeError(
+                    f"Expected all tensors to be on the same device, got {tuple(value.shape)} on {value.device} for "
+                    f"{operator} on {NAME}"
+                )
+    asked = kwargs.get("device")
+    if asked is not None:
+        kwargs["device"] = torch.device("cpu")
+    held_args, held_kwargs = tree_map(_held, (args, kwargs))
+    if operator is _ATEN.copy_.default:
+        held_args[0].copy_(held_args[1])
+        return args[0]
+    found = operator(*held_args, **held_kwargs)
+    if not (_is_second(asked) if asked is not None else remote):
+        return found
+    found = tree_map(lambda value: _Remote(value) if isinstance(value, Tensor) else value, found)
+    return return_and_correct_aliasing(operator, args, kwargs, found) if remote else found
+
+
+def _held(value: Any) -> Any:
+    return value.held if isinstance(value, _Remote) else value
+
+
+def _remote(args: Sequence[Any], kwargs: Mapping[str, Any]) -> bool:
+    return any(isinstance(value, _Remote) for value in tree_leaves((args, kwargs)))
+
+
+def _is_second(device: Any) -> bool:
+    return device is not None and torch.device(device).type == NAME
+
+
+@cache
+def _register() -> torch.library.Library:
+    """Makes the device known to PyTorch, with what it asks for by itself: memory, and copies into it."""
+    backend_registration._setup_privateuseone_for_python_backend(NAME)
+
+    def empty(size: Any, *, dtype: Any = None, **_: Any) -> Tensor:
+        return _Remote(torch.empty(size, dtype=dtype))
+
+    def empty_strided(size: Any, stride: Any, *, dtype: Any = None, **_: Any) -> Tensor:
+        return _Remote(torch.empty_strided(size, stride, dtype=dtype))
+
+    def copy_from(source: Tensor, target: Tensor, non_blocking: bool = False) -> Tensor:
+        _held(target).copy_(_held(source))
+        return target
+
+    library = torch.library.Library("aten", "IMPL")
+    functions = {"empty.memory_format": empty, "empty_strided": empty_strided, "_copy_from": copy_from}
+    for name, function in functions.items():
+        library.impl(name, function, "PrivateUse1")
+    return library

@@ -1,0 +1,132 @@
+"""Source of truth: the CPU, whose results a GPU has within rounding, and so has a device made of the CPU's memory."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+
+import pytest
+import torch
+from second_device import AVAILABLE, second_device
+
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.hull_blend import HullBlend
+from hyperplanes.adaptation.reflections import with_reflections
+from hyperplanes.configuration.presets import preset
+from hyperplanes.data import read_task
+from hyperplanes.export.baking import bake
+from hyperplanes.geometry import ImagePlanes, carve
+from hyperplanes.geometry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
+from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.rendering import RayMarching
+from hyperplanes.training import Trainer
+from hyperplanes.views import Task
+
+CPU = torch.device("cpu")
+OTHERS = [
+    pytest.param("second", marks=pytest.mark.skipif(not AVAILABLE, reason="needs PyTorch with backends in Python")),
+    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")),
+]
+PLAIN = {"antialias": False, "mixed_precision": False}
+ACROSS = Plane((1.0, 0.0, 0.0), 0.0)
+
+
+@pytest.fixture(params=OTHERS)
+def device(request):
+    with second_device() if request.param == "second" else nullcontext(torch.device(request.param)) as other:
+        yield other
+
+
+def car(device, shown=3, size=24):
+    task = read_task("example-car")
+    support, query = (
+        each.resized(size).to(device) for each in (task.support[:: len(task.support) // shown], task.query[:1])
+    )
+    return Task(support[:shown], query, task.name)
+
+
+def small(device):
+    model = HyperPlanes.from_pretrained("small").to(device)
+    every = RayMarching(64, stop=0)  # whose samples all have gradients, none of which is drawn
+    model.config = replace(model.config, symmetric=False, hull_resolution=24, sampling=every)
+    return model
+
+
+def test_operands_on_two_devices_are_refused(device):
+    there = torch.ones(2, 3, device=device)
+    assert (there + 1).device.type == device.type
+    with pytest.raises(RuntimeError, match="Expected all tensors to be on the same device"):
+        there + torch.ones(2, 3)
+    with pytest.raises(TypeError, match="to numpy"):
+        there.numpy()
+
+
+def test_lookups_and_their_gradients(device):
+    def pulled(where):
+        support = car(where).support
+        points = torch.linspace(-0.4, 0.4, 60).reshape(20, 3).to(where).requires_grad_()
+        found = ImagePlanes(support.images, support.cameras, exact=True).lookup(points, return_directions=True)
+        return torch.cat([found.colours.flatten(), *torch.autograd.grad(found.colours.square().sum(), points)[0]])
+
+    torch.testing.assert_close(pulled(device).cpu(), pulled(CPU), atol=1e-3, rtol=1e-4)
+
+
+def test_one_step_shows_the_same_picture(device):
+    def shown(where):
+        task = car(where, shown=12)
+        return small(where).adapt(task.support).render(task.query.cameras, **PLAIN)
+
+    found, expected = shown(device), shown(CPU)
+    assert found.images.device.type == device.type
+    assert float((found.images.cpu() - expected.images).square().mean()) < 1e-5
+    assert float(expected.opacity.mean()) > 0.05
+
+
+def test_gradient_steps_end_with_the_same_weights(device):
+    def tuned(where):
+        task = car(where)
+        return small(where).fine_tune(task.support, 2).render(task.query.cameras, **PLAIN).images
+
+    assert float((tuned(device).cpu() - tuned(CPU)).square().mean()) < 1e-4
+
+
+def test_planes_of_symmetry_are_found(device):
+    def found(where):
+        support = car(where, shown=12, size=32).support
+        hull = carve(support.masks, support.cameras, support.bounds, 32)
+        planes = [most_symmetric_plane(hull), more_symmetric_plane(hull, ACROSS)]
+        return torch.tensor([[*plane.normal, plane.offset] for plane in planes])
+
+    torch.testing.assert_close(found(device), found(CPU), atol=0.02, rtol=0)
+
+
+def test_the_hull_of_views_and_reflections_looks_the_same(device):
+    def shown(where):
+        task = car(where)
+        return (
+            HullBlend()
+            .adapt(with_reflections(task.support, Symmetry(ACROSS)))
+            .render(task.query.cameras, **PLAIN)
+            .images
+        )
+
+    assert float((shown(device).cpu() - shown(CPU)).square().mean()) < 1e-4
+
+
+def test_a_training_step_has_the_same_loss(device):
+    class One:
+        def names(self, split):
+            return ["car"] if split == "train" else []
+
+        def task(self, name):
+            return car(CPU, shown=6)
+
+    def loss(where):
+        settings = replace(preset("small").training, prefetch=0, tasks=1, rays=32, precision="single")
+        return Trainer(small(where), One(), settings).take_step()
+
+    assert loss(device) == pytest.approx(loss(CPU), rel=1e-3)
+
+
+def test_voxels_are_baked_from_it(device):
+    values = [bake(small(where).adapt(car(where).support), side=24).values for where in (device, CPU)]
+    assert values[0].device.type == "cpu"
+    assert abs(len(values[0]) - len(values[1])) <= 0.02 * len(values[1])
