@@ -27,7 +27,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import pad
 
-from benchmarks._timing import interleaved, timed
+from benchmarks._timing import interleaved, peak_bytes, timed
 from benchmarks.objects import held_out
 from benchmarks.reporting import Row, finish
 from benchmarks.training import Objects
@@ -91,7 +91,7 @@ def views(checkpoint: str, data: Tasks, device: torch.device, sizes: tuple[int, 
     for size in sizes:
         task = _task(data, size, device)
         adapted = model.adapt(task.support)
-        drawn = {"default": _drawing(adapted), "one ray a pixel": _drawing(adapted, antialias=False)}
+        drawn = {"default": _drawing(adapted, antialias=True), "one ray a pixel": _drawing(adapted)}
         if size == COMPILED or len(sizes) == 1:
             drawn |= _ways(adapted, device)
         elif name != "small":
@@ -104,7 +104,22 @@ def _task(data: Tasks, size: int, device: torch.device) -> Task:
     """The first held-out object: 25 views that are shown, and some that are not, of so many pixels."""
     names = sorted(data.names("test") or data.names("train"))
     task = Shown(data, SHOWN, COMPARED).task(names[0])
-    return Task(*(each.resized(size).to(device) for each in (task.support, task.query)), task.name)
+    return Task(task.support.resized(size).to(device), task.query.resized(size).to(device), task.name)
+
+
+@dataclass(frozen=True)
+class _Resized:
+    """Tasks with pictures of so many pixels."""
+
+    data: Tasks
+    size: int
+
+    def names(self, split: str) -> list[str]:
+        return sorted(self.data.names(split))
+
+    def task(self, name: str) -> Task:
+        task = self.data.task(name)
+        return Task(task.support.resized(self.size), task.query.resized(self.size), name)
 
 
 @dataclass(frozen=True)
@@ -126,22 +141,23 @@ class Drawing:
             return self.adapted.render(cameras, **self.options).images
 
 
-def _drawing(adapted: AdaptedField, around: Callable[[], Any] = nullcontext, **options: Any) -> Drawing:
-    return Drawing(adapted, options, around)
+def _drawing(
+    adapted: AdaptedField, around: Callable[[], Any] = nullcontext, antialias: bool = False, **options: Any
+) -> Drawing:
+    return Drawing(adapted, {"antialias": antialias, **options}, around)
 
 
 def _ways(adapted: AdaptedField, device: torch.device) -> dict[str, Drawing]:
     """One ray a pixel: other ways, each in place of one thing, and other ways of evaluating the field."""
-    one = {"antialias": False}
     found = {} if isinstance(adapted, StackedField) else {"paper's protocol": _drawing(adapted, sampling=PAPER_SAMPLES)}
     found |= {
-        "lookups by PyTorch": _drawing(adapted, _lookups_by_pytorch, **one),
-        "no TF32": _drawing(adapted, _without_tf32, **one),
-        "layers in bfloat16": _drawing(adapted, partial(_layers_in_bfloat16, device.type), **one),
-        "field as a function": _drawing(_with_functions(adapted, lambda function: function), **one),
+        "lookups by PyTorch": _drawing(adapted, _lookups_by_pytorch),
+        "no TF32": _drawing(adapted, _without_tf32),
+        "layers in bfloat16": _drawing(adapted, partial(_layers_in_bfloat16, device.type)),
+        "field as a function": _drawing(_with_functions(adapted, lambda function: function)),
     }
     if device.type == "cuda":
-        found["CUDA graph of that"] = _drawing(_with_functions(adapted, Graphed), **one)
+        found["CUDA graph of that"] = _drawing(_with_functions(adapted, Graphed))
     return found
 
 
@@ -160,10 +176,9 @@ def compiled(data: Tasks, device: torch.device, size: int, repeats: int) -> list
 
     task = _task(data, size, device)
     adapted = HyperPlanes.from_pretrained(PAPER).to(device).adapt(task.support)
-    one = {"antialias": False}
     drawn = {
-        "field as a function": _drawing(_with_functions(adapted, lambda function: function), **one),
-        "torch.compile of that": _drawing(_with_functions(adapted, change), **one),
+        "field as a function": _drawing(_with_functions(adapted, lambda function: function)),
+        "torch.compile of that": _drawing(_with_functions(adapted, change)),
     }
     return _compare(f"{PAPER.name}, {size}x{size}", task, drawn, repeats)
 
@@ -256,8 +271,9 @@ def _compare(name: str, task: Task, drawn: dict[str, Drawing], repeats: int) -> 
             rows.append({"name": f"{name}, {way}", "error": f"{type(error).__name__}: {str(error)[:300]}"})
             continue
         working[way] = draw
+        peak = peak_bytes(lambda draw=draw: draw(one), one.intrinsics.device.type) / 2**30
         quality = float(psnr(images.clamp(0, 1), task.query.images).mean())
-        rows.append({"name": f"{name}, {way}", "first_seconds": first, "psnr": quality})
+        rows.append({"name": f"{name}, {way}", "first_seconds": first, "psnr": quality, "peak_gib": peak})
     times = interleaved({way: (lambda draw=draw: draw(one)) for way, draw in working.items()}, repeats)
     measured = iter(times.values())
     for row in rows:
@@ -294,6 +310,7 @@ def adapting(data: Tasks, device: torch.device, steps: int) -> list[Row]:
 def training(data: Tasks, device: torch.device, repeats: int) -> list[Row]:
     """Steps of training of `small`, whose objects are ready, with few and with many rays."""
     settings, rows = preset("small").training, list[Row]()
+    data = _Resized(data, 128)
     for rays in (settings.rays, 16 * settings.rays):
         model = HyperPlanes.from_pretrained("small").to(device)
         rates = {f"{name}learning_rate": 1e-6 for name in ("", "muon_", "hypernetwork_")}
