@@ -21,17 +21,15 @@ from hyperplanes.training import Trainer
 from hyperplanes.views import Task
 
 CPU = torch.device("cpu")
-OTHERS = [
-    pytest.param("second", marks=pytest.mark.skipif(not AVAILABLE, reason="needs PyTorch with backends in Python")),
-    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")),
-]
+HAS_GPU = torch.cuda.is_available()
+pytestmark = pytest.mark.skipif(not (HAS_GPU or AVAILABLE), reason="needs a GPU, or PyTorch with backends in Python")
 PLAIN = {"antialias": False, "mixed_precision": False}
 ACROSS = Plane((1.0, 0.0, 0.0), 0.0)
 
 
-@pytest.fixture(params=OTHERS)
-def device(request):
-    with second_device() if request.param == "second" else nullcontext(torch.device(request.param)) as other:
+@pytest.fixture
+def device():
+    with nullcontext(torch.device("cuda")) if HAS_GPU else second_device() as other:
         yield other
 
 
