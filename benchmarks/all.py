@@ -13,17 +13,20 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import torch
+
 from benchmarks import tables
 from benchmarks.load import OF_SPEED
 from hyperplanes.utilities.environment import usable_cores
 
-__all__ = ["COMMANDS", "OF_DATA", "OF_SUITES", "main"]
+__all__ = ["COMMANDS", "OF_DATA", "OF_GPU", "OF_SUITES", "main"]
 
 RESULTS = Path(__file__).parent / "results"
 COMMANDS: dict[str, list[str]] = {
@@ -41,6 +44,9 @@ COMMANDS: dict[str, list[str]] = {
     "captures": ["--checkpoint", "small", "--size", "640"],
 }
 """Names of results, and options of the benchmarks beside --json and --plot."""
+
+OF_GPU = {"gpu": ["--compile"], "lookup_gpu": ["--device", "cuda"]}
+"""Likewise, of those that run where PyTorch sees a CUDA device."""
 
 OF_DATA = ("views", "baked", "image_based", "hypernetwork")
 """Those that are given --data."""
@@ -79,7 +85,7 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks all", description=__doc__)
     parser.add_argument("--out", type=Path, default=RESULTS, help="the folder of the results (default: %(default)s)")
     parser.add_argument("--data", type=Path, nargs="+", default=[],
-                        help=f"data sets for {', '.join(OF_DATA)}; the first one for steps")  # fmt: skip
+                        help=f"data sets for {', '.join(OF_DATA)}; the first one for steps and gpu")  # fmt: skip
     parser.add_argument("--root", type=Path, help="the folder of the data sets of suites")
     parser.add_argument("--scene", type=Path, help="posed images that are adapted to and, with --data, baked")
     parser.add_argument("--meshes", type=Path, nargs="+", help="objects of the captures")
@@ -128,10 +134,13 @@ def _run(commands: dict[str, list[str]], workers: int, settings: dict[str, str])
 def _commands(chosen: argparse.Namespace) -> dict[str, tuple[str, list[str]]]:
     """The benchmark of each result and its command."""
     data, scene = ["--data", *map(str, chosen.data)], [str(chosen.scene)] if chosen.scene else []
-    given = {"adapting": ["--views", *scene] if scene else [], "steps": data[:2] if chosen.data else []}
+    first = data[:2] if chosen.data else []
+    given = {"adapting": ["--views", *scene] if scene else [], "steps": first, "gpu": first}
     given["baked"] = [*data, *scene]
     given["captures"] = ["--meshes", *map(str, chosen.meshes)] if chosen.meshes else []
-    commands = {name: (name.removesuffix("_curves"), given.get(name, []), more) for name, more in COMMANDS.items()}
+    made = COMMANDS | OF_GPU if torch.cuda.is_available() else COMMANDS
+    whose = {name: re.sub("_curves$|_gpu$", "", name) for name in made}
+    commands = {name: (whose[name], given.get(name, []), more) for name, more in made.items()}
     if chosen.data:
         commands |= {name: (name, given.get(name, data), MORE.get(name, [])) for name in OF_DATA}
     if chosen.root:

@@ -81,7 +81,7 @@ def main(arguments: list[str]) -> int:
     rows += views(str(PAPER), data, device, sizes, repeats) + views("small", data, device, sizes, repeats)
     if chosen.compile:
         rows += compiled(data, device, sizes[-2:][0], repeats)
-    return finish("gpu", rows, chosen.json)
+    return finish("gpu", rows, chosen.json, device.type)
 
 
 def views(checkpoint: str, data: Tasks, device: torch.device, sizes: tuple[int, ...], repeats: int) -> list[Row]:

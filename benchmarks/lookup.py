@@ -119,7 +119,7 @@ def main(arguments: list[str]) -> int:
     rows += swept
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
-        content = {"benchmark": "lookup", **about, "rows": rows}
+        content = {"benchmark": "lookup", "device": options.device, **about, "rows": rows}
         options.json.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     if options.plot:
         plot(rows, options.plot, title)

@@ -84,7 +84,7 @@ def main(arguments: list[str]) -> int:
         grown = growth(model, options.quick)
         plot_growth(grown, options.plot)
         rows += grown
-    return finish("rendering", rows, options.json)
+    return finish("rendering", rows, options.json, options.device)
 
 
 @dataclass(frozen=True)

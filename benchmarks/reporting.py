@@ -14,13 +14,14 @@ __all__ = ["Row", "finish", "write_rows"]
 Row = dict[str, str | float | int]
 
 
-def finish(name: str, rows: list[Row], json_file: Path | None) -> int:
+def finish(name: str, rows: list[Row], json_file: Path | None, device: str = "cpu") -> int:
     """Print the rows, one a line, and write them with their environment where asked.
 
     Args:
         name: of the benchmark.
         rows: what was measured; each has a "name".
         json_file: where to, or None.
+        device: what was measured.
 
     Returns:
         The exit code, 0.
@@ -29,17 +30,18 @@ def finish(name: str, rows: list[Row], json_file: Path | None) -> int:
         numbers = (f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items())
         print("  ".join(numbers).removeprefix("name "))
     if json_file is not None:
-        write_rows(name, rows, json_file)
+        write_rows(name, rows, json_file, device)
     return 0
 
 
-def write_rows(name: str, rows: list[Row], json_file: Path) -> None:
+def write_rows(name: str, rows: list[Row], json_file: Path, device: str = "cpu") -> None:
     """Write rows with the commit and the hardware.
 
     Args:
         name: of the benchmark.
         rows: what was measured.
         json_file: where to.
+        device: what was measured.
     """
-    content = {"benchmark": name, **environment(), "load": round(load_at_start(), 2), "rows": rows}
+    content = {"benchmark": name, "device": device, **environment(), "load": round(load_at_start(), 2), "rows": rows}
     write_whole(json_file, (json.dumps(content, indent=2) + "\n").encode())

@@ -85,6 +85,8 @@ def _measured(result: Result) -> str:
         commits = dict.fromkeys([result["commit"], *(row["commit"] for row in result["rows"] if "commit" in row)])
         return f"Commit {', '.join(commits)}"
     load = result.get("load")
+    if result.get("device") == "cuda":
+        return f"{result['gpu']}, PyTorch {result['torch']}; commit {result['commit']}"
     threads, beside = result["threads"], "not recorded" if load is None else f"{load:.2f} cores"
     machine = f"{result['processor']}, {result['cores']} cores, {threads} thread{'s' if threads > 1 else ''}"
     return f"{machine}; commit {result.get('commit') or 'not recorded'}; load of other processes: {beside}"
@@ -144,13 +146,52 @@ def _lookup(result: Result) -> str:
         for row in rows:  # the first of each: later ones are of the growth with each size
             if (row["part"], row["gradient"]) == (part, gradient):
                 ways.setdefault(row["way"], row)
-        ours, per_second = ways.get("cpu_packed", ways["cpu"]), "million_lookups_per_second"
+        ours = next(ways[way] for way in ("cpu_packed", "cpu", "triton", "torch") if way in ways)
+        per_second = "million_lookups_per_second"
         over = f"{ours['speedup']:.1f} ({ours['speedup_low']:.1f} to {ours['speedup_high']:.1f})"
         others = [f"{ways[way][per_second]:.0f}" for way in ("kornia_loop", "kornia_batched")]
         name = f"{part}, with gradient" if gradient else part
         lines.append([name, *others, f"**{ours[per_second]:.0f}**", over, f"{ours['over_batched']:.1f}"])
     headings = ["Kornia, camera by camera", "Kornia batched", "ours", "over the loop", "over batched"]
     return markdown_table(["million lookups/s", *headings], lines)
+
+
+def _gpu(result: Result) -> str:
+    found = {row["name"]: row for row in result["rows"] if "milliseconds" in row}
+    lines = []
+    for network in NETWORKS:
+        for size in dict.fromkeys(name.split(", ")[1] for name in found if name.startswith(f"{network}, ")):
+            ways = [
+                found.get(f"{network}, {size}, {way}") for way in ("default", "one ray a pixel", "paper's protocol")
+            ]
+            times = [f"{way['milliseconds']:.0f} ms" if way else "-" for way in ways]
+            quality = [f"{way['psnr']:.2f}" if way else "-" for way in ways]
+            ratio = f"{ways[2]['milliseconds'] / ways[1]['milliseconds']:.1f}" if ways[1] and ways[2] else "-"
+            lines.append(
+                [f"{NETWORKS[network]}, {size}", *times, ratio, " / ".join(quality), f"{ways[0]['peak_gib']:.1f} GiB"]
+            )
+    headings = ["default", "one ray a pixel", "paper's protocol", "ratio", "PSNR in dB", "memory"]
+    return markdown_table(["one view", *headings], lines)
+
+
+def _gpu_ways(result: Result) -> str:
+    found: dict[str, dict[str, Result]] = {}
+    for row in result["rows"]:
+        network, size, way = row["name"].split(", ", 2) if row["name"].count(", ") == 2 else ("", "", "")
+        if size == "200x200" and way not in ("default", "paper's protocol"):
+            found.setdefault(way, {}).setdefault(network, row)
+    lines = []
+    for way, networks in found.items():
+        ones = [networks.get(network) for network in NETWORKS]
+        cells = [f"{one['milliseconds']:.1f} ms, {one['psnr']:.2f} dB" if one else "-" for one in ones]
+        lines.append(["as it is" if way == "one ray a pixel" else way, *cells])
+    return markdown_table(["200x200, one ray a pixel", *NETWORKS.values()], lines)
+
+
+def _gpu_work(result: Result) -> str:
+    rows = [row for row in result["rows"] if "milliseconds" not in row]
+    lines = [[row["name"], _seconds(row["seconds"]), f"{row['psnr']:.2f} dB" if "psnr" in row else ""] for row in rows]
+    return markdown_table(["", "seconds", "PSNR"], lines)
 
 
 def _rendering(result: Result) -> str:
@@ -225,6 +266,8 @@ def _splats(result: Result) -> str:
         lines.append([kind, *quality, f"{row['splats']:,}", _seconds(row["fit_seconds"])])
     return markdown_table(["", "the model's field", "voxels", "splats", "number", "fitted in"], lines)
 
+
+NETWORKS = {"paper-network": "paper's network", "small": "`small`"}
 
 NAMES = {
     "cars": "cars",
@@ -369,6 +412,8 @@ SUMMARY = (3, 5, 25)  # numbers of views in README
 OF_VIEWS = ("views_procedural", "views_cc0", "views_random", "views_posed")
 SOURCES = {
     "captures_masks": ("captures",),
+    "gpu_ways": ("gpu",),
+    "gpu_work": ("gpu",),
     "views": OF_VIEWS,
     "views_over": OF_VIEWS,
     "views_srn": ("views_srn", "views_srn_2"),
@@ -383,8 +428,12 @@ TABLES: dict[str, Callable[..., str]] = {
     "captures": _captures,
     "captures_masks": _captures_masks,
     "generation": _generation,
+    "gpu": _gpu,
+    "gpu_ways": _gpu_ways,
+    "gpu_work": _gpu_work,
     "image_based": _image_based,
     "lookup": _lookup,
+    "lookup_gpu": _lookup,
     "rendering": _rendering,
     "small": _small,
     "splats": _splats,

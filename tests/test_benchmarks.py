@@ -17,7 +17,7 @@ from small_demo import demo_folder
 
 from benchmarks import __main__ as benchmarks_main
 from benchmarks import all as all_benchmarks
-from benchmarks import image_based, steps, tables, views
+from benchmarks import gpu, image_based, steps, tables, views
 from benchmarks.load import OF_SPEED
 from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes, stacking
@@ -122,6 +122,7 @@ def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch
     Three make no rows of their own: `gating` makes weights.
     """
     ran, without_rows = [], {"all", "tables", "gating"}
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     run = types.SimpleNamespace(returncode=0)
     monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
     assert all_benchmarks.main(["--out", str(tmp_path)]) == 0
@@ -134,10 +135,22 @@ def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch
     assert len(set(written)) == len(ran)
     for words in ran:
         assert words[0] == "--under-load"
-        assert ("--data" in words) == (words[1] in {*all_benchmarks.OF_DATA, "steps"})
+        assert ("--data" in words) == (words[1] in {*all_benchmarks.OF_DATA, "steps", "gpu"})
         module = importlib.import_module(f"benchmarks.{words[1]}")
         options = {word for word in words[1:] if word.startswith("--")}
         assert options <= set(re.findall(r"--[\w-]+", inspect.getsource(module) + inspect.getsource(views)))
+
+
+def test_all_measures_a_gpu_only_where_there_is_one(tmp_path, monkeypatch):
+    ran = []
+    run = types.SimpleNamespace(returncode=0)
+    monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
+    for here in (False, True):
+        ran.clear()
+        monkeypatch.setattr(torch.cuda, "is_available", lambda here=here: here)
+        assert all_benchmarks.main(["--out", str(tmp_path)]) == 0
+        assert ("gpu" in {words[0] for words in ran}) == here
+        assert sum("cuda" in words for words in ran) == here  # lookups
 
 
 def test_all_bakes_the_scene_that_it_adapts_to_beside_the_data(tmp_path, monkeypatch):
@@ -178,11 +191,24 @@ def test_all_runs_those_of_speed_alone_and_those_of_quality_several_at_once(tmp_
         return types.SimpleNamespace(returncode=int(name in ("small", "views")))
 
     monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert all_benchmarks.main(["--out", str(tmp_path), "--data", "cars", "--workers", "2"]) == 1
     assert "failed: small; failed: views" in capsys.readouterr().out
     assert beside[True] == {(name,) for name in OF_SPEED}
     assert max(map(len, beside[False])) == 2
     assert not any(OF_SPEED & set(names) for names in beside[False])
+
+
+def test_other_ways_to_draw_on_a_gpu_show_the_same_field():
+    model, task = HyperPlanes(MODEL), Balls(views=6, size=(24, 24)).task("train0")
+    adapted, cameras = model.adapt(task.support), task.query.cameras
+    expected = adapted.render(cameras, antialias=False, mixed_precision=False).images
+    found = {name: draw(cameras) for name, draw in gpu._ways(adapted, torch.device("cpu")).items()}
+    assert not torch.equal(found.pop("layers in bfloat16"), expected)
+    assert not torch.equal(found.pop("paper's protocol"), expected)
+    assert found.keys() == {"lookups by PyTorch", "no TF32", "field as a function"}
+    for images in found.values():
+        assert float((images - expected).square().mean()) < 1e-4
 
 
 @pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
