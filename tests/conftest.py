@@ -43,9 +43,11 @@ os.environ.setdefault("LP_NUM_THREADS", "0")  # of Mesa, when it draws in this p
 STARTS_OTHERS = "-n" in sys.argv and ("-n", "0") not in pairwise(sys.argv) and "PYTEST_XDIST_WORKER" not in os.environ
 if not STARTS_OTHERS:  # the process that starts others (`make test`) runs no test
     gc.disable()  # until everything is imported and found
+    import second_device
     import torch
     import typechecker
 
+    second_device.register()  # before the first gradient, when autograd makes a queue for each device that it knows
     torch.set_num_threads(1)  # small tensors: more threads only wait for each other; tests of threads set their own
     typechecker.install("hyperplanes")
 

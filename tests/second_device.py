@@ -18,7 +18,7 @@ from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map
 
-__all__ = ["AVAILABLE", "NAME", "second_device"]
+__all__ = ["AVAILABLE", "NAME", "register", "second_device"]
 
 NAME = "second"
 AVAILABLE = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")
@@ -32,8 +32,7 @@ _INDEXING = {_ATEN.index.Tensor, _ATEN.index_put_.default, _ATEN.index_put.defau
 
 @contextmanager
 def second_device() -> Generator[torch.device]:
-    """A device, as long as the context lasts."""
-    _register()
+    """A device, as long as the context lasts; `register` was called before any gradient was computed."""
     with _Operations(), _Functions():
         yield torch.device(NAME, 0)
 
@@ -130,8 +129,13 @@ def _is_second(device: Any) -> bool:
 
 
 @cache
-def _register() -> torch.library.Library:
-    """Makes the device known to PyTorch, with what it asks for by itself: memory, and copies into it."""
+def register() -> torch.library.Library | None:
+    """Makes the device known to PyTorch, with what it asks for by itself: memory, and copies into it.
+
+    Not beside a GPU, whose gradients fail then: autograd takes streams of one kind of device.
+    """
+    if not AVAILABLE or torch.cuda.is_available():
+        return None
     backend_registration._setup_privateuseone_for_python_backend(NAME)
 
     def empty(size: Any, *, dtype: Any = None, **_: Any) -> Tensor:

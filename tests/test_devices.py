@@ -69,7 +69,7 @@ def test_lookups_and_their_gradients(device):
 
 def test_one_step_shows_the_same_picture(device):
     def shown(where):
-        task = car(where, shown=12)
+        task = car(where, shown=5)
         return small(where).adapt(task.support).render(task.query.cameras, **PLAIN)
 
     found, expected = shown(device), shown(CPU)

@@ -5,6 +5,7 @@ import subprocess
 import types
 
 import pytest
+import torch
 
 from benchmarks import all as all_benchmarks
 from benchmarks import tables
@@ -17,6 +18,7 @@ def commands(monkeypatch):
     run = types.SimpleNamespace(returncode=0)
     monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
     monkeypatch.setattr(tables, "main", lambda arguments: 0)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert all_benchmarks.main(["--root", "data", "--data", "cars", "--scene", "chair", "--meshes", "a.glb"]) == 0
     return ran
 
