@@ -159,19 +159,16 @@ def _lookup(result: Result) -> str:
 def _gpu(result: Result) -> str:
     found = {row["name"]: row for row in result["rows"] if "milliseconds" in row}
     lines = []
-    for network in NETWORKS:
-        for size in dict.fromkeys(name.split(", ")[1] for name in found if name.startswith(f"{network}, ")):
-            ways = [
-                found.get(f"{network}, {size}, {way}") for way in ("default", "one ray a pixel", "paper's protocol")
-            ]
-            times = [f"{way['milliseconds']:.0f} ms" if way else "-" for way in ways]
-            quality = [f"{way['psnr']:.2f}" if way else "-" for way in ways]
-            ratio = f"{ways[2]['milliseconds'] / ways[1]['milliseconds']:.1f}" if ways[1] and ways[2] else "-"
-            lines.append(
-                [f"{NETWORKS[network]}, {size}", *times, ratio, " / ".join(quality), f"{ways[0]['peak_gib']:.1f} GiB"]
-            )
-    headings = ["default", "one ray a pixel", "paper's protocol", "ratio", "PSNR in dB", "memory"]
-    return markdown_table(["one view", *headings], lines)
+    for network, name in NETWORKS.items():
+        for size in dict.fromkeys(each.split(", ")[1] for each in found if each.startswith(f"{network}, ")):
+            default, one, paper = (found.get(f"{network}, {size}, {way}") for way in WAYS_TO_DRAW)
+            assert default is not None
+            assert one is not None
+            times = [f"{way['milliseconds']:.0f} ms" if way else "-" for way in (default, one, paper)]
+            ratio = f"{paper['milliseconds'] / one['milliseconds']:.1f}" if paper else "-"
+            quality = " / ".join(f"{way['psnr']:.2f}" if way else "-" for way in (default, one, paper))
+            lines.append([f"{name}, {size}", *times, ratio, quality, f"{default['peak_gib']:.1f} GiB"])
+    return markdown_table(["one view", *WAYS_TO_DRAW, "ratio", "PSNR in dB", "memory"], lines)
 
 
 def _gpu_ways(result: Result) -> str:
@@ -268,6 +265,7 @@ def _splats(result: Result) -> str:
 
 
 NETWORKS = {"paper-network": "paper's network", "small": "`small`"}
+WAYS_TO_DRAW = ("default", "one ray a pixel", "paper's protocol")
 
 NAMES = {
     "cars": "cars",

@@ -258,13 +258,14 @@ class VisibilityPlanes:
         # depth and opacity of every view where the point falls: (point, view)
         planes = self.colours.with_images(depth_opacity.permute(0, 3, 1, 2))
         found = planes.lookup(points, return_directions=True)
-        assert found.directions is not None
-        assert found.distances is not None
+        rays, distances = found.directions, found.distances
+        assert rays is not None
+        assert distances is not None
         valid = found.valid & ~self._masked
         depth, coverage = found.colours.unbind(-1)
         coverage = torch.where(valid, coverage, 1.0)
         # how far behind the surface, in radii, and what that and a broken mask cost
-        behind = torch.where(valid, (found.distances - depth) / self.occupancy.bounds.radius, 0.0)
+        behind = torch.where(valid, (distances - depth) / self.occupancy.bounds.radius, 0.0)
         own = self._penalties
         penalty = (own.steep * (behind - self.tolerance)).clamp(own.least, own.deepest)
         penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self._handicaps
@@ -277,12 +278,12 @@ class VisibilityPlanes:
             if not count:
                 score = score[:, :0]  # nothing to sort
             index = score.sort(stable=True, dim=1).indices[:, :count]
-            along = found.directions.gather(1, index[..., None].expand(-1, -1, 3))
+            along = rays.gather(1, index[..., None].expand(-1, -1, 3))
             return ChosenViews(index, along, *(each.gather(1, index) for each in (behind, coverage, penalty)))
 
         near = None
         if directions is not None:
-            angle = torch.acos((found.directions * directions[:, None]).sum(-1).clamp(-1, 1))
+            angle = torch.acos((rays * directions[:, None]).sum(-1).clamp(-1, 1))
             near = chosen(angle + ANGLE * penalty.clamp_min(0), nearest)
         return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
 

@@ -158,7 +158,7 @@ def _by_importance(
 
 def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: float) -> tuple[Tensor, Tensor]:
     """The densities of samples in front of what leaves less than `stop` of the light, and which samples these are."""
-    if rays.origins.device.type != "cpu":  # all, as in `_in_rounds`
+    if not _gain_by_rounds(rays):
         points, _ = _packed_points(rays, samples)
         found = torch.cat([field.density_of(each) for each in _in_batches(field.hidden, points)])
         return found.to(samples.distances), torch.arange(len(samples), device=points.device)
@@ -178,6 +178,11 @@ def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: floa
         optical_depth = optical_depth.index_add(0, samples.ray[chosen], density[chosen] * samples.step)
         remaining = remaining[optical_depth[samples.ray[remaining]] < -math.log(stop)]
     return density, reached.nonzero()[:, 0]
+
+
+def _gain_by_rounds(rays: Rays) -> bool:
+    """Whether fewer samples take less time, if they come in rounds; a GPU waits for each of these."""
+    return rays.origins.device.type == "cpu"
 
 
 def _scaled_gradient(value: Tensor, factor: Tensor) -> Tensor:
@@ -244,7 +249,7 @@ def _in_rounds(
             optical_depths[index] = (density * samples.step).to(optical_depths)
             found.append((index, value))
 
-    if ray.device.type != "cpu":  # a GPU is idle between rounds, and has all samples done in less time
+    if not _gain_by_rounds(rays):
         evaluated = torch.arange(len(ray), device=ray.device)
         visit(evaluated, 1)
         return evaluated, optical_depths, found
