@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import statistics
 import time
@@ -13,7 +14,19 @@ from typing import Any
 
 import torch
 
-__all__ = ["Times", "copy_bandwidth", "interleaved", "peak_bytes", "ratio", "table", "timed", "without"]
+from hyperplanes.data.devices import choose_device
+
+__all__ = [
+    "Times",
+    "add_device_option",
+    "copy_bandwidth",
+    "interleaved",
+    "peak_bytes",
+    "ratio",
+    "table",
+    "timed",
+    "without",
+]
 
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler announces itself on every start otherwise
 
@@ -61,6 +74,23 @@ def interleaved(
             times[name].processor.append((time.process_time() - computed) / row)
             times[name].wall.append((time.perf_counter() - begun) / row)
     return times
+
+
+def add_device_option(parser: argparse.ArgumentParser, default: str) -> None:
+    """Adds --device, a name of PyTorch; one that is not here ends the program with a line.
+
+    Args:
+        parser: of a benchmark.
+        default: where the option is absent.
+    """
+
+    def known(name: str) -> str:
+        try:
+            return str(choose_device(name))
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    parser.add_argument("--device", type=known, default=default, help="what computes (default: %(default)s)")
 
 
 def timed(run: Callable[[], Any]) -> tuple[float, Any]:

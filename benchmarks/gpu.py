@@ -27,7 +27,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import pad
 
-from benchmarks._timing import interleaved, peak_bytes, timed
+from benchmarks._timing import add_device_option, interleaved, peak_bytes, timed
 from benchmarks.objects import held_out
 from benchmarks.reporting import Row, finish
 from benchmarks.training import Objects
@@ -65,7 +65,7 @@ def main(arguments: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks gpu", description=__doc__)
     parser.add_argument("--data", type=Path, help="a data set; a procedural car where absent")
-    parser.add_argument("--device", default="cuda", help="what computes (default: %(default)s)")
+    add_device_option(parser, "cuda")
     parser.add_argument("--steps", type=int, default=100, help="of fine-tuning (default: %(default)s)")
     parser.add_argument("--repeats", type=int, default=7, help="of each view (default: %(default)s)")
     parser.add_argument("--compile", action="store_true", help="compile the paper's network, too: a minute or two")
@@ -73,8 +73,6 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)
     device = torch.device(chosen.device)
-    if device.type == "cuda" and not torch.cuda.is_available():
-        parser.error("--device: expected a CUDA device that PyTorch can see, got none; --device cpu shows that it runs")
     sizes, repeats, steps = ((48,), 1, 1) if chosen.quick else (SIZES, chosen.repeats, chosen.steps)
     data: Tasks = Objects(held_out(4, max(sizes), 50)) if chosen.data is None else open_dataset(chosen.data)
     rows = adapting(data, device, steps) + training(data, device, repeats)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks._timing import copy_bandwidth, interleaved, peak_bytes, ratio, table
+from benchmarks._timing import add_device_option, copy_bandwidth, interleaved, peak_bytes, ratio, table
 from benchmarks.load import load_at_start
 from benchmarks.lookup_plot import plot
 from benchmarks.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
@@ -97,7 +97,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of them goes (PNG)")
     parser.add_argument("--threads", type=int, metavar="N", help="of PyTorch and of the kernels")
-    parser.add_argument("--device", default="cpu", help="what computes (default: %(default)s)")
+    add_device_option(parser, "cpu")
     options = parser.parse_args(arguments)
     if options.threads:
         torch.set_num_threads(options.threads)

@@ -19,7 +19,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from benchmarks._timing import timed, without
+from benchmarks._timing import add_device_option, timed, without
 from benchmarks.objects import held_out
 from benchmarks.rendering_growth import growth, plot_growth
 from benchmarks.reporting import Row, finish
@@ -63,7 +63,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="a trained model (default: %(default)s)")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the growth goes (PNG)")
-    parser.add_argument("--device", default="cpu", help="what renders (default: %(default)s)")
+    add_device_option(parser, "cpu")
     parser.add_argument("--memory", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     model = HyperPlanes.from_pretrained(options.checkpoint).to(options.device)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks._timing import interleaved, peak_bytes, ratio, timed
+from benchmarks._timing import add_device_option, interleaved, peak_bytes, ratio, timed
 from benchmarks.objects import held_out
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--curves", type=int, metavar="STEPS", help="train both this far instead, which takes long")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the curves goes (PNG)")
-    parser.add_argument("--device", default="cpu", help="what trains (default: %(default)s)")
+    add_device_option(parser, "cpu")
     options = parser.parse_args(arguments)
     rows: list[Row] = []
     if options.curves:

@@ -16,8 +16,8 @@ import torch
 from small_demo import demo_folder
 
 from benchmarks import __main__ as benchmarks_main
+from benchmarks import _timing, gpu, image_based, steps, tables, views
 from benchmarks import all as all_benchmarks
-from benchmarks import gpu, image_based, steps, tables, views
 from benchmarks.load import OF_SPEED
 from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes, stacking
@@ -138,7 +138,15 @@ def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch
         assert ("--data" in words) == (words[1] in {*all_benchmarks.OF_DATA, "steps", "gpu"})
         module = importlib.import_module(f"benchmarks.{words[1]}")
         options = {word for word in words[1:] if word.startswith("--")}
-        assert options <= set(re.findall(r"--[\w-]+", inspect.getsource(module) + inspect.getsource(views)))
+        assert options <= set(re.findall(r"--[\w-]+", "".join(map(inspect.getsource, (module, views, _timing)))))
+
+
+@pytest.mark.parametrize("name", ["gpu", "lookup", "rendering", "training"])
+def test_a_device_that_is_not_here_is_one_line(name, capsys):
+    with pytest.raises(SystemExit) as ended:
+        benchmarks_main.main([name, "--device", "cuda:7"])
+    assert ended.value.code == 2
+    assert "got 'cuda:7'" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_all_measures_a_gpu_only_where_there_is_one(tmp_path, monkeypatch):
