@@ -278,3 +278,14 @@ def test_hidden_planes_show_no_point_and_the_others_what_they_did(chosen):
     assert torch.equal(found.colours[~gone], before.colours[~gone])
     assert torch.equal(found.colours[gone], torch.full_like(found.colours[gone], 0.25))
     assert torch.equal(planes.lookup(points, views).colours, before.colours)
+
+
+def test_other_images_of_the_same_cameras_are_looked_up_where_the_first_are():
+    points, ours, images = scene()
+    planes = ImagePlanes(images, ours, 0.25)
+    planes.lookup(points)  # packs the first images
+    other = torch.rand(5, 2, *images.shape[2:], generator=torch.Generator().manual_seed(3))
+    found = planes.mask_views(torch.tensor([1])).with_images(other).lookup(points)
+    expected = ImagePlanes(other, ours, 0.25, exact=True).lookup(points)
+    assert torch.equal(found.colours, expected.colours)
+    assert torch.equal(found.valid, expected.valid)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 
 
 @pytest.mark.parametrize("distance", [3.0, 100.0, 5000.0])
@@ -21,3 +21,9 @@ def test_rays_of_distant_cameras_meet_the_sphere_where_they_do_in_double_precisi
     assert inside.sum() > 300
     assert (single - double)[inside].abs().max() < 2e-6 * max(distance, 10)
     assert ((single > 0) != (double > 0)).float().mean() < 0.01
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (0.0, 0.0, -2.0)])
+def test_a_sphere_is_moved_to_the_unit_sphere(centre):
+    sphere, directions = Sphere(centre, 4.0), torch.nn.functional.normalize(torch.eye(3) + 0.5, dim=1)
+    torch.testing.assert_close(sphere.normalise(torch.tensor(centre) + 4 * directions), directions)

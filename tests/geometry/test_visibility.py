@@ -255,6 +255,11 @@ def test_the_nearest_views_are_judged_by_the_surface_that_is_given_and_the_best_
         torch.testing.assert_close(found.behind, expected.behind)
         torch.testing.assert_close(found.penalty, expected.penalty)
     assert torch.equal(wanted.number, by_hull.number)
+    without = loose.with_surface(ball()).mask_views(hidden).choose(points, directions, best=0, nearest=2)
+    assert without.best.views.shape == (60, 0)
+    assert torch.equal(without.nearest.views, wanted.nearest.views)
+    for name in ("coverage", "number"):
+        torch.testing.assert_close(getattr(without, name), getattr(wanted, name), atol=0, rtol=0)
 
 
 @pytest.mark.parametrize("compiled", [True, False])
