@@ -37,10 +37,11 @@ from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.configuration.presets import preset
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
+from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering import renderer
-from hyperplanes.rendering.renderer import Hierarchical
+from hyperplanes.rendering.renderer import FieldFunction, Hierarchical
 from hyperplanes.training import Trainer
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task, Tasks
@@ -51,10 +52,8 @@ PAPER = Path(__file__).parent / "weights" / "paper-network"
 PAPER_SAMPLES = Hierarchical(64, 128)
 SHOWN, COMPARED = 25, 4
 SIZES = (128, 200, 400)
-COMPILED = 200  # pixels of a side at which the ways are compared
-SPAN = 1 << 14  # points by which graphs differ in size
-
-FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+SIZE_OF_WAYS = 200  # pixels of a side at which the ways are compared
+SPAN = 1 << 14  # points by which graphs and compiled functions differ in size
 
 
 def main(arguments: list[str]) -> int:
@@ -78,7 +77,7 @@ def main(arguments: list[str]) -> int:
     rows = adapting(data, device, steps) + training(data, device, repeats)
     rows += views(str(PAPER), data, device, sizes, repeats) + views("small", data, device, sizes, repeats)
     if chosen.compile:
-        rows += compiled(data, device, sizes[-2:][0], repeats)
+        rows += compiled(data, device, _size_of_ways(sizes), repeats)
     return finish("gpu", rows, chosen.json, device.type)
 
 
@@ -90,34 +89,33 @@ def views(checkpoint: str, data: Tasks, device: torch.device, sizes: tuple[int, 
         task = _task(data, size, device)
         adapted = model.adapt(task.support)
         drawn = {"default": _drawing(adapted, antialias=True), "one ray a pixel": _drawing(adapted)}
-        if size == COMPILED or len(sizes) == 1:
-            drawn |= _ways(adapted, device)
-        elif name != "small":
+        if not isinstance(adapted, StackedField):  # the hull beside such a one has no coarse pass
             drawn["paper's protocol"] = _drawing(adapted, sampling=PAPER_SAMPLES)
+        if size == _size_of_ways(sizes):
+            drawn |= _ways(adapted, device)
         rows += _compare(f"{name}, {size}x{size}", task, drawn, repeats)
     return rows
+
+
+def _size_of_ways(sizes: tuple[int, ...]) -> int:
+    return SIZE_OF_WAYS if SIZE_OF_WAYS in sizes else sizes[0]
 
 
 def _task(data: Tasks, size: int, device: torch.device) -> Task:
     """The first held-out object: 25 views that are shown, and some that are not, of so many pixels."""
     names = sorted(data.names("test") or data.names("train"))
-    task = Shown(data, SHOWN, COMPARED).task(names[0])
-    return Task(task.support.resized(size).to(device), task.query.resized(size).to(device), task.name)
+    task = _Resized(Shown(data, SHOWN, COMPARED), size).task(names[0])
+    return Task(task.support.to(device), task.query.to(device), task.name)
 
 
 @dataclass(frozen=True)
-class _Resized:
+class _Resized(TaskWrapper):
     """Tasks with pictures of so many pixels."""
 
-    data: Tasks
     size: int
 
-    def names(self, split: str) -> list[str]:
-        return sorted(self.data.names(split))
-
-    def task(self, name: str) -> Task:
-        task = self.data.task(name)
-        return Task(task.support.resized(self.size), task.query.resized(self.size), name)
+    def change(self, task: Task) -> Task:
+        return Task(task.support.resized(self.size), task.query.resized(self.size), task.name)
 
 
 @dataclass(frozen=True)
@@ -147,8 +145,7 @@ def _drawing(
 
 def _ways(adapted: AdaptedField, device: torch.device) -> dict[str, Drawing]:
     """One ray a pixel: other ways, each in place of one thing, and other ways of evaluating the field."""
-    found = {} if isinstance(adapted, StackedField) else {"paper's protocol": _drawing(adapted, sampling=PAPER_SAMPLES)}
-    found |= {
+    found = {
         "lookups by PyTorch": _drawing(adapted, _lookups_by_pytorch),
         "no TF32": _drawing(adapted, _without_tf32),
         "layers in bfloat16": _drawing(adapted, partial(_layers_in_bfloat16, device.type)),
@@ -166,8 +163,8 @@ def compiled(data: Tasks, device: torch.device, size: int, repeats: int) -> list
         fast = torch.compile(function, dynamic=False)
 
         def padded(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-            count, room = len(points), -(-max(1, len(points)) // SPAN) * SPAN
-            colour, density = fast(*(pad(each, (0, 0, 0, room - count)) for each in (points, directions)))
+            count = len(points)
+            colour, density = fast(*(pad(each, (0, 0, 0, _room(count) - count)) for each in (points, directions)))
             return colour[:count], density[:count]
 
         return padded
@@ -207,6 +204,11 @@ def _layers_in_bfloat16(device: str) -> Generator[None]:
         yield
 
 
+def _room(count: int) -> int:
+    """A number of points, rounded up."""
+    return -(-max(1, count) // SPAN) * SPAN
+
+
 class Graphed:
     """A field whose work is recorded once for every number of points, rounded up, and replayed.
 
@@ -219,18 +221,18 @@ class Graphed:
         self.graphs: dict[int, tuple[torch.cuda.CUDAGraph, list[Tensor]]] = {}
 
     def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours and densities, in memory that the next call writes to."""
+        """Colours and densities."""
         count = len(points)
-        room = -(-max(1, count) // SPAN) * SPAN
+        room = _room(count)
         if room not in self.graphs:
-            self.graphs[room] = self._record(points, directions, room)
+            self.graphs[room] = self._record(room, points.device)
         graph, tensors = self.graphs[room]
         tensors[0][:count], tensors[1][:count] = points, directions
         graph.replay()
         return tensors[2][:count].clone(), tensors[3][:count].clone()
 
-    def _record(self, points: Tensor, directions: Tensor, room: int) -> tuple[torch.cuda.CUDAGraph, list[Tensor]]:
-        inputs = [torch.zeros(room, 3, device=points.device) for _ in range(2)]
+    def _record(self, room: int, device: torch.device) -> tuple[torch.cuda.CUDAGraph, list[Tensor]]:
+        inputs = [torch.zeros(room, 3, device=device) for _ in range(2)]
         inputs[1][:, 0] = 1
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())

@@ -41,10 +41,10 @@ def car(device, shown=3, size=24):
     return Task(support[:shown], query, task.name)
 
 
-def small(device):
+def small(device, stop=0.0):
+    """Without a `stop` all samples have gradients, none of which is drawn."""
     model = HyperPlanes.from_pretrained("small").to(device)
-    every = RayMarching(64, stop=0)  # whose samples all have gradients, none of which is drawn
-    model.config = replace(model.config, symmetric=False, hull_resolution=24, sampling=every)
+    model.config = replace(model.config, symmetric=False, hull_resolution=24, sampling=RayMarching(64, stop))
     return model
 
 
@@ -84,6 +84,23 @@ def test_gradient_steps_end_with_the_same_weights(device):
         return small(where).fine_tune(task.support, 2).render(task.query.cameras, **PLAIN).images
 
     assert float((tuned(device).cpu() - tuned(CPU)).square().mean()) < 1e-4
+
+
+def test_rays_that_end_where_they_are_opaque_are_shown_alike(device):
+    """On the CPU in rounds, until little light is left; elsewhere all samples at once, with gradients or without."""
+    pixels = []
+    for where in (CPU, device):
+        task = car(where)
+        field = small(where, stop=5e-3).adapt(task.support)
+        rays, _ = task.query.sample_rays(150, generator=torch.Generator().manual_seed(0))
+        placed = len(field.sampling.place(rays, field.occupancy))
+        drawn = torch.Generator().manual_seed(1)
+        with torch.enable_grad():
+            found = [field.trace(rays, differentiable=False), field.trace(rays, drawn)]
+        pixels.append([each.colour.detach().cpu() for each in found])
+        assert found[0].samples == placed if where == device else found[0].samples < placed
+    for here, there in zip(*pixels, strict=True):
+        assert float((here - there).square().mean()) < 1e-5
 
 
 def test_planes_of_symmetry_are_found(device):
