@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from functools import partial
-
 import torch
 
-from hyperplanes.adaptation.held_out import Trial, hold_out
-from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
+from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.symmetry import possible_symmetries, symmetry_of
-from hyperplanes.geometry.kernels.threads import side_by_side
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.views import Views
 
-__all__ = ["FoundSymmetry", "find_symmetry"]
+__all__ = ["find_symmetry"]
 
 SIZE, PIXELS = 128, 2048  # along the longer side of a single view, and those by which it is judged
-FEWEST_JUDGED = 10  # views from which on some are held out; fewer gain more, and tell less
-
-
-@dataclass(frozen=True)
-class FoundSymmetry:
-    """What was found about the symmetry of an object.
-
-    Attributes:
-        symmetry: by which its views are to be reflected; None where they are not.
-        trial: what was made of it so while views were held out, if they were.
-    """
-
-    symmetry: Symmetry | None
-    trial: Trial | None = None
 
 
 @torch.no_grad()
-def find_symmetry(network: HyperPlanesNetwork, support: Views) -> FoundSymmetry:
+def find_symmetry(network: HyperPlanesNetwork, support: Views) -> Symmetry | None:
     """As `HyperPlanes.find_symmetry`.
 
     Args:
@@ -44,14 +24,9 @@ def find_symmetry(network: HyperPlanesNetwork, support: Views) -> FoundSymmetry:
     """
     config = network.config
     if config.symmetry is not None or not config.symmetric:
-        return FoundSymmetry(config.symmetry)
+        return config.symmetry
     views = network.to_own(support)
-    if len(views) == 1:
-        return FoundSymmetry(_of_one_view(network, views))
-    found = symmetry_of(views)
-    if found is None or len(views) < FEWEST_JUDGED:
-        return FoundSymmetry(found)
-    return _judged(network, views, found)
+    return _of_one_view(network, views) if len(views) == 1 else symmetry_of(views)
 
 
 def _of_one_view(network: HyperPlanesNetwork, view: Views) -> Symmetry | None:
@@ -74,20 +49,3 @@ def _of_one_view(network: HyperPlanesNetwork, view: Views) -> Symmetry | None:
         return float((found.colour - truth).square().sum())
 
     return min((None, *possible), key=error)
-
-
-def _judged(network: HyperPlanesNetwork, views: Views, symmetry: Symmetry) -> FoundSymmetry:
-    """The symmetry, unless views that are held out are shown worse with reflections of the others.
-
-    By more than the standard error of the difference: what looks symmetric mostly is.
-    """
-    with in_use(network):
-        device = views.images.device
-        alone, both = side_by_side(partial(hold_out, network, views), [None, symmetry], device)
-        if alone is None or both is None:
-            return FoundSymmetry(symmetry)
-        errors = side_by_side(lambda each: alone.pixels.errors(each.learned), [alone, both], device)
-        without, reflected = (each.square().sum(1) for each in errors)
-    lost = reflected - without
-    worse = lost.mean() > lost.std() / math.sqrt(len(lost))
-    return FoundSymmetry(None, alone) if worse else FoundSymmetry(symmetry, both)

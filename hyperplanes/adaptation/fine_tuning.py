@@ -83,13 +83,13 @@ def fine_tune(
             on_step(0)
         return one_step(network, support)
     if steps != "auto":
-        context = network.prepare(support, symmetry=find_symmetry(network, support).symmetry)
+        context = network.prepare(support, symmetry=find_symmetry(network, support))
         return fine_tune_to(network, context, steps, settings, views=_trained_on(context, support), on_step=on_step)
 
     # how many steps show some of the views best that the others were fine-tuned without, from as many random weights
     settings = settings.for_views(len(support), network.target.permutation_invariant)
     shown, holdout = split_holdout(support, settings)
-    context = network.prepare(shown, symmetry=find_symmetry(network, shown).symmetry)
+    context = network.prepare(shown, symmetry=find_symmetry(network, shown))
     trial, _ = make_descent(network, context, settings, _trained_on(context, shown))
     pixels = network.live_pixels_of(context, holdout)
     with torch.no_grad():
@@ -97,7 +97,7 @@ def fine_tune(
     stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
-    context = network.prepare(support, symmetry=find_symmetry(network, support).symmetry)
+    context = network.prepare(support, symmetry=find_symmetry(network, support))
     views = _trained_on(context, support)
     return fine_tune_to(network, context, stop, settings, views=views, schedule=settings.max_steps, on_step=on_step)
 
@@ -110,9 +110,8 @@ def one_step(network: HyperPlanesNetwork, support: Views) -> AdaptedField:
         network: the model.
         support: the views of the object.
     """
-    found = find_symmetry(network, support)
-    context = network.prepare(support, symmetry=found.symmetry)
-    return stacked_field(network, context, network.adapted_weights(context), found.trial)
+    context = network.prepare(support, symmetry=find_symmetry(network, support))
+    return stacked_field(network, context, network.adapted_weights(context))
 
 
 def _trained_on(context: SupportContext, support: Views) -> Views:

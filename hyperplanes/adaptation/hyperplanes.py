@@ -61,11 +61,10 @@ class HyperPlanes(HyperPlanesNetwork):
 
         Returns:
             `config.symmetry` where that is known. Else the planes about which the object looks symmetric
-            (`symmetry.symmetry_of`), or None. With ten views or more, some that are held out must not be
-            shown worse with reflections. A single view is reflected about several planes if its silhouette and colours
-            show them, and about one if it is shown better so itself.
+            (`symmetry.symmetry_of`), or None. A single view is reflected about several planes if its silhouette and
+            colours show them, and about one if it is shown better so itself.
         """
-        return find_symmetry(self, support).symmetry
+        return find_symmetry(self, support)
 
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:

@@ -174,9 +174,7 @@ def stack(
 
 
 @torch.no_grad()
-def stacked_field(
-    network: HyperPlanesNetwork, context: SupportContext, weights: Parameters, trial: Trial | None = None
-) -> AdaptedField:
+def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
     """The field of given weights, stacked with the visual hull where the model is configured so.
 
     The share of the hull is that of the object's own update (`hull_share`), whatever the weights are, or the one that
@@ -187,7 +185,6 @@ def stacked_field(
         network: the model.
         context: the object.
         weights: of the field.
-        trial: with views held out, where there has been one.
     """
     learned = network.rendering_field(context, weights)
     if context.views.masks is None:
@@ -195,7 +192,7 @@ def stacked_field(
     share = network.config.hull_share
     if network.config.stacked:
         with in_use(network):
-            share = hull_share(trial or hold_out(network, context.given, context.symmetry))
+            share = hull_share(hold_out(network, context.given, context.symmetry))
     gate = network.gate if len(context.views) >= FEWEST else None
     if not share and gate is None:
         return learned

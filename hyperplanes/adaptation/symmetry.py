@@ -10,6 +10,7 @@ from functools import partial
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.context import live_pixels
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.reflections import (
     HULL_SIDE,
@@ -45,6 +46,10 @@ MOST_IMAGES = 64  # views and reflections; more make no better pictures, and tak
 MOST_PIXELS = 1 << 25  # of them about several planes: with 192 million adapting takes 10 GB and ten times as long
 SINGLE_VIEW_ORDER = 3  # at least: by one view, many a car is the same from the front and from the back
 WORTH = 0.5  # power of the order by which the error may grow
+FOLDS, ONE_IN = 3, 6  # that are held out one after the other, each of one view in so many
+FEW = 16  # views, of which the held-out ones must gain more
+GAIN_OF_FEW, GAIN = 0.6, 0.1  # dB that reflections must bring to held-out views
+JUDGED_SIZE, PIXELS = 128, 1024  # of held-out views, along the longer side at most, and those compared of each fold
 
 VERTICAL = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 AXES = (*VERTICAL, (0.0, 1.0, 0.0))
@@ -69,7 +74,8 @@ def symmetry_of(support: Views) -> Symmetry | None:
         The symmetry by which `HullBlend` shows the views best, if its squared error is at most TOLERANCE times that
         without reflections; None with fewer than FEWEST views, or without masks. Other planes than those across the
         axes need FEWEST_TO_SEARCH views, whose hull is near enough to the object, those near to one FEWEST_TO_REFINE.
-        Several planes are looked for with fewer views than that.
+        With fewer views than that several planes are looked for. With as many, those that are held out must be shown
+        better with reflections of the others, by GAIN_OF_FEW or GAIN.
     """
     if support.masks is None or len(support) < FEWEST or not support.masks.any():
         return None
@@ -86,7 +92,10 @@ def symmetry_of(support: Views) -> Symmetry | None:
             found = min(errors, key=errors.__getitem__, default=None)
     if found is None:
         return None
-    several = judge.several(found, errors[found], support) if len(support) < FEWEST_TO_REFINE else None
+    if len(support) >= FEWEST_TO_REFINE:
+        needed = GAIN_OF_FEW if len(support) < FEW else GAIN
+        return Symmetry(found) if _held_out_gain(support, Symmetry(found)) >= needed else None
+    several = judge.several(found, errors[found], support)
     return Symmetry(found) if several is None else several[0]
 
 
@@ -114,11 +123,39 @@ class ReflectedHullBlend:
 
     def adapt(self, support: Views) -> AdaptedField:
         """The hull of views and reflections, and its colours."""
-        symmetry, blend = symmetry_of(support), HullBlend()
-        planes = blend.planes_of(with_reflections(support, symmetry))
-        if symmetry is not None:
-            planes = planes.with_handicaps(handicaps(len(support), symmetry))
-        return blend.adapt_to(planes)
+        return _blend(support, symmetry_of(support))
+
+
+def _blend(support: Views, symmetry: Symmetry | None) -> AdaptedField:
+    """`HullBlend` of views, and of their reflections where there is a symmetry."""
+    blend = HullBlend()
+    planes = blend.planes_of(with_reflections(support, symmetry))
+    return blend.adapt_to(planes if symmetry is None else planes.with_handicaps(handicaps(len(support), symmetry)))
+
+
+def _held_out_gain(support: Views, symmetry: Symmetry) -> float:
+    """By how many dB of PSNR `HullBlend` shows held-out views better by the other views and their reflections.
+
+    FOLDS times one view in ONE_IN is held out (cross-validation, Stone 1974), and the same pixels are compared. No
+    weights are needed: two views that are held out from a trained field tell less (docs/image-based.md).
+    """
+    views = support.resized(JUDGED_SIZE)
+    order = torch.randperm(len(views), generator=torch.Generator().manual_seed(0)).tolist()
+    trials = [(sorted(order[fold::ONE_IN]), by) for by in (None, symmetry) for fold in range(FOLDS)]
+    errors = side_by_side(lambda trial: _held_out_error(views, *trial), trials, views.images.device)
+    alone, reflected = sum(errors[:FOLDS]), sum(errors[FOLDS:])
+    return 10 * math.log10(alone / reflected) if reflected else math.inf
+
+
+def _held_out_error(views: Views, held_out: list[int], symmetry: Symmetry | None) -> float:
+    """The squared error of some views by the others, in pixels that are the same with a symmetry and without."""
+    shown, others = views[sorted({*range(len(views))} - {*held_out})], views[held_out]
+    among = live_pixels(_hull(shown), others)
+    if not len(among):
+        return 0.0
+    drawn = torch.randint(len(among), (PIXELS,), generator=torch.Generator().manual_seed(0))
+    rays, truth, _ = others.rays_at(among[drawn.to(among.device)])
+    return float((_blend(shown, symmetry).trace(rays, differentiable=False).colour - truth).square().sum())
 
 
 @dataclass(frozen=True)
