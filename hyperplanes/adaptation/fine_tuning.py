@@ -25,6 +25,7 @@ __all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "made_anyway", "make_
 
 Made = TypeVar("Made")
 
+MOST_REFLECTED = 15  # given views, up to which gradient steps take rays of their reflections, too
 NEARLY = 0.99  # of the error of an empty picture, which a field that has lost everything may miss by rounding
 
 
@@ -115,11 +116,13 @@ def one_step(network: HyperPlanesNetwork, support: Views) -> AdaptedField:
 
 
 def _trained_on(context: SupportContext, support: Views) -> Views:
-    """Where rays come from: the support views, in their order, or these and their reflections about one plane.
+    """Where rays come from: the support views, in their order, or a few and their reflections about one plane.
 
-    Rays of reflections about several planes show 0.3 dB less (17 lamps from 3 and 5 views, 100 steps).
+    Rays of reflections about several planes show 0.3 dB less (17 lamps from 3 and 5 views, 100 steps). Many views show
+    an object well enough, and what is not quite symmetric would be learned wrongly (docs/image-based.md).
     """
-    return support if context.symmetry is None else context.views[: 2 * len(support)]
+    few = context.symmetry is not None and len(support) <= MOST_REFLECTED
+    return context.views[: 2 * len(support)] if few else support
 
 
 def fine_tune_to(

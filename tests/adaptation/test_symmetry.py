@@ -326,6 +326,13 @@ def test_gradient_steps_draw_no_rays_of_reflections_about_further_planes(drawn):
     assert {count for count, _ in drawn} == {8}
 
 
+@pytest.mark.parametrize(("given", "shown"), [(15, 30), (16, 16)])
+def test_gradient_steps_draw_rays_of_reflections_of_few_views_alone(drawn, given, shown):
+    settings = replace(TUNING, draw="uniform")
+    model(symmetry=ACROSS).fine_tune(balls(cameras(given), BODY), 2, settings)
+    assert {count for count, _ in drawn} == {shown}
+
+
 def test_views_of_a_ball_are_reflected_by_kernels_and_plain_pytorch_alike(monkeypatch):
     from hyperplanes.geometry import visibility as module
 
