@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 
@@ -33,9 +32,14 @@ from hyperplanes.views import Views
 __all__ = ["ReflectedHullBlend", "possible_symmetries", "symmetry_of"]
 
 FEWEST = 2  # views that planes are judged by: a single one contradicts none of them
-FEWEST_TO_SEARCH, FEWEST_TO_REFINE = 5, 10
+FEWEST_TO_REFINE = 10  # whose hull is near enough to the object to find planes by it
 MOST = 8
-SIZE = 64  # pixels of these along the longer side, at most
+SIZE, COARSE_SIZE = 64, 32  # pixels of these along the longer side, at most: to judge a plane, and to look for one
+COARSE_HULL = 48  # voxels an axis, to look for one
+AZIMUTHS = 24  # of vertical planes that are tried
+NEARLY = 1.5  # times the error of the best of these, up to which better ones are looked for near to the second, too
+COARSE_ROUNDS, FINE_ROUNDS = 3, 2  # of looking for better ones
+SPAN = 0.04  # radii of the scene, by which planes are moved first
 LOST = 0.05  # share of the object's pixels that the hull with reflections may miss
 TOLERANCE = 1.75  # times the squared error without reflections, by which the views still show the same object
 FLOOR = 3e-3  # of that error in a pixel of the object; smaller ones are those of the hull's voxels
@@ -62,34 +66,39 @@ def symmetry_of(support: Views) -> Symmetry | None:
 
     If an object is symmetric, the visual hull of its views and their reflections still shows the views. If not, this
     hull is too small, or it has the colours of another part of the object. Silhouettes and colours are compared; no
-    weights are needed. The planes through the middle of the scene that are orthogonal to its axes are tried first. Then
-    the best of these is compared with one near to it (`more_symmetric_plane`) or, where none will do, the vertical
-    plane about which the hull of the views is most nearly symmetric is tried (`most_symmetric_plane`). Of few views of
-    an object that is symmetric about a vertical plane, likewise 2, 3, 4, 6 and 8 planes through one axis are tried.
+    weights are needed. Planes through the middle of the scene that are orthogonal to its axes are tried first. Where
+    none of them will do, vertical planes of all azimuths are. Of an object that is symmetric about a vertical plane,
+    likewise 2, 3, 4, 6 and 8 planes through one axis are tried.
+
+    FEWEST_TO_REFINE views have a hull that is near enough to the object to look for planes by it: one near to the best
+    of those across the axes (`more_symmetric_plane`) or, where none will do, the vertical plane about which the hull is
+    most nearly symmetric (`most_symmetric_plane`). Several planes are not looked for. Those of the views that are held
+    out must be shown better with reflections of the others, by GAIN_OF_FEW or GAIN.
 
     Args:
         support: views with masks, y up; MOST of them, those farthest apart, are looked at.
 
     Returns:
         The symmetry by which `HullBlend` shows the views best, if its squared error is at most TOLERANCE times that
-        without reflections; None with fewer than FEWEST views, or without masks. Other planes than those across the
-        axes need FEWEST_TO_SEARCH views, whose hull is near enough to the object, those near to one FEWEST_TO_REFINE.
-        With fewer views than that several planes are looked for. With as many, those that are held out must be shown
-        better with reflections of the others, by GAIN_OF_FEW or GAIN.
+        without reflections; None with fewer than FEWEST views, or without masks.
     """
     if support.masks is None or len(support) < FEWEST or not support.masks.any():
         return None
     centre = support.bounds.centre
     chosen = farthest_first(camera_directions(support.cameras, centre).cpu(), 0, min(MOST, len(support)))
-    judge, errors = _Judge.of(support[sorted(chosen)], _planes(support.bounds, AXES))
+    views = support[sorted(chosen)]
+    judge = _Judge.of(views)
+    errors = judge.errors(_planes(support.bounds, AXES), TOLERANCE)
     found = min(errors, key=errors.__getitem__, default=None)
-    if len(support) >= (FEWEST_TO_SEARCH if found is None else FEWEST_TO_REFINE):
+    if len(support) < FEWEST_TO_REFINE:
+        tried = [] if found else [_best_plane(judge, views)]
+    else:
         voxels = _hull(support)
-        if voxels.occupied.any():
-            more = most_symmetric_plane(voxels) if found is None else more_symmetric_plane(voxels, found)
-            error = judge.error(Symmetry(more))
-            errors |= {more: error} if error <= TOLERANCE else {}
-            found = min(errors, key=errors.__getitem__, default=None)
+        if not voxels.occupied.any():
+            return None
+        tried = [most_symmetric_plane(voxels) if found is None else more_symmetric_plane(voxels, found)]
+    errors |= judge.errors(tried, TOLERANCE)
+    found = min(errors, key=errors.__getitem__, default=None)
     if found is None:
         return None
     if len(support) >= FEWEST_TO_REFINE:
@@ -110,7 +119,8 @@ def possible_symmetries(view: Views) -> list[Symmetry]:
         The most likely one where there are several planes through one axis: few other objects look like such a one.
         Else those about one plane, of which a single view tells nothing more.
     """
-    judge, errors = _Judge.of(view, _planes(view.bounds, VERTICAL), most=math.inf)
+    judge = _Judge.of(view)
+    errors = judge.errors(_planes(view.bounds, VERTICAL))
     several = [judge.several(plane, errors[plane], view, SINGLE_VIEW_ORDER) for plane in errors]
     likely = [each for each in several if each is not None]
     if likely:
@@ -164,25 +174,29 @@ class _Judge:
 
     Attributes:
         views: small ones.
+        side: voxels an axis of their hull.
         alone: their squared error without reflections, and FLOOR.
         floor: of all errors.
     """
 
     views: Views
+    side: int
     alone: float
     floor: float
 
     @classmethod
-    def of(cls, support: Views, planes: Sequence[Plane], most: float = TOLERANCE) -> tuple[_Judge, dict[Plane, float]]:
-        """The judge of some views with masks, and the errors of those planes by which they are at most so large."""
-        views = support.resized(SIZE)
+    def of(cls, support: Views, size: int = SIZE, side: int = HULL_SIDE) -> _Judge:
+        """The judge of views with masks, so many pixels along the longer side at most."""
+        views = support.resized(size)
         assert views.masks is not None
         floor = FLOOR * float((views.masks >= SHOWN).sum())
-        symmetries = [None, *(Symmetry(plane) for plane in planes)]
-        alone, *errors = side_by_side(partial(_squared_error, views), symmetries, views.images.device)
-        judge = cls(views, alone + floor, floor)
-        relative = zip(planes, map(judge._relative, errors), strict=True)
-        return judge, {plane: error for plane, error in relative if error <= most and math.isfinite(error)}
+        return cls(views, side, _squared_error(views, None, side) + floor, floor)
+
+    def errors(self, planes: Sequence[Plane], most: float = math.inf) -> dict[Plane, float]:
+        """Those of the planes by which they are at most so large, and finite."""
+        errors = side_by_side(lambda plane: self.error(Symmetry(plane)), planes, self.views.images.device)
+        found = zip(planes, errors, strict=True)
+        return {plane: error for plane, error in found if error <= most and math.isfinite(error)}
 
     def several(self, plane: Plane, error: float, given: Views, least: int = 2) -> tuple[Symmetry, float] | None:
         """The most likely order of symmetries of several planes, one of which is known, and its error over its worth.
@@ -217,23 +231,20 @@ class _Judge:
 
     def error(self, symmetry: Symmetry) -> float:
         """That of the hull of views and reflections; infinite where it loses too many pixels."""
-        return self._relative(_squared_error(self.views, symmetry))
-
-    def _relative(self, error: float) -> float:
-        return (error + self.floor) / self.alone
+        return (_squared_error(self.views, symmetry, self.side) + self.floor) / self.alone
 
 
-def _hull(views: Views) -> Occupancy:
+def _hull(views: Views, side: int = HULL_SIDE) -> Occupancy:
     """The visual hull of views with masks."""
     assert views.masks is not None
-    return carve(views.masks, views.cameras, views.bounds, HULL_SIDE)
+    return carve(views.masks, views.cameras, views.bounds, side)
 
 
-def _squared_error(views: Views, symmetry: Symmetry | None) -> float:
+def _squared_error(views: Views, symmetry: Symmetry | None, side: int) -> float:
     """That of views by `HullBlend` of them and their reflections; infinite where their hull loses too many pixels."""
     assert views.masks is not None
     shown = views if symmetry is None else images_by(views, symmetry)
-    among, hull = torch.ones_like(views.masks, dtype=torch.bool), _hull(shown)
+    among, hull = torch.ones_like(views.masks, dtype=torch.bool), _hull(shown, side)
     if symmetry is not None:
         seen, held = views.masks >= SHOWN, footprint(hull, views.cameras)[:, None]
         if not hull.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
@@ -243,6 +254,62 @@ def _squared_error(views: Views, symmetry: Symmetry | None) -> float:
     blend = HullBlend().adapt_to(VisibilityPlanes(shown.images, shown.cameras, shown.masks, hull))
     found = blend.render(views.cameras)
     return float((found.images - views.images).square().mean(1, keepdim=True)[among].sum())
+
+
+def _best_plane(judge: _Judge, views: Views) -> Plane:
+    """The vertical plane by which views are shown best.
+
+    Planes of all azimuths are tried by smaller pictures, then those near to the best one or two, and last, by larger
+    pictures, those beside the best of these. A few degrees beside the right plane the error is several times as large.
+
+    Args:
+        judge: by the larger pictures.
+        views: what is judged.
+    """
+    coarse, step = _Judge.of(views, COARSE_SIZE, COARSE_HULL), math.pi / AZIMUTHS
+    angles = {_vertical(views.bounds, index * step): index * step for index in range(AZIMUTHS)}
+    errors = coarse.errors(list(angles))
+    if not errors:
+        return next(iter(angles))
+    first, *others = sorted(errors, key=errors.__getitem__)
+    apart = [each for each in others if abs(math.sin(angles[each] - angles[first])) > math.sin(1.5 * step)]
+    likely = [first, *(each for each in apart[:1] if errors[each] <= NEARLY * errors[first])]
+    nearer = [_refined(coarse, (angles[each], 0.0), (step / 2, 0.0), COARSE_ROUNDS) for each in likely]
+    start, _ = min(nearer, key=lambda each: each[1])
+    (angle, offset), _ = _refined(judge, start, (step / 2**COARSE_ROUNDS, SPAN), FINE_ROUNDS)
+    return _vertical(views.bounds, angle, offset)
+
+
+def _refined(
+    judge: _Judge, start: tuple[float, float], steps: tuple[float, float], rounds: int
+) -> tuple[tuple[float, float], float]:
+    """Azimuth and offset of a vertical plane near to another one by which views are shown better, and its error.
+
+    Args:
+        judge: of the views.
+        start: azimuth and offset of the other one.
+        steps: by which both are changed first; half as much in each further round.
+        rounds: how many.
+    """
+    (angle, offset), (turn, shift), bounds = start, steps, judge.views.bounds
+    error = judge.error(Symmetry(_vertical(bounds, angle, offset)))
+    for _ in range(rounds):
+        around = [(angle + turn, offset), (angle - turn, offset)]
+        around += [(angle, offset + shift), (angle, offset - shift)] if shift else []
+        tried = {_vertical(bounds, *each): each for each in around}
+        errors = judge.errors(list(tried), error)
+        if errors:
+            best = min(errors, key=errors.__getitem__)
+            (angle, offset), error = tried[best], errors[best]
+        turn, shift = turn / 2, shift / 2
+    return (angle, offset), error
+
+
+def _vertical(bounds: Sphere, angle: float, offset: float = 0.0) -> Plane:
+    """The vertical plane whose normal has this azimuth, so many radii from the middle of a scene."""
+    normal = (math.cos(angle), 0.0, math.sin(angle))
+    through = sum(a * b for a, b in zip(normal, bounds.centre, strict=True))
+    return Plane(normal, through + offset * bounds.radius)
 
 
 def _planes(bounds: Sphere, normals: Sequence[tuple[float, float, float]]) -> list[Plane]:
