@@ -440,6 +440,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "views": _views,
     "views_over": _views_over,
     "views_srn": _views,
+    "views_rotated": _views,
     "views_summary": _views_summary,
     "views_tuned": _views_tuned,
 }
