@@ -9,8 +9,9 @@ from second_device import AVAILABLE, second_device
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.hull_blend import HullBlend
+from hyperplanes.adaptation.judging_symmetry import SymmetryJudge
 from hyperplanes.adaptation.reflections import with_reflections
-from hyperplanes.adaptation.symmetry import _held_out_error, _Judge
+from hyperplanes.adaptation.symmetry import _held_out_error
 from hyperplanes.configuration.presets import preset
 from hyperplanes.data import read_task
 from hyperplanes.export.baking import bake
@@ -117,7 +118,10 @@ def test_planes_of_symmetry_are_found(device):
 def test_planes_are_judged_alike(device):
     def judged(where):
         support = car(where, shown=4, size=16).support
-        return [_Judge.of(support, 16, 24).error(Symmetry(ACROSS)), _held_out_error(support, [1], Symmetry(ACROSS))]
+        return [
+            SymmetryJudge.of(support, 16, 24).error(Symmetry(ACROSS)),
+            _held_out_error(support, [1], Symmetry(ACROSS)),
+        ]
 
     assert judged(device) == pytest.approx(judged(CPU), rel=0.02)
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HullBlend, HyperPlanes, finding_symmetry, symmetry
+from hyperplanes.adaptation import HullBlend, HyperPlanes, finding_symmetry, judging_symmetry, symmetry
 from hyperplanes.adaptation.base import hull
 from hyperplanes.adaptation.fine_tuned import FromScratch
 from hyperplanes.adaptation.fine_tuning import made_anyway
@@ -176,7 +176,7 @@ def test_a_solid_of_revolution_has_as_many_planes_as_there_is_room_for_images(co
 
 def test_large_pictures_have_room_for_fewer(monkeypatch):
     views = balls(cameras(2, SMOOTH), REVOLVED)
-    monkeypatch.setattr(symmetry, "MOST_PIXELS", 13 * views.images[:, 0].numel())
+    monkeypatch.setattr(judging_symmetry, "MOST_PIXELS", 13 * views.images[:, 0].numel())
     assert symmetry_of(views).order == 6
 
 

@@ -1,0 +1,186 @@
+"""How well views are shown by their visual hull with reflections, and the plane by which they are shown best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from hyperplanes.adaptation.hull_blend import HullBlend
+from hyperplanes.adaptation.reflections import HULL_SIDE, SHOWN, images_by
+from hyperplanes.geometry.kernels.threads import side_by_side
+from hyperplanes.geometry.occupancy import Occupancy, carve
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.rendering.footprint import footprint
+from hyperplanes.views import Views
+
+__all__ = ["TOLERANCE", "SymmetryJudge", "best_vertical_plane", "carved", "planes_across"]
+
+SIZE, COARSE_SIZE = 64, 32  # pixels of views along the longer side, at most: to judge a plane, and to look for one
+COARSE_HULL = 48  # voxels an axis, to look for one
+AZIMUTHS = 24  # of vertical planes that are tried
+NEARLY = 1.5  # times the error of the best of these, up to which better ones are looked for near to the second, too
+COARSE_ROUNDS, FINE_ROUNDS = 3, 2  # of looking for better ones
+SPAN = 0.04  # radii of the scene, by which planes are moved first
+LOST = 0.05  # share of the object's pixels that the hull with reflections may miss
+TOLERANCE = 1.75  # times the squared error without reflections, by which the views still show the same object
+FLOOR = 3e-3  # of that error in a pixel of the object; smaller ones are those of the hull's voxels
+
+ORDERS = {2: (), 3: (), 4: (2,), 6: (2, 3), 8: (2, 4)}
+"""Orders that are tried, and those that an object of such a symmetry has, too."""
+MOST_IMAGES = 64  # views and reflections; more make no better pictures, and take longer
+MOST_PIXELS = 1 << 25  # of them about several planes: with 192 million adapting takes 10 GB and ten times as long
+WORTH = 0.5  # power of the order by which the error may grow
+
+
+@dataclass(frozen=True)
+class SymmetryJudge:
+    """How well views are shown by `HullBlend` of them and their reflections.
+
+    Attributes:
+        views: small ones.
+        side: voxels an axis of their hull.
+        alone: their squared error without reflections, and FLOOR.
+        floor: of all errors.
+    """
+
+    views: Views
+    side: int
+    alone: float
+    floor: float
+
+    @classmethod
+    def of(cls, support: Views, size: int = SIZE, side: int = HULL_SIDE) -> SymmetryJudge:
+        """The judge of views with masks, so many pixels along the longer side at most."""
+        views = support.resized(size)
+        assert views.masks is not None
+        floor = FLOOR * float((views.masks >= SHOWN).sum())
+        return cls(views, side, _squared_error(views, None, side) + floor, floor)
+
+    def errors(self, planes: Sequence[Plane], most: float = math.inf) -> dict[Plane, float]:
+        """Those of the planes by which they are at most so large, and finite."""
+        errors = side_by_side(lambda plane: self.error(Symmetry(plane)), planes, self.views.images.device)
+        found = zip(planes, errors, strict=True)
+        return {plane: error for plane, error in found if error <= most and math.isfinite(error)}
+
+    def several(self, plane: Plane, error: float, given: Views, least: int = 2) -> tuple[Symmetry, float] | None:
+        """The most likely order of symmetries of several planes, one of which is known, and its error over its worth.
+
+        Args:
+            plane: the one.
+            error: by it alone.
+            given: all views of the object, of which there are to be reflections.
+            least: order.
+
+        Returns:
+            None where it is more likely that there are no other ones.
+        """
+        if abs(plane.normal[1]) > 1e-6:
+            return None
+        centre = self.views.bounds.centre
+        apart = sum(a * b for a, b in zip(plane.normal, centre, strict=True)) - plane.offset
+        x, y, z = (a - apart * b for a, b in zip(centre, plane.normal, strict=True))
+        room = min(MOST_IMAGES // len(given), MOST_PIXELS // given.images[:, 0].numel())
+        found, best, possible = None, error, set[int]()
+        for order, parts in ORDERS.items():
+            symmetry = Symmetry(plane, order, (x, y, z))
+            if symmetry.images > room or not possible.issuperset(parts):
+                continue
+            error = self.error(symmetry)
+            if error > TOLERANCE:
+                continue
+            possible.add(order)
+            if order >= least and error / order**WORTH < best:
+                found, best = symmetry, error / order**WORTH
+        return None if found is None else (found, best)
+
+    def error(self, symmetry: Symmetry) -> float:
+        """That of the hull of views and reflections; infinite where it loses too many pixels."""
+        return (_squared_error(self.views, symmetry, self.side) + self.floor) / self.alone
+
+
+def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
+    """The vertical plane by which views are shown best.
+
+    Planes of all azimuths are tried by smaller pictures, then those near to the best one or two, and last, by larger
+    pictures, those beside the best of these. A few degrees beside the right plane the error is several times as large.
+
+    Args:
+        judge: by the larger pictures.
+        views: what is judged.
+    """
+    coarse, step = SymmetryJudge.of(views, COARSE_SIZE, COARSE_HULL), math.pi / AZIMUTHS
+    angles = {_vertical(views.bounds, index * step): index * step for index in range(AZIMUTHS)}
+    errors = coarse.errors(list(angles))
+    if not errors:
+        return next(iter(angles))
+    first, *others = sorted(errors, key=errors.__getitem__)
+    apart = [each for each in others if abs(math.sin(angles[each] - angles[first])) > math.sin(1.5 * step)]
+    likely = [first, *(each for each in apart[:1] if errors[each] <= NEARLY * errors[first])]
+    nearer = [_refined(coarse, (angles[each], 0.0), (step / 2, 0.0), COARSE_ROUNDS) for each in likely]
+    start, _ = min(nearer, key=lambda each: each[1])
+    (angle, offset), _ = _refined(judge, start, (step / 2**COARSE_ROUNDS, SPAN), FINE_ROUNDS)
+    return _vertical(views.bounds, angle, offset)
+
+
+def planes_across(bounds: Sphere, normals: Sequence[tuple[float, float, float]]) -> list[Plane]:
+    """The planes through the middle of a scene that have these normals."""
+    return [Plane(normal, sum(a * b for a, b in zip(normal, bounds.centre, strict=True))) for normal in normals]
+
+
+def carved(views: Views, side: int = HULL_SIDE) -> Occupancy:
+    """The visual hull of views with masks, which may be empty."""
+    assert views.masks is not None
+    return carve(views.masks, views.cameras, views.bounds, side)
+
+
+def _refined(
+    judge: SymmetryJudge, start: tuple[float, float], steps: tuple[float, float], rounds: int
+) -> tuple[tuple[float, float], float]:
+    """Azimuth and offset of a vertical plane near to another one by which views are shown better, and its error.
+
+    Args:
+        judge: of the views.
+        start: azimuth and offset of the other one.
+        steps: by which both are changed first; half as much in each further round.
+        rounds: how many.
+    """
+    (angle, offset), (turn, shift), bounds = start, steps, judge.views.bounds
+    error = judge.error(Symmetry(_vertical(bounds, angle, offset)))
+    for _ in range(rounds):
+        around = [(angle + turn, offset), (angle - turn, offset)]
+        around += [(angle, offset + shift), (angle, offset - shift)] if shift else []
+        tried = {_vertical(bounds, *each): each for each in around}
+        errors = judge.errors(list(tried), error)
+        if errors:
+            best = min(errors, key=errors.__getitem__)
+            (angle, offset), error = tried[best], errors[best]
+        turn, shift = turn / 2, shift / 2
+    return (angle, offset), error
+
+
+def _vertical(bounds: Sphere, angle: float, offset: float = 0.0) -> Plane:
+    """The vertical plane whose normal has this azimuth, so many radii from the middle of a scene."""
+    normal = (math.cos(angle), 0.0, math.sin(angle))
+    through = sum(a * b for a, b in zip(normal, bounds.centre, strict=True))
+    return Plane(normal, through + offset * bounds.radius)
+
+
+def _squared_error(views: Views, symmetry: Symmetry | None, side: int) -> float:
+    """That of views by `HullBlend` of them and their reflections; infinite where their hull loses too many pixels."""
+    assert views.masks is not None
+    shown = views if symmetry is None else images_by(views, symmetry)
+    among, voxels = torch.ones_like(views.masks, dtype=torch.bool), carved(shown, side)
+    if symmetry is not None:
+        seen, held = views.masks >= SHOWN, footprint(voxels, views.cameras)[:, None]
+        if not voxels.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
+            return math.inf
+        among = held | ~seen
+    assert shown.masks is not None
+    blend = HullBlend().adapt_to(VisibilityPlanes(shown.images, shown.cameras, shown.masks, voxels))
+    found = blend.render(views.cameras)
+    return float((found.images - views.images).square().mean(1, keepdim=True)[among].sum())
