@@ -18,7 +18,7 @@ from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views
 
-__all__ = ["TOLERANCE", "SymmetryJudge", "best_vertical_plane", "carved", "planes_across"]
+__all__ = ["TOLERANCE", "SymmetryJudge", "best_vertical_plane", "carved"]
 
 SIZE, COARSE_SIZE = 64, 32  # pixels of views along the longer side, at most: to judge a plane, and to look for one
 COARSE_HULL = 48  # voxels an axis, to look for one
@@ -123,11 +123,6 @@ def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
     return _vertical(views.bounds, angle, offset)
 
 
-def planes_across(bounds: Sphere, normals: Sequence[tuple[float, float, float]]) -> list[Plane]:
-    """The planes through the middle of a scene that have these normals."""
-    return [Plane(normal, sum(a * b for a, b in zip(normal, bounds.centre, strict=True))) for normal in normals]
-
-
 def carved(views: Views, side: int = HULL_SIDE) -> Occupancy:
     """The visual hull of views with masks, which may be empty."""
     assert views.masks is not None
@@ -161,9 +156,7 @@ def _refined(
 
 def _vertical(bounds: Sphere, angle: float, offset: float = 0.0) -> Plane:
     """The vertical plane whose normal has this azimuth, so many radii from the middle of a scene."""
-    normal = (math.cos(angle), 0.0, math.sin(angle))
-    through = sum(a * b for a, b in zip(normal, bounds.centre, strict=True))
-    return Plane(normal, through + offset * bounds.radius)
+    return Plane.of_sphere(bounds, (math.cos(angle), 0.0, math.sin(angle)), offset)
 
 
 def _squared_error(views: Views, symmetry: Symmetry | None, side: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 
@@ -14,14 +15,13 @@ from hyperplanes.adaptation.judging_symmetry import (
     SymmetryJudge,
     best_vertical_plane,
     carved,
-    planes_across,
 )
 from hyperplanes.adaptation.reflections import handicaps, with_reflections
 from hyperplanes.geometry.cameras import camera_directions
 from hyperplanes.geometry.kernels.threads import side_by_side
 from hyperplanes.geometry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
 from hyperplanes.geometry.poses import farthest_first
-from hyperplanes.geometry.reflections import Symmetry
+from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.views import Views
 
 __all__ = ["ReflectedHullBlend", "possible_symmetries", "symmetry_of"]
@@ -68,22 +68,13 @@ def symmetry_of(support: Views) -> Symmetry | None:
     chosen = farthest_first(camera_directions(support.cameras, centre).cpu(), 0, min(MOST, len(support)))
     views = support[sorted(chosen)]
     judge = SymmetryJudge.of(views)
-    errors = judge.errors(planes_across(support.bounds, AXES), TOLERANCE)
-    found = min(errors, key=errors.__getitem__, default=None)
-    if len(support) < FEWEST_TO_REFINE:
-        tried = [] if found else [best_vertical_plane(judge, views)]
-    else:
-        voxels = carved(support)
-        if not voxels.occupied.any():
-            return None
-        tried = [most_symmetric_plane(voxels) if found is None else more_symmetric_plane(voxels, found)]
-    errors |= judge.errors(tried, TOLERANCE)
-    found = min(errors, key=errors.__getitem__, default=None)
-    if found is None:
-        return None
+    across = judge.errors([Plane.of_sphere(support.bounds, normal) for normal in AXES], TOLERANCE)
     if len(support) >= FEWEST_TO_REFINE:
-        needed = GAIN_OF_FEW if len(support) < FEW else GAIN
-        return Symmetry(found) if _held_out_gain(support, Symmetry(found)) >= needed else None
+        return _of_many(support, judge, across)
+    errors = across or judge.errors([best_vertical_plane(judge, views)], TOLERANCE)
+    if not errors:
+        return None
+    found = min(errors, key=errors.__getitem__)
     several = judge.several(found, errors[found], support)
     return Symmetry(found) if several is None else several[0]
 
@@ -100,7 +91,7 @@ def possible_symmetries(view: Views) -> list[Symmetry]:
         Else those about one plane, of which a single view tells nothing more.
     """
     judge = SymmetryJudge.of(view)
-    errors = judge.errors(planes_across(view.bounds, VERTICAL))
+    errors = judge.errors([Plane.of_sphere(view.bounds, normal) for normal in VERTICAL])
     several = [judge.several(plane, errors[plane], view, SINGLE_VIEW_ORDER) for plane in errors]
     likely = [each for each in several if each is not None]
     if likely:
@@ -114,6 +105,29 @@ class ReflectedHullBlend:
     def adapt(self, support: Views) -> AdaptedField:
         """The hull of views and reflections, and its colours."""
         return _blend(support, symmetry_of(support))
+
+
+def _of_many(support: Views, judge: SymmetryJudge, across: Mapping[Plane, float]) -> Symmetry | None:
+    """The symmetry about the best plane by the hull of many views, if views that are held out gain by it.
+
+    Args:
+        support: the views.
+        judge: of some of them.
+        across: planes across the axes that will do, and their errors.
+    """
+    voxels = carved(support)
+    if not voxels.occupied.any():
+        return None
+    if across:
+        more = more_symmetric_plane(voxels, min(across, key=across.__getitem__))
+    else:
+        more = most_symmetric_plane(voxels)
+    errors = {**across, **judge.errors([more], TOLERANCE)}
+    if not errors:
+        return None
+    symmetry = Symmetry(min(errors, key=errors.__getitem__))
+    needed = GAIN_OF_FEW if len(support) < FEW else GAIN
+    return symmetry if _held_out_gain(support, symmetry) >= needed else None
 
 
 def _blend(support: Views, symmetry: Symmetry | None) -> AdaptedField:

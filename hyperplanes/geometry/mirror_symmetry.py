@@ -90,9 +90,8 @@ def more_symmetric_plane(voxels: Occupancy, plane: Plane) -> Plane:
 
 def _in_world(plane: Float[Tensor, 4], bounds: Sphere) -> Plane:
     """A plane of the unit sphere as one of the world."""
-    normal = torch.nn.functional.normalize(plane[:3].double(), dim=0).tolist()
-    through = sum(a * b for a, b in zip(normal, bounds.centre, strict=True))
-    return Plane((normal[0], normal[1], normal[2]), through + float(plane[3]) * bounds.radius)
+    x, y, z = torch.nn.functional.normalize(plane[:3].double(), dim=0).tolist()
+    return Plane.of_sphere(bounds, (x, y, z), float(plane[3]))
 
 
 def _points_of(voxels: Occupancy, count: int) -> Float[Tensor, "point 3"]:

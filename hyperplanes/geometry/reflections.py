@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.arguments import checked
 
 __all__ = ["Plane", "Symmetry", "reflected_cameras", "rotation_about"]
@@ -40,6 +41,12 @@ class Plane:
             raise ValueError(
                 f"plane: expected a normal of length 1 and a finite offset, got {self.normal}, {self.offset}"
             )
+
+    @classmethod
+    def of_sphere(cls, bounds: Sphere, normal: tuple[float, float, float], offset: float = 0.0) -> Plane:
+        """The plane of this normal, so many radii from the middle of a sphere."""
+        through = sum(a * b for a, b in zip(normal, bounds.centre, strict=True))
+        return cls(normal, through + offset * bounds.radius)
 
     @property
     def reflection(self) -> Float[Tensor, "4 4"]:
