@@ -135,6 +135,16 @@ def test_no_plane_of_any_azimuth_is_found_of_an_object_that_has_none():
     assert symmetry_of(balls(cameras(), placed)) is None
 
 
+@pytest.mark.parametrize("count", [4, 12])
+def test_views_whose_masks_contradict_each_other_show_no_symmetry(count):
+    """Their hull is empty; what is wrong with them is said where they are adapted to."""
+    views = balls(cameras(count), BODY)
+    corners = torch.zeros_like(views.masks)
+    for index, mask in enumerate(corners):
+        mask[:, :9, slice(9) if index % 2 else slice(-9, None)] = 1.0
+    assert symmetry_of(replace(views, masks=corners)) is None
+
+
 def around(order, colours, radius=0.25):
     """Balls around the vertical axis, the first of them on the z axis, and one below them in the middle."""
     angles = [2 * math.pi * index / order for index in range(order)]
