@@ -23,6 +23,7 @@ __all__ = ["TOLERANCE", "SymmetryJudge", "best_vertical_plane", "carved"]
 SIZE, COARSE_SIZE = 64, 32  # pixels of views along the longer side, at most: to judge a plane, and to look for one
 COARSE_HULL = 48  # voxels an axis, to look for one
 AZIMUTHS = 24  # of vertical planes that are tried
+NEARLY = 1.5  # times the error of the best of these, up to which better ones are looked for near to the second, too
 COARSE_ROUNDS, FINE_ROUNDS = 3, 2  # of looking for better ones
 SPAN = 0.04  # radii of the scene, by which planes are moved first
 LOST = 0.05  # share of the object's pixels that the hull with reflections may miss
@@ -105,8 +106,8 @@ class SymmetryJudge:
 def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
     """The vertical plane by which views are shown best.
 
-    Planes of all azimuths are tried by smaller pictures, then those near to the best one, and last, by larger pictures,
-    those beside it, too. A few degrees beside the right plane the error is several times as large.
+    Planes of all azimuths are tried by smaller pictures, then those near to the best one or two, and last, by larger
+    pictures, those beside the best of these. A few degrees beside the right plane the error is several times as large.
 
     Args:
         judge: by the larger pictures.
@@ -117,9 +118,12 @@ def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
     errors = coarse.errors(list(angles))
     if not errors:
         return next(iter(angles))
-    best = angles[min(errors, key=errors.__getitem__)]
-    angle, _ = _refined(coarse, (best, 0.0), (step / 2, 0.0), COARSE_ROUNDS)
-    angle, offset = _refined(judge, (angle, 0.0), (step / 2**COARSE_ROUNDS, SPAN), FINE_ROUNDS)
+    first, *others = sorted(errors, key=errors.__getitem__)
+    apart = [each for each in others if abs(math.sin(angles[each] - angles[first])) > math.sin(1.5 * step)]
+    likely = [first, *(each for each in apart[:1] if errors[each] <= NEARLY * errors[first])]
+    nearer = [_refined(coarse, (angles[each], 0.0), (step / 2, 0.0), COARSE_ROUNDS) for each in likely]
+    start, _ = min(nearer, key=lambda each: each[1])
+    (angle, offset), _ = _refined(judge, start, (step / 2**COARSE_ROUNDS, SPAN), FINE_ROUNDS)
     return _vertical(views.bounds, angle, offset)
 
 
@@ -131,8 +135,8 @@ def carved(views: Views, side: int = HULL_SIDE) -> Occupancy:
 
 def _refined(
     judge: SymmetryJudge, start: tuple[float, float], steps: tuple[float, float], rounds: int
-) -> tuple[float, float]:
-    """Azimuth and offset of a vertical plane near to another one by which views are shown better.
+) -> tuple[tuple[float, float], float]:
+    """Azimuth and offset of a vertical plane near to another one by which views are shown better, and its error.
 
     Args:
         judge: of the views.
@@ -151,7 +155,7 @@ def _refined(
             best = min(errors, key=errors.__getitem__)
             (angle, offset), error = tried[best], errors[best]
         turn, shift = turn / 2, shift / 2
-    return angle, offset
+    return (angle, offset), error
 
 
 def _vertical(bounds: Sphere, angle: float, offset: float = 0.0) -> Plane:
