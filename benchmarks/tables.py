@@ -283,6 +283,7 @@ METHODS = {
     "hull_blend_reflected": "`hull_blend` with reflections",
     "swapped": "the update of another object",
     "unreflected": "`small` without reflections",
+    "unrotated": "`small` without a canonical frame",
     "one_step": "**`small`**",
 }
 """Rows of the table of views, in its order."""

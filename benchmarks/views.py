@@ -36,8 +36,10 @@ from torch.nn.functional import pad
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Renderable
+from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.adaptation.symmetry import ReflectedHullBlend
@@ -49,7 +51,6 @@ from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
 from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.episodes.augmentation import Rotation
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.utilities.writing import write_whole
@@ -272,13 +273,14 @@ class _Partly:
     def adapt(self, support: Views) -> AdaptedField:
         """The field of theta and what is left of the update."""
         model = self.model.eval()
-        prepared = model.prepare(support, symmetry=model.find_symmetry(support))
+        placed = to_canonical_frame(model, support)
+        prepared = model.prepare(placed.views, symmetry=placed.symmetry)
         if prepared.volume is not None:
             kept = [float(channel not in self.masked) for channel in range(CHANNELS)]
             volume = prepared.volume * prepared.volume.new_tensor(kept)[:, None, None, None]
             prepared = replace(prepared, volume=volume)
         update = Parameters((name, value) for name, value in model.update(prepared).items() if self.updated(name))
-        return model.rendering_field(prepared, model.theta + update)
+        return placed.in_scene(model.rendering_field(prepared, model.theta + update))
 
 
 @dataclass(frozen=True)
@@ -290,7 +292,13 @@ class _Ungated:
     def adapt(self, support: Views) -> AdaptedField:
         """The model's own field without its gating network."""
         found = self.model.adapt(support)
-        return replace(found, gate=None) if isinstance(found, StackedField) else found
+        if isinstance(found, RotatedField):
+            return found.rotation.field(_ungated(found.unrotated))
+        return _ungated(found)
+
+
+def _ungated(field: AdaptedField) -> AdaptedField:
+    return replace(field, gate=None) if isinstance(field, StackedField) else field
 
 
 @dataclass(frozen=True)
@@ -302,6 +310,17 @@ class _Unreflected:
     def adapt(self, support: Views) -> AdaptedField:
         """The model's own field of the views alone."""
         return self.model.adapt_to(self.model.prepare(support))
+
+
+@dataclass(frozen=True)
+class _Unrotated:
+    """A model that takes every object as it faces in its scene."""
+
+    model: HyperPlanes
+
+    def adapt(self, support: Views) -> AdaptedField:
+        """The model's own field in the frame of the scene."""
+        return self.model.adapt_to(self.model.prepare(support, symmetry=self.model.find_symmetry(support)))
 
 
 @dataclass(frozen=True)
@@ -344,6 +363,7 @@ METHODS = {
     "unstacked": lambda model, *_: _Partly(model),
     "ungated": lambda model, *_: _Ungated(model),
     "unreflected": lambda model, *_: _Unreflected(model),
+    "unrotated": lambda model, *_: _Unrotated(model),
     "one_ray": lambda model, *_: _Rendered(model, {"antialias": False}),
     "single_precision": lambda model, *_: _Rendered(model, {"mixed_precision": False}),
 }

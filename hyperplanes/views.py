@@ -274,8 +274,7 @@ def moved(views: Views, motion: Float[Tensor, "4 4"]) -> Views:
         views: of the object.
         motion: in world coordinates, in float64.
     """
-    pose = camera.camera_from_world(views.cameras)
-    return views._derived(cameras=camera.with_poses(views.cameras, pose @ torch.linalg.inv(motion).to(pose)))
+    return views._derived(cameras=camera.moved(views.cameras, motion))
 
 
 @dataclass(frozen=True)

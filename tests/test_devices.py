@@ -7,10 +7,12 @@ import pytest
 import torch
 from second_device import AVAILABLE, second_device
 
-from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation import HyperPlanes, canonical_frame
+from hyperplanes.adaptation.canonical_frame import Placed
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.judging_symmetry import SymmetryJudge
 from hyperplanes.adaptation.reflections import with_reflections
+from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.adaptation.symmetry import _held_out_error
 from hyperplanes.configuration.presets import preset
 from hyperplanes.data import read_task
@@ -124,6 +126,20 @@ def test_planes_are_judged_alike(device):
         ]
 
     assert judged(device) == pytest.approx(judged(CPU), rel=0.02)
+
+
+def test_frames_are_judged_alike_and_rotated_fields_shown_alike(device):
+    def judged(where):
+        task, model = car(where, shown=3, size=16), small(where)
+        placed = Placed(Rotation(0.5).views(task.support), None, Rotation(0.5))
+        field = placed.in_scene(model.adapt_to(model.prepare(placed.views)))
+        picture = field.render(task.query.cameras, **PLAIN).images.cpu()
+        centres = field.occupancy.centres()
+        return canonical_frame._error(model, placed, 1), float(field.density(centres).detach().mean()), picture
+
+    (error, density, picture), expected = judged(device), judged(CPU)
+    assert (error, density) == pytest.approx(expected[:2], rel=0.02)
+    assert float((picture - expected[2]).square().mean()) < 1e-4
 
 
 def test_the_hull_of_views_and_reflections_looks_the_same(device):

@@ -15,13 +15,13 @@ from benchmarks.objects import held_out
 from hyperplanes.adaptation import HullBlend, HyperPlanes, diagnose, reflections, swap_gap, symmetry
 from hyperplanes.adaptation.descent import LEAST, contrast, draw_pixels, ray_loss
 from hyperplanes.adaptation.fine_tuning import make_descent
+from hyperplanes.adaptation.rotation import RotatedField, Rotation
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import TargetConfig
 from hyperplanes.fields.layers import has_mixed_precision
 from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.training.episodes.augmentation import Rotation
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task
 from tests.reference_rendering import Balls, small_model
@@ -276,6 +276,19 @@ def test_reflections_bring_decibels_on_cars_that_face_another_way():
     found = sum(mean_psnr(model, task, 3) for task in rotated)
     model.config = replace(model.config, symmetric=False)
     assert found > sum(mean_psnr(model, task, 3) for task in rotated) + 1.0 * len(rotated)
+
+
+def test_the_canonical_frame_of_a_car_is_found_and_brings_decibels():
+    """2.5 and 3.6 dB from 3 views. The cars of the training face along an axis; these look back between two."""
+    angle, model = 0.5 + math.pi, coarse("small", symmetric=True)
+    rotated = [Task(*map(Rotation(angle).views, (task.support, task.query)), task.name) for task in cars()]
+    fields = [model.adapt(few(task, 3)) for task in rotated]
+    for field in fields:
+        assert isinstance(field, RotatedField)
+        assert math.degrees(field.rotation.angle - angle) % 360 == pytest.approx(360, abs=2)
+    found = sum(map(quality, fields, rotated))
+    model.config = replace(model.config, azimuth=0.0)
+    assert found > sum(mean_psnr(model, task, 3) for task in rotated) + 1.5 * len(rotated)
 
 
 def with_symmetry(symmetry):

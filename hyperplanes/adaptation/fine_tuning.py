@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.context import SupportContext, observe
 from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
-from hyperplanes.adaptation.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import stacked_field, tuned_field
 from hyperplanes.configuration.compatibility import check_fine_tuning
@@ -84,23 +84,29 @@ def fine_tune(
             on_step(0)
         return one_step(network, support)
     if steps != "auto":
-        context = network.prepare(support, symmetry=find_symmetry(network, support))
-        return fine_tune_to(network, context, steps, settings, views=_trained_on(context, support), on_step=on_step)
+        placed = to_canonical_frame(network, support)
+        context = network.prepare(placed.views, symmetry=placed.symmetry)
+        views = _trained_on(context, placed.views)
+        return placed.in_scene(fine_tune_to(network, context, steps, settings, views=views, on_step=on_step))
 
     # how many steps show some of the views best that the others were fine-tuned without, from as many random weights
     settings = settings.for_views(len(support), network.target.permutation_invariant)
     shown, holdout = split_holdout(support, settings)
-    context = network.prepare(shown, symmetry=find_symmetry(network, shown))
-    trial, _ = make_descent(network, context, settings, _trained_on(context, shown))
+    placed = to_canonical_frame(network, shown)
+    holdout = placed.rotation.views(holdout)
+    context = network.prepare(placed.views, symmetry=placed.symmetry)
+    trial, _ = make_descent(network, context, settings, _trained_on(context, placed.views))
     pixels = network.live_pixels_of(context, holdout)
     with torch.no_grad():
         unchanged = network.field(context, network.adapted_weights(context))
     stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
-    context = network.prepare(support, symmetry=find_symmetry(network, support))
-    views = _trained_on(context, support)
-    return fine_tune_to(network, context, stop, settings, views=views, schedule=settings.max_steps, on_step=on_step)
+    placed = to_canonical_frame(network, support)
+    context = network.prepare(placed.views, symmetry=placed.symmetry)
+    views, schedule = _trained_on(context, placed.views), settings.max_steps
+    tuned = fine_tune_to(network, context, stop, settings, views=views, schedule=schedule, on_step=on_step)
+    return placed.in_scene(tuned)
 
 
 @torch.no_grad()
@@ -111,8 +117,9 @@ def one_step(network: HyperPlanesNetwork, support: Views) -> AdaptedField:
         network: the model.
         support: the views of the object.
     """
-    context = network.prepare(support, symmetry=find_symmetry(network, support))
-    return stacked_field(network, context, network.adapted_weights(context))
+    placed = to_canonical_frame(network, support)
+    context = network.prepare(placed.views, symmetry=placed.symmetry)
+    return placed.in_scene(stacked_field(network, context, network.adapted_weights(context)))
 
 
 def _trained_on(context: SupportContext, support: Views) -> Views:

@@ -16,6 +16,7 @@ from hyperplanes.adaptation.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.fine_tuning import fine_tune, fine_tune_to, make_descent, one_step
 from hyperplanes.adaptation.hub import upload_checkpoint
 from hyperplanes.adaptation.network import HyperPlanesNetwork
+from hyperplanes.adaptation.rotation import RotatedField
 from hyperplanes.adaptation.stacking import learned_part, stacked_field
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
@@ -47,8 +48,8 @@ class HyperPlanes(HyperPlanesNetwork):
         """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6).
 
         Where `config.symmetric` says so, reflections of the views of an object that looks symmetric count as views, too
-        (`adaptation.symmetry`). Where `config.stacked` says so, its pictures are means with those of the visual hull
-        (`adaptation.stacking`).
+        (`adaptation.symmetry`), and it is adapted to in its canonical frame (`adaptation.canonical_frame`). Where
+        `config.stacked` says so, its pictures are means with those of the visual hull (`adaptation.stacking`).
         """
         return one_step(self, support)
 
@@ -126,7 +127,8 @@ class HyperPlanes(HyperPlanesNetwork):
         """
         learned = learned_part(adapted)
         beside = {"hull_share": learned.share, "gated": learned.gate is not None}
-        beside |= {"symmetric": False, "symmetry": adapted.symmetry}
+        azimuth = -adapted.rotation.angle if isinstance(adapted, RotatedField) else 0.0
+        beside |= {"symmetric": False, "symmetry": adapted.symmetry, "azimuth": azimuth}
         found = {"fine": learned.field.field, "coarse": learned.field.proposal}
         shape = self.target.config_of(self.target.parameters_of(found["fine"]))
         result = HyperPlanes(replace(self.config.target_alone(), network=shape, **beside))

@@ -17,6 +17,7 @@ from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.held_out import FEWEST, Trial, hold_out
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
+from hyperplanes.adaptation.rotation import RotatedField
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry.kernels.threads import at_once
 from hyperplanes.geometry.rays import Rays
@@ -131,8 +132,10 @@ def learned_part(adapted: AdaptedField) -> Learned:
     """The part of a field that is a network, and what is beside it.
 
     Args:
-        adapted: a field, stacked or not.
+        adapted: a field, stacked or not, in its canonical frame or in that of the scene.
     """
+    if isinstance(adapted, RotatedField):
+        return learned_part(adapted.unrotated)
     if not isinstance(adapted, StackedField):
         return Learned(adapted)
     if adapted.overruled:

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.network import in_use
 from hyperplanes.adaptation.stacking import stacked_field
@@ -35,20 +36,21 @@ class Swapped:
         self._updates: dict[str, Parameters] = {}
         with torch.no_grad(), in_use(model):
             for support in objects:
-                self._updates[_digest(support)] = model.update(
-                    model.prepare(support, carved=False, symmetry=model.find_symmetry(support))
-                )
+                placed = to_canonical_frame(model, support)
+                prepared = model.prepare(placed.views, carved=False, symmetry=placed.symmetry)
+                self._updates[_digest(support)] = model.update(prepared)
         if len(self._updates) < 2:
             raise ValueError(f"swapped: expected at least 2 objects to swap updates of, got {len(self._updates)}")
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The field of theta plus the update of the object after this one, stacked as with its own update."""
-        prepared = self.model.prepare(support, symmetry=self.model.find_symmetry(support))
+        placed = to_canonical_frame(self.model, support)
+        prepared = self.model.prepare(placed.views, symmetry=placed.symmetry)
         known = list(self._updates)
         own = _digest(support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]
-        return stacked_field(self.model, prepared, self.model.theta + self._updates[other])
+        return placed.in_scene(stacked_field(self.model, prepared, self.model.theta + self._updates[other]))
 
 
 def _digest(support: Views) -> str:

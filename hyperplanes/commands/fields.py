@@ -101,6 +101,7 @@ def adapt_to(
         ValueError: fine-tuning steps of a baked scene.
     """
     from hyperplanes.adaptation.kept import keep_field, kept_folder, recall_field
+    from hyperplanes.adaptation.rotation import RotatedField
     from hyperplanes.adaptation.stacking import StackedField
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.evaluation.suitability import suitability_warnings
@@ -144,7 +145,10 @@ def adapt_to(
     if field.symmetry is not None:
         planes = field.symmetry.order
         how += ", together with their reflections" + (f" about {planes} planes" if planes > 1 else "")
-    how += ", averaged with the visual hull" if isinstance(field, StackedField) else ""
+    rendered = field.unrotated if isinstance(field, RotatedField) else field
+    if rendered is not field:
+        how += ", rotated into its canonical frame"
+    how += ", averaged with the visual hull" if isinstance(rendered, StackedField) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")
     return field, warned

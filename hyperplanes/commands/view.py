@@ -146,20 +146,22 @@ def _adapt(
     """Shows the field as it is adapted, fine-tuned and baked; ends early where another number of views is wanted."""
     import torch
 
+    from hyperplanes.adaptation.canonical_frame import to_canonical_frame
     from hyperplanes.adaptation.fine_tuning import make_descent
     from hyperplanes.adaptation.stacking import tuned_field
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene, default_side
 
     console.say(f"adapting to {len(shown)} views")
-    context, steps = model.prepare(shown, symmetry=model.find_symmetry(shown)), arguments.steps if len(shown) > 1 else 0
+    placed, steps = to_canonical_frame(model, shown), arguments.steps if len(shown) > 1 else 0
+    context = model.prepare(placed.views, symmetry=placed.symmetry)
     descent, variables = make_descent(model, context, FineTuning())
     field = None
     for done in descent.run(steps):
         if done % EVERY == 0 or done == steps:
             with torch.no_grad():
                 weights = variables.weights().detach()
-            field = tuned_field(model, context, weights) if steps else model.adapt_to(context)
+            field = placed.in_scene(tuned_field(model, context, weights) if steps else model.adapt_to(context))
             viewer.show(field, f"{len(shown)} support views, {done} of {steps} fine-tuning steps")
         if not wanted.empty():
             return

@@ -33,7 +33,7 @@ def check_model(config: ModelConfig) -> type[Target]:
     _check_hypernetwork(config, target)
     if config.plane_dropout and (target.permutation_invariant or config.target == "nerf"):
         raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
-    for name in ("stacked", "hull_share", "gated", "symmetric", "symmetry"):
+    for name in ("stacked", "hull_share", "gated", "symmetric", "symmetry", "azimuth"):
         if getattr(config, name) and not target.permutation_invariant:
             raise ValueError(f"{name}: expected a field that takes any number of views, got {config.target}")
     return target

@@ -58,6 +58,8 @@ class ModelConfig:
         symmetric: views of an object that looks symmetric are shown to the model together with their reflections
             (`adaptation.symmetry`). Training does without.
         symmetry: that of the object, where it is known: what was found for one.
+        azimuth: likewise, the rotation of the object to its canonical frame, in radians. Where it is not known, a
+            `symmetric` model looks for it (`adaptation.canonical_frame`).
     """
 
     target: str = "point_multiplane"
@@ -75,6 +77,7 @@ class ModelConfig:
     gated: bool = False
     symmetric: bool = False
     symmetry: Symmetry | None = None
+    azimuth: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.plane_dropout < 1:

@@ -260,6 +260,12 @@ def with_poses(cameras: PinholeCamera, camera_from_world: Float[Tensor, "view 4 
 
 
 @checked
+def moved(cameras: PinholeCamera, motion: Float[Tensor, "4 4"]) -> PinholeCamera:
+    """The cameras after a rigid motion of the world, in float64, which they take part in."""
+    pose = camera_from_world(cameras)
+    return with_poses(cameras, pose @ torch.linalg.inv(motion).to(pose))
+
+
 def cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     """The cameras of images whose right and lower borders were moved; calibration and distortion stay."""
     bare = PinholeCamera(

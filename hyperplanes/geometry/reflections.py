@@ -61,6 +61,11 @@ class Plane:
         result[:3, 3] = 2 * self.offset * normal
         return result
 
+    def moved(self, motion: Float[Tensor, "4 4"]) -> Plane:
+        """The plane after a rigid motion of the world, in float64."""
+        normal = motion[:3, :3] @ torch.tensor(self.normal, dtype=torch.float64)
+        return Plane(_triple(normal), self.offset + float(normal @ motion[:3, 3]))
+
 
 @dataclass(frozen=True)
 class Symmetry:
@@ -100,6 +105,11 @@ class Symmetry:
         """The rotations of the world after which the object is the same, in float64; the first one is none."""
         return [rotation_about(self.axis, 2 * math.pi * index / self.order) for index in range(self.order)]
 
+    def moved(self, motion: Float[Tensor, "4 4"]) -> Symmetry:
+        """The symmetry of the object after a rigid motion, in float64; of several planes one about a vertical axis."""
+        axis = motion[:3, :3] @ torch.tensor(self.axis, dtype=torch.float64) + motion[:3, 3]
+        return Symmetry(self.plane.moved(motion), self.order, _triple(axis))
+
 
 def rotation_about(point: tuple[float, float, float], angle: float) -> Float[Tensor, "4 4"]:
     """The rotation of the world about the vertical axis through a point, in float64.
@@ -138,3 +148,8 @@ def reflected_cameras(cameras: PinholeCamera, plane: Plane) -> PinholeCamera:
     lens = cameras.distortion.clone()
     lens[:, 3] = -lens[:, 3]  # p2, of the tangential part along x
     return DistortedCamera(bare, lens)
+
+
+def _triple(values: Tensor) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

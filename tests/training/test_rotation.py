@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.training import Trainer
-from hyperplanes.training.episodes.augmentation import Rotation, draw_rotation
+from hyperplanes.training.episodes.augmentation import draw_rotation, rotated_volume
 from hyperplanes.training.episodes.episode import volume_of_all_views
 from hyperplanes.views import Task
 from tests.reference_rendering import Balls
@@ -44,7 +45,7 @@ def test_a_rotated_volume_is_that_of_the_rotated_views(angle):
     share = expected[:1]
 
     def errors(change):
-        found = change.volume(volume_of_all_views(model, task)).float()
+        found = rotated_volume(volume_of_all_views(model, task), change).float()
         return float((found[:1] - share).abs().mean()), float(((found[1:] - expected[1:]).abs() * share).mean())
 
     place, colours = errors(drawn)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -11,35 +10,10 @@ from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.geometry.reflections import rotation_about
+from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.views import Views, moved
 
-__all__ = ["Rotation", "draw_rotation", "drop_planes", "over_random_colour"]
-
-
-@dataclass(frozen=True)
-class Rotation:
-    """A rotation of an object, the same for all of its views.
-
-    Attributes:
-        angle: in radians, about the vertical axis through the middle of the scene.
-    """
-
-    angle: float = 0.0
-
-    def views(self, views: Views) -> Views:
-        """The views of the rotated object: the same pictures, whose cameras are rotated with it."""
-        return moved(views, rotation_about(views.bounds.centre, self.angle)) if self.angle else views
-
-    def volume(self, volume: Float[Tensor, "4 x y z"]) -> Float[Tensor, "4 x y z"]:
-        """The first channels of a volume (`geometry.volume.volume_of`) of the rotated object.
-
-        Args:
-            volume: the share of every cell that is occupied, and its mean colour in [-1, 1]. It is resampled, so that
-                the result is smoother than the volume of the rotated views.
-        """
-        return _resampled(volume, self.angle) if self.angle else volume
+__all__ = ["draw_rotation", "drop_planes", "over_random_colour", "rotated_volume"]
 
 
 def draw_rotation(share: float, generator: torch.Generator) -> Rotation:
@@ -82,9 +56,17 @@ def over_random_colour(
     return rendered.over(colour), truth + (1 - opacity) * (colour - 1)
 
 
-def _resampled(volume: Float[Tensor, "4 x y z"], angle: float) -> Float[Tensor, "4 x y z"]:
-    """A volume rotated, its colours weighted by how much of each cell is occupied."""
-    cos, sin = math.cos(angle), math.sin(angle)
+def rotated_volume(volume: Float[Tensor, "4 x y z"], rotation: Rotation) -> Float[Tensor, "4 x y z"]:
+    """The first channels of a volume (`geometry.volume.volume_of`) of a rotated object.
+
+    Args:
+        volume: the share of every cell that is occupied, and its mean colour in [-1, 1], which is weighted by it. It is
+            resampled, so that the result is smoother than the volume of the rotated views.
+        rotation: of the object.
+    """
+    if not rotation.angle:
+        return volume
+    cos, sin = math.cos(rotation.angle), math.sin(rotation.angle)
     inverse = volume.new_tensor([[cos, 0, sin, 0], [0, 1, 0, 0], [-sin, 0, cos, 0]], dtype=torch.float32)
     share, colours = volume.float().split([1, 3])
     weighted = torch.cat([share, colours * share])[None]

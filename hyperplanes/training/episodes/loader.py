@@ -15,7 +15,7 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.training.distributed import Processes
-from hyperplanes.training.episodes.augmentation import draw_rotation
+from hyperplanes.training.episodes.augmentation import draw_rotation, rotated_volume
 from hyperplanes.training.episodes.drawing import (
     draw,
     draw_balanced,
@@ -163,7 +163,7 @@ class EpisodeLoader:
         if config.rotations:
             rotation = draw_rotation(config.rotations, generator)
             task = Task(rotation.views(task.support), rotation.views(task.query), task.name)
-            target = None if target is None else rotation.volume(target)
+            target = None if target is None else rotated_volume(target, rotation)
         # show some of its views, and keep others for rays
         return prepare_subset(self.model, task, config.views, generator, target)
 

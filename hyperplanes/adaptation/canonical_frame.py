@@ -1,0 +1,113 @@
+"""The canonical frame of an object: the one in which objects of its class are aligned in the training data.
+
+As in NOCS (Wang et al. 2019, "Normalized Object Coordinate Space"), which predicts it; here held-out views decide.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.finding_symmetry import find_symmetry
+from hyperplanes.adaptation.network import HyperPlanesNetwork
+from hyperplanes.adaptation.rotation import Rotation
+from hyperplanes.geometry.kernels.threads import side_by_side
+from hyperplanes.geometry.reflections import Symmetry
+from hyperplanes.views import Views
+
+__all__ = ["Placed", "find_rotation", "to_canonical_frame"]
+
+FEWEST, MOST = 2, 15  # views by which a frame is looked for
+FOLDS = 3  # views that are held out, one at a time
+SIZE, PIXELS = 64, 1024  # of a held-out view, along its longer side, and those that are compared
+GAIN = 0.5  # dB by which a rotation must show held-out views better than none, where none will do
+MOST_PLANES = 2  # of symmetry: what has more looks alike after each rotation
+QUARTER = math.pi / 2
+ALIGNED = math.radians(0.5)  # from which on a plane that is not across an axis is rotated to be
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The views of an object in its canonical frame.
+
+    Attributes:
+        views: the rotated ones.
+        symmetry: of the rotated object.
+        rotation: from the frame of the scene.
+    """
+
+    views: Views
+    symmetry: Symmetry | None
+    rotation: Rotation
+
+    def in_scene(self, field: AdaptedField) -> AdaptedField:
+        """A field of these views in the frame of the scene."""
+        return self.rotation.inverse.field(field)
+
+
+def to_canonical_frame(network: HyperPlanesNetwork, support: Views) -> Placed:
+    """The views of an object as a model takes them, and the symmetry by which they are reflected.
+
+    Args:
+        network: the model.
+        support: the views.
+    """
+    symmetry = find_symmetry(network, support)
+    rotation = find_rotation(network, support, symmetry)
+    return Placed(rotation.views(support), rotation.symmetry(symmetry, support.bounds), rotation)
+
+
+@torch.no_grad()
+def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | None) -> Rotation:
+    """The rotation after which an object stands as those of its class did in training.
+
+    A vertical plane of symmetry leaves four rotations: after each it is orthogonal to the x or to the z axis. After the
+    right one the model shows a view best that is held out from it.
+
+    Args:
+        network: the model.
+        support: the views of the object.
+        symmetry: of the object.
+
+    Returns:
+        `config.azimuth` where that is known. Else the one of the four by which held-out views are shown best; where the
+        plane is across an axis as it is, this must be by GAIN better than none. None where the object has no such plane
+        or more than MOST_PLANES, and with fewer than FEWEST views or more than MOST.
+    """
+    config = network.config
+    if config.azimuth is not None:
+        return Rotation(config.azimuth)
+    if not config.symmetric or symmetry is None or symmetry.order > MOST_PLANES or not FEWEST <= len(support) <= MOST:
+        return Rotation()
+    x, y, z = symmetry.plane.normal
+    if abs(y) > math.hypot(x, z):
+        return Rotation()
+    smallest = (math.atan2(z, x) + QUARTER / 2) % QUARTER - QUARTER / 2
+    smallest = smallest if abs(smallest) > ALIGNED else 0.0
+    rotations = [Rotation(smallest + turns * QUARTER) for turns in range(4)]
+    # the views that are held out one after the other, the same ones after each rotation
+    views = network.to_own(support).resized(SIZE)
+    folds = range(min(FOLDS, len(views)))
+    placed = [Placed(each.views(views), each.symmetry(symmetry, views.bounds), each) for each in rotations]
+    trials = [(each, held_out) for each in placed for held_out in folds]
+    found = side_by_side(lambda trial: _error(network, *trial), trials, views.images.device)
+    errors = [sum(found[start : start + len(folds)]) for start in range(0, len(found), len(folds))]
+    if not smallest:
+        errors[0] *= 10 ** (-GAIN / 10)
+    return rotations[min(range(len(errors)), key=errors.__getitem__)]
+
+
+def _error(network: HyperPlanesNetwork, placed: Placed, held_out: int) -> float:
+    """The squared error of some pixels of a view by the field of the others; 0 where these do not show the object."""
+    views, near_far = placed.views, network.config.sampling.near_far
+    shown = views[[index for index in range(len(views)) if index != held_out]]
+    if shown.masks is not None and not shown.masks.any():
+        return 0.0
+    generator = torch.Generator().manual_seed(0)
+    rays, truth = views[[held_out]].sample_rays(PIXELS, generator=generator, near_far=near_far)
+    context = network.prepare(shown, symmetry=placed.symmetry)
+    field = network.field(context, network.adapted_weights(context))
+    return float((field.trace(rays, differentiable=False).colour - truth).square().sum())

@@ -1,0 +1,162 @@
+"""Rotations of an object about the vertical axis of its scene: of its views, its symmetry and its field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from hyperplanes.adaptation.base import AdaptedField, Pictures
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.rays import Rays, Sphere
+from hyperplanes.geometry.reflections import Symmetry, rotation_about
+from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.rendering.renderer import FieldFunction, Sampler
+from hyperplanes.rendering.scene import SplitField
+from hyperplanes.utilities.arguments import checked
+from hyperplanes.views import Views, moved
+
+__all__ = ["RotatedField", "Rotation"]
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """A rotation of an object, the same for all of its views.
+
+    Attributes:
+        angle: in radians, about the vertical axis through the middle of the scene; by a quarter turn the z axis is
+            mapped onto the x axis.
+    """
+
+    angle: float = 0.0
+
+    @property
+    def inverse(self) -> Rotation:
+        """The rotation back."""
+        return Rotation(-self.angle)
+
+    def about(self, bounds: Sphere) -> Float[Tensor, "4 4"]:
+        """The map of the world, in float64."""
+        return rotation_about(bounds.centre, self.angle)
+
+    def views(self, views: Views) -> Views:
+        """The views of the rotated object: the same pictures, whose cameras are rotated with it."""
+        return moved(views, self.about(views.bounds)) if self.angle else views
+
+    def symmetry(self, symmetry: Symmetry | None, bounds: Sphere) -> Symmetry | None:
+        """The symmetry of the rotated object."""
+        return symmetry.moved(self.about(bounds)) if symmetry is not None and self.angle else symmetry
+
+    def field(self, field: AdaptedField) -> AdaptedField:
+        """The field of the rotated object, which renders as the other one does by cameras that are rotated back."""
+        if not self.angle:
+            return field
+        bounds, split = field.occupancy.bounds, isinstance(field.field, SplitField)
+        return RotatedField(
+            (_SplitMoved if split else _Moved)(field.field, self.inverse.about(bounds)),
+            self._occupancy(field.occupancy),
+            field.sampling,
+            symmetry=self.symmetry(field.symmetry, bounds),
+            unrotated=field,
+            rotation=self,
+        )
+
+    def _occupancy(self, occupancy: Occupancy) -> Occupancy:
+        """Voxels that hold all that the rotated ones hold."""
+        occupied = torch.zeros_like(occupancy.occupied)
+        occupied.view(-1)[occupancy.index(_moved(occupancy.centres(), self.about(occupancy.bounds)))] = True
+        return replace(occupancy, occupied=occupied).dilated()  # half a diagonal of a voxel is less than one
+
+
+@dataclass(frozen=True, repr=False)
+class RotatedField(AdaptedField):
+    """The field of a rotated object: another field at points that are rotated back.
+
+    Attributes:
+        unrotated: the other field.
+        rotation: of the object.
+    """
+
+    unrotated: AdaptedField = field(kw_only=True)
+    rotation: Rotation = field(kw_only=True)
+
+    def __repr__(self) -> str:
+        return f"RotatedField({self.unrotated!r}, {self.rotation.angle:.2f} radians)"
+
+    @property
+    def _back(self) -> Float[Tensor, "4 4"]:
+        return self.rotation.inverse.about(self.occupancy.bounds)
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """As `AdaptedField.density`."""
+        return self.unrotated.density(_moved(points, self._back))
+
+    def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
+        """As `AdaptedField.trace`."""
+        origins, directions = _moved(rays.origins, self._back), _moved(rays.directions, self._back, 0.0)
+        rays = replace(rays, origins=origins, directions=directions)
+        return self.unrotated.trace(rays, generator, differentiable=differentiable)
+
+    @checked
+    @torch.no_grad()
+    def render(
+        self,
+        cameras: PinholeCamera,
+        sampling: Sampler | None = None,
+        antialias: bool | None = None,
+        *,
+        mixed_precision: bool = True,
+    ) -> Pictures:
+        """As `AdaptedField.render`."""
+        cameras = camera.moved(cameras, self._back)
+        return self.unrotated.render(cameras, sampling, antialias, mixed_precision=mixed_precision)
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """A field at points that are moved.
+
+    Attributes:
+        field: at the points it is asked for.
+        motion: of the points, in float64.
+    """
+
+    field: FieldFunction
+    motion: Tensor
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return getattr(self.field, "dtype", torch.float32)
+
+    @property
+    def thread_safe(self) -> bool:
+        return getattr(self.field, "thread_safe", False)
+
+    def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        return self.field(_moved(points, self.motion), _moved(directions, self.motion, 0.0))
+
+
+class _SplitMoved(_Moved):
+    """Likewise, of one whose colours can be asked for later than its densities."""
+
+    field: Any
+
+    def hidden(self, points: Tensor) -> Any:
+        return self.field.hidden(_moved(points, self.motion))
+
+    def density_of(self, hidden: Any) -> Tensor:
+        return self.field.density_of(hidden)
+
+    def colour_of(self, hidden: Any, directions: Tensor) -> Tensor:
+        return self.field.colour_of(hidden, _moved(directions, self.motion, 0.0))
+
+
+def _moved(points: Float[Tensor, "*point 3"], motion: Float[Tensor, "4 4"], translated: float = 1.0) -> Tensor:
+    """Points after a rigid motion; directions, which it does not translate, with 0."""
+    motion = motion.to(points)
+    return points @ motion[:3, :3].T + translated * motion[:3, 3]
