@@ -69,8 +69,8 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "5", *_METHODS]),
     "views_rotated": (
         ["procedural", "cc0"],
-        ["--objects", "5", "--query", "2", "--counts", "2", "3", "5", "--rotated", "33"]
-        + ["--methods", "hull_blend", "hull_blend_reflected", "unreflected"],
+        ["--objects", "5", "--query", "2", "--counts", "2", "3", "5", "12", "--rotated", "33"]
+        + ["--methods", "hull_blend", "hull_blend_reflected", "unreflected", "unrotated"],
     ),
     "views_tuned_3": (["procedural", "cc0", "random", "posed"], ["--objects", "5", "--counts", "3", *_TUNED]),
     "views_tuned": (["procedural", "cc0", "random", "posed"], ["--objects", "3", "--counts", "25", *_TUNED]),

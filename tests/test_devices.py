@@ -135,10 +135,10 @@ def test_frames_are_judged_alike_and_rotated_fields_shown_alike(device):
         field = placed.in_scene(model.adapt_to(model.prepare(placed.views)))
         picture = field.render(task.query.cameras, **PLAIN).images.cpu()
         centres = field.occupancy.centres()
-        return canonical_frame._error(model, placed, 1), float(field.density(centres).detach().mean()), picture
+        return canonical_frame._quality(model, placed, 1), float(field.density(centres).detach().mean()), picture
 
-    (error, density, picture), expected = judged(device), judged(CPU)
-    assert (error, density) == pytest.approx(expected[:2], rel=0.02)
+    (quality, density, picture), expected = judged(device), judged(CPU)
+    assert (quality, density) == pytest.approx(expected[:2], rel=0.02)
     assert float((picture - expected[2]).square().mean()) < 1e-4
 
 

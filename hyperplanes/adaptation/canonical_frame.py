@@ -23,7 +23,8 @@ __all__ = ["Placed", "find_rotation", "to_canonical_frame"]
 FEWEST, MOST = 2, 15  # views by which a frame is looked for
 FOLDS = 3  # views that are held out, one at a time
 SIZE, PIXELS = 64, 1024  # of a held-out view, along its longer side, and those that are compared
-GAIN = 0.5  # dB by which a rotation must show held-out views better than none, where none will do
+GAIN = 0.75  # dB by which a rotation must show held-out views better than none, where none will do
+FLOOR = 1e-4  # of a squared error: better views, such as empty ones, tell nothing
 MOST_PLANES = 2  # of symmetry: what has more looks alike after each rotation
 QUARTER = math.pi / 2
 ALIGNED = math.radians(0.5)  # from which on a plane that is not across an axis is rotated to be
@@ -73,9 +74,9 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
         symmetry: of the object.
 
     Returns:
-        `config.azimuth` where that is known. Else the one of the four by which held-out views are shown best; where the
-        plane is across an axis as it is, this must be by GAIN better than none. None where the object has no such plane
-        or more than MOST_PLANES, and with fewer than FEWEST views or more than MOST.
+        `config.azimuth` where that is known. Else the one of the four by which held-out views are shown best, by the
+        mean of their PSNR; where the plane is across an axis as it is, this must be by GAIN better than none. None
+        where the object has no such plane or more than MOST_PLANES, and with fewer than FEWEST views or more than MOST.
     """
     config = network.config
     if config.azimuth is not None:
@@ -93,15 +94,15 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
     folds = range(min(FOLDS, len(views)))
     placed = [Placed(each.views(views), each.symmetry(symmetry, views.bounds), each) for each in rotations]
     trials = [(each, held_out) for each in placed for held_out in folds]
-    found = side_by_side(lambda trial: _error(network, *trial), trials, views.images.device)
-    errors = [sum(found[start : start + len(folds)]) for start in range(0, len(found), len(folds))]
+    found = side_by_side(lambda trial: _quality(network, *trial), trials, views.images.device)
+    qualities = [sum(found[start : start + len(folds)]) / len(folds) for start in range(0, len(found), len(folds))]
     if not smallest:
-        errors[0] *= 10 ** (-GAIN / 10)
-    return rotations[min(range(len(errors)), key=errors.__getitem__)]
+        qualities[0] += GAIN
+    return rotations[max(range(len(rotations)), key=qualities.__getitem__)]
 
 
-def _error(network: HyperPlanesNetwork, placed: Placed, held_out: int) -> float:
-    """The squared error of some pixels of a view by the field of the others; 0 where these do not show the object."""
+def _quality(network: HyperPlanesNetwork, placed: Placed, held_out: int) -> float:
+    """PSNR of some pixels of a view by the field of the others; 0 where these do not show the object."""
     views, near_far = placed.views, network.config.sampling.near_far
     shown = views[[index for index in range(len(views)) if index != held_out]]
     if shown.masks is not None and not shown.masks.any():
@@ -110,4 +111,5 @@ def _error(network: HyperPlanesNetwork, placed: Placed, held_out: int) -> float:
     rays, truth = views[[held_out]].sample_rays(PIXELS, generator=generator, near_far=near_far)
     context = network.prepare(shown, symmetry=placed.symmetry)
     field = network.field(context, network.adapted_weights(context))
-    return float((field.trace(rays, differentiable=False).colour - truth).square().sum())
+    error = float((field.trace(rays, differentiable=False).colour - truth).square().mean())
+    return -10 * math.log10(max(error, FLOOR))

@@ -102,17 +102,18 @@ def test_a_rotated_symmetry_is_that_of_the_rotated_views():
     assert moved.order == 3  # whose plane goes through its axis, or it would have been refused
 
 
-def found_by(monkeypatch, errors, symmetry=ACROSS, count=4, **changes):
-    """The rotation in degrees where held-out views have these errors, one a rotation, in the order they are tried."""
+def found_by(monkeypatch, qualities, symmetry=ACROSS, count=4, **changes):
+    """The rotation in degrees where held-out views have these PSNR after each, in the order they are tried."""
     tried = []
 
-    def error(network, placed, held_out):
+    def quality(network, placed, held_out):
         angle = math.degrees(placed.rotation.angle)
         if angle not in tried:
             tried.append(angle)
-        return errors[tried.index(angle)]
+        found = qualities[tried.index(angle)]
+        return found if isinstance(found, float) else found[held_out]
 
-    monkeypatch.setattr(canonical_frame, "_error", error)
+    monkeypatch.setattr(canonical_frame, "_quality", quality)
     with torch.no_grad():
         torch.set_num_threads(1)
         found = find_rotation(model(**changes), balls(cameras(count), BODY), symmetry)
@@ -132,18 +133,25 @@ def threads():
 
 
 def test_held_out_views_choose_among_the_rotations_that_bring_the_plane_across_an_axis(monkeypatch):
-    assert found_by(monkeypatch, [4.0, 2.0, 1.0, 3.0]) == pytest.approx(180)
-    assert found_by(monkeypatch, [4.0, 2.0, 3.0, 1.0], turned(0.5)) == pytest.approx(270 - math.degrees(0.5))
-    assert found_by(monkeypatch, [1.0, 1.0, 1.0, 1.0], turned(1.2)) == pytest.approx(90 - math.degrees(1.2))
+    assert found_by(monkeypatch, [21.0, 22.0, 24.0, 23.0]) == pytest.approx(180)
+    assert found_by(monkeypatch, [21.0, 23.0, 22.0, 24.0], turned(0.5)) == pytest.approx(270 - math.degrees(0.5))
+    assert found_by(monkeypatch, [21.0, 21.0, 21.0, 21.0], turned(1.2)) == pytest.approx(90 - math.degrees(1.2))
     # by a little less than is asked for, an object whose plane is across an axis stays as it faces, and no other one
-    little = 10 ** (-(GAIN - 0.01) / 10)
-    assert found_by(monkeypatch, [1.0, little, 1.0, 1.0]) == 0
-    assert found_by(monkeypatch, [1.0, little - 0.01, 1.0, 1.0]) == pytest.approx(90)
-    assert found_by(monkeypatch, [1.0, little, 1.0, 1.0], turned(0.5)) == pytest.approx(90 - math.degrees(0.5))
+    less, more = 21 + GAIN - 0.01, 21 + GAIN + 0.01
+    assert found_by(monkeypatch, [21.0, less, 21.0, 21.0]) == 0
+    assert found_by(monkeypatch, [21.0, more, 21.0, 21.0]) == pytest.approx(90)
+    assert found_by(monkeypatch, [21.0, less, 21.0, 21.0], turned(0.5)) == pytest.approx(90 - math.degrees(0.5))
+
+
+def test_each_held_out_view_counts_by_its_own_psnr(monkeypatch):
+    """By the sum of squared errors the third view alone would decide, which no rotation shows well."""
+    one, other = (30.0, 30.0, 10.0), (26.0, 26.0, 10.5)
+    assert found_by(monkeypatch, [one, other, 10.0, 10.0], turned(0.5)) == pytest.approx(-math.degrees(0.5))
+    assert found_by(monkeypatch, [other, one, 10.0, 10.0], turned(0.5)) == pytest.approx(90 - math.degrees(0.5))
 
 
 def test_what_shows_no_frame_is_left_as_it_faces(monkeypatch):
-    better = [4.0, 1.0, 2.0, 2.0]
+    better = [21.0, 24.0, 22.0, 22.0]
     assert found_by(monkeypatch, better) == pytest.approx(90)
     assert found_by(monkeypatch, better, None) == 0
     assert found_by(monkeypatch, better, Symmetry(Plane((0.0, 1.0, 0.0)))) == 0
@@ -154,17 +162,17 @@ def test_what_shows_no_frame_is_left_as_it_faces(monkeypatch):
     assert found_by(monkeypatch, better, None, azimuth=1.0) == pytest.approx(math.degrees(1.0))
 
 
-def test_an_error_is_that_of_a_view_that_is_not_shown(monkeypatch):
+def test_a_quality_is_that_of_a_view_that_is_not_shown(monkeypatch):
     adapter, views = model(), balls(cameras(), BODY)
     shown = []
     prepare = adapter.prepare
     monkeypatch.setattr(adapter, "prepare", lambda views, **keys: shown.append(views) or prepare(views, **keys))
     placed = canonical_frame.Placed(views, ACROSS, Rotation())
-    found = canonical_frame._error(adapter, placed, 2)
+    found = canonical_frame._quality(adapter, placed, 2)
     assert [torch.equal(a, b) for a, b in zip(shown[0].images, views.images[[0, 1, 3]], strict=True)] == [True] * 3
-    assert found == canonical_frame._error(adapter, placed, 2) != canonical_frame._error(adapter, placed, 1)
+    assert found == canonical_frame._quality(adapter, placed, 2) != canonical_frame._quality(adapter, placed, 1)
     alone = replace(views, masks=torch.where(torch.arange(4)[:, None, None, None] == 2, views.masks, 0.0))
-    assert canonical_frame._error(adapter, replace(placed, views=alone), 2) == 0
+    assert canonical_frame._quality(adapter, replace(placed, views=alone), 2) == 0
 
 
 @pytest.mark.parametrize("steps", [0, 2])
