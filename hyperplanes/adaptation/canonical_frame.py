@@ -21,7 +21,7 @@ from hyperplanes.views import Views
 __all__ = ["Placed", "find_rotation", "to_canonical_frame"]
 
 FEWEST, MOST = 2, 15  # views by which a frame is looked for
-FOLDS = 3  # views that are held out, one at a time
+FOLDS = 2  # views that are held out, one at a time; a third one finds no more
 SIZE, PIXELS = 64, 1024  # of a held-out view, along its longer side, and those that are compared
 GAIN = 0.75  # dB by which a rotation must show held-out views better than none, where none will do
 FLOOR = 1e-4  # of a squared error: better views, such as empty ones, tell nothing
