@@ -7,11 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HullBlend, canonical_frame
+from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, canonical_frame
 from hyperplanes.adaptation.canonical_frame import FEWEST, GAIN, MOST, find_rotation, to_canonical_frame
 from hyperplanes.adaptation.reflections import reflected
 from hyperplanes.adaptation.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.stacking import StackedField
+from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.geometry import Sphere
@@ -208,3 +209,15 @@ def test_a_placed_object_is_rotated_with_its_symmetry():
     unrotated = to_canonical_frame(model(azimuth=0.0), views)
     assert unrotated.views is views
     assert unrotated.in_scene(field := made(stacked=False)) is field
+
+
+def test_another_objects_update_is_shown_in_the_frame_of_the_scene():
+    views, other = balls(cameras(), BODY), balls(cameras(), BODY[:2])
+    found = Swapped(model(azimuth=ANGLE), [views, other]).adapt(views)
+    assert isinstance(found, RotatedField)
+    assert found.rotation == Rotation(-ANGLE)
+
+
+def test_a_field_that_knows_its_views_by_their_places_has_no_azimuth():
+    with pytest.raises(ValueError, match="azimuth: expected a field that takes any number of views"):
+        HyperPlanes(ModelConfig(azimuth=ANGLE))
