@@ -9,6 +9,8 @@ import torch
 
 from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, canonical_frame
 from hyperplanes.adaptation.canonical_frame import FEWEST, GAIN, MOST, find_rotation, to_canonical_frame
+from hyperplanes.adaptation.descent import Descent, split_holdout
+from hyperplanes.adaptation.fine_tuning import made_anyway
 from hyperplanes.adaptation.reflections import reflected
 from hyperplanes.adaptation.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.stacking import StackedField
@@ -221,3 +223,11 @@ def test_another_objects_update_is_shown_in_the_frame_of_the_scene():
 def test_a_field_that_knows_its_views_by_their_places_has_no_azimuth():
     with pytest.raises(ValueError, match="azimuth: expected a field that takes any number of views"):
         HyperPlanes(ModelConfig(azimuth=ANGLE))
+
+
+def test_views_that_auto_holds_out_are_rotated_with_the_others(monkeypatch):
+    views, settings, seen = balls(cameras(6), BODY), FineTuning(rays=16, max_steps=2), []
+    monkeypatch.setattr(Descent, "best_stop", lambda self, holdout, **options: seen.append(holdout) or 1)
+    made_anyway(lambda: model(azimuth=ANGLE).fine_tune(views, "auto", settings))
+    _, expected = split_holdout(Rotation(ANGLE).views(views), settings)
+    torch.testing.assert_close(seen[0].cameras.extrinsics, expected.cameras.extrinsics)
