@@ -266,6 +266,7 @@ def moved(cameras: PinholeCamera, motion: Float[Tensor, "4 4"]) -> PinholeCamera
     return with_poses(cameras, pose @ torch.linalg.inv(motion).to(pose))
 
 
+@checked
 def cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     """The cameras of images whose right and lower borders were moved; calibration and distortion stay."""
     bare = PinholeCamera(
