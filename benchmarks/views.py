@@ -274,7 +274,7 @@ class _Partly:
         """The field of theta and what is left of the update."""
         model = self.model.eval()
         placed = to_canonical_frame(model, support)
-        prepared = model.prepare(placed.views, symmetry=placed.symmetry)
+        prepared = placed.context(model)
         if prepared.volume is not None:
             kept = [float(channel not in self.masked) for channel in range(CHANNELS)]
             volume = prepared.volume * prepared.volume.new_tensor(kept)[:, None, None, None]

@@ -6,11 +6,12 @@ As in NOCS (Wang et al. 2019, "Normalized Object Coordinate Space"), which predi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.rotation import Rotation
@@ -20,8 +21,8 @@ from hyperplanes.views import Views
 
 __all__ = ["Placed", "find_rotation", "to_canonical_frame"]
 
-FEWEST, MOST = 2, 15  # views by which a frame is looked for
 FOLDS = 2  # views that are held out, one at a time; a third one finds no more
+FEWEST, MOST = FOLDS, 15  # views by which a frame is looked for
 SIZE, PIXELS = 64, 1024  # of a held-out view, along its longer side, and those that are compared
 GAIN = 0.75  # dB by which a rotation must show held-out views better than none, where none will do
 FLOOR = 1e-4  # of a squared error: better views, such as empty ones, tell nothing
@@ -43,6 +44,10 @@ class Placed:
     views: Views
     symmetry: Symmetry | None
     rotation: Rotation
+
+    def context(self, network: HyperPlanesNetwork, *, carved: bool = True) -> SupportContext:
+        """The object as `HyperPlanes.prepare` makes it of the rotated views and their reflections."""
+        return network.prepare(self.views, carved=carved, symmetry=self.symmetry)
 
     def in_scene(self, field: AdaptedField) -> AdaptedField:
         """A field of these views in the frame of the scene."""
@@ -91,11 +96,10 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
     rotations = [Rotation(smallest + turns * QUARTER) for turns in range(4)]
     # the views that are held out one after the other, the same ones after each rotation
     views = network.to_own(support).resized(SIZE)
-    folds = range(min(FOLDS, len(views)))
     placed = [Placed(each.views(views), each.symmetry(symmetry, views.bounds), each) for each in rotations]
-    trials = [(each, held_out) for each in placed for held_out in folds]
+    trials = [(each, held_out) for each in placed for held_out in range(FOLDS)]
     found = side_by_side(lambda trial: _quality(network, *trial), trials, views.images.device)
-    qualities = [sum(found[start : start + len(folds)]) / len(folds) for start in range(0, len(found), len(folds))]
+    qualities = [sum(found[start : start + FOLDS]) / FOLDS for start in range(0, len(found), FOLDS)]
     if not smallest:
         qualities[0] += GAIN
     return rotations[max(range(len(rotations)), key=qualities.__getitem__)]
@@ -109,7 +113,7 @@ def _quality(network: HyperPlanesNetwork, placed: Placed, held_out: int) -> floa
         return 0.0
     generator = torch.Generator().manual_seed(0)
     rays, truth = views[[held_out]].sample_rays(PIXELS, generator=generator, near_far=near_far)
-    context = network.prepare(shown, symmetry=placed.symmetry)
+    context = replace(placed, views=shown).context(network)
     field = network.field(context, network.adapted_weights(context))
     error = float((field.trace(rays, differentiable=False).colour - truth).square().mean())
     return -10 * math.log10(max(error, FLOOR))

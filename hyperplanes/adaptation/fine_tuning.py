@@ -85,7 +85,7 @@ def fine_tune(
         return one_step(network, support)
     if steps != "auto":
         placed = to_canonical_frame(network, support)
-        context = network.prepare(placed.views, symmetry=placed.symmetry)
+        context = placed.context(network)
         views = _trained_on(context, placed.views)
         return placed.in_scene(fine_tune_to(network, context, steps, settings, views=views, on_step=on_step))
 
@@ -94,7 +94,7 @@ def fine_tune(
     shown, holdout = split_holdout(support, settings)
     placed = to_canonical_frame(network, shown)
     holdout = placed.rotation.views(holdout)
-    context = network.prepare(placed.views, symmetry=placed.symmetry)
+    context = placed.context(network)
     trial, _ = make_descent(network, context, settings, _trained_on(context, placed.views))
     pixels = network.live_pixels_of(context, holdout)
     with torch.no_grad():
@@ -103,7 +103,7 @@ def fine_tune(
 
     # as many steps on all of them, by the same schedule
     placed = to_canonical_frame(network, support)
-    context = network.prepare(placed.views, symmetry=placed.symmetry)
+    context = placed.context(network)
     views, schedule = _trained_on(context, placed.views), settings.max_steps
     tuned = fine_tune_to(network, context, stop, settings, views=views, schedule=schedule, on_step=on_step)
     return placed.in_scene(tuned)
@@ -118,7 +118,7 @@ def one_step(network: HyperPlanesNetwork, support: Views) -> AdaptedField:
         support: the views of the object.
     """
     placed = to_canonical_frame(network, support)
-    context = network.prepare(placed.views, symmetry=placed.symmetry)
+    context = placed.context(network)
     return placed.in_scene(stacked_field(network, context, network.adapted_weights(context)))
 
 

@@ -37,8 +37,7 @@ class Swapped:
         with torch.no_grad(), in_use(model):
             for support in objects:
                 placed = to_canonical_frame(model, support)
-                prepared = model.prepare(placed.views, carved=False, symmetry=placed.symmetry)
-                self._updates[_digest(support)] = model.update(prepared)
+                self._updates[_digest(support)] = model.update(placed.context(model, carved=False))
         if len(self._updates) < 2:
             raise ValueError(f"swapped: expected at least 2 objects to swap updates of, got {len(self._updates)}")
 
@@ -46,7 +45,7 @@ class Swapped:
     def adapt(self, support: Views) -> AdaptedField:
         """The field of theta plus the update of the object after this one, stacked as with its own update."""
         placed = to_canonical_frame(self.model, support)
-        prepared = self.model.prepare(placed.views, symmetry=placed.symmetry)
+        prepared = placed.context(self.model)
         known = list(self._updates)
         own = _digest(support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]

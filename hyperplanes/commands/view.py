@@ -154,7 +154,7 @@ def _adapt(
 
     console.say(f"adapting to {len(shown)} views")
     placed, steps = to_canonical_frame(model, shown), arguments.steps if len(shown) > 1 else 0
-    context = model.prepare(placed.views, symmetry=placed.symmetry)
+    context = placed.context(model)
     descent, variables = make_descent(model, context, FineTuning())
     field = None
     for done in descent.run(steps):

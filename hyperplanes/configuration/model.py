@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -84,6 +85,8 @@ class ModelConfig:
             raise ValueError(f"plane_dropout: expected a probability from 0 to below 1, got {self.plane_dropout}")
         if not 0 <= self.hull_share <= 1:
             raise ValueError(f"hull_share: expected a share from 0 to 1, got {self.hull_share}")
+        if self.azimuth is not None and not math.isfinite(self.azimuth):
+            raise ValueError(f"azimuth: expected a finite angle in radians, got {self.azimuth}")
         if self.stacked and self.hull_share:
             raise ValueError(f"hull_share: expected 0 where views decide it (stacked), got {self.hull_share}")
         if self.order not in ORDERS:

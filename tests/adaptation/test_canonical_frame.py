@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, canonical_frame
+from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig, canonical_frame
 from hyperplanes.adaptation.canonical_frame import FEWEST, GAIN, MOST, find_rotation, to_canonical_frame
 from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.fine_tuning import made_anyway
@@ -15,11 +15,16 @@ from hyperplanes.adaptation.reflections import reflected
 from hyperplanes.adaptation.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.fields import adapt_to
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.rendering import RayMarching
+from hyperplanes.rendering.scene import SplitField
 from hyperplanes.utilities.metrics import psnr
 from tests.adaptation.test_symmetry import ACROSS, BODY, SIZE, balls, cameras, model
 from tests.reference_rendering import ring
@@ -231,3 +236,24 @@ def test_views_that_auto_holds_out_are_rotated_with_the_others(monkeypatch):
     made_anyway(lambda: model(azimuth=ANGLE).fine_tune(views, "auto", settings))
     _, expected = split_holdout(Rotation(ANGLE).views(views), settings)
     torch.testing.assert_close(seen[0].cameras.extrinsics, expected.cameras.extrinsics)
+
+
+@pytest.mark.parametrize("angle", [math.nan, math.inf])
+def test_an_angle_that_is_none_is_refused(angle):
+    with pytest.raises(ValueError, match="azimuth: expected a finite angle in radians"):
+        model(azimuth=angle)
+
+
+def test_a_command_says_that_an_object_was_rotated(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path))
+    for angle, said in ((ANGLE, True), (0.0, False)):
+        adapt_to(model(azimuth=angle), balls(cameras(), BODY), "balls", Console())
+        assert ("rotated into its canonical frame" in "".join(capsys.readouterr())) == said
+
+
+def test_a_field_that_is_one_function_stays_one():
+    field = AdaptedField(lambda points, directions: (points, points[:, 0]), full(BESIDE, 4), RayMarching(4))
+    rotated, points = Rotation(math.pi / 2).field(field), torch.tensor([[0.2, 0.3, 0.5]])
+    assert not isinstance(rotated.field, SplitField)
+    # by a quarter turn about (0.2, y, 0.1) z is mapped onto x: from x = 0.6
+    torch.testing.assert_close(rotated(points, points)[0], torch.tensor([[-0.2, 0.3, 0.1]]))
