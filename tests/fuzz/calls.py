@@ -88,6 +88,7 @@ def make_calls(home):
         "resized": (cameras.resized, {"cameras": batch, "height": 4, "width": 5}),
         "cropped": (cameras.cropped, {"cameras": batch, "height": 4, "width": 5}),
         "with_poses": (cameras.with_poses, {"cameras": batch, "camera_from_world": pose}),
+        "moved": (cameras.moved, {"cameras": batch, "motion": torch.eye(4, dtype=torch.float64)}),
         "select": (cameras.select, {"cameras": batch, "index": [0, 1]}),
         "look_at": (poses.look_at, {"eyes": points, "target": (1.0, 1.0, 1.0)}),
         "orbit": (poses.orbit, {"views": 3, "distance": 2.0, "elevation": 0.3}),

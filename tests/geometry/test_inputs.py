@@ -255,3 +255,16 @@ def test_poses_of_half_precision_are_checked_as_others_are():
     assert torch.equal(cameras.with_poses(rig(), poses.half()).extrinsics, poses.half())
     with pytest.raises(ValueError, match="camera_from_world: expected a rotation"):
         cameras.with_poses(rig(), (2 * poses).half())
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda batch: cameras.cropped(batch, "60", 4),
+        lambda batch: cameras.resized(batch, 4.5, 4),
+        lambda batch: cameras.moved(batch, [[1.0]]),
+    ],
+)
+def test_functions_of_cameras_name_the_argument_that_is_wrong(call):
+    with pytest.raises(ValueError, match=r"^(height|motion): expected"):
+        call(rig())
