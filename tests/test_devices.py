@@ -13,7 +13,7 @@ from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.judging_symmetry import SymmetryJudge
 from hyperplanes.adaptation.reflections import with_reflections
 from hyperplanes.adaptation.rotation import Rotation
-from hyperplanes.adaptation.symmetry import _held_out_error
+from hyperplanes.adaptation.symmetry import Fold
 from hyperplanes.configuration.presets import preset
 from hyperplanes.data import read_task
 from hyperplanes.export.baking import bake
@@ -122,7 +122,7 @@ def test_planes_are_judged_alike(device):
         support = car(where, shown=4, size=16).support
         return [
             SymmetryJudge.of(support, 16, 24).error(Symmetry(ACROSS)),
-            _held_out_error(support, [1], Symmetry(ACROSS)),
+            Fold.of(support, [1]).error(Symmetry(ACROSS)),
         ]
 
     assert judged(device) == pytest.approx(judged(CPU), rel=0.02)

@@ -206,15 +206,20 @@ class _SplitCast(_Cast):
         return self.field.colour_of(hidden, directions.to(self.dtype)).float()
 
 
-def hull(support: Views, side: int) -> Occupancy:
+def hull(support: Views, side: int, within: Occupancy | None = None) -> Occupancy:
     """The visual hull of the support masks, or a full grid where there are none.
+
+    Args:
+        support: the views.
+        side: voxels an axis.
+        within: voxels that it is known to lie in, where masks are carved.
 
     Raises:
         ValueError: masks that leave nothing.
     """
     if support.masks is None:
         return full(support.bounds, side, support.images.device)
-    carved = carve(support.masks, support.cameras, support.bounds, side)
+    carved = carve(support.masks, support.cameras, support.bounds, side, within=within)
     seen = int((support.masks > 0).flatten(1).any(1).sum())
     if not (seen and carved.occupied.any()):
         found = f"{seen} of {len(support)} with a pixel set, and no point that all of them may show"

@@ -55,8 +55,12 @@ class HullBlend:
         """The hull and its colours; errors are those of `planes_of`."""
         return self.adapt_to(self.planes_of(support))
 
-    def planes_of(self, support: Views) -> VisibilityPlanes:
+    def planes_of(self, support: Views, within: Occupancy | None = None) -> VisibilityPlanes:
         """The views and their hull, as `adapt_to` takes them.
+
+        Args:
+            support: the views.
+            within: voxels that their hull is known to lie in; `side` an axis.
 
         Raises:
             ValueError: views without masks, or masks that leave nothing.
@@ -64,7 +68,7 @@ class HullBlend:
         if support.masks is None:
             raise ValueError("hull_blend: expected support views with masks, got none; images with alpha have them")
         support = support.to(dtype=torch.float32)
-        return VisibilityPlanes(support.images, support.cameras, support.masks, hull(support, self.side))
+        return VisibilityPlanes(support.images, support.cameras, support.masks, hull(support, self.side, within))
 
     @torch.no_grad()
     def adapt_to(self, planes: VisibilityPlanes) -> AdaptedField:
@@ -76,7 +80,7 @@ class HullBlend:
         region, blend = planes.occupancy, _Blend(planes, planes.occupancy.bounds, self.nearest)
         # voxels whose centre lies in the hull: by all that it enters views would see its surface too near
         depth = torch.zeros_like(region.occupied, dtype=torch.float32)
-        centres = region.centres().to(planes.depth_opacity).split(POINTS)
+        centres = region.centres().to(planes.maps).split(POINTS)
         depth[region.occupied] = torch.cat([blend.density(each) for each in centres]).float() * region.voxel
         voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
         blend = replace(blend, planes=planes.with_penalties(Penalties.alike()).with_surface(voxels.solid()))
@@ -157,7 +161,7 @@ class _Blend:
     @property
     def dtype(self) -> torch.dtype:
         """That of the views, in which points are expected."""
-        return self.planes.depth_opacity.dtype
+        return self.planes.maps.dtype
 
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]

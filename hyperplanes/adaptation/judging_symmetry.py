@@ -43,13 +43,13 @@ class SymmetryJudge:
 
     Attributes:
         views: small ones.
-        side: voxels an axis of their hull.
+        voxels: their visual hull.
         alone: their squared error without reflections, and FLOOR.
         floor: of all errors.
     """
 
     views: Views
-    side: int
+    voxels: Occupancy
     alone: float
     floor: float
 
@@ -58,8 +58,8 @@ class SymmetryJudge:
         """The judge of views with masks, so many pixels along the longer side at most."""
         views = support.resized(size)
         assert views.masks is not None
-        floor = FLOOR * float((views.masks >= SHOWN).sum())
-        return cls(views, side, _squared_error(views, None, side) + floor, floor)
+        voxels, floor = carved(views, side), FLOOR * float((views.masks >= SHOWN).sum())
+        return cls(views, voxels, _squared_error(views, None, voxels) + floor, floor)
 
     def errors(self, planes: Sequence[Plane], most: float = math.inf) -> dict[Plane, float]:
         """Those of the planes by which they are at most so large, and finite."""
@@ -100,7 +100,7 @@ class SymmetryJudge:
 
     def error(self, symmetry: Symmetry) -> float:
         """That of the hull of views and reflections; infinite where it loses too many pixels."""
-        return (_squared_error(self.views, symmetry, self.side) + self.floor) / self.alone
+        return (_squared_error(self.views, symmetry, self.voxels) + self.floor) / self.alone
 
 
 def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
@@ -127,10 +127,10 @@ def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
     return _vertical(views.bounds, angle, offset)
 
 
-def carved(views: Views, side: int = HULL_SIDE) -> Occupancy:
-    """The visual hull of views with masks, which may be empty."""
+def carved(views: Views, side: int = HULL_SIDE, within: Occupancy | None = None) -> Occupancy:
+    """The visual hull of views with masks, which may be empty; the part of it within some voxels, if there are any."""
     assert views.masks is not None
-    return carve(views.masks, views.cameras, views.bounds, side)
+    return carve(views.masks, views.cameras, views.bounds, side, within=within)
 
 
 def _refined(
@@ -163,12 +163,19 @@ def _vertical(bounds: Sphere, angle: float, offset: float = 0.0) -> Plane:
     return Plane.of_sphere(bounds, (math.cos(angle), 0.0, math.sin(angle)), offset)
 
 
-def _squared_error(views: Views, symmetry: Symmetry | None, side: int) -> float:
-    """That of views by `HullBlend` of them and their reflections; infinite where their hull loses too many pixels."""
+def _squared_error(views: Views, symmetry: Symmetry | None, voxels: Occupancy) -> float:
+    """That of views by `HullBlend` of them and their reflections; infinite where their hull loses too many pixels.
+
+    Args:
+        views: with masks.
+        symmetry: of the reflections, if there are any.
+        voxels: the visual hull of the views alone.
+    """
     assert views.masks is not None
-    shown = views if symmetry is None else images_by(views, symmetry)
-    among, voxels = torch.ones_like(views.masks, dtype=torch.bool), carved(shown, side)
+    shown, among = views, torch.ones_like(views.masks, dtype=torch.bool)
     if symmetry is not None:
+        shown = images_by(views, symmetry)
+        voxels = carved(shown[len(views) :], len(voxels.occupied), voxels)
         seen, held = views.masks >= SHOWN, footprint(voxels, views.cameras)[:, None]
         if not voxels.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
             return math.inf

@@ -62,7 +62,7 @@ def handicaps(given: int, symmetry: Symmetry) -> Float[Tensor, " view"]:
 
 
 @torch.no_grad()
-def with_reflections(support: Views, symmetry: Symmetry | None) -> Views:
+def with_reflections(support: Views, symmetry: Symmetry | None, known: Occupancy | None = None) -> Views:
     """The views, and after them their reflections (`images_by`).
 
     Few things are symmetric in all of their parts. What views show, and the visual hull of views and reflections does
@@ -71,25 +71,27 @@ def with_reflections(support: Views, symmetry: Symmetry | None) -> Views:
     Args:
         support: of an object that is symmetric, but for some parts.
         symmetry: None leaves the views as they are.
+        known: the visual hull of the views, HULL_SIDE voxels an axis; carved where absent.
     """
     if symmetry is None:
         return support
     found = images_by(support, symmetry)
     if support.masks is None or found.masks is None:
         return found
-    parts = _asymmetric_parts(support, found)
+    reflections = found[len(support) :]
+    parts = _asymmetric_parts(support, reflections, known or hull(support, HULL_SIDE))
     if parts.occupied.any():
-        wrong = footprint(parts, found.cameras)[:, None]
-        wrong[: len(support)] = False
-        found = replace(found, masks=torch.where(wrong, UNKNOWN, found.masks))
+        wrong = footprint(parts, reflections.cameras)[:, None]
+        masks = torch.where(wrong, UNKNOWN, found.masks[len(support) :])
+        found = replace(found, masks=torch.cat([support.masks, masks]))
     return found
 
 
-def _asymmetric_parts(support: Views, both: Views) -> Occupancy:
+def _asymmetric_parts(support: Views, reflections: Views, found: Occupancy) -> Occupancy:
     """The voxels of the hull of views that lie where these show what their hull with reflections does not hold."""
     assert support.masks is not None
-    assert both.masks is not None
-    found, common = hull(support, HULL_SIDE), carve(both.masks, both.cameras, both.bounds, HULL_SIDE)
+    assert reflections.masks is not None
+    common = carve(reflections.masks, reflections.cameras, found.bounds, HULL_SIDE, within=found)
     missed = (support.masks >= SHOWN) & ~footprint(common, support.cameras)[:, None]
     points, occupied = found.centres().to(support.images), found.occupied.clone()
     where = ImagePlanes(missed.to(support.images), support.cameras, background=0.0).lookup(points).colours

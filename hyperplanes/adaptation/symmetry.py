@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import live_pixels
@@ -16,11 +19,13 @@ from hyperplanes.adaptation.judging_symmetry import (
     best_vertical_plane,
     carved,
 )
-from hyperplanes.adaptation.reflections import handicaps, with_reflections
+from hyperplanes.adaptation.reflections import HULL_SIDE, handicaps, with_reflections
 from hyperplanes.geometry.cameras import camera_directions
 from hyperplanes.geometry.kernels.threads import side_by_side
 from hyperplanes.geometry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
+from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.geometry.rays import Rays
 from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.views import Views
 
@@ -130,10 +135,10 @@ def _of_many(support: Views, judge: SymmetryJudge, across: Mapping[Plane, float]
     return symmetry if _held_out_gain(support, symmetry) >= needed else None
 
 
-def _blend(support: Views, symmetry: Symmetry | None) -> AdaptedField:
-    """`HullBlend` of views, and of their reflections where there is a symmetry."""
-    blend = HullBlend()
-    planes = blend.planes_of(with_reflections(support, symmetry))
+def _blend(support: Views, symmetry: Symmetry | None, known: Occupancy | None = None) -> AdaptedField:
+    """`HullBlend` of views, and of their reflections where there is a symmetry; `known` is the hull of the views."""
+    blend = HullBlend(side=HULL_SIDE)
+    planes = blend.planes_of(with_reflections(support, symmetry, known), known)
     return blend.adapt_to(planes if symmetry is None else planes.with_handicaps(handicaps(len(support), symmetry)))
 
 
@@ -145,18 +150,42 @@ def _held_out_gain(support: Views, symmetry: Symmetry) -> float:
     """
     views = support.resized(JUDGED_SIZE)
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(0)).tolist()
-    trials = [(sorted(order[fold::ONE_IN]), by) for by in (None, symmetry) for fold in range(FOLDS)]
-    errors = side_by_side(lambda trial: _held_out_error(views, *trial), trials, views.images.device)
-    alone, reflected = sum(errors[:FOLDS]), sum(errors[FOLDS:])
+    folds = [Fold.of(views, sorted(order[fold::ONE_IN])) for fold in range(FOLDS)]
+    trials = [(fold, by) for by in (symmetry, None) for fold in folds]  # the longer ones first
+    errors = side_by_side(lambda trial: trial[0].error(trial[1]), trials, views.images.device)
+    reflected, alone = sum(errors[:FOLDS]), sum(errors[FOLDS:])
     return 10 * math.log10(alone / reflected) if reflected else math.inf
 
 
-def _held_out_error(views: Views, held_out: list[int], symmetry: Symmetry | None) -> float:
-    """The squared error of some views by the others, in pixels that are the same with a symmetry and without."""
-    shown, others = views[sorted({*range(len(views))} - {*held_out})], views[held_out]
-    among = live_pixels(carved(shown), others)
-    if not len(among):
-        return 0.0
-    drawn = torch.randint(len(among), (PIXELS,), generator=torch.Generator().manual_seed(0))
-    rays, truth, _ = others.rays_at(among[drawn.to(among.device)])
-    return float((_blend(shown, symmetry).trace(rays, differentiable=False).colour - truth).square().sum())
+@dataclass(frozen=True)
+class Fold:
+    """Views of which some are held out.
+
+    Attributes:
+        shown: the others.
+        voxels: their visual hull.
+        rays: some of those held out that meet it.
+        truth: the colours of these.
+    """
+
+    shown: Views
+    voxels: Occupancy
+    rays: Rays
+    truth: Float[Tensor, "ray 3"]
+
+    @classmethod
+    def of(cls, views: Views, held_out: list[int]) -> Fold:
+        """The fold in which these views are held out, by PIXELS rays at most."""
+        shown, others = views[sorted({*range(len(views))} - {*held_out})], views[held_out]
+        voxels = carved(shown)
+        among = live_pixels(voxels, others)
+        drawn = torch.randint(max(1, len(among)), (PIXELS,), generator=torch.Generator().manual_seed(0))
+        rays, truth, _ = others.rays_at(among[drawn.to(among.device)] if len(among) else among)
+        return cls(shown, voxels, rays, truth)
+
+    def error(self, symmetry: Symmetry | None) -> float:
+        """The squared error of the rays by the views that are shown, with their reflections if there is a symmetry."""
+        if not len(self.rays):
+            return 0.0
+        found = _blend(self.shown, symmetry, self.voxels).trace(self.rays, differentiable=False).colour
+        return float((found - self.truth).square().sum())

@@ -40,12 +40,12 @@ def hull_hits(
     Returns:
         Their distances along the rays; infinite where there is none.
     """
-    cameras, bounds, shape = planes.shown_cameras(), voxels.bounds, planes.depth_opacity.shape
+    cameras, bounds, shape = planes.shown_cameras(), voxels.bounds, planes.maps.shape
     arrays = [each.contiguous().numpy() for each in (rays.origins, rays.directions, first, rays.far)]
     fixed = (
         *arrays, np.float32(step), np.array([*bounds.centre, bounds.radius], np.float32),
         np.array(voxels.box, np.float32), voxels.occupied.contiguous().numpy().view(np.uint8),
-        *(each.contiguous().flatten().numpy() for each in (cameras, planes.depth_opacity)),
+        *(each.contiguous().flatten().numpy() for each in (cameras, planes.maps)),
         (*shape[:3], cameras.shape[1]), np.array([planes.colours.nearest, opacity], np.float32),
     )  # fmt: skip
     nearest = torch.empty(len(rays))

@@ -136,7 +136,14 @@ def full(bounds: Sphere, side: int = 64, device: torch.device | str | None = Non
 
 @checked
 @torch.no_grad()
-def carve(masks: ArrayLike, cameras: PinholeCamera, bounds: Sphere, side: int = 64, votes: int = 1) -> Occupancy:
+def carve(
+    masks: ArrayLike,
+    cameras: PinholeCamera,
+    bounds: Sphere,
+    side: int = 64,
+    votes: int = 1,
+    within: Occupancy | None = None,
+) -> Occupancy:
     """The visual hull: voxels that no mask rules out, or fewer masks than `votes`.
 
     A voxel is cleared where some image contains the whole projection of the voxel's bounding ball and no pixel of the
@@ -156,10 +163,12 @@ def carve(masks: ArrayLike, cameras: PinholeCamera, bounds: Sphere, side: int = 
         side: voxels an axis.
         votes: masks that have to rule a voxel out. More than one leave standing what as many wrong masks less one cut
             off, and leave of a right hull what only few views see past.
+        within: voxels of the same side and bounds, such as the hull of other views: the result lies in them. It takes
+            less time the fewer they are.
 
     Raises:
-        ValueError: cameras with lens distortion, masks of another number or size than the cameras, an absurd side, or
-            less than one vote.
+        ValueError: cameras with lens distortion, masks of another number or size than the cameras, an absurd side, less
+            than one vote, or a grid to carve in of another side, bounds or device.
     """
     masks = as_images(masks, "masks")
     expected = (cameras.batch_size, 1, *(camera.image_size(cameras) if cameras.batch_size else masks.shape[2:]))
@@ -174,40 +183,39 @@ def carve(masks: ArrayLike, cameras: PinholeCamera, bounds: Sphere, side: int = 
     matrices, calibrations = camera.projection_matrices(cameras).float(), camera.intrinsics(cameras).float()
     compiled = masks.device.type == "cpu" and find_spec("numba") and masks[0:1].numel() < 2**30  # pixels in 32 bits
     carver = _carve_compiled if compiled else _carve_torch
-    return Occupancy(carver(masks[:, 0] > 0, matrices, calibrations, bounds, side, votes), bounds)
+    given = full(bounds, side, masks.device) if within is None else within
+    if (given.bounds, len(given.occupied), given.occupied.device) != (bounds, side, masks.device):
+        found = f"{len(given.occupied)} in {given.bounds} on {given.occupied.device}"
+        raise ValueError(f"within: expected {side} voxels an axis in {bounds} on {masks.device}, got {found}")
+    return Occupancy(carver(masks[:, 0] > 0, matrices, calibrations, given, votes), bounds)
 
 
-def _carve_compiled(
-    masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int, votes: int
-) -> Tensor:
+def _carve_compiled(masks: Tensor, matrices: Tensor, calibrations: Tensor, given: Occupancy, votes: int) -> Tensor:
     """The occupied voxels, by the compiled kernel. NumPy prepares its inputs: PyTorch's threads start slowly."""
     views, height, width = masks.shape
     tables = np.zeros((views, height + 1, width + 1), np.int32)
     np.cumsum(masks.numpy().cumsum(1, np.int32), 2, out=tables[:, 1:, 1:])
-    grid = Occupancy(torch.from_numpy(np.ones((side, side, side), np.bool_)), bounds)
-    corner = np.asarray(bounds.centre, np.float32) - np.float32(bounds.radius)
-    numbers = [np.float32(value) for value in (grid.voxel, grid.voxel * math.sqrt(3) / 2, _min_z(grid), votes)]
+    corner = np.asarray(given.bounds.centre, np.float32) - np.float32(given.bounds.radius)
+    numbers = [np.float32(value) for value in (given.voxel, given.voxel * math.sqrt(3) / 2, _min_z(given), votes)]
     fixed = (matrices.contiguous().numpy(), calibrations.contiguous().numpy(), tables, corner, *numbers)
-    kernel, occupied = compile_kernel("carving.carve", torch.float32), grid.occupied.numpy().view(np.uint8)
-    parallel_for(lambda start, stop: kernel(*fixed, occupied, start, stop), side, 2)
-    return grid.occupied
+    kernel, occupied = compile_kernel("carving.carve", torch.float32), given.occupied.numpy().astype(np.uint8, "C")
+    parallel_for(lambda start, stop: kernel(*fixed, occupied, start, stop), len(occupied), 2)
+    return torch.from_numpy(occupied.view(np.bool_))
 
 
-def _carve_torch(
-    masks: Tensor, matrices: Tensor, calibrations: Tensor, bounds: Sphere, side: int, votes: int
-) -> Tensor:
+def _carve_torch(masks: Tensor, matrices: Tensor, calibrations: Tensor, given: Occupancy, votes: int) -> Tensor:
     """The occupied voxels, in plain PyTorch."""
-    grid, tables = full(bounds, side, masks.device), pad(masks.int().cumsum(1).cumsum(2), (1, 0, 1, 0))
-    kept, points = torch.arange(grid.occupied.numel(), device=tables.device), grid.centres()
+    tables = pad(masks.int().cumsum(1).cumsum(2), (1, 0, 1, 0))
+    kept, points = given.occupied.flatten().nonzero()[:, 0], given.centres()
     missing = torch.full_like(kept, votes)
     last = points.new_tensor([tables.shape[2] - 1.5, tables.shape[1] - 1.5])
     for matrix, calibration, table in zip(matrices, calibrations, tables, strict=True):
         # where the voxels that are left fall into the view, and the boxes around what their balls cover
         homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
         z = homogeneous[:, 2]
-        front = z > _min_z(grid)
+        front = z > _min_z(given)
         pixels = homogeneous[:, :2] / torch.where(front, z, 1.0)[:, None]
-        extent = ball_extent(pixels, z, calibration, grid.voxel * math.sqrt(3) / 2) + 0.5
+        extent = ball_extent(pixels, z, calibration, given.voxel * math.sqrt(3) / 2) + 0.5
         # pixels of the mask in each box, from four entries of its summed table
         inside = front & ((pixels - extent >= -0.5) & (pixels + extent <= last)).all(1)
         low, high = pixels[inside] - extent[inside], pixels[inside] + extent[inside]
@@ -218,7 +226,7 @@ def _carve_torch(
         missing[inside.nonzero()[count == 0, 0]] -= 1
         stays = missing > 0
         kept, points, missing = kept[stays], points[stays], missing[stays]
-    return torch.zeros_like(grid.occupied).flatten().index_fill_(0, kept, True).reshape(grid.occupied.shape)
+    return torch.zeros_like(given.occupied).flatten().index_fill_(0, kept, True).reshape(given.occupied.shape)
 
 
 def _min_z(grid: Occupancy) -> float:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.util import find_spec
 
 import numpy as np
@@ -69,10 +70,10 @@ class VisibilityPlanes:
     ) -> None:
         self.colours = ImagePlanes(images, cameras)
         self.occupancy = occupancy
-        self.depth_opacity: Float[Tensor, "view height width 2"] = images.new_ones(*images[:, 0].shape, 2)
-        self.depth_opacity[..., 0] = first_hits(occupancy, cameras, masks)
+        maps = images.new_ones(*images[:, 0].shape, 2)
         if masks is not None:
-            self.depth_opacity[..., 1] = masks[:, 0]
+            maps[..., 1] = masks[:, 0]
+        self._maps = _Maps(maps, cameras, occupancy)
         matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
@@ -84,6 +85,16 @@ class VisibilityPlanes:
 
     def __len__(self) -> int:
         return len(self.colours)
+
+    @property
+    def depth_opacity(self) -> Float[Tensor, "view height width 2"]:
+        """Distance of the first occupied voxel along the ray of each pixel (`first_hits`), and opacity."""
+        return self._maps.complete
+
+    @property
+    def maps(self) -> Float[Tensor, "view height width 2"]:
+        """As `depth_opacity` for those who read opacities alone: depths may not have been computed yet."""
+        return self._maps.values
 
     @property
     def tolerance(self) -> float:
@@ -128,9 +139,9 @@ class VisibilityPlanes:
             voxels: within the hull; a pixel whose ray meets none of them sees all that lies along it.
         """
         result = copy.copy(self)
-        mask = self.depth_opacity[..., 1]
-        distances = first_hits(voxels, self.colours.cameras, mask[:, None])
-        result._surface = torch.stack([distances.to(mask), mask], -1)
+        opacity = self.maps[..., 1]
+        distances = first_hits(voxels, self.colours.cameras, opacity[:, None])
+        result._surface = torch.stack([distances.to(opacity), opacity], -1)
         return result
 
     @torch.no_grad()
@@ -156,6 +167,8 @@ class VisibilityPlanes:
         """
         best, nearest = min(best, len(self)), min(nearest + 1, len(self)) if directions is not None else 0
         choose = self._choose_compiled if self.has_kernels(points) else self._choose_torch
+        if not best and not nearest:  # no view is returned, and depths do not count
+            return choose(points, directions, 0, 0, self.maps)
         if self._surface is None or directions is None:
             return choose(points, directions, best, nearest, self.depth_opacity)
         near = choose(points, directions, 0, nearest, self._surface)
@@ -164,14 +177,14 @@ class VisibilityPlanes:
     def has_kernels(self, points: Tensor) -> bool:
         """Whether the kernels take these points: single precision, on the CPU, pinhole cameras."""
         pinholes = not isinstance(self.colours.cameras, DistortedCamera)
-        compiled = find_spec("numba") and points.device.type == "cpu" and self.depth_opacity.numel() < 2**31
-        return bool(compiled) and points.dtype == torch.float32 == self.depth_opacity.dtype and pinholes
+        compiled = find_spec("numba") and points.device.type == "cpu" and self.maps.numel() < 2**31
+        return bool(compiled) and points.dtype == torch.float32 == self.maps.dtype and pinholes
 
     def _limits(self) -> list[float]:
         """The numbers by which the kernels judge."""
         per_radius, own = 1 / self.occupancy.bounds.radius, self._penalties
         limits = [self.colours.nearest, per_radius, self.tolerance, own.deepest, own.partly, WHOLE, UNSEEN, ANGLE]
-        return [*limits, own.steep, own.highest, own.least, 1 / _margin(*self.depth_opacity.shape[1:3]), CUT, BEYOND]
+        return [*limits, own.steep, own.highest, own.least, 1 / _margin(*self.maps.shape[1:3]), CUT, BEYOND]
 
     def shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, 0 where hidden, its handicap and margins."""
@@ -226,7 +239,7 @@ class VisibilityPlanes:
             grid: features over the scene, which are written into the same rows, the first through a sigmoid; in any
                 layout, without a copy where the numbers of a cell are side by side.
         """
-        count, views = len(points), self.depth_opacity.shape[:3]
+        count, views = len(points), self.maps.shape[:3]
         packed = self.colours.packed_images(points)
         assert packed is not None
         features = points.new_zeros(1, 1, 1, 0) if grid is None else grid.permute(1, 2, 3, 0).contiguous()
@@ -237,9 +250,10 @@ class VisibilityPlanes:
         kept = min(reading.nearest, len(self))
         weights, colours = torch.empty(len(along), kept), torch.empty(len(along), kept, 3)
         surface = points.new_zeros(0) if self._surface is None else self._surface
+        depths = self.depth_opacity if reading.best or self._surface is None else self.maps
         numbers = [*self._limits(), FADING, reading.falloff, SMALLEST_ANGLE]
         frequencies = reading.point_frequencies, reading.direction_frequencies
-        maps = [each.contiguous().flatten().numpy() for each in (self.shown_cameras(), self.depth_opacity, surface)]
+        maps = [each.contiguous().flatten().numpy() for each in (self.shown_cameras(), depths, surface)]
         fixed = (
             points.contiguous().numpy(), along.contiguous().numpy(), *maps,
             packed.words.flatten().numpy().view(np.uint32), features.numpy(),
@@ -286,6 +300,27 @@ class VisibilityPlanes:
             angle = torch.acos((rays * directions[:, None]).sum(-1).clamp(-1, 1))
             near = chosen(angle + ANGLE * penalty.clamp_min(0), nearest)
         return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """Depth and opacity of the pixels of planes and of all their copies.
+
+    Attributes:
+        values: (view, row, column, 2), whose depths are 1 until they are asked for: opacities alone say what is held.
+        cameras: of the views.
+        occupancy: whose first voxel along a ray gives the depth.
+    """
+
+    values: Float[Tensor, "view height width 2"]
+    cameras: PinholeCamera
+    occupancy: Occupancy
+
+    @cached_property
+    def complete(self) -> Float[Tensor, "view height width 2"]:
+        """The values with their depths."""
+        self.values[..., 0] = first_hits(self.occupancy, self.cameras, self.values[..., 1][:, None])
+        return self.values
 
 
 def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 4"]:

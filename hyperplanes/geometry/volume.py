@@ -33,7 +33,7 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
     """
     occupancy = planes.occupancy
     # which share of each cell is within the hull (x, y, z), and the centres of cells that have some
-    share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.depth_opacity), SIDE)[0, 0]
+    share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.maps), SIDE)[0, 0]
     cells = (share > 0).nonzero()
     unit = (cells.to(share) + 0.5) * (2 / SIDE) - 1
     points = unit * occupancy.bounds.radius + unit.new_tensor(occupancy.bounds.centre)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from importlib.util import find_spec
 
+import numpy as np
 import torch
 from jaxtyping import Bool
 from kornia.geometry.camera import PinholeCamera
@@ -12,8 +14,11 @@ from torch.nn.functional import max_pool2d
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.kernels.compiling import compile_kernel
+from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy, ball_extent
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.transforms import transform_of
 
 __all__ = ["footprint", "pixels_across"]
 
@@ -37,30 +42,46 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
     height, width = camera.image_size(cameras)
     if isinstance(cameras, DistortedCamera) and occupancy.occupied.any():
         return torch.ones(cameras.batch_size, height, width, dtype=torch.bool, device=cameras.intrinsics.device)
-    matrices, calibration = camera.projection_matrices(cameras), camera.intrinsics(cameras)
+    matrices, calibrations = camera.projection_matrices(cameras), camera.intrinsics(cameras)
     points = occupancy.surface_centres.to(matrices)
-    result = torch.zeros(len(matrices), height, width, dtype=torch.bool, device=points.device)
+    seen = torch.zeros(len(matrices), height, width, dtype=torch.bool, device=points.device)
     if not len(points):
-        return result
+        return seen
+    compiled = points.device.type == "cpu" and find_spec("numba") and points.dtype in (torch.float32, torch.float64)
+    mark = _mark_compiled if compiled and not transform_of(matrices) else _mark_torch
+    mark(seen, points, matrices, calibrations, occupancy.voxel)
+    return seen
+
+
+def _mark_compiled(seen: Tensor, points: Tensor, matrices: Tensor, calibrations: Tensor, voxel: float) -> None:
+    """Sets the pixels of `seen` around surface voxels with these centres, by the compiled kernel."""
+    kernel = compile_kernel("footprints.footprints", points.dtype)
+    fixed = [each.contiguous().numpy() for each in (points, matrices, calibrations)]
+    numbers = np.asarray([voxel * math.sqrt(3) / 2, 2 * voxel], fixed[0].dtype)
+    parallel_for(lambda start, stop: kernel(*fixed, *numbers, seen.numpy(), start, stop), len(seen), 1)
+
+
+def _mark_torch(seen: Tensor, points: Tensor, matrices: Tensor, calibrations: Tensor, voxel: float) -> None:
+    """As `_mark_compiled`, in plain PyTorch."""
+    height, width = seen.shape[1:]
     for view, matrix in enumerate(matrices):
         # centres of the voxels at the surface, in pixels of the view; everything where one is too near
         homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
-        if float(homogeneous[:, 2].min()) < 2 * occupancy.voxel:
-            result[view] = True
+        if float(homogeneous[:, 2].min()) < 2 * voxel:
+            seen[view] = True
             continue
         pixels = homogeneous[:, :2] / homogeneous[:, 2:]
         # half sizes of the boxes around what the voxels' balls cover; those that meet the image
-        extent = ball_extent(pixels, homogeneous[:, 2], calibration[view], occupancy.voxel * math.sqrt(3) / 2)
+        extent = ball_extent(pixels, homogeneous[:, 2], calibrations[view], voxel * math.sqrt(3) / 2)
         touching = ((pixels + extent >= 0) & (pixels - extent <= pixels.new_tensor([width - 1, height - 1]))).all(-1)
         if not touching.any():
             continue
         across, down = (int(value) for value in (extent[touching].amax(0) + 0.51).tolist())
         if across > width or down > height:
-            result[view] = True
+            seen[view] = True
             continue
         # each centre's pixel, spread by the largest of these boxes
         padded = torch.zeros(height + 2 * down, width + 2 * across, device=points.device)
         column, row = pixels[touching].round().long().unbind(-1)
         padded[row + down, column + across] = 1.0
-        result[view] = max_pool2d(max_pool2d(padded[None], (2 * down + 1, 1), 1), (1, 2 * across + 1), 1)[0] > 0
-    return result
+        seen[view] = max_pool2d(max_pool2d(padded[None], (2 * down + 1, 1), 1), (1, 2 * across + 1), 1)[0] > 0

@@ -25,7 +25,7 @@ from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.adaptation.symmetry import ReflectedHullBlend, possible_symmetries, symmetry_of
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.geometry import Sphere, cast
-from hyperplanes.geometry.cameras import camera_from_world, image_size
+from hyperplanes.geometry.cameras import camera_from_world, centres, image_size
 from hyperplanes.geometry.rays import pixel_grid
 from hyperplanes.geometry.reflections import Plane, Symmetry, reflected_cameras
 from hyperplanes.utilities.metrics import psnr
@@ -443,22 +443,18 @@ def test_from_ten_views_on_those_that_are_held_out_must_be_shown_better(monkeypa
 @pytest.mark.parametrize("better", [1.0, 2.0])
 def test_errors_of_all_folds_are_summed(monkeypatch, better):
     """With reflections one fold is shown worse by 3, two are shown better by 1 or by 2 each."""
-    seen = []
+    folds = []
 
-    def error(views, held_out, by):
-        first = not seen or seen[0][0] == held_out
-        seen.append((held_out, by))
-        return 4.0 if by is None else 7.0 if first else 4.0 - better
+    def fold(views, held_out):
+        reflected = 4.0 - better if folds else 7.0
+        folds.append(held_out)
+        return SimpleNamespace(error=lambda by: 4.0 if by is None else reflected)
 
-    monkeypatch.setattr(symmetry, "_held_out_error", error)
-    monkeypatch.setattr(symmetry, "side_by_side", lambda function, items, device: [function(each) for each in items])
+    monkeypatch.setattr(symmetry.Fold, "of", fold)
     gain = symmetry._held_out_gain(balls(cameras(12), BODY), ACROSS)
     assert gain == pytest.approx(10 * math.log10(12 / (15 - 2 * better)))
-    folds = [each for each, _ in seen]
-    assert folds[:3] == folds[3:]
-    assert [by for _, by in seen] == [None] * 3 + [ACROSS] * 3
-    held_out = [view for fold in folds[:3] for view in fold]
-    assert len(held_out) == len(set(held_out)) == 6
+    held_out = [view for fold in folds for view in fold]
+    assert (len(folds), len(held_out), len(set(held_out))) == (3, 6, 6)
 
 
 def test_held_out_views_know_the_plane_from_another_one():
@@ -472,18 +468,13 @@ def test_views_that_hold_out_no_pixel_of_the_object_reject_nothing():
     assert symmetry._held_out_gain(empty, ACROSS) == math.inf
 
 
-def test_the_same_pixels_are_judged_with_reflections_and_without(monkeypatch):
-    """The hull with reflections about a wrong plane is smaller, and other pixels would be drawn within it."""
-    views, drawn, found = balls(cameras(12), BODY), [], Views.rays_at
-
-    def rays_at(self, pixels, **options):
-        drawn.append(pixels)
-        return found(self, pixels, **options)
-
-    monkeypatch.setattr(Views, "rays_at", rays_at)
-    for each in (None, ALONG):
-        symmetry._held_out_error(views, [1, 5], each)
-    assert torch.equal(*drawn)
+def test_a_fold_is_judged_by_rays_of_the_views_that_it_holds_out():
+    views = balls(cameras(12), BODY)
+    fold = symmetry.Fold.of(views, [1, 5])
+    distances = torch.cdist(fold.rays.origins, centres(views.cameras))
+    assert set(distances.argmin(1).tolist()) == {1, 5}
+    assert float(distances.amin(1).max()) < 1e-4
+    torch.testing.assert_close(centres(fold.shown.cameras), centres(views[[0, 2, 3, 4, *range(6, 12)]].cameras))
 
 
 def test_two_threads_find_what_one_does():

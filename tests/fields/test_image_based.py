@@ -120,7 +120,7 @@ def test_turning_and_moving_the_world_changes_only_what_reads_world_coordinates(
     cameras = type(views.cameras)(views.cameras.intrinsics, pose, views.cameras.height, views.cameras.width)
     shown = target.planes_of(views, occupancy)
     moved = VisibilityPlanes(views.images, cameras, views.masks, occupancy)
-    moved.depth_opacity = shown.depth_opacity  # the hull is turned with the world: depths are the same
+    moved._maps = shown._maps  # the hull is turned with the world: depths are the same
     expected = target.bind(parameters, shown)(points, directions)
     found = target.bind(parameters, moved)(points @ turn.T, directions @ turn.T)
     for one, other in zip(found, expected, strict=True):

@@ -11,6 +11,7 @@ from torch.autograd import forward_ad, gradgradcheck
 from hyperplanes.geometry import ImagePlanes, Sphere, cameras, carve, cast, sample
 from hyperplanes.geometry.kernels import operators
 from hyperplanes.geometry.lookup import lookup
+from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.packed_images import pack
 from hyperplanes.geometry.rays import pixel_grid
 
@@ -59,6 +60,11 @@ WRONG = [
     (lambda p, m, i: carve(i, rig(), Sphere()), r"masks: expected shape \(3, 1, 6, 7\)"),
     (lambda p, m, i: carve(i[:, :1], rig(), Sphere(), 0), "side: expected 1 to 1024 voxels, got 0"),
     (lambda p, m, i: carve(i[:, :1], rig(), Sphere(), 10**6), "side: expected 1 to 1024 voxels"),
+    (
+        lambda p, m, i: carve(i[:, :1], rig(), Sphere(), 8, within=full(Sphere(), 9)),
+        "within: expected 8 voxels an axis in .*radius=1.0.* on cpu, got 9 in ",
+    ),
+    (lambda p, m, i: carve(i[:, :1], rig(), Sphere(), 8, within=full(Sphere(radius=2.0), 8)), "within: .*radius=2.0"),
     (lambda p, m, i: cast(rig(), torch.zeros(2, dtype=torch.long), torch.zeros(3, 2)), "view, pixels: expected"),
     (lambda p, m, i: cast(rig(), torch.tensor([3]), p[:1, :2]), "view: expected indices of 3 cameras, got 3 to 3"),
     (lambda p, m, i: Sphere(radius=-1.0), "sphere: expected finite numbers and no negative radius"),

@@ -135,6 +135,20 @@ def test_the_hull_does_not_depend_on_the_order_of_views():
     assert torch.equal(turned.occupied, carve(masks, ours, Sphere(), 16).occupied)
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_views_can_be_carved_one_after_the_other(compiled, monkeypatch):
+    ours = cameras.pinhole(cameras.symmetric_intrinsics(20, 20, 0.9), cameras.fibonacci_sphere(8, 2.7), 20, 20)
+    masks = pictures(box(0.4), ours, 20)
+    if not compiled:
+        monkeypatch.setattr("hyperplanes.geometry.occupancy.find_spec", lambda name: None)
+    first = carve(masks[:3], cameras.select(ours, [0, 1, 2]), Sphere(), 18)
+    before = first.occupied.clone()
+    both = carve(masks[3:], cameras.select(ours, [3, 4, 5, 6, 7]), Sphere(), 18, within=first)
+    assert torch.equal(both.occupied, carve(masks, ours, Sphere(), 18).occupied)
+    assert both.occupied.sum() < before.sum()
+    assert torch.equal(first.occupied, before)
+
+
 def test_no_view_keeps_everything_and_empty_masks_what_no_camera_sees():
     ours = cameras.pinhole(cameras.symmetric_intrinsics(20, 20, 0.3), cameras.orbit(2, 2.7), 20, 20)
     assert carve(torch.zeros(0, 1, 20, 20), cameras.select(ours, []), Sphere(), 8).occupied.all()

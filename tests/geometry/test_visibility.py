@@ -227,6 +227,26 @@ def test_a_point_on_a_ball_is_seen_from_its_side_and_lies_behind_it_from_the_oth
     assert found.penalty[0].tolist() == sorted(found.penalty[0].tolist())
 
 
+def test_depths_of_the_hull_are_computed_once_for_all_copies_and_not_where_opacities_are_enough(monkeypatch):
+    computed = []
+
+    def counted(*given):
+        computed.append(given)
+        return first_hits(*given)
+
+    monkeypatch.setattr(module, "first_hits", counted)
+    shown = planes()
+    points, directions = queries(50)
+    coverage = shown.choose(points, best=0).coverage
+    by_surface = shown.with_surface(ball(side=32))
+    by_surface.choose(points, directions, best=0, nearest=2)
+    assert len(computed) == 1  # of the surface
+    copies = [shown.with_penalties(Penalties.alike()), shown.with_handicaps(torch.zeros(len(shown))), by_surface]
+    for each in (shown, *copies):
+        torch.testing.assert_close(each.choose(points, best=2).coverage, coverage)
+    assert len(computed) == 2
+
+
 def test_without_masks_every_picture_counts_as_opaque():
     views = ball_views(ring(3, SIZE), masks=False)
     shown = VisibilityPlanes(views.images, views.cameras, None, full(Sphere(), 4))

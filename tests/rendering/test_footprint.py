@@ -85,6 +85,21 @@ def test_everything_occupied_is_seen_where_the_cube_is():
     assert footprint(full(Sphere(), 8), camera).all()
 
 
+@pytest.mark.parametrize("which", CAMERAS)
+def test_the_kernel_finds_what_pytorch_does(which, monkeypatch):
+    grid = blobs(12, 0.02, OFF_CENTRE)
+    found = footprint(grid, CAMERAS[which])
+    monkeypatch.setattr("hyperplanes.rendering.footprint.find_spec", lambda name: None)
+    assert torch.equal(found, footprint(grid, CAMERAS[which]))
+
+
+def test_a_camera_without_a_pose_sees_nothing():
+    """Its pixels would be written anywhere."""
+    camera = CAMERAS["ring"]
+    lost = type(camera)(camera.intrinsics, torch.full_like(camera.extrinsics, math.nan), camera.height, camera.width)
+    assert not footprint(blobs(12, 0.02, Sphere()), lost).any()
+
+
 def test_cameras_in_double_precision():
     grid, cameras = blobs(4, 0.3, Sphere()), ring(1)
     assert torch.equal(footprint(grid, cameras), footprint(grid, to(cameras, dtype=torch.float64)))

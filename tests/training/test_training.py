@@ -652,7 +652,7 @@ def test_memory_is_bounded_in_bytes():
 
 def test_the_papers_protocol_carves_no_hull_unless_empty_space_is_asked_for(monkeypatch):
     carved = []
-    monkeypatch.setattr(base, "carve", lambda *given: carved.append(given) or occupancy.carve(*given))
+    monkeypatch.setattr(base, "carve", lambda *given, **more: carved.append(given) or occupancy.carve(*given, **more))
     dense = {"coarse_network": True, "sampling": Hierarchical(4, 4)}
     trainer = Trainer(small_model(**dense), Balls(), FAST)
     trainer.take_step()

@@ -16,6 +16,7 @@ RENDERING = {
     "hull_hits.hull_hits": "",
     "marching.march": "",
     "first_hits.first_hits": "",
+    "footprints.footprints": "",
 }
 """Names of kernels, and what they take as points; those of layers are the processor's."""
 

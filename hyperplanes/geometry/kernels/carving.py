@@ -69,6 +69,8 @@ def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius
 def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, votes, occupied, start, stop):
     """Clears the voxels in layers start..stop of `occupied` that `occupancy.carve` describes as ruled out.
 
+    Voxels that are clear from the start are not looked at.
+
     `tables` (view, row + 1, column + 1) count the set pixels above and left; `corner` is where voxel (0, 0, 0) starts;
     `votes` so many views have to rule a voxel out.
     """
@@ -80,8 +82,13 @@ def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, votes, o
             for begin in range(0, occupied.shape[2], LANES):
                 count = min(LANES, occupied.shape[2] - begin)
                 bottom = corner[2] + corner.dtype.type(begin) * voxel
+                given = 0
                 for k in range(LANES):
-                    alive[k] = votes if k < count else 0
+                    left = occupied[i, j, begin + k] if k < count else 0
+                    alive[k] = votes if left else 0
+                    given += left
+                if given == 0:
+                    continue
                 for turn in range(planes):  # the view that ruled out the last voxels often rules out their neighbours
                     view = last + turn if last + turn < planes else last + turn - planes
                     m, c = matrices[view], calibrations[view]

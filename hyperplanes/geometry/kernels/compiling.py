@@ -60,6 +60,7 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
     "first_hits.first_hits": (
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T, uint8[:, :, ::1], T[::1], int64, int64"
     ),
+    "footprints.footprints": "T[:, ::1], T[:, :, ::1], T[:, :, ::1], T, T, boolean[:, :, ::1], int64, int64",
     "layers.layers": "T[:, :], T[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
     "layers_bfloat16.layers": "T[:, :], int32[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
     "layers_amx_bfloat16.layers": "T[:, :], int16[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
