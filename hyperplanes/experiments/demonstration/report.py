@@ -115,6 +115,7 @@ def compile_kernels(device: torch.device) -> None:
     """Have everything compiled and loaded that the packaged model renders with, by one small view of an example."""
     example = read_task(EXAMPLES / "example-car")
     model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(device)
+    model.config = replace(model.config, symmetric=False)  # looking for a symmetry takes longer and compiles no more
     few = example.support[:FEWEST].resized(32)  # as many as have it stack
     model.adapt(few).render(resized(example.query[:1].cameras, 32, 32))
 

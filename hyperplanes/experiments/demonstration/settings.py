@@ -194,7 +194,7 @@ class DemoSettings:
             tuned_objects=1,
             first=("car", "lamp"),
             first_resolution=24,
-            first_counts=(3, 8),
+            first_counts=(2, 3),
             tiny=True,
         )
 
