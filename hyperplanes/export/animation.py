@@ -78,7 +78,7 @@ def choose_representation(
     """
     if not isinstance(field, AdaptedField) or representation == "field":
         return field
-    side = default_side(max(views.size, camera.image_size(cameras), key=max))
+    side = default_side(views.size)  # pictures may be larger: what the views show is not, and dots would be seen
     if representation == "auto":
         on_cpu = field.occupancy.occupied.device.type == "cpu"
         if not (on_cpu and draws_by_voxels(len(views), cameras, side)):
