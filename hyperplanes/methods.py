@@ -344,7 +344,7 @@ class WithSampler:
         made = self.adapter.adapt(support)
         if self.sampling is None or not isinstance(made, AdaptedField):
             return made
-        return replace(made, sampling=self.sampling)
+        return made.with_sampling(self.sampling)
 
 
 @dataclass(frozen=True)

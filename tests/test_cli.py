@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -23,10 +24,10 @@ from rendered_here import rendered_here
 from small_demo import demo_folder, demo_preset, first_object
 
 from data_gen.rendering.renderers import RendererError
-from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation import HullBlend, HyperPlanes
 from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
 from hyperplanes.cli import main
-from hyperplanes.commands import find_verbs
+from hyperplanes.commands import adapt, find_verbs
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.configuration.fine_tuning import FineTuning
@@ -426,6 +427,33 @@ def test_steps_chosen_on_left_out_views_are_reported(tmp_path, monkeypatch, caps
     assert len(re.findall(adapted, capsys.readouterr().out)) == 2  # kept where the first one took long
 
 
+def test_a_stage_of_capture_that_returns_has_a_bar_that_is_open(tmp_path, monkeypatch):
+    opened, shown = [], []
+
+    @contextmanager
+    def bar(self, title):
+        opened.append(title)
+        yield SimpleNamespace(show=lambda *_, **__: shown.append((title, opened[-1])))
+        opened.append("closed")
+
+    def capture(photographs, out, settings, progress):
+        for stage in ("features", "features", "poses", "features"):
+            progress(stage, 0, 1, "")
+        raise ValueError("seen enough")
+
+    monkeypatch.setattr(Console, "bar", bar)
+    monkeypatch.setattr("hyperplanes.capture.capture", capture)
+    assert main(["capture", str(tmp_path), "--out", str(tmp_path / "scene")]) == 2
+    assert shown == [(stage, stage) for stage in ("features", "features", "poses", "features")]
+
+
+def test_a_turntable_of_no_frames_is_refused_before_anything_is_made(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["export", "--checkpoint", "small", "--views", "example-car", "--out", str(out), "--frames", "0"]) == 2
+    assert "--frames" in complaint(capsys)
+    assert not out.exists()
+
+
 def test_psnr_over_fine_tuning_steps_is_a_table_and_a_chart(tmp_path, capsys):
     demo, chart = demo_folder(), tmp_path / "curve.svg"
     command = ["evaluate", "--data", str(demo / "data"), "--checkpoint", str(demo), "--curve", str(chart)]
@@ -438,6 +466,31 @@ def test_psnr_over_fine_tuning_steps_is_a_table_and_a_chart(tmp_path, capsys):
     assert {"nearest_view", "hyperplanes", "scratch", "fine-tuning steps", "PSNR (dB)"} <= set(texts)
     assert main([*command, *methods, "3"]) == 2
     assert "at least two numbers of --steps" in complaint(capsys)
+
+
+def test_a_method_that_fails_on_every_object_is_left_out_of_the_chart(tmp_path, monkeypatch, capsys):
+    def fails(self, support):
+        raise ValueError("support: no masks")
+
+    monkeypatch.setattr(HullBlend, "adapt", fails)
+    chart, methods = tmp_path / "curve.svg", ["--method", "nearest_view", "hull_blend", "--steps", "0", "1"]
+    command = ["evaluate", "--data", str(demo_folder() / "data"), "--objects", "2", "--curve", str(chart), *methods]
+    assert main(command) == 1
+    assert "hull_blend" in capsys.readouterr().err
+    assert "nearest_view" in chart.read_text()
+    assert "hull_blend" not in chart.read_text()
+
+
+@pytest.mark.parametrize("given", [[], ["--all-views"], ["--learn-background"], ["--refine-poses"]])
+def test_adapt_names_the_command_that_shows_its_weights_the_same_views(given, tmp_path, monkeypatch, capsys):
+    scene, small = str(first_object(demo_folder())), HyperPlanes.from_pretrained(demo_folder() / "hyperplanes")
+    task, _ = read_scene(Path(scene), Console(silent=True))
+    monkeypatch.setattr(adapt, "read_object", lambda *_: (task, "y"))
+    monkeypatch.setattr(adapt, "load_adaptable", lambda *_, **__: small)
+    assert main(["adapt", "--views", scene, "--checkpoint", "small", "--out", str(tmp_path / "out"), *given]) == 0
+    proposed = capsys.readouterr().out.splitlines()[-1]
+    assert all(option in proposed for option in given)
+    assert proposed.count("--") == 3 + len(given)
 
 
 def test_seeds_of_trainings_and_of_gradient_steps_in_every_kind_of_file(tmp_path, capsys):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -88,6 +88,14 @@ class AdaptedField:
         poses = camera.look_at(eyes + torch.tensor(bounds.centre), bounds.centre)
         cameras = camera.pinhole(camera.symmetric_intrinsics(96, 96, 0.8), poses, 96, 96)
         return show_views(repr(self), self.render(cameras).images, cameras, bounds)
+
+    def with_sampling(self, sampling: Sampler) -> Self:
+        """The same field, rendered by another sampler.
+
+        Args:
+            sampling: the sampler.
+        """
+        return replace(self, sampling=sampling)
 
     @property
     def dtype(self) -> torch.dtype:

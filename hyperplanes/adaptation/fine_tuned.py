@@ -66,7 +66,7 @@ class FromScratch:
         fresh = random_model(replace(self.model.config, symmetric=False, symmetry=symmetry), self.settings.seed)
         fresh.rig.copy_(self.model.rig)
         settings = _rated(self.settings, fresh)
-        return fresh.to(self.model.rig.device).fine_tune(support, self.steps, settings, on_step=on_step)
+        return fresh.to(self.model.rig).fine_tune(support, self.steps, settings, on_step=on_step)
 
 
 @dataclass(frozen=True)

@@ -84,10 +84,7 @@ def fine_tune(
             on_step(0)
         return one_step(network, support)
     if steps != "auto":
-        placed = to_canonical_frame(network, support)
-        context = placed.context(network)
-        views = _trained_on(context, placed.views)
-        return placed.in_scene(fine_tune_to(network, context, steps, settings, views=views, on_step=on_step))
+        return _fine_tune_in_frame(network, support, steps, settings, None, on_step)
 
     # how many steps show some of the views best that the others were fine-tuned without, from as many random weights
     settings = settings.for_views(len(support), network.target.permutation_invariant)
@@ -95,17 +92,33 @@ def fine_tune(
     placed = to_canonical_frame(network, shown)
     holdout = placed.rotation.views(holdout)
     context = placed.context(network)
-    trial, _ = make_descent(network, context, settings, _trained_on(context, placed.views))
+    trial, _ = make_descent(network, context, settings, trained_on(context, placed.views))
     pixels = network.live_pixels_of(context, holdout)
     with torch.no_grad():
         unchanged = network.field(context, network.adapted_weights(context))
     stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
+    return _fine_tune_in_frame(network, support, stop, settings, settings.max_steps, on_step)
+
+
+def _fine_tune_in_frame(
+    network: HyperPlanesNetwork,
+    support: Views,
+    steps: int,
+    settings: FineTuning,
+    schedule: int | None,
+    on_step: Callable[[int], None] | None,
+) -> AdaptedField:
+    """As `fine_tune_to`, of an object that is rotated into its canonical frame for that."""
     placed = to_canonical_frame(network, support)
     context = placed.context(network)
-    views, schedule = _trained_on(context, placed.views), settings.max_steps
-    tuned = fine_tune_to(network, context, stop, settings, views=views, schedule=schedule, on_step=on_step)
+    views = trained_on(context, placed.views)
+    try:
+        tuned = fine_tune_to(network, context, steps, settings, views=views, schedule=schedule, on_step=on_step)
+    except NoProgressError as error:
+        error.field = None if error.field is None else placed.in_scene(error.field)
+        raise
     return placed.in_scene(tuned)
 
 
@@ -122,11 +135,15 @@ def one_step(network: HyperPlanesNetwork, support: Views) -> AdaptedField:
     return placed.in_scene(stacked_field(network, context, network.adapted_weights(context)))
 
 
-def _trained_on(context: SupportContext, support: Views) -> Views:
+def trained_on(context: SupportContext, support: Views) -> Views:
     """Where rays come from: the support views, in their order, or a few and their reflections about one plane.
 
     Rays of reflections about several planes show 0.3 dB less (17 lamps from 3 and 5 views, 100 steps). Many views show
     an object well enough, and what is not quite symmetric would be learned wrongly (docs/image-based.md).
+
+    Args:
+        context: of the object.
+        support: the views, without reflections.
     """
     few = context.symmetry is not None and len(support) <= MOST_REFLECTED
     return context.views[: 2 * len(support)] if few else support

@@ -101,7 +101,8 @@ class HyperPlanes(HyperPlanesNetwork):
         Returns:
             The field. Steps that cannot be taken are a ValueError: those of a hypernetwork that the model has not, a
             negative number, "auto" with fewer than 3 views, or a single view of a field that takes any number of them,
-            unless `settings.mask_views` is off.
+            unless `settings.mask_views` is off. So are steps that lower nothing (`NoProgressError`, which holds the
+            field that they ended at).
         """
         return fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
 
@@ -140,7 +141,7 @@ class HyperPlanes(HyperPlanesNetwork):
                 network.load_state_dict(network.parameters_of(found[name]))
             except RuntimeError as error:
                 raise ValueError(f"adapted: expected a field of this model, got {adapted!r}") from error
-        return result.eval()
+        return result.to(self.rig).eval()
 
     @checked
     def save(self, folder: Path | str, dtype: torch.dtype | None = None) -> None:

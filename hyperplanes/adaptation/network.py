@@ -45,7 +45,7 @@ class HyperPlanesNetwork(nn.Module):
         make = check_model(config)
         self.config = config
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)  # `torch.manual_seed` would seed GPUs, too
             self.targets: dict[str, Target] = {"fine": make(config.network)}
             if config.coarse_network:
                 self.targets["coarse"] = make(config.network)

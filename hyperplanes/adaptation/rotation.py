@@ -88,6 +88,10 @@ class RotatedField(AdaptedField):
     def __repr__(self) -> str:
         return f"RotatedField({self.unrotated!r}, {self.rotation.angle:.2f} radians)"
 
+    def with_sampling(self, sampling: Sampler) -> RotatedField:
+        """As `AdaptedField.with_sampling`."""
+        return replace(self, sampling=sampling, unrotated=self.unrotated.with_sampling(sampling))
+
     @property
     def _back(self) -> Float[Tensor, "4 4"]:
         return self.rotation.inverse.about(self.occupancy.bounds)

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +117,7 @@ def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[
         The photographs that can be read, and a sentence about each one that cannot.
     """
     found, notes = [], []
-    names = Counter[str]()
+    names = set[str]()
     given = match_masks(masks, paths) if masks is not None else None
     for index, path in enumerate(paths):
         try:
@@ -126,8 +127,8 @@ def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[
             notes.append(f"left out: {error}")
             continue
         name = re.sub(r"[^A-Za-z0-9._-]+", "_", path.stem).lstrip(".") or "photograph"
-        names[name] += 1
-        name = name if names[name] == 1 else f"{name}_{names[name]}"
+        name = next(each for each in chain([name], (f"{name}_{n}" for n in count(2))) if each not in names)
+        names.add(name)
         longer, shorter = max(header.size), min(header.size)
         camera = " ".join(
             str(part).strip() for part in (tags.get(_MAKE, ""), tags.get(_MODEL, ""), tags.get(_FOCAL, ""))

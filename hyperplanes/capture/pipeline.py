@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -25,7 +26,7 @@ from hyperplanes.capture.placement import Placement, find_up, object_points, obj
 from hyperplanes.capture.scene import Captured, straightened, write_scene
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages, fingerprint
-from hyperplanes.capture.structure_from_motion import ATTEMPTS, Picture, find_poses
+from hyperplanes.capture.structure_from_motion import ATTEMPTS, EXHAUSTIVE, Picture, Progress, find_poses
 from hyperplanes.capture.video import VIDEO_SUFFIXES, take_frames
 from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import Pixels, read_image
@@ -36,9 +37,6 @@ from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["Captured", "Progress", "Settings", "capture"]
-
-Progress = Callable[[str, int, int, str], None]
-"""Called with what is done, how far, of how much, and a few words."""
 
 WORK = "capture"
 """The folder within the scene that holds what the stages made."""
@@ -209,7 +207,7 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
 def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
     """The largest model; other features are tried while it holds few of the pictures."""
     order = work.settings.order
-    sequential = order == "sequence" or (order == "auto" and is_video)
+    sequential = order == "sequence" or (order == "auto" and (is_video or len(pictures) > EXHAUSTIVE))
     how = [asdict(features) for features in ATTEMPTS]
     key = fingerprint([asdict(picture) for picture in pictures], sequential, work.stages.key("pictures"), how)
     folder = work.stages.folder / "poses"
@@ -243,8 +241,10 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
     if len(best) < ENOUGH * len(pictures):
         work.notes.append(f"few photographs could be posed; for the next time: {ADVICE}")
     best.save(folder / "model.npz")
-    for used in folder.glob("*.db*"):
-        used.unlink() if used.is_file() else None
+    for database in folder.glob("*.db*"):
+        database.unlink()
+    for models in folder.glob("*.models"):
+        shutil.rmtree(models)
     work.stages.finish("poses", key, {"count": len(best), "error": best.reprojection_error})
     return best
 

@@ -61,7 +61,7 @@ class Features:
     long again.
 
     Attributes:
-        name: of the attempt, for file names and messages.
+        name: of the attempt, for messages.
         count: in a picture, at most.
         peak: contrast that a feature must have, relative to COLMAP's default.
         pooled: whether descriptors are pooled over several sizes of a feature.
@@ -116,7 +116,7 @@ def find_poses(
     with _quiet(pycolmap):
         pycolmap.set_random_seed(seed)
         _extract(pycolmap, pictures, folder, database, features, progress)
-        _match(pycolmap, pictures, database, sequential or len(pictures) > EXHAUSTIVE, progress)
+        _match(pycolmap, pictures, database, sequential, progress)
         found = _map(pycolmap, len(pictures), folder, database, progress, seed)
     if not found:
         return None

@@ -42,7 +42,7 @@ def run(arguments: Arguments) -> int:
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "adapt")
     refuse_checkpoint(arguments.out, arguments.checkpoint)
-    model = load_adaptable(arguments.checkpoint, device, reflections=arguments.reflections)
+    model = load_adaptable(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     task, up = read_object(arguments, model, console)
     settings = FineTuning(trainable=arguments.fine_tune)
     field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)
@@ -50,6 +50,8 @@ def run(arguments: Arguments) -> int:
     model.with_weights_of(field).save(arguments.out)
     more = "" if up == "y" else f" --up={up}"
     more += " --all-views" if arguments.all_views else ""
+    more += " --learn-background" if arguments.learn_background else ""
+    more += " --refine-poses" if arguments.refine_poses else ""
     more += "" if arguments.downscale is None else f" --downscale {arguments.downscale}"
     console.say(f"{arguments.out}: the weights of {task.name}")
     console.say(

@@ -76,7 +76,7 @@ def run(arguments: Arguments) -> int:
         coarsening(arguments.voxels)
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "bake")
-    model = load_adaptable(arguments.checkpoint, device, reflections=arguments.reflections)
+    model = load_adaptable(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     task, _ = read_object(arguments, model, console)
     shown, query = task.support.to(device), task.query
     field, _ = adapt_to(model, shown, task.name, console, steps=arguments.steps)

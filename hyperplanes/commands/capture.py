@@ -64,13 +64,14 @@ def run(arguments: Arguments) -> int:
     console, started = Console(), time.perf_counter()
     settings = Settings(arguments.size, arguments.mask, arguments.frames, arguments.order)
     with ExitStack() as stack:
-        shown: dict[str, Bar] = {}
+        shown: tuple[str, Bar] | None = None
 
         def progress(stage: str, done: int, total: int, text: str) -> None:
-            if stage not in shown:
+            nonlocal shown
+            if shown is None or shown[0] != stage:  # stages return where photographs are tried again
                 stack.close()
-                shown[stage] = stack.enter_context(console.bar(stage))
-            shown[stage].show(done, total, text, important=done == 0)
+                shown = stage, stack.enter_context(console.bar(stage))
+            shown[1].show(done, total, text, important=done == 0)
 
         captured = capture(arguments.photographs, arguments.out, settings, progress)
     for note in captured.notes:

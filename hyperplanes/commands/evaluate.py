@@ -263,9 +263,14 @@ def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Compar
         # a method that takes no steps is a level
         quality = {score.method: score.mean("psnr") for score in scores}
         curves = {
-            method: [(float(count), quality[name]) for count in arguments.steps for name in at_steps(method, [count])]
+            method: [
+                (float(count), quality[name])
+                for count in arguments.steps
+                for name in at_steps(method, [count])
+                if name in quality  # it failed on every object
+            ]
             for method in arguments.method
         }
-        figures.save_curves(curves, arguments.steps, arguments.curve)
+        figures.save_curves({name: curve for name, curve in curves.items() if curve}, arguments.steps, arguments.curve)
     if arguments.boxes is not None:
         figures.save_boxes(scores, arguments.boxes)

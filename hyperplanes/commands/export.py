@@ -45,7 +45,7 @@ class Arguments(ObjectArguments):
         voxels: Along each side of the grid that the mesh is cut from.
         level: Density at the surface, and nothing else; when not given the one whose silhouettes and depth agree best
             with the rendered ones, and what no shown camera sees into is filled.
-        page_voxels: Along each side of the grid that the page shows and splats are made of; 1.3 a pixel of the images,
+        page_voxels: Along each side of the grid that the page shows and splats are made of; 1.4 a pixel of the images,
             and at most 256, when not given.
         fit: Gradient steps that fit these voxels to the shown views, and twice as many for splats; 0 keeps what the
             field shows.
@@ -58,7 +58,7 @@ class Arguments(ObjectArguments):
         "turntable",
         "mesh",
     )
-    frames: int = 48
+    frames: Annotated[int, range(1, 100_000)] = 48
     size: OptionalInt = None
     turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
     mesh_format: Literal["ply", "glb", "obj"] = "glb"
@@ -101,7 +101,7 @@ def run(arguments: Arguments) -> int:
         with prefix_errors("--page-voxels"):
             coarsening(arguments.page_voxels)
     console, device, out = Console(), choose_device(arguments.device), arguments.out
-    source = load_source(arguments.checkpoint, device, reflections=arguments.reflections)
+    source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     task, _ = read_object(arguments, source, console)
     refuse_sources(out / "images", arguments.views, task.query.names)
     shown, query = task.support.to(device), task.query.to(device)

@@ -65,7 +65,7 @@ class ObjectArguments:
             background together, and take what the object covers as masks.
         refine_poses: Refine the poses of all views first, and keep them where support views that the model is not given
             are shown better by half a decibel: for poses that are a little wrong.
-        reflections: Show the model the views of an object that looks symmetric together with their reflections.
+        no_reflections: Do not show the model the mirror images of the views of an object that looks symmetric.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held. Meshes, turntables and baked files have y up.
         downscale: Reduce the images by this factor, averaging pixels. When not given, images of more than a megapixel
@@ -80,7 +80,7 @@ class ObjectArguments:
     all_views: bool = False
     learn_background: bool = False
     refine_poses: bool = False
-    reflections: bool = True
+    no_reflections: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
     device: str = "auto"

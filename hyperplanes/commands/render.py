@@ -114,7 +114,7 @@ def run(arguments: Arguments) -> int:
 
     _check(arguments)
     console, device = Console(), choose_device(arguments.device)
-    source = load_source(arguments.checkpoint, device, reflections=arguments.reflections)
+    source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     task, up = read_object(arguments, source, console)
     refuse_sources(arguments.out, arguments.views, task.query.names)
     shown, known = task.support.to(device), task.query.to(device)

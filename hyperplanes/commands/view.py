@@ -58,7 +58,7 @@ class Arguments:
             background together, and take what the object covers as masks.
         refine_poses: Refine the poses of the views first, and keep them where views that the model is not given are
             shown better by half a decibel: for poses that are a little wrong.
-        reflections: Show the model the views of an object that looks symmetric together with their reflections.
+        no_reflections: Do not show the model the mirror images of the views of an object that looks symmetric.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
             0,0.1,1, or auto: as the cameras are held.
         downscale: Reduce the images by this factor, averaging pixels. When not given, images of more than a megapixel
@@ -74,7 +74,7 @@ class Arguments:
     port: Annotated[int, range(65_536)] = 8080
     learn_background: bool = False
     refine_poses: bool = False
-    reflections: bool = True
+    no_reflections: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
     device: str = "auto"
@@ -90,7 +90,7 @@ def run(arguments: Arguments) -> int:
         "ignore", "Queued a .* on a closed connection", UserWarning
     )  # viser's, of visitors who left
     console, device = Console(), choose_device(arguments.device)
-    source = load_source(arguments.checkpoint, device, reflections=arguments.reflections)
+    source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
     shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
@@ -147,20 +147,21 @@ def _adapt(
     import torch
 
     from hyperplanes.adaptation.canonical_frame import to_canonical_frame
-    from hyperplanes.adaptation.fine_tuning import make_descent
+    from hyperplanes.adaptation.fine_tuning import make_descent, trained_on
     from hyperplanes.adaptation.stacking import tuned_field
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene, default_side
+    from hyperplanes.parameters import Parameters
 
     console.say(f"adapting to {len(shown)} views")
     placed, steps = to_canonical_frame(model, shown), arguments.steps if len(shown) > 1 else 0
     context = placed.context(model)
-    descent, variables = make_descent(model, context, FineTuning())
+    descent, variables = make_descent(model, context, FineTuning(), trained_on(context, placed.views))
     field = None
     for done in descent.run(steps):
         if done % EVERY == 0 or done == steps:
             with torch.no_grad():
-                weights = variables.weights().detach()
+                weights = Parameters((name, value.clone()) for name, value in variables.weights().items())
             field = placed.in_scene(tuned_field(model, context, weights) if steps else model.adapt_to(context))
             viewer.show(field, f"{len(shown)} support views, {done} of {steps} fine-tuning steps")
         if not wanted.empty():

@@ -174,9 +174,9 @@ def coarsening(side: int) -> int:
 def default_side(size: tuple[int, int]) -> int:
     """Voxels an axis that suit views of (height, width) once they are fitted to them: 1.4 a pixel, and at most 256.
 
-    More show less of what lies between the rays of the views' pixels. Fitted to 25 views of 64x64, new views of a car, a
-    chair and a lamp have 33.0, 31.3 and 34.5 dB by 128 voxels an axis, 32.9, 31.9 and 34.7 by 96, and 31.5, 31.6 and
-    32.2 by 64.
+    More show less of what lies between the rays of the views' pixels. Fitted to 25 views of 64x64, new views of a
+    car, a chair and a lamp have 33.0, 31.3 and 34.5 dB by 128 voxels an axis, 32.9, 31.9 and 34.7 by 96, and 31.5,
+    31.6 and 32.2 by 64.
 
     >>> default_side((64, 64)), default_side((100, 80)), default_side((400, 400))
     (96, 128, 256)

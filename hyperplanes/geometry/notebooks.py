@@ -51,7 +51,8 @@ def _picture(image: Float[Tensor, "channel height width"]) -> str:
 
 def _drawn(cameras: PinholeCamera, bounds: Sphere) -> str:
     """The cameras from above: a dot where each stands, a line along which it looks."""
-    eyes, along = (part.detach().float().cpu()[:, [0, 2]] for part in (camera.centres(cameras), _forward(cameras)))
+    parts = camera.centres(cameras), camera.viewing_directions(cameras)
+    eyes, along = (part.detach().float().cpu()[:, [0, 2]] for part in parts)
     middle = torch.tensor([bounds.centre[0], bounds.centre[2]])
     reach = max(bounds.radius, float((eyes - middle).norm(dim=1).max()) if len(eyes) else 0.0) * 1.15
     points = ((eyes - middle) / reach + 1) * SIDE / 2
@@ -63,8 +64,3 @@ def _drawn(cameras: PinholeCamera, bounds: Sphere) -> str:
     )
     sphere = f'<circle cx="{SIDE / 2}" cy="{SIDE / 2}" r="{bounds.radius / reach * SIDE / 2:.1f}" fill="#e0e0e0"/>'
     return f'<svg width="{SIDE}" height="{SIDE}" style="vertical-align:middle">{sphere}{lines}</svg>'
-
-
-def _forward(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
-    """The direction along which each camera looks, in the world."""
-    return camera.camera_from_world(cameras)[:, 2, :3]

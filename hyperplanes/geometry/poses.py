@@ -84,7 +84,7 @@ def orbit(views: Count, distance: float, elevation: float = math.radians(20.0)) 
         distance: from the origin, in world units.
         elevation: above the xz plane, in radians.
     """
-    azimuth = torch.arange(views) * (2 * math.pi / max(views, 1))
+    azimuth = torch.arange(views) * (2 * math.pi / views)
     flat = math.cos(elevation)
     up = torch.full_like(azimuth, math.sin(elevation))
     return look_at(distance * torch.stack([flat * azimuth.sin(), up, flat * azimuth.cos()], -1))
@@ -103,7 +103,7 @@ def fibonacci_sphere(views: Count, distance: float, lowest: float = -1.0, highes
     Returns:
         (view, 4, 4) poses in the order of a golden-angle spiral from `highest` to `lowest`.
     """
-    fraction = (torch.arange(views) + 0.5) / max(views, 1)
+    fraction = (torch.arange(views) + 0.5) / views
     height = highest + (lowest - highest) * fraction
     azimuth = torch.arange(views) * (math.pi * (3 - math.sqrt(5)))
     flat = (1 - height**2).clamp_min(0).sqrt()

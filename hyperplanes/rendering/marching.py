@@ -36,11 +36,19 @@ class RayMarching:
 
     Attributes:
         steps: samples along a diameter of the scene's sphere.
-        stop: transmittance below which a ray is finished (only where no gradient is wanted); 0 never stops.
+        stop: transmittance below which a ray is finished, in [0, 1); 0 never stops. With gradients too on a CPU, where
+            samples are random; on a GPU all samples have theirs.
+
+    Raises:
+        ValueError: a `stop` out of its range.
     """
 
     steps: Annotated[int, range(1, MOST_STEPS + 1)] = 96
     stop: float = 5e-3
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.stop < 1:
+            raise ValueError(f"stop: expected a transmittance from 0 to below 1, got {self.stop}")
 
     @property
     def near_far(self) -> str:

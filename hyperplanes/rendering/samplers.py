@@ -68,7 +68,10 @@ class Sampler(Protocol):
 
     @property
     def stop(self) -> float:
-        """Transmittance below which a ray of packed samples is finished, where no gradient is wanted; 0 never stops."""
+        """Transmittance below which a ray of packed samples is finished; 0 never stops.
+
+        With gradients rays end there on a CPU alone, where samples are random.
+        """
         ...
 
     def for_rendering(self, pixels: float) -> Sampler:

@@ -94,7 +94,7 @@ def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS, seed: int
     if not examples:
         raise ValueError("examples: expected at least one, got none")
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.default_generator.manual_seed(seed)  # `torch.manual_seed` would seed GPUs, too
         gate = GatingNetwork().requires_grad_()
     descent = torch.optim.Adam(gate.parameters(), RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(descent, steps)

@@ -10,7 +10,7 @@ import torch
 from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig, canonical_frame
 from hyperplanes.adaptation.canonical_frame import FEWEST, GAIN, MOST, find_rotation, to_canonical_frame
 from hyperplanes.adaptation.descent import Descent, split_holdout
-from hyperplanes.adaptation.fine_tuning import made_anyway
+from hyperplanes.adaptation.fine_tuning import NoProgressError, made_anyway
 from hyperplanes.adaptation.reflections import reflected
 from hyperplanes.adaptation.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.stacking import StackedField
@@ -23,9 +23,11 @@ from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.reflections import Plane, Symmetry
-from hyperplanes.rendering import RayMarching
+from hyperplanes.methods import WithSampler
+from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.rendering.scene import SplitField
 from hyperplanes.utilities.metrics import psnr
+from tests.adaptation.test_stacking import CONFIG
 from tests.adaptation.test_symmetry import ACROSS, BODY, SIZE, balls, cameras, model
 from tests.reference_rendering import ring
 
@@ -236,6 +238,40 @@ def test_views_that_auto_holds_out_are_rotated_with_the_others(monkeypatch):
     made_anyway(lambda: model(azimuth=ANGLE).fine_tune(views, "auto", settings))
     _, expected = split_holdout(Rotation(ANGLE).views(views), settings)
     torch.testing.assert_close(seen[0].cameras.extrinsics, expected.cameras.extrinsics)
+
+
+@pytest.mark.parametrize("angle", [0.0, ANGLE])
+def test_steps_that_lower_nothing_leave_a_field_in_the_frame_of_the_scene(angle, monkeypatch):
+    views, settings = balls(cameras(), BODY), FineTuning(rays=16)
+    expected = made_anyway(lambda: model(azimuth=angle).fine_tune(views, 1, settings))
+    monkeypatch.setattr(Descent, "errors", lambda self: (0.0, 0.0))
+    with pytest.raises(NoProgressError) as caught:
+        model(azimuth=angle).fine_tune(views, 1, settings)
+    found = caught.value.field
+    assert isinstance(found, RotatedField) == bool(angle)
+    torch.testing.assert_close(found.render(views.cameras).images, expected.render(views.cameras).images)
+
+
+@pytest.mark.parametrize("angle", [0.0, ANGLE])
+def test_a_protocol_is_that_of_a_rotated_field_too(angle):
+    views, sampler = balls(cameras(), BODY), Hierarchical(2, 2)
+    found = WithSampler(model(azimuth=angle, stacked=False), sampler).adapt(views).render(views.cameras)
+    height, width = SIZE
+    assert found.samples == len(views) * height * width * (2 + 4)
+
+
+def test_a_model_in_training_stays_in_training_and_learns_nothing_of_the_frame():
+    """Two threads at once, of which the first to end must not switch the other one back."""
+    adapter, before = HyperPlanes(replace(CONFIG, symmetric=True)).train(), torch.get_num_threads()
+    kept = {name: value.clone() for name, value in adapter.state_dict().items()}
+    torch.set_num_threads(2)
+    try:
+        for _ in range(3):
+            find_rotation(adapter, balls(cameras(), BODY), ACROSS)
+    finally:
+        torch.set_num_threads(before)
+    assert all(part.training for part in adapter.modules())
+    assert all(torch.equal(value, kept[name]) for name, value in adapter.state_dict().items())
 
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf])

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HullBlend, HyperPlanes
+from hyperplanes.adaptation.descent import Descent
 from hyperplanes.adaptation.gating import GatingNetwork, readings
 from hyperplanes.adaptation.held_out import FEWEST
 from hyperplanes.adaptation.stacking import StackedField, stack
@@ -108,6 +109,29 @@ def test_view_shows_the_pictures_that_render_writes(tmp_path):
     view._adapt(adapter, support, arguments, viewer, queue.SimpleQueue(), Console(silent=True))
     expected = adapter.fine_tune(support, 1).render(cameras).images
     torch.testing.assert_close(viewer.field.render(cameras).images, expected)
+
+
+def test_view_takes_rays_as_render_does_and_shows_fields_that_stay_as_they_are(tmp_path, monkeypatch):
+    class Viewer:
+        fields, pictures = [], []
+
+        def show(self, field, _):
+            self.fields.append(field)
+            self.pictures.append(field.render(cameras).images)
+
+    adapter, support, cameras, descents = HyperPlanes(CONFIG).eval(), ball_views(ring(8, (24, 24))), ring(1), []
+    adapter.config = replace(adapter.config, symmetry=Symmetry(Plane((1.0, 0.0, 0.0)), 2, (0.0, 0.0, 0.0)))
+    run = Descent.run
+    monkeypatch.setattr(Descent, "run", lambda self, steps: descents.append(self) or run(self, steps))
+    monkeypatch.setattr(view, "EVERY", 1)
+    arguments, viewer = view.Arguments(tmp_path, steps=2, fit=0), Viewer()
+    view._adapt(adapter, support, arguments, viewer, queue.SimpleQueue(), Console(silent=True))
+    adapter.fine_tune(support, 2)
+    assert len(descents[0].views) == len(descents[1].views)
+    assert len(viewer.fields) == 3
+    for field, picture in zip(viewer.fields, viewer.pictures, strict=True):
+        assert torch.equal(field.render(cameras).images, picture)
+    assert not torch.equal(*viewer.pictures[:2])
 
 
 def test_a_fitted_gate_takes_the_picture_that_is_right():

@@ -394,3 +394,11 @@ def test_planes_in_the_order_of_the_file_and_the_first_as_hyperplanes():
     assert model.prepare(views).hyperplanes.tolist() == [0, 1, 2]
     with pytest.raises(ValueError, match="order: expected one of 'matched', 'file', got 'random'"):
         ModelConfig(order="random")
+
+
+def test_a_new_model_leaves_the_generators_of_all_devices_alone(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", lambda seed: pytest.fail("seeds the GPUs"))
+    before = torch.random.get_rng_state()
+    one, other = HyperPlanes(ModelConfig()), HyperPlanes(ModelConfig())
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert all(torch.equal(value, other.state_dict()[name]) for name, value in one.state_dict().items())

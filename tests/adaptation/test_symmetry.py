@@ -477,6 +477,12 @@ def test_a_fold_is_judged_by_rays_of_the_views_that_it_holds_out():
     torch.testing.assert_close(centres(fold.shown.cameras), centres(views[[0, 2, 3, 4, *range(6, 12)]].cameras))
 
 
+def test_a_model_of_one_object_has_the_precision_of_the_model():
+    adapter = model().double()
+    assert next(adapter.with_weights_of(adapter.adapt(balls(cameras(), BODY))).parameters()).dtype == torch.float64
+    assert FromScratch(adapter, 0).adapt(balls(cameras(), BODY)).dtype == torch.float64
+
+
 def test_two_threads_find_what_one_does():
     views, found = balls(cameras(10), BODY), []
     before = torch.get_num_threads()

@@ -25,6 +25,39 @@ class Model:
 
 
 @pytest.mark.parametrize(
+    ("order", "is_video", "count", "sequential"),
+    [
+        ("auto", False, 80, False),
+        ("auto", False, 81, True),
+        ("auto", True, 20, True),
+        ("any", True, 200, False),
+        ("sequence", False, 20, True),
+    ],
+)
+def test_all_pairs_are_matched_where_they_are_asked_for_or_few(
+    order, is_video, count, sequential, tmp_path, monkeypatch
+):
+    asked = []
+    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **how: asked.append(how["sequential"]) or Model(count))
+    work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(order=order), progress=print, notes=[])
+    pipeline._poses([Picture(f"{index}.jpg", 0, (3, 4)) for index in range(count)], is_video, work)
+    assert asked == [sequential]
+
+
+def test_nothing_of_colmap_stays_behind(tmp_path, monkeypatch):
+    def find_poses(pictures, folder, database, **how):
+        database.touch()
+        database.with_suffix(".db-wal").touch()
+        (database.with_suffix(".models") / "0").mkdir(parents=True)
+        return Model(len(pictures))
+
+    monkeypatch.setattr(pipeline, "find_poses", find_poses)
+    work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(), progress=print, notes=[])
+    pipeline._poses([Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)], False, work)
+    assert [path.name for path in sorted((tmp_path / "poses").iterdir())] == ["model.npz"]
+
+
+@pytest.mark.parametrize(
     ("found", "kept", "advised"),
     [([19], 19, False), ([18, 16], 18, False), ([9, 20], 20, False), ([None, 8, 7], 8, True)],
 )

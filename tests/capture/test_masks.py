@@ -55,8 +55,9 @@ def test_any_command_can_make_masks(tmp_path):
     )
     picture = np.zeros((20, 30, 3), np.uint8)
     picture[5:15, 10:20] = 200
-    opacity = Command(f"{sys.executable} {script} {{image}} {{mask}}")(picture)
-    np.testing.assert_array_equal(opacity, (picture[..., 0] > 100).astype(float))
+    for more in ("", " {0} {print}"):  # braces of its own
+        opacity = Command(f"{sys.executable} {script} {{image}} {{mask}}{more}")(picture)
+        np.testing.assert_array_equal(opacity, (picture[..., 0] > 100).astype(float))
 
 
 def test_a_command_that_fails_says_what_it_said():

@@ -45,6 +45,13 @@ def test_photographs_are_read_upright(upright, tmp_path, orientation):
     np.testing.assert_array_equal(picture[..., :3], upright)
 
 
+def test_photographs_of_one_name_get_names_that_no_other_has(upright, tmp_path):
+    for name in ("a.jpg", "a.png", "a_2.jpg"):
+        save(upright, tmp_path / name)
+    photographs, _ = list_photographs(find_photographs(tmp_path))
+    assert len({each.name for each in photographs}) == 3
+
+
 def test_the_rarer_shape_lies_on_its_side_and_knows_where_up_is(upright, tmp_path):
     for index in range(3):
         save(upright, tmp_path / f"{index}.png")

@@ -30,7 +30,8 @@ VOXELS = BakedField(torch.full((4, 4, 4), -1, dtype=torch.int32), torch.zeros(0,
 def test_voxels_draw_long_animations_of_many_views(frames, side, shown, representation, by_voxels):
     lens = camera.symmetric_intrinsics(side, side, 0.8)
     cameras = camera.pinhole(lens, torch.eye(4).expand(frames, 4, 4), side, side)
-    views = Views(torch.ones(shown, 3, 8, 8), camera.pinhole(lens, torch.eye(4).expand(shown, 4, 4), 8, 8))
+    poses = torch.eye(4).expand(shown, 4, 4)
+    views = Views(torch.ones(1, 3, side, side).expand(shown, -1, -1, -1), camera.pinhole(lens, poses, side, side))
     found = choose_representation(FIELD, views, cameras, representation, make=lambda *_: VOXELS)
     assert isinstance(found, BakedScene) == by_voxels
     assert choose_representation(found, views, cameras, representation) is found or not by_voxels

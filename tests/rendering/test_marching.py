@@ -19,6 +19,12 @@ def random_grid(bounds, side=6, share=0.3, seed=0):
     return Occupancy(torch.rand(side, side, side, generator=torch.Generator().manual_seed(seed)) < share, bounds)
 
 
+@pytest.mark.parametrize("stop", [-0.1, 1.0, math.nan])
+def test_a_transmittance_that_is_none_is_refused(stop):
+    with pytest.raises(ValueError, match="stop: expected a transmittance from 0 to below 1"):
+        RayMarching(stop=stop)
+
+
 @pytest.mark.parametrize("bounds", [Sphere(), OFF_CENTRE])
 def test_samples_are_those_of_a_walk_ray_by_ray(bounds):
     grid, rays = random_grid(bounds), some_rays(40)

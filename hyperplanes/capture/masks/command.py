@@ -42,7 +42,9 @@ class Command:
         with tempfile.TemporaryDirectory() as folder:
             image, mask = Path(folder) / "image.png", Path(folder) / "mask.png"
             image.write_bytes(encode_png(picture))
-            words = [word.format(image=image, mask=mask) for word in shlex.split(self.line)]
+            words = [
+                word.replace("{image}", str(image)).replace("{mask}", str(mask)) for word in shlex.split(self.line)
+            ]
             try:
                 done = subprocess.run(words, capture_output=True, text=True, timeout=LONGEST, check=False)
             except (OSError, subprocess.TimeoutExpired) as error:
