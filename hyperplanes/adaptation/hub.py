@@ -1,4 +1,4 @@
-"""Checkpoints on the Hugging Face hub, by the optional package huggingface_hub: `pip install hyperplanes[hub]`."""
+"""Checkpoints on the Hugging Face hub, by the optional package huggingface_hub: `pip install 'hyperplanes[hub]'`."""
 
 from __future__ import annotations
 

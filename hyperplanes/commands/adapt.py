@@ -4,8 +4,8 @@ The result is a checkpoint without a hypernetwork. `render` and `export` take it
 images, which the field looks its colours up in.
 
 Example:
-    hyperplanes adapt --checkpoint runs/demo --views photos/ --out chair-weights --steps 100
-    hyperplanes render --checkpoint chair-weights --views photos/ --out new-views
+    hyperplanes adapt --checkpoint runs/demo --views scene --out chair-weights --steps 100
+    hyperplanes render --checkpoint chair-weights --views scene --out new-views
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ the baked pictures are compared with the field's own and with the true query vie
 views, which brings back what baking loses, and more.
 
 Example:
-    hyperplanes bake --checkpoint runs/demo --views photos/ --out chair.safetensors
-    hyperplanes bake --checkpoint runs/demo --views photos/ --out chair.safetensors --voxels 384 --orbit 96
+    hyperplanes bake --checkpoint runs/demo --views scene --out chair.safetensors
+    hyperplanes bake --checkpoint runs/demo --views scene --out chair.safetensors --voxels 384 --orbit 96
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Arguments(ObjectArguments):
         fit: Gradient steps that fit the voxels to the shown views; 0 keeps what the field shows.
         orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
         size: Pixels along the longer side of the turntable; as the images when not given.
-        turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`.
+        turntable: The format of the turntable; mp4 and webm need `pip install 'hyperplanes[video]'`.
     """
 
     voxels: int = 256

@@ -16,9 +16,9 @@ measured stands in FILE.partial.json until the FILE of --json is whole.
 Example:
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method nearest_view hyperplanes hyperplanes_swapped
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method hyperplanes scratch --steps 10 100
-    hyperplanes evaluate --data photos/ --checkpoint runs/demo --method hyperplanes --json photos.json
+    hyperplanes evaluate --data scene --checkpoint runs/demo --method hyperplanes --json scene.json
     hyperplanes evaluate --data data/cars --checkpoint runs/cars-{seed} --seeds 5 --markdown cars.md --boxes cars.png
-    hyperplanes evaluate --data photos/ --method nearest_view hull_blend point_multiplane_scratch_300
+    hyperplanes evaluate --data scene --method nearest_view hull_blend point_multiplane_scratch_300
 """
 
 from __future__ import annotations
@@ -54,11 +54,12 @@ class Arguments:
 
     Attributes:
         data: A data set or one posed scene; example-car comes with the package.
-        method: nearest_view and hull_blend (nothing is learned); nerf, multiplane, point_multiplane, image_based,
-            hyperplanes, hyperplanes_swapped (each object with the update of another), autoencoder; scratch_N (the field
-            of a checkpoint from random weights), nerf_scratch_N, multiplane_scratch_N, point_multiplane_scratch_N (no
-            checkpoint is needed); standard, mv_matched, mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but
-            the first two and hyperplanes_swapped may be followed by _N or _auto for gradient steps.
+        method: nearest_view, hull_blend and hull_blend_reflected (nothing is learned); nerf, multiplane,
+            point_multiplane, image_based, hyperplanes, hyperplanes_swapped (each object with the update of another),
+            autoencoder; scratch_N (the field of a checkpoint from random weights), nerf_scratch_N,
+            multiplane_scratch_N, point_multiplane_scratch_N (no checkpoint is needed); standard, mv_matched,
+            mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but the first three and hyperplanes_swapped may
+            be followed by _N or _auto for gradient steps.
         checkpoint: Folders that `train` wrote, folders of them such as runs/demo, or a packaged model: small,
             small-paper, cars-64; {seed} stands for each seed.
         json: Write the table here too, with every object, every seed and every pair of methods.

@@ -5,9 +5,9 @@ slide shows and three.js open it. The page is one HTML file that a browser opens
 voxels and turns them with the mouse or a finger.
 
 Example:
-    hyperplanes export --checkpoint runs/demo --views photos/ --out chair
-    hyperplanes export --checkpoint runs/demo --views photos/ --out chair --what mesh --voxels 192
-    hyperplanes export --checkpoint small --views photos/ --out chair --what page --all-views
+    hyperplanes export --checkpoint runs/demo --views scene --out chair
+    hyperplanes export --checkpoint runs/demo --views scene --out chair --what mesh --voxels 192
+    hyperplanes export --checkpoint small --views scene --out chair --what page --all-views
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Arguments(ObjectArguments):
         what: Any of them.
         frames: Of the turntable.
         size: Pixels along the longer side of the turntable; as the images when not given.
-        turntable: The format of the turntable; mp4 and webm need `pip install hyperplanes[video]`. Voxels draw it where
-            `render --representation auto` takes them.
+        turntable: The format of the turntable; mp4 and webm need `pip install 'hyperplanes[video]'`. Voxels draw it
+            where `render --representation auto` takes them.
         mesh_format: The format of the mesh: glb has a texture and normals, ply and obj a colour a vertex.
         faces: Of a mesh with a texture, at most.
         texture: Pixels along the longer side of the texture, about.

@@ -3,14 +3,14 @@
 The images come as a folder with transforms.json (Blender's, nerfstudio's), a COLMAP model, what Polycam, Record3D,
 KIRI Engine, RealityCapture or Metashape export, a scene of LLFF, IDR or NSVF, or an object of any data set. The model
 is shown the support half of the views and asked for the other half, so that the result can be compared with the truth;
---orbit asks for a round about the object instead, --camera-path for the frames of a path of nerfstudio's viewer.
+--orbit asks for a full turn around the object instead, --camera-path for the frames of a path of nerfstudio's viewer.
 
 Example:
     hyperplanes render --checkpoint small --views example-car --out new-views
-    hyperplanes render --checkpoint runs/demo --views photos/ --out new-views
-    hyperplanes render --checkpoint runs/demo --views photos/ --out new-views --orbit 48 --all-views
-    hyperplanes render --checkpoint small --views photos/ --out video --camera-path camera_path.json --turntable mp4
-    hyperplanes render --checkpoint small --views photos/ --out geometry --rendered-output-names rgb depth normals
+    hyperplanes render --checkpoint runs/demo --views scene --out new-views
+    hyperplanes render --checkpoint runs/demo --views scene --out new-views --orbit 48 --all-views
+    hyperplanes render --checkpoint small --views scene --out video --camera-path camera_path.json --turntable mp4
+    hyperplanes render --checkpoint small --views scene --out geometry --rendered-output-names rgb depth normals
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Arguments(ObjectArguments):
             (opacity); all but rgb into folders of their names.
         size: Pixels along the longer side of the pictures of an orbit or a path; of an orbit as the images, but 400 at
             most, when not given.
-        turntable: The format of the animation; mp4 and webm need `pip install hyperplanes[video]`.
+        turntable: The format of the animation; mp4 and webm need `pip install 'hyperplanes[video]'`.
         representation: What draws the pictures: the field itself, or voxels that are baked from it and fitted to the
             shown views, which takes half a minute once and milliseconds a picture. auto takes voxels for an orbit or
             a path of so many pictures that they are drawn sooner so, where 16 views or more are shown.

@@ -70,8 +70,8 @@ class Arguments:
             multiplane, nerf, image_based, or a field of another package; autoencoder; or a learned initialisation:
             mv_meta, sv_meta (Reptile from many views or a single one), maml, maml_first_order, mv_matched (random
             weights matched to mv_meta).
-        field: Which target network: nerf, multiplane, point_multiplane, image_based, or that of another package; when
-            not given the preset's, or for learned initialisations NeRF.
+        field: Which target network: nerf, multiplane, point_multiplane, image_based, simplified_nerf, or that of
+            another package; when not given the preset's, or for learned initialisations NeRF.
         support: Support views and ImagePlanes an object; more than the data set has are taken from its query views.
         checkpoint: Weights to begin with instead of random ones: a checkpoint, or a packaged model such as small; for
             mv_matched the checkpoint of mv_meta that it is to match.

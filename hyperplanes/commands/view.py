@@ -6,11 +6,11 @@ it.
 
 Example:
     hyperplanes view example-car
-    hyperplanes view photos/ --steps 100
-    hyperplanes view photos/ --checkpoint chair.safetensors
-    hyperplanes view photos/ --refine-poses
-    hyperplanes view photos/ --learn-background
-    hyperplanes view photos/ --compare hull_blend scratch_100
+    hyperplanes view scene --steps 100
+    hyperplanes view scene --checkpoint chair.safetensors
+    hyperplanes view scene --refine-poses
+    hyperplanes view scene --learn-background
+    hyperplanes view scene --compare hull_blend scratch_100
 """
 
 from __future__ import annotations
