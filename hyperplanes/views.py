@@ -91,6 +91,11 @@ class Views:
     def __len__(self) -> int:
         return len(self.images)
 
+    @property
+    def camera_directions(self) -> Float[Tensor, "view 3"]:
+        """Unit vectors from the centre of the scene to the cameras, in single precision."""
+        return camera.camera_directions(self.cameras, self.bounds.centre).float()
+
     def __repr__(self) -> str:
         height, width = self.size
         masks, names = "" if self.masks is None else ", masks", f", {self.names[0]} ..." if self.names else ""

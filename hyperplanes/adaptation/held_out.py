@@ -12,7 +12,6 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext, live_pixels
 from hyperplanes.adaptation.descent import contrast
 from hyperplanes.adaptation.network import HyperPlanesNetwork
-from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
 from hyperplanes.geometry.reflections import Symmetry
@@ -89,7 +88,7 @@ def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | N
     if len(support) < FEWEST or support.masks is None:
         return None
     support = support.resized(SIZE)
-    order = outermost_first(camera_directions(support).cpu(), len(support))
+    order = outermost_first(support.camera_directions.cpu(), len(support))
     count = max(HELD_OUT, len(support) // ONE_IN)
     shown, held_out = support[sorted(order[:-count])], support[order[-count:]]
     assert shown.masks is not None

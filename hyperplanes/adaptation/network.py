@@ -16,7 +16,7 @@ from hyperplanes.adaptation.reflections import UNKNOWN
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
-from hyperplanes.fields.rig import Rig, camera_directions
+from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.hypernetwork.making import make_hypernetwork
@@ -86,7 +86,7 @@ class HyperPlanesNetwork(nn.Module):
         """
         if len(support) < len(self.rig):
             raise ValueError(f"support: expected at least {len(self.rig)} views, one a plane, got {len(support)}")
-        self.rig.copy_(camera_directions(support)[: len(self.rig)])
+        self.rig.copy_(support.camera_directions[: len(self.rig)])
 
     def arrange(self, support: Views) -> Views:
         """The support views as the field takes them: one a plane of the rig, or all as they are.

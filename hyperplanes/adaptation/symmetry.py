@@ -20,7 +20,6 @@ from hyperplanes.adaptation.judging_symmetry import (
     carved,
 )
 from hyperplanes.adaptation.reflections import HULL_SIDE, handicaps, with_reflections
-from hyperplanes.geometry.cameras import camera_directions
 from hyperplanes.geometry.kernels.threads import side_by_side
 from hyperplanes.geometry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
 from hyperplanes.geometry.occupancy import Occupancy
@@ -69,8 +68,7 @@ def symmetry_of(support: Views) -> Symmetry | None:
     """
     if support.masks is None or len(support) < FEWEST or not support.masks.any():
         return None
-    centre = support.bounds.centre
-    chosen = farthest_first(camera_directions(support.cameras, centre).cpu(), 0, min(MOST, len(support)))
+    chosen = farthest_first(support.camera_directions.cpu(), 0, min(MOST, len(support)))
     views = support[sorted(chosen)]
     judge = SymmetryJudge.of(views)
     across = judge.errors([Plane.of_sphere(support.bounds, normal) for normal in AXES], TOLERANCE)

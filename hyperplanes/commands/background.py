@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+from hyperplanes.commands.writing import keep_if_possible
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
@@ -40,10 +41,8 @@ def cut_out_task(task: Task, console: Console, *, all_views: bool = False) -> Ta
     else:
         with console.bar("learning the background") as bar:
             found = separate_background(shown, on_step=lambda done, total: bar.show(done, total, "steps"))
-        try:
-            keep_tensors(file, {"inner": found.inner, "outer": found.outer})
-        except OSError as error:
-            console.warn(f"{file}: not kept for another time: {error}")
+        grids = {"inner": found.inner, "outer": found.outer}
+        keep_if_possible(file, lambda: keep_tensors(file, grids), console)
         how = ""
     support = found.cut_out(shown)
     query = support if all_views else found.cut_out(task.query)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from hyperplanes.commands.writing import keep_if_possible
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
@@ -137,10 +138,7 @@ def adapt_to(
 
         field = source.fine_tune(shown, steps, settings, on_step=count, on_trial=count_trials)
     if time.perf_counter() - started > WORTH_KEEPING:
-        try:
-            keep_field(source, field, folder)
-        except OSError as error:  # the field is there, and what is asked of it can be done
-            console.warn(f"{folder}: not kept for another time: {error}")
+        keep_if_possible(folder, lambda: keep_field(source, field, folder), console)
     how = f", {taken[-1]} fine-tuning steps" if any(taken) else ""
     if field.symmetry is not None:
         planes = field.symmetry.order

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
+from hyperplanes.commands.writing import keep_if_possible
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
@@ -52,10 +54,7 @@ def refine_task(source: HyperPlanes | BakedScene, task: Task, console: Console, 
     if found is None:
         found = _refined(source, views, count, console)
         how = format_duration(time.perf_counter() - started)
-        try:
-            keep_tensors(file, found)
-        except OSError as error:
-            console.warn(f"{file}: not kept for another time: {error}")
+        keep_if_possible(file, partial(keep_tensors, file, found), console)
     before, after = found["psnr"].tolist()
     figures = f"support views left out have {after:.2f} dB with them, {before:.2f} as given (64 pixels); {how}"
     if after < before + LEAST_GAIN:

@@ -7,9 +7,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["check_output", "refuse_checkpoint", "writes_to"]
+if TYPE_CHECKING:
+    from hyperplanes.commands.console import Console
+
+__all__ = ["check_output", "keep_if_possible", "refuse_checkpoint", "writes_to"]
 
 READ = re.compile(
     r"(manifest|model|training|transforms|diagnostics|initial)([-_]\w+)?\.json|.*_splits\.json|config\.yaml"
@@ -17,6 +20,20 @@ READ = re.compile(
 """Names of files that this program reads as a model, a training or a data set."""
 
 WEIGHTS = re.compile(r"(model|training-\d+)\.safetensors")
+
+
+def keep_if_possible(path: Path, keep: Callable[[], None], console: Console) -> None:
+    """Keep what was computed for another time; where that fails it is there all the same, and a warning says so.
+
+    Args:
+        path: where it is kept.
+        keep: writes it.
+        console: of the warning.
+    """
+    try:
+        keep()
+    except OSError as error:
+        console.warn(f"{path}: not kept for another time: {error}")
 
 
 def refuse_checkpoint(out: Path, checkpoint: Path) -> None:

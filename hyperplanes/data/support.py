@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 
 from hyperplanes.data.wrapper import TaskWrapper
-from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, join_views
@@ -90,8 +89,7 @@ class Shown(TaskWrapper):
         asked = torch.linspace(0, len(task.query) - 1, min(self.query, len(task.query))).round().long()
         rest = [index for index in range(len(task.query)) if index not in asked.tolist()]
         views = join_views(task.support, task.query[rest])
-        standing = camera.camera_directions(views.cameras, views.bounds.centre)
-        chosen = farthest_first(standing, 0, min(self.count, len(views)))
+        chosen = farthest_first(views.camera_directions, 0, min(self.count, len(views)))
         return replace(task, support=views[torch.tensor(chosen)], query=task.query[asked])
 
 

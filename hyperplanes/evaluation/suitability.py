@@ -8,7 +8,6 @@ from hyperplanes.adaptation.base import Renderable
 from hyperplanes.adaptation.context import observe
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
-from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
@@ -109,7 +108,7 @@ def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
     with torch.no_grad():
         context = model.prepare(shown, carved=False)
         if len(model.rig):
-            cosine = (camera_directions(context.views).to(model.rig) * model.rig).sum(-1)
+            cosine = (context.views.camera_directions.to(model.rig) * model.rig).sum(-1)
             angle = float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).mean())
         codes = None if network is None else network.standardised_codes(observe([context], network.resolution))
     return None if codes is None else float(codes.square().mean().sqrt()), angle

@@ -19,7 +19,7 @@ from torch.nn.functional import pad, relu, softplus
 
 from hyperplanes.fields.base import Field, Target, TargetConfig
 from hyperplanes.fields.encoding import encode, encoded_size
-from hyperplanes.fields.rig import Rig, camera_directions
+from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.chosen_views import ChosenViews, Described, Reading, Visibility
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import outermost_first
@@ -135,7 +135,7 @@ class ImageBasedNeRF(Target):
         count, device = min(count, len(views)), views.images.device
         if choice == "first":
             return torch.arange(count, device=device)
-        return torch.tensor(outermost_first(camera_directions(views).cpu(), count), dtype=torch.long, device=device)
+        return torch.tensor(outermost_first(views.camera_directions.cpu(), count), dtype=torch.long, device=device)
 
     def hull_resolution(self, configured: int, support: Views) -> int:
         """More than configured where masks are larger, so that the hull is as fine as they are."""

@@ -9,11 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.views import Views
 
-__all__ = ["Rig", "match", "repeated_planes", "camera_directions"]
+__all__ = ["Rig", "match", "repeated_planes"]
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Rig:
         if self.order == "file":
             chosen = torch.arange(len(self)) % len(support)
         else:
-            chosen = match(self.known, camera_directions(support).cpu())
+            chosen = match(self.known, support.camera_directions.cpu())
         return chosen.to(support.images.device)
 
     def repeated(self, support: Views) -> Int[Tensor, " repeated"]:
@@ -60,21 +59,12 @@ class Rig:
         places = self.places(support)
         near = torch.zeros(len(self))
         if self.order != "file":
-            near = (self.known * camera_directions(support[places]).cpu()).sum(1)
+            near = (self.known * support[places].camera_directions.cpu()).sum(1)
         return repeated_planes(places, near)
 
     def farthest(self, count: int) -> Int[Tensor, " k"]:
         """So many planes that stand as far apart as they can, the first one among them."""
         return torch.tensor(farthest_first(self.known, 0, count), dtype=torch.long, device=self.positions.device)
-
-
-def camera_directions(views: Views) -> Float[Tensor, "view 3"]:
-    """Unit vectors from the scene's centre to the cameras.
-
-    Args:
-        views: of one scene.
-    """
-    return camera.camera_directions(views.cameras, views.bounds.centre).float()
 
 
 def match(rig: Float[Tensor, "plane 3"], standing: Float[Tensor, "view 3"]) -> Int[Tensor, " plane"]:

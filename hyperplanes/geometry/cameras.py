@@ -215,6 +215,11 @@ def _rebuilt(cameras: PinholeCamera, change: Callable[[Tensor], Tensor]) -> Pinh
     return DistortedCamera(bare, change(cameras.distortion)) if isinstance(cameras, DistortedCamera) else bare
 
 
+def _with_lens_of(cameras: PinholeCamera, bare: PinholeCamera) -> PinholeCamera:
+    """Pinhole cameras with the distortion of other ones, if these have any."""
+    return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
+
+
 @checked
 def select(cameras: PinholeCamera, index: slice | list[int] | Int[Tensor, " chosen"]) -> PinholeCamera:
     """The cameras at `index`, in that order."""
@@ -256,7 +261,7 @@ def to(
 def with_poses(cameras: PinholeCamera, camera_from_world: Float[Tensor, "view 4 4"]) -> PinholeCamera:
     """The cameras at other poses, with the same calibration and distortion."""
     bare = pinhole(intrinsics(cameras), camera_from_world, *image_size(cameras))
-    return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
+    return _with_lens_of(cameras, bare)
 
 
 @checked
@@ -275,7 +280,7 @@ def cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
         torch.full_like(cameras.height, height),
         torch.full_like(cameras.width, width),
     )
-    return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
+    return _with_lens_of(cameras, bare)
 
 
 @checked
@@ -297,4 +302,4 @@ def resized(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     bare = PinholeCamera(
         matrix, cameras.extrinsics, torch.full_like(cameras.height, height), torch.full_like(cameras.width, width)
     )
-    return DistortedCamera(bare, cameras.distortion) if isinstance(cameras, DistortedCamera) else bare
+    return _with_lens_of(cameras, bare)

@@ -27,7 +27,6 @@ from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.base import Field
-from hyperplanes.fields.rig import camera_directions
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.poses import outermost_first
@@ -167,7 +166,7 @@ def test_the_views_that_decide_are_not_shown(monkeypatch):
     assert 0 <= hull_share(hold_out(adapter, support)) <= 1
     (rest,) = shown
     assert len(rest) == 5
-    kept = sorted(outermost_first(camera_directions(support), 7)[:-2])  # without those that the others stand around
+    kept = sorted(outermost_first(support.camera_directions, 7)[:-2])  # without those that the others stand around
     torch.testing.assert_close(centres(rest.cameras), centres(support.cameras)[kept])
     apart = torch.cdist(centres(support.cameras), centres(rest.cameras)).amin(1)
     assert int((apart > 1e-3).sum()) == 2
@@ -204,7 +203,7 @@ def test_held_out_pixels_are_the_mean_of_three_rays_where_they_are_not_even(monk
     """Brute force: all three rays of every pixel."""
     monkeypatch.setattr(held_out, "EVEN", even)
     adapter, support = model(), ball_views(ring(8, (24, 24)))
-    order = outermost_first(camera_directions(support), len(support))
+    order = outermost_first(support.camera_directions, len(support))
     held = support[order[-HELD_OUT:]]
     trial = hold_out(adapter, support)
     among, generators = live_pixels(trial.context.occupancy, held), [torch.Generator().manual_seed(0) for _ in range(2)]
@@ -230,7 +229,7 @@ def test_few_views_or_none_with_masks_decide_nothing():
     support = ball_views(ring(6, (24, 24)))
     assert hull_share(hold_out(model(empty=True), replace(support, masks=None))) == 0
     few = support.masks.clone()
-    few[sorted(outermost_first(camera_directions(support), 6)[:-2])] = 0
+    few[sorted(outermost_first(support.camera_directions, 6)[:-2])] = 0
     assert hull_share(hold_out(model(empty=True), replace(support, masks=few))) == 0  # of which none is shown
     saved = HyperPlanes(replace(CONFIG, stacked=False, hull_share=0.5))
     assert not isinstance(saved.adapt(replace(support, masks=None)), StackedField)
