@@ -346,7 +346,7 @@ def test_views_that_are_held_out_find_out_what_is_wrong_for_an_object():
 
 @pytest.mark.parametrize(("kind", "count"), [("lamp", 10), ("random", 25)])
 def test_a_mean_with_the_hull_is_better_than_either_and_one_by_pixel_better_still(kind, count):
-    """By 0.31 and 0.24 dB, and by 0.12 and 0.06 more; docs/image-based.md has means over many objects."""
+    """By 0.31 and 0.24 dB, and by 0.12 and 0.06 more; docs/image-based-measurements.md has means over many objects."""
     model, task = coarse("small"), {"lamp": lamp, "random": shape}[kind]()
     alone, by_object, by_pixel = by_parts(task, count, model)
     assert by_object > max(alone, mean_psnr(HullBlend(), task, count)) + 0.1
@@ -372,6 +372,6 @@ def test_the_loss_of_few_rays_by_contrast_varies_less():
 
 
 def test_a_fine_tuned_lamp_is_shown_better_with_the_hull_beside_it():
-    """By 0.6 dB; docs/image-based.md has means over many objects."""
+    """By 0.6 dB; docs/image-based-measurements.md has means over many objects."""
     tuned = with_symmetry(Symmetry(Plane((1.0, 0.0, 0.0)))).fine_tune(few(lamp(), 10), 8)
     assert quality(tuned, lamp()) > quality(replace(tuned, gate=None), lamp()) + 0.3

@@ -139,7 +139,7 @@ def trained_on(context: SupportContext, support: Views) -> Views:
     """Where rays come from: the support views, in their order, or a few and their reflections about one plane.
 
     Rays of reflections about several planes show 0.3 dB less (17 lamps from 3 and 5 views, 100 steps). Many views show
-    an object well enough, and what is not quite symmetric would be learned wrongly (docs/image-based.md).
+    an object well enough, and what is not quite symmetric would be learned wrongly (docs/image-based-measurements.md).
 
     Args:
         context: of the object.

@@ -39,7 +39,7 @@ __all__ = [
     "tuned_field",
 ]
 
-CAUTION = 1.5  # power of the share that shows held-out views best: few views, so less than that (docs/image-based.md)
+CAUTION = 1.5  # power of the share that shows held-out views best: few views, so less (docs/image-based.md, "Stacking")
 OVERRULED = 0.8  # share of the hull from which on it is its surface that counts
 MARGIN = 0.02  # of the squared error, by which it has to be lower to be worth a second picture
 

@@ -144,7 +144,8 @@ def _held_out_gain(support: Views, symmetry: Symmetry) -> float:
     """By how many dB of PSNR `HullBlend` shows held-out views better by the other views and their reflections.
 
     FOLDS times one view in ONE_IN is held out (cross-validation, Stone 1974), and the same pixels are compared. No
-    weights are needed: two views that are held out from a trained field tell less (docs/image-based.md).
+    weights are needed: two views that are held out from a trained field tell less
+    (docs/image-based-measurements.md).
     """
     views = support.resized(JUDGED_SIZE)
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(0)).tolist()
