@@ -42,13 +42,13 @@ class Arguments:
             primitives that mean nothing; or one of another installed package.
         meshes: A folder of mesh files, instead of --class.
         meshes_class: What the meshes are, where their tree does not say it: layouts of other projects name folders so.
-        count: How many procedural objects, the held-out ones included.
+        count: How many procedural objects, the held-out ones included; 70 when not given.
         seed: Of the procedural shapes and of random rigs and lights.
         resolution: Pixels along a side of the square images; what the rig or the layout is made for, else 64, when not
             given.
         views: Cameras an object, alternately support and query; 50 when not given.
-        held_out: Objects for the test split: a count, or a fraction below 1. A seventh when not given; of mesh files
-            the split that their tree states, else a fifth.
+        held_out: Objects of each class for the test split: a count, or a fraction below 1. A seventh when not given; of
+            mesh files the split that their tree states, else a fifth.
         rig: Where the cameras stand: the same places for all objects, random ones, a circle, a spiral, or as in one
             of the two data sets of the paper or in SRN's, with its distance, lens and resolution.
         distance: Of the cameras from the object's centre, in radii of the object; what the rig or the layout is made
@@ -73,7 +73,7 @@ class Arguments:
     class_name: Annotated[str | None, optional("NAME", name="class")] = None
     meshes: OptionalFolder = None
     meshes_class: Annotated[str | None, optional("NAME", name="class-name")] = None
-    count: int = 70
+    count: OptionalInt = None
     seed: int = 0
     resolution: OptionalInt = None
     views: OptionalInt = None
@@ -97,11 +97,14 @@ class Arguments:
     verify: bool = False
 
 
+COUNT = 70  # procedural objects
+
+
 def source_of(arguments: Arguments) -> Procedural | MeshFolder:
     """Where the objects come from.
 
     Raises:
-        ValueError: both or none of --class and --meshes, or a class that there is not.
+        ValueError: both or none of --class and --meshes, an option of the other one, or a class that there is not.
     """
     from data_gen.datasets.generate import MeshFolder, Procedural
     from data_gen.shapes import check_class
@@ -110,14 +113,16 @@ def source_of(arguments: Arguments) -> Procedural | MeshFolder:
         found = "none" if arguments.meshes is None else "both"
         raise ValueError(f"expected --class NAME or --meshes FOLDER, found {found}; `hyperplanes generate --help`")
     if arguments.meshes is not None:
+        if arguments.count is not None:
+            raise ValueError("count: expected with --class, found with --meshes, all of which are rendered")
         return MeshFolder(arguments.meshes, arguments.up, arguments.split_file, arguments.up_of, arguments.meshes_class)
     if arguments.split_file is not None:
         raise ValueError("split_file: expected with --meshes and a ShapeNetCore tree, found with --class")
-    if arguments.meshes_class is not None or arguments.up_of:
-        raise ValueError("class_name, up_of: expected with --meshes, found with --class")
+    if arguments.meshes_class is not None or arguments.up_of or arguments.up != "y":
+        raise ValueError("class_name, up, up_of: expected with --meshes, found with --class")
     name = str(arguments.class_name)
     check_class(name)
-    return Procedural(name, arguments.count, arguments.seed)
+    return Procedural(name, COUNT if arguments.count is None else arguments.count, arguments.seed)
 
 
 def summary(report: GenerationReport, out: Path) -> str:

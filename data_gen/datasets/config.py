@@ -156,6 +156,7 @@ class GenerationConfig:
         Raises:
             ValueError: if a name is unknown, a number makes no sense, or no renderer works.
         """
+        from data_gen.rendering.mesh_renderer import MAX_SUPERSAMPLE
         from data_gen.rendering.renderers import find_renderer
 
         self._check_names()
@@ -165,6 +166,13 @@ class GenerationConfig:
                 f"resolution: the {self.layout} layout's loaders take {layout.resolution} for granted, "
                 f"got {self.resolution}"
             )
+        if self.field_of_view is not None and layout.field_of_view not in (None, self.field_of_view):
+            raise ValueError(
+                f"field_of_view: the {self.layout} layout's loaders take {layout.field_of_view:.4g} degrees for "
+                f"granted, got {self.field_of_view:g}"
+            )
+        if not 1 <= self.supersample <= MAX_SUPERSAMPLE:
+            raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, got {self.supersample}")
         distance, field_of_view = self.distance, self.field_of_view
         if distance is None and layout.planes is None:
             distance = preset.distance if preset else DEFAULT_DISTANCE
@@ -192,7 +200,9 @@ class GenerationConfig:
         return replace(config, renderer=find_renderer(self.renderer).name)
 
     def _check_names(self) -> None:
-        known = {"rig": RIGS, "engine": ENGINES, "layout": tuple(LAYOUTS)}
+        from data_gen.rendering.lighting import LIGHTING_PRESETS
+
+        known = {"rig": RIGS, "engine": ENGINES, "layout": tuple(LAYOUTS), "lighting": LIGHTING_PRESETS}
         for name, values in known.items():
             if getattr(self, name) not in values:
                 given, near = getattr(self, name), did_you_mean(getattr(self, name), values)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.datasets.config import GenerationConfig, RenderConfig
-from data_gen.datasets.layouts import LAYOUTS
+from data_gen.datasets.layouts import LAYOUTS, check_names
 from data_gen.datasets.manifest import GenerationState, build_manifest
 from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
@@ -94,6 +94,7 @@ def generate(
     classes = sorted({item.class_name for item in items}, key=str)
     for class_name in classes:
         render.check_class(class_name)
+    check_names(render.layout, [item.name for item in items])
     with GenerationState(out, _configuration(source, items, render, config.held_out)) as state:
         done = state.done()
         reused = sum(item.name in done for item in items)

@@ -92,7 +92,9 @@ def inspect(
     if names:
         pictures, labels = _pictures(data, names)
         files.append(out / "contact_sheet.png")
-        write_whole(files[0], encode_png(contact_sheet(pictures, min(_VIEWS, len(pictures)), labels)))
+        write_whole(
+            files[0], encode_png(contact_sheet(pictures, min(_VIEWS, len(data.posed(names[0]).support)), labels))
+        )
         views = _all_views(data, names[0])
         sparse = _sparse(locate_scene(path), data.posed(names[0])) if len(data) == 1 else None
         report = describe_scene(views, sparse) if len(data) == 1 and len(views) > 1 else None

@@ -15,7 +15,7 @@ from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.utilities.axes import flip_camera_axes
 from hyperplanes.utilities.encoding import encode_json, encode_npz, encode_png
 
-__all__ = ["LAYOUTS", "Layout", "RenderedObject"]
+__all__ = ["LAYOUTS", "Layout", "RenderedObject", "check_names"]
 
 _AUTHORS_FOCAL = 277.77
 
@@ -146,7 +146,30 @@ def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
         "rgba": rendered.rgba,
         "focal": np.float64(rig.intrinsics[0, 0, 0]),
     }
-    return {f"{_plural(item)}/sampled/{len(rig)}_{item.name.replace('_', '-')}.npz": encode_npz(arrays)}
+    return {f"{_plural(item)}/sampled/{len(rig)}_{_hyphenated(item.name)}.npz": encode_npz(arrays)}
+
+
+def check_names(layout: str, names: Sequence[str]) -> None:
+    """Refuse objects that a layout would give one name.
+
+    Args:
+        layout: of the data set.
+        names: of all objects.
+
+    Raises:
+        ValueError: two of them differ by hyphens and underscores alone, in the layout hyperplanes-200.
+    """
+    if layout != "hyperplanes-200":
+        return
+    taken: dict[str, str] = {}
+    for name in names:
+        other = taken.setdefault(_hyphenated(name), name)
+        if other != name:
+            raise ValueError(f"{name}: expected a name that {layout} tells from {other}, whose _ become -; rename one")
+
+
+def _hyphenated(name: str) -> str:
+    return name.replace("_", "-")
 
 
 def srn(rendered: RenderedObject) -> dict[str, bytes]:

@@ -85,7 +85,7 @@ def list_items(source: Source, held_out: float | int | None) -> list[Item]:
 
     Args:
         source: what to list.
-        held_out: how many objects go into the test split: a count, a fraction below 1 of each class, or None for one
+        held_out: how many objects of each class go into the test split: a count, a fraction below 1, or None for one
             in seven of procedural objects, and for mesh files the split that the tree states, else the last 20 % of
             each class by name (as the paper's 200x200 data were split).
 
@@ -179,6 +179,6 @@ def _axes(source: MeshFolder, paths: list[Path]) -> dict[Path, Any]:
 def _held_out(total: int, wanted: float | int) -> int:
     if isinstance(wanted, float) and 0 <= wanted < 1:
         return min(math.ceil(total * wanted - 1e-9), max(total - 1, 0))
-    if wanted != int(wanted) or not 0 <= wanted <= total:
-        raise ValueError(f"held_out: expected a fraction below 1 or a count up to {total}, got {wanted}")
+    if not math.isfinite(wanted) or wanted != int(wanted) or not 0 <= wanted <= total:
+        raise ValueError(f"held_out: expected a fraction below 1 or a count up to {total} of each class, got {wanted}")
     return int(wanted)

@@ -83,11 +83,11 @@ def make(class_name: str, seed: int) -> trimesh.Scene:
     """A procedural object.
 
     Args:
-        class_name: one of `CLASSES`.
+        class_name: one of `find_classes`.
         seed: any non-negative integer; the same one gives the same vertices, faces and pixels.
 
     Returns:
-        A scene with one textured geometry, named after the class: metres, y up, front along +z. Its `metadata["parts"]`
-        lists (part name, first face, number of faces).
+        A scene with one textured geometry a finish, the first named after the class: metres, y up, front along +z. Its
+        `metadata["parts"]` lists (part name, first face, number of faces).
     """
     return build_scene(class_name, assemble(class_name, seed))

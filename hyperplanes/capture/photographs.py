@@ -19,7 +19,15 @@ from PIL import Image
 from hyperplanes.capture.video import VIDEO_SUFFIXES
 from hyperplanes.data.formats.unposed import photographs_folder
 from hyperplanes.data.pictures.frames import listed
-from hyperplanes.data.pictures.images import PICTURE_SUFFIXES, Pixels, image_header, read_image, resized, turned
+from hyperplanes.data.pictures.images import (
+    PICTURE_SUFFIXES,
+    Pixels,
+    image_header,
+    opacity_of,
+    read_image,
+    resized,
+    turned,
+)
 from hyperplanes.data.pictures.masks import match_masks
 from hyperplanes.utilities.files import DataError
 
@@ -179,7 +187,7 @@ def read_upright(photograph: Photograph, max_size: int) -> tuple[Pixels, bool]:
     picture = turned(picture, photograph.orientation)
     if photograph.mask is not None:
         values, has_alpha = read_image(photograph.mask)
-        opacity = values[..., 3] if has_alpha and not np.ptp(values[..., :3]) else values[..., :3].max(-1)
+        opacity = opacity_of(values, has_alpha)
         if _same_shape(opacity.shape, stored) and not _same_shape(opacity.shape, picture.shape[:2]):
             opacity = turned(opacity, photograph.orientation)  # drawn on the pixels as they are stored
         elif stored == picture.shape[:2] and photograph.orientation != 1:

@@ -6,6 +6,7 @@ import io
 import math
 import tempfile
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,10 @@ FRAMED, MARGIN = 48, 0.02  # voxels an axis of the hull that fits into an orbit,
 CODECS = {"mp4": "libx264", "webm": "libvpx-vp9"}
 
 
+FASTEST = 20
+"""Milliseconds that a frame of an animation lasts at least; browsers slow down what is faster."""
+
+
 @checked
 def to_pixels(images: Float[Tensor, "view 3 height width"]) -> npt.NDArray[np.uint8]:
     """Images in [0, 1] as 8-bit pixels (view, height, width, 3); what lies outside is clamped.
@@ -59,7 +64,8 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
     Args:
         frames: (frame, height, width, 3) pixels.
         kind: "webp" or "gif"; "mp4" or "webm" for a video.
-        seconds: of one round.
+        seconds: of one round. No frame lasts less than 20 ms, which browsers would slow down, so that more than 50
+            frames a second take longer; a video has as many as it is asked for.
 
     Returns:
         The file.
@@ -83,7 +89,9 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
     first, *others = [Image.fromarray(frame) for frame in frames]
     how = {"quality": 90, "method": 4} if kind == "webp" else {}
     buffer = io.BytesIO()
-    duration = max(20, round(1000 * seconds / len(frames)))
+    unit = 10 if kind == "gif" else 1  # milliseconds in which the format counts
+    ends = [unit * round(1000 * seconds * (index + 1) / len(frames) / unit) for index in range(len(frames))]
+    duration = [max(FASTEST, end - begin) for begin, end in pairwise([0, *ends])]
     first.save(buffer, kind.upper(), save_all=True, append_images=others, duration=duration, loop=0, **how)
     return buffer.getvalue()
 

@@ -478,9 +478,9 @@ def test_a_fold_is_judged_by_rays_of_the_views_that_it_holds_out():
 
 
 def test_a_model_of_one_object_has_the_precision_of_the_model():
-    adapter = model().double()
-    assert next(adapter.with_weights_of(adapter.adapt(balls(cameras(), BODY))).parameters()).dtype == torch.float64
-    assert FromScratch(adapter, 0).adapt(balls(cameras(), BODY)).dtype == torch.float64
+    adapter, views = HyperPlanes(CONFIG).double(), balls(cameras(), BODY)
+    assert next(adapter.with_weights_of(adapter.adapt(views)).parameters()).dtype == torch.float64
+    assert FromScratch(adapter, 0).adapt(views).dtype == torch.float64
 
 
 def test_two_threads_find_what_one_does():

@@ -10,6 +10,8 @@ from PIL import Image
 
 from hyperplanes.adaptation.base import hull
 from hyperplanes.data import DataError, read_task, read_views
+from hyperplanes.data.pictures.images import opacity_of, read_image
+from hyperplanes.data.pictures.masks import match_masks
 from hyperplanes.data.pictures.posed import Posed
 from hyperplanes.export.images import orbit_cameras
 from hyperplanes.geometry import cameras as camera
@@ -214,3 +216,52 @@ def test_a_linked_folder_of_pictures_inside_the_tree_is_followed(scene, tmp_path
     assert len(open_dataset(tmp_path).task("car").support) == 4
     with pytest.raises(DataError, match="expected file names inside"):
         read_views(tmp_path / "car")
+
+
+def masks_of_widths(paths):
+    """Masks of 8 x 8 pixels, of which the first one's first column is set, the second one's first two, and so on."""
+    for width, path in enumerate(paths, 1):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mask = np.zeros((8, 8), np.uint8)
+        mask[:, :width] = 255
+        Image.fromarray(mask).save(path)
+
+
+def test_masks_of_one_name_belong_to_the_pictures_of_their_folders(tmp_path):
+    names = ["cam0/0.png", "cam1/0.png", "cam0/1.png", "cam1/1.png"]
+    masks_of_widths([tmp_path / "masks" / name for name in names])
+    pictures = [tmp_path / "images" / name for name in names]
+    assert match_masks(tmp_path / "masks", pictures) == [tmp_path / "masks" / name for name in names]
+    with pytest.raises(DataError, match="expected one mask for .*cam2/0.png, found 2: cam0/0.png, cam1/0.png"):
+        match_masks(tmp_path / "masks", [tmp_path / "images/cam2/0.png"])
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_a_mask_is_that_of_a_picture_whose_alpha_says_nothing(transparent, tmp_path):
+    picture = np.full((8, 8, 4), 200, np.uint8)
+    picture[..., 3] = 255
+    picture[0, 0, 3] -= transparent
+    (tmp_path / "images").mkdir()
+    Image.fromarray(picture).save(tmp_path / "images/0.png")
+    masks_of_widths([tmp_path / "masks/0.png"])
+    pose = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 3.0], [0, 0, 0, 1.0]]
+    frames = [{"file_path": "images/0.png", "transform_matrix": pose}] * 2
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    shown = read_task(tmp_path).support
+    assert float(shown.masks.mean()) == pytest.approx((64 * 255 - 1) / 64 / 255 if transparent else 1 / 8)
+
+
+def test_floating_point_pictures_up_to_one_are_as_bright_as_they_say(tmp_path):
+    Image.fromarray(np.linspace(0, 1, 64, dtype=np.float32).reshape(8, 8)).save(tmp_path / "mask.tiff")
+    pixels, _ = read_image(tmp_path / "mask.tiff")
+    np.testing.assert_allclose(pixels[..., 0].flatten(), np.linspace(0, 255, 64), atol=0.51)
+
+
+@pytest.mark.parametrize(
+    ("mask", "has_alpha", "opacity"), [((0, 255), True, 0), ((0, 90), True, 90), ((80, 255), False, 80)]
+)
+def test_a_mask_says_by_its_alpha_what_its_colours_do_not(mask, has_alpha, opacity):
+    grey, alpha = mask
+    pixels = np.full((2, 2, 4), grey, np.uint8)
+    pixels[..., 3] = alpha
+    assert (opacity_of(pixels, has_alpha) == opacity).all()

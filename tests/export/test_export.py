@@ -1,6 +1,7 @@
 """Source of truth: a ball of known density and colour, whose surface and volume have closed forms."""
 
 import gc
+import io
 import math
 
 import numpy as np
@@ -259,3 +260,16 @@ def test_a_video_has_the_frames(kind, tmp_path):
     assert all(abs(float(part[..., 0].mean()) - 40 * number) < 12 for number, part in enumerate(found))
     del reader
     gc.collect()
+
+
+@pytest.mark.parametrize("kind", ["webp", "gif"])
+def test_an_animation_lasts_as_long_as_it_was_asked_to(kind):
+    frames = np.random.default_rng(0).integers(0, 255, (48, 2, 2, 3), np.uint8)
+    with Image.open(io.BytesIO(encode_animation(frames, kind, seconds=4.0))) as picture:
+        durations = []
+        for index in range(picture.n_frames):
+            picture.seek(index)
+            picture.load()
+            durations.append(picture.info["duration"])
+    assert sum(durations) == 4000
+    assert max(durations) - min(durations) <= 10

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hyperplanes.data.pictures.images import read_image
+from hyperplanes.data.pictures.images import opacity_of, read_image
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.files import DataError
 
@@ -56,7 +56,7 @@ class Command:
                     "try the command on one photograph"
                 )
             values, alpha = read_image(mask)
-        opacity = values[..., 3] if alpha and (values[..., 3] < 255).any() else values[..., :3].max(-1)
+        opacity = opacity_of(values, alpha)
         if opacity.shape != picture.shape[:2]:
             found = f"{opacity.shape[1]} x {opacity.shape[0]}"
             size = f"{picture.shape[1]} x {picture.shape[0]} pixels"

@@ -149,6 +149,8 @@ def _authors(
     folder: Path, archives: list[Path], manifest: dict[str, Any], bounds: Sphere | None, legacy: bool
 ) -> Catalogue:
     paths = {path.stem.rpartition("_")[2]: path for path in archives}
+    if isinstance(manifest.get("objects"), dict):  # whose names have underscores
+        manifest = {**manifest, "objects": {k.replace("_", "-"): v for k, v in manifest["objects"].items()}}
     splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
     if isinstance(manifest.get("splits"), dict):
         for split in SPLITS:

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from hyperplanes.data.dataset import Dataset
@@ -96,8 +97,10 @@ class Description:
             if first.extent is not None and first.coverage is not None:
                 box = " x ".join(f"{side:.3g}" for side in first.extent)
                 lines.append(f"visual hull: {box}, {first.coverage:.0%} of the pixels covered")
-            else:
+            elif first.coverage is None:
                 lines.append("masks: none; the packaged models need them (RGBA images, or a folder masks/)")
+            else:
+                lines.append("visual hull: empty, no point is shown by all masks; check poses, masks and bounds")
             wrong = [one for one in self.objects if not one.consistent]
             shown = (wrong or self.objects)[0]
             lines += [shown.conventions.line(), *shown.problems, *shown.checks]
@@ -123,9 +126,9 @@ def describe(path: str | Path | Dataset, objects: int = 8) -> Description:
     """
     data = path if isinstance(path, Dataset) else Dataset(path)
     names = data.names()
-    step = max(1, len(names) // max(1, objects))
+    chosen = np.linspace(0, len(names) - 1, min(max(1, objects), len(names))).round().astype(int)
     found, broken = [], []
-    for name in names[::step][:objects]:
+    for name in (names[index] for index in chosen):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # the notes are listed

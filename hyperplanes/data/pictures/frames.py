@@ -16,6 +16,7 @@ from hyperplanes.data.pictures.images import (
     Pixels,
     image_header,
     image_size,
+    opacity_of,
     read_image,
     reduced,
     resized,
@@ -250,7 +251,7 @@ def scaled_matrix(
 def _pixels(one: _Found, size: tuple[int, int], factor: int) -> tuple[Pixels, bool]:
     picture, alpha = read_image(one.frame.path, one.stored)
     picture = turned(picture, one.turn)
-    if one.frame.mask is not None and not alpha:
+    if one.frame.mask is not None and not (alpha and (picture[..., 3] < 255).any()):
         stored = image_size(one.frame.mask)
         if stored not in (one.size, one.stored):
             raise DataError(
@@ -260,12 +261,6 @@ def _pixels(one: _Found, size: tuple[int, int], factor: int) -> tuple[Pixels, bo
                 "scale the mask to the size of its picture",
             )
         values, has_alpha = read_image(one.frame.mask, stored)
-        opacity = values if stored == one.size else turned(values, one.turn)
-        picture[..., 3] = opacity[..., 3] if _only_alpha(opacity, has_alpha) else opacity[..., :3].max(-1)
+        picture[..., 3] = opacity_of(values if stored == one.size else turned(values, one.turn), has_alpha)
         alpha = True
     return reduced(resized(picture, size), factor), alpha
-
-
-def _only_alpha(values: Pixels, has_alpha: bool) -> bool:
-    """Whether a mask says what it says by its alpha channel alone."""
-    return has_alpha and bool((values[..., 3] < 255).any()) and not np.ptp(values[..., :3])

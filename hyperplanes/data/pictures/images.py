@@ -24,6 +24,7 @@ __all__ = [
     "composite_over_white",
     "image_header",
     "image_size",
+    "opacity_of",
     "read_image",
     "reduced",
     "resized",
@@ -119,7 +120,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     """The pixels of an image.
 
     Args:
-        path: one of FORMATS; more than 8 bits a channel are scaled down to 8.
+        path: one of FORMATS; more than 8 bits a channel are scaled down to 8, floating-point numbers up to 1 up to 255.
         size: the (height, width) that it must have, checked before decoding.
 
     Returns:
@@ -139,11 +140,23 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
             image.load()
             alpha = "A" in image.getbands() or "transparency" in image.info
             if image.mode.startswith("I") or image.mode == "F":
-                wide = np.asarray(image, dtype=np.float64)
-                image = Image.fromarray((wide / max(65535.0, float(wide.max())) * 255).round().astype(np.uint8))
+                wide = np.nan_to_num(np.asarray(image, dtype=np.float64)).clip(0)
+                white = 1.0 if image.mode == "F" and wide.max() <= 1 else max(65535.0, float(wide.max()))
+                image = Image.fromarray((wide / white * 255).round().astype(np.uint8))
             return np.array(image.convert("RGBA")), alpha
         except (OSError, SyntaxError, ValueError, EOFError, IndexError) as error:
             raise DataError(path, "a whole image", f"a broken one ({error})", _REMEDY) from error
+
+
+def opacity_of(mask: Pixels, has_alpha: bool) -> UInt8[np.ndarray, "height width"]:
+    """What a picture of a mask says: its alpha where that alone says something, else its brightest channel.
+
+    Args:
+        mask: (height, width, 4), as `read_image` returns it.
+        has_alpha: likewise.
+    """
+    by_alpha = has_alpha and bool((mask[..., 3] < 255).any()) and not np.ptp(mask[..., :3])
+    return mask[..., 3] if by_alpha else mask[..., :3].max(-1)
 
 
 def composite_over_white(

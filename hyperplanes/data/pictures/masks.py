@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
@@ -46,21 +48,49 @@ def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None
     """The mask of each picture, found by its name or by its number; None for those that have none.
 
     A mask is called as its picture with any ending, as its picture with _mask after its name, or as COLMAP has it, as
-    its picture with .png after it. Where no name fits, there are as many masks as pictures and all names are numbers,
+    its picture with .png after it. Of several masks of one name in different folders it is the one whose folders are
+    called as those of the picture. Where no name fits, there are as many masks as pictures and all names are numbers,
     as NeuS publishes image/000000.png beside mask/000.png, both are taken in the order of their numbers.
 
     Args:
         folder: what holds masks.
         pictures: their files.
-        root: as in `find_masks`; a link that leads out of it is a DataError.
+        root: as in `find_masks`; a link that leads out of it is a DataError, and so are several masks of one name whose
+            folders fit a picture equally well.
     """
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES)
     for path in files:
         check_link(path, root or folder)
-    by_name = {path.stem.removesuffix("_mask"): path for path in files}
-    by_name |= {path.name: path for path in files} | {path.stem: path for path in files}
-    masks = [by_name.get(picture.name) or by_name.get(picture.stem) for picture in pictures]
+    exact, with_ending = defaultdict[str, list[Path]](list), defaultdict[str, list[Path]](list)
+    for path in files:
+        with_ending[path.stem.removesuffix("_mask")].append(path)
+        for name in {path.name, path.stem}:
+            exact[name].append(path)
+    masks = []
+    for picture in pictures:
+        tables = [(table, name) for name in (picture.name, picture.stem) for table in (exact, with_ending)]
+        found = next((table[name] for table, name in tables if table.get(name)), [])
+        masks.append(_of_the_same_folders(found, picture, folder) if found else None)
     return masks if any(masks) else list(_by_number(files, pictures) or masks)
+
+
+def _of_the_same_folders(masks: Sequence[Path], picture: Path, folder: Path) -> Path:
+    """The mask in folders that are called as those of a picture, the innermost first; the last of one folder."""
+
+    def shared(mask: Path) -> int:
+        pairs = zip(reversed(mask.relative_to(folder).parent.parts), reversed(picture.parent.parts), strict=False)
+        return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+    most = max(map(shared, masks))
+    best = [mask for mask in masks if shared(mask) == most]
+    if len({mask.parent for mask in best}) > 1:
+        raise DataError(
+            folder,
+            f"one mask for {picture}",
+            f"{len(best)}: {', '.join(mask.relative_to(folder).as_posix() for mask in best[:3])}",
+            "put the masks into folders that are called as those of the pictures",
+        )
+    return best[-1]
 
 
 def _by_number(masks: Sequence[Path], pictures: Sequence[Path]) -> list[Path] | None:

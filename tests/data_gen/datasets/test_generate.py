@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import signal
@@ -17,7 +18,7 @@ import trimesh
 from rendered_here import rendered_here
 
 from data_gen import SUPERSAMPLE
-from data_gen.commands.generate import remarks
+from data_gen.commands.generate import Arguments, remarks, source_of
 from data_gen.datasets import objects
 from data_gen.datasets.generate import PICTURES, GenerationConfig, MeshFolder, Procedural, generate
 from data_gen.datasets.inspect import inspect
@@ -244,13 +245,43 @@ def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypat
         ({"views": 10**9}, "views: expected at most 10,000 an object, got 1,000,000,000"),
         ({"timeout": 0.0}, "timeout: expected seconds above 0, got 0"),
         ({"views": 0}, "views: expected at least 1, received 0"),
-        ({"held_out": 9}, "held_out: expected a fraction below 1 or a count up to 5, got 9"),
+        ({"held_out": math.inf}, "held_out: expected a fraction below 1 or a count up to 5 of each class, got inf"),
+        ({"held_out": math.nan}, "held_out: expected a fraction below 1 or a count up to 5 of each class, got nan"),
+        ({"supersample": 0}, "supersample: expected 1 to 8, got 0"),
+        ({"supersample": 9}, "supersample: expected 1 to 8, got 9"),
+        ({"lighting": "sun"}, "lighting: expected one of studio, headlight, random, got 'sun'"),
+        (
+            {"layout": "hyperplanes-200", "field_of_view": 60.0},
+            "field_of_view: the hyperplanes-200 layout's loaders take 39.6",
+        ),
+        ({"held_out": 9}, "held_out: expected a fraction below 1 or a count up to 5 of each class, got 9"),
     ],
 )
 def test_arguments_that_make_no_sense_are_named(tmp_path, arguments, message):
     with pytest.raises(ValueError, match=message):
         generate(CARS, tmp_path / "out", GenerationConfig(**arguments))
     assert not (tmp_path / "out").exists()
+
+
+def test_names_that_the_authors_layout_makes_the_same_are_refused(tmp_path):
+    for name in ("a_1", "a-1"):
+        trimesh.creation.box().export(tmp_path / f"{name}.ply")
+    config = GenerationConfig(layout="hyperplanes-200", views=1)
+    with pytest.raises(ValueError, match="a_1: expected a name that hyperplanes-200 tells from a-1"):
+        generate(MeshFolder(tmp_path, class_name="car"), tmp_path / "out", config)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"meshes": Path("meshes"), "count": 1}, "count: expected with --class"),
+        ({"class_name": "car", "up": "z"}, "class_name, up, up_of: expected with --meshes"),
+    ],
+)
+def test_options_of_the_other_source_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        source_of(Arguments(Path("out"), **given))
 
 
 @pytest.mark.usefixtures("here")

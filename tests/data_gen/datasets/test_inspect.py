@@ -101,3 +101,29 @@ def test_without_matplotlib_the_rest_is_still_done(tmp_path):
     found = inspect(write(tmp_path / "ball"), tmp_path / "out")
     assert [path.name for path in found.files] == ["contact_sheet.png"]
     assert found.notes == ("cameras.png: not drawn, matplotlib is not installed; pip install matplotlib",)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_objects_are_looked_at_from_all_splits(tmp_path):
+    """A row of the contact sheet each: 3 support views of 32 pixels."""
+    for index in range(7):
+        folder = write(tmp_path / f"set/o{index}")
+        document = json.loads((folder / "transforms.json").read_text())
+        document["frames"] = document["frames"][:6]
+        (folder / "transforms.json").write_text(json.dumps(document))
+    found = inspect(tmp_path / "set", tmp_path / "out", 4)
+    assert [one.name for one in found.description.objects] == ["o0", "o2", "o4", "o6"]
+    height, width = np.array(Image.open(found.files[0])).shape[:2]
+    assert 3 * SIZE < width < 4 * SIZE
+    assert 4 * SIZE < height
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_an_empty_hull_is_not_said_to_be_a_lack_of_masks(tmp_path):
+    folder = write(tmp_path / "ball")
+    document = json.loads((folder / "transforms.json").read_text())
+    document["scene_sphere"] = {"centre": [-0.8, 0.1, 0.0], "radius": 0.1}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    text = "\n".join(inspect(folder, tmp_path / "out").lines())
+    assert "visual hull: empty" in text
+    assert "masks: none" not in text

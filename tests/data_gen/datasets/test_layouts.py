@@ -53,6 +53,7 @@ def write(layout, folder, manifest=True):
                 "version": 1,
                 "layout": layout,
                 "scene_sphere": {"centre": [0, 0, 0], "radius": LAYOUTS[layout].scale},
+                "objects": {item.name: {"class": item.class_name} for item in ITEMS},
                 "splits": {
                     split: [item.name for item in ITEMS if item.split == split] for split in ("train", "val", "test")
                 },
@@ -118,6 +119,8 @@ def test_the_authors_loader_finds_what_it_reads(tmp_path):
         assert np.array_equal(np.rint(arrays["images"] * 255), over_white(original.rgba))
         assert arrays["cam_poses"].shape == (VIEWS, 4, 4)
     assert abs(original.rig.intrinsics[0, 0, 0] - 277.77) < 1e-9
+    data = open_dataset(tmp_path)  # the manifest has names with underscores
+    assert {data.class_of(name) for name in data.names()} == {"car"}
     assert 2.0 < original.rig.near < original.rig.far < 6.0
 
 
