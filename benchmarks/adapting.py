@@ -63,7 +63,7 @@ def main(arguments: list[str]) -> int:
     task = read()
     every = max(1, len(task.query) // chosen.query)
     query = task.query[torch.arange(0, len(task.query), every)[: chosen.query]]
-    _warm_up(model, replace(task, query=query), chosen.side)
+    _warm_up(model, replace(task, query=query))
     rows = [_measured(name, way, read, query) for name, way in ways.items()]
     if chosen.steps:
         for row in rows:
@@ -90,7 +90,7 @@ def _voxels(model: HyperPlanes, side: int | None, fit: int, views: Views) -> Bak
     return BakedScene(fitted_voxels(model.adapt(views), views, side or default_side(views.size), steps=fit))
 
 
-def _warm_up(model: HyperPlanes, task: Task, side: int | None) -> None:
+def _warm_up(model: HyperPlanes, task: Task) -> None:
     """What is compiled or kept by the first use of each way, on a small copy of the views."""
     views = task.support.resized(32)
     _voxels(model, 32, 1, views).render(task.query[:1].cameras)

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks._timing import ratio
 from benchmarks.reporting import Row, finish
+from hyperplanes.utilities.environment import usable_cores
 
 if TYPE_CHECKING:
     from hyperplanes.adaptation import HyperPlanes
@@ -55,7 +56,7 @@ def main(arguments: list[str]) -> int:
     if chosen.measure:
         print(json.dumps(_seconds(chosen.measure, 1 if chosen.quick else chosen.repeats, chosen.quick)))
         return 0
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     counts, rows = sorted({1, 2, cores}), []
     for load, spinning in (("idle", 0), ("busy", cores)):
         for work in chosen.works:

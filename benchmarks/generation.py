@@ -29,6 +29,7 @@ from benchmarks._timing import ratio
 from benchmarks.generation_parts import RESOLUTION, VIEWS
 from benchmarks.reporting import Row, finish
 from data_gen import SUPERSAMPLE
+from hyperplanes.utilities.environment import usable_cores
 
 __all__ = ["main"]
 
@@ -101,7 +102,7 @@ def compare(renderer: str, folder: Path, *, rounds: int, objects: int) -> list[R
     rows: list[Row] = []
     for supersample, runs in ours.items():
         row: Row = {"name": f"generate, {supersample**2} samples a pixel", "renderer": renderer, "rounds": rounds}
-        row |= {"workers": _cores(), "objects": objects, "load": os.getloadavg()[0], **_speed(runs)}
+        row |= {"workers": usable_cores(), "objects": objects, "load": os.getloadavg()[0], **_speed(runs)}
         if loop:
             row |= {f"reference_{key}": value for key, value in _speed(loop).items()}
             row |= ratio(*([run.wall / run.images for run in side] for side in (loop, runs)))
@@ -121,10 +122,6 @@ def _speed(runs: list[Run]) -> Row:
         "images_per_second": statistics.median(run.images / run.wall for run in runs),
         "processor_milliseconds_an_image": statistics.median(1e3 * run.processor / run.images for run in runs),
     }
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
 
 
 def measured(run: Callable[[], int]) -> Run:

@@ -26,6 +26,7 @@ from benchmarks.lookup_plot import plot
 from benchmarks.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
 from benchmarks.reporting import Row
 from hyperplanes.utilities.environment import environment
+from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["main"]
 
@@ -120,7 +121,7 @@ def main(arguments: list[str]) -> int:
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         content = {"benchmark": "lookup", "device": options.device, **about, "rows": rows}
-        options.json.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        write_whole(options.json, (json.dumps(content, indent=1) + "\n").encode())
     if options.plot:
         plot(rows, options.plot, title)
     return 0

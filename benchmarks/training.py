@@ -67,12 +67,12 @@ def main(arguments: list[str]) -> int:
         rows = curves(chosen, Objects(held_out(10, chosen.resolution, device=options.device)), options.curves)
         if options.plot:
             plot(rows, options.plot)
-        return finish("training", rows, options.json)
+        return finish("training", rows, options.json, options.device)
     for name in ("quick",) if options.quick else ("quick", "small-paper", "paper-128"):
         chosen = preset(name).by_protocol("ray_marching")
         tasks = held_out(2 + UNSEEN, chosen.resolution, device=options.device)
-        rows += compare(name, chosen, Objects(tasks), 3 if options.quick else 8)
-    return finish("training", rows, options.json)
+        rows += compare(name, chosen, Objects(tasks), 3 if options.quick else 8, options.device)
+    return finish("training", rows, options.json, options.device)
 
 
 def both(chosen: Preset, objects: Objects) -> dict[str, Trainer]:
@@ -88,8 +88,8 @@ def both(chosen: Preset, objects: Objects) -> dict[str, Trainer]:
     return trainers
 
 
-def compare(name: str, chosen: Preset, objects: Objects, steps: int) -> list[Row]:
-    """Rays a second, memory and the parts of a step, of both paths in turn."""
+def compare(name: str, chosen: Preset, objects: Objects, steps: int, device: str) -> list[Row]:
+    """Rays a second and memory of both paths in turn, and on a CPU the parts of a step."""
     trainers = both(chosen, objects)
     times = interleaved({path: each.take_step for path, each in trainers.items()}, steps, seconds=120)
     row: Row = {"name": f"packed training, {name}, {RAYS} rays a step"}
@@ -98,8 +98,10 @@ def compare(name: str, chosen: Preset, objects: Objects, steps: int) -> list[Row
     row |= ratio(times["dense"].wall, times["packed"].wall)
     row["speedup_processor"] = ratio(times["dense"].processor, times["packed"].processor)["speedup"]
     row["steps"] = len(times["packed"].wall)
-    row["peak_megabytes"] = peak_bytes(trainers["packed"].take_step) / 1e6
-    row["reference_peak_megabytes"] = peak_bytes(trainers["dense"].take_step) / 1e6
+    row["peak_megabytes"] = peak_bytes(trainers["packed"].take_step, device) / 1e6
+    row["reference_peak_megabytes"] = peak_bytes(trainers["dense"].take_step, device) / 1e6
+    if device != "cpu":
+        return [row]
     return [row, *(part for path, each in trainers.items() for part in step_parts(f"{name}, {path}", each))]
 
 

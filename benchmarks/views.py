@@ -108,7 +108,9 @@ def main(arguments: list[str]) -> int:
             shown = _Rotated(inputs or Shown(data, count, chosen.query or 3), chosen.rotated)
             steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
             plain: Score | None = None
-            for method, adapter in adapters(model, shown, names, chosen.methods, steps, coarse=chosen.coarse).items():
+            made_by = adapters(model, shown, names, chosen.methods, steps, coarse=chosen.coarse)
+            for method in sorted(made_by, key=lambda name: name != "hull_blend"):  # others are compared with it
+                adapter = made_by[method]
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
                 row |= {"suite": suite} if suite else {}
                 row |= {"rotated": chosen.rotated} if chosen.rotated else {}

@@ -80,6 +80,15 @@ def test_memory_that_is_free_is_known_and_little_is_not_asked_for(monkeypatch):
         memory.require_memory("views", 3, 5e9, "take fewer")
 
 
+def test_files_that_the_kernel_keeps_are_free_memory(monkeypatch):
+    """A control group of 16 GiB, of which 13 of 15 that are taken are such files."""
+    files = {"max": f"{16 * 2**30}", "current": f"{15 * 2**30}", "stat": f"anon {2**31}\ninactive_file {13 * 2**30}"}
+    read = Path.read_text
+    monkeypatch.setattr(Path, "read_text", lambda path, **how: files.get(path.name.removeprefix("memory."), ""))
+    assert memory.available_memory() == 14 * 2**30
+    monkeypatch.setattr(Path, "read_text", read)
+
+
 @pytest.mark.parametrize("asked", [["--help"], ["presets", "--help"]])
 def test_a_full_disk_behind_standard_output(asked):
     with open("/dev/full", "w") as full:

@@ -102,20 +102,22 @@ def check_training(config: TrainingConfig, model: ModelConfig) -> None:
     """Refuse a training that a model cannot have.
 
     Raises:
-        ValueError: numbers of views for a field that knows them by their places, rotations without such numbers, or
-            the volume loss for a model without a volume or a grid.
+        ValueError: numbers of views for a field that knows them by their places, what a learned initialisation does
+            not do, rotations without numbers of views, or the volume loss for a model without a volume or a grid.
     """
     if config.views and (not find_targets()[model.target].permutation_invariant or min(config.views) < 1):
         raise ValueError(
             "training.views: expected numbers of at least 1, for the field image_based, which takes any of them, "
             f"got {list(config.views)} for {model.target}"
         )
-    for name in ("random_background", "empty_points"):
+    for name in ("random_background", "empty_points", "antialias"):
         if getattr(config, name) and model.initialisation is not None:
             raise ValueError(
                 f"training.{name}: expected {type(getattr(config, name))()} for {model.method}, whose steps on "
                 f"an object are plain fine-tuning, got {getattr(config, name)}"
             )
+    if model.plane_dropout and model.initialisation is not None:
+        raise ValueError(f"model.plane_dropout: expected 0 for {model.method}, which hides no plane")
     if config.rotations and not config.views:
         raise ValueError(f"training.rotations: expected 0 without training.views, got {config.rotations}")
     volume, grid = isinstance(model.hypernetwork, VolumeHyperNetworkConfig), getattr(model.network, "grid", 0)

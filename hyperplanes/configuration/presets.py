@@ -94,6 +94,8 @@ class Preset:
         chosen = self
         if method in targets:
             chosen, target = self.without_hypernetwork(), method
+        elif method == self.model.method:  # another field for it: its own settings stay
+            pass
         elif method == "autoencoder":
             chosen = self.with_autoencoder()
         elif method in LEARNED:
@@ -107,13 +109,15 @@ class Preset:
 
     def for_known_places(self) -> Preset:
         """Without what only a field of any number of views can do: be trained by some of them, and be shown more."""
-        model = replace(self.model, stacked=False, symmetric=False)
+        alone = {"stacked": False, "gated": False, "hull_share": 0.0, "symmetric": False}
+        model = replace(self.model, **alone, symmetry=None, azimuth=None)
         return replace(self, model=model, training=replace(_of_all_views(self.training), volume_loss=0.0))
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
         training = replace(self.training, volume_loss=0.0)  # of what a hypernetwork reads
-        return replace(self, model=replace(self.model, hypernetwork=None), training=training)
+        model = replace(self.model, hypernetwork=None, autoencoder=None, initialisation=None)
+        return replace(self, model=model, training=training)
 
     def with_autoencoder(self) -> Preset:
         """The same target with the code of an encoder as an input, in place of a hypernetwork."""
@@ -135,12 +139,14 @@ class Preset:
             learning_rate=self.outer_rate,
             random_background=False,
             empty_points=0,
+            antialias=False,
         )
         if method == "mv_matched":
             training = replace(training, learning_rate=MATCHING_RATE)
         else:
             training = replace(training, tasks=1, rays=128, warmup=0, final_rate_factor=1.0)
-        return replace(plain, model=replace(plain.model, initialisation=initialisation), training=training)
+        model = replace(plain.model, initialisation=initialisation, plane_dropout=0.0)
+        return replace(plain, model=model, training=training)
 
 
 def _of_all_views(training: TrainingConfig) -> TrainingConfig:

@@ -183,6 +183,8 @@ def parse_options(given: Sequence[str]) -> dict[str, Any]:
             raise SettingsError(
                 option, f"expected a plain value, got {values} ({' '.join(str(error).split())})"
             ) from None
+        if isinstance(node.get(names[-1]), dict):
+            raise SettingsError(option, "given beside a part of it; leave one of them out")
         node[names[-1]] = True if not read else read[0] if len(read) == 1 else read
     return result
 

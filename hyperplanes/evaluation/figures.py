@@ -60,6 +60,7 @@ class PictureGrid:
         found[method] = to_pixels(pictures.images[view : view + 1])[0]
 
     def save(self, path: Path) -> None:
-        """Draw the grid."""
-        columns = list(next(iter(self.seen.values())))
-        save_figure(draw_grid([list(row.values()) for row in self.seen.values()], columns, list(self.seen)), path)
+        """Draw the grid, of the objects that no method failed on which shows any of them."""
+        columns = list(dict.fromkeys(name for row in self.seen.values() for name in row))
+        whole = {name: [row[each] for each in columns] for name, row in self.seen.items() if len(row) == len(columns)}
+        save_figure(draw_grid(list(whole.values()), columns, list(whole)), path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,6 +16,7 @@ from hyperplanes.adaptation.base import Adapter, Pictures, Renderable
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
+from hyperplanes.utilities.timing import clock
 from hyperplanes.views import Task, Tasks
 
 __all__ = ["QUANTITIES", "ObjectScore", "Perceptual", "Score", "evaluate", "evaluate_all", "merge_seeds"]
@@ -91,8 +91,9 @@ class Score:
         return [value for each in self.objects if (value := getattr(each, quantity)) is not None]
 
     def deviation(self, quantity: str) -> float | None:
-        """Standard deviation over seeds of the mean over objects; None of fewer than two seeds."""
-        return stdev(seed.mean(quantity) for seed in self.seeds) if len(self.seeds) > 1 else None
+        """Standard deviation over seeds of the mean over objects; None of fewer than two, or of infinite means."""
+        means = [seed.mean(quantity) for seed in self.seeds]
+        return stdev(means) if len(means) > 1 and all(map(math.isfinite, means)) else None
 
     @property
     def quantities(self) -> list[str]:
@@ -198,12 +199,12 @@ def _evaluate_one(
     task = data.task(name)
     if not len(task.query):
         raise ValueError(f"{name}: expected at least one query view to compare with, got none")
-    start = time.perf_counter()
+    start = clock()
     with prefix_errors(name):
         adapted = adapter.adapt(task.support)
-    adapted_at = time.perf_counter()
+    adapted_at = clock()
     pictures = adapted.render(task.query.cameras)
-    rendered_at = time.perf_counter()
+    rendered_at = clock()
     images, truth, masks = pictures.images.to(task.query.images).clamp(0, 1), task.query.images, task.query.masks
     score = ObjectScore(
         name,

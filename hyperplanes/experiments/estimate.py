@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-
-import torch
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.experiments.engine import Runner
@@ -16,6 +13,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.training import Trainer
 from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.utilities.formatting import format_duration, format_rate
+from hyperplanes.utilities.timing import clock
 
 __all__ = ["Estimate", "estimate"]
 
@@ -47,10 +45,13 @@ def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
         seeds: of every training and evaluation.
 
     Returns:
-        The time of all trainings and evaluations, whatever of them is done already.
+        The time of all trainings, those that others refer to among them, and of evaluations but those of packaged
+        models, whatever of them is done already.
     """
     rows, whole = [], 0.0
-    for trained in experiment.trainings:
+    references = [each.reference for each in experiment.trainings if each.reference is not None]
+    references = [each for each in references if each not in experiment.trainings]
+    for trained in (*references, *experiment.trainings):
         if trained.packaged:
             continue
         chosen = runner.trainings.configuration(experiment, trained, 0)
@@ -93,20 +94,17 @@ def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measu
     trainer = _trainer(runner, experiment, trained)
     trainer.loader.names = trainer.loader.names[: trainer.config.tasks]  # made ready by the first step
     trainer.take_step()
-    _wait()
-    started = time.perf_counter()
+    started = clock()
     for _ in range(STEPS):
         trainer.take_step()
-    _wait()
-    step = (time.perf_counter() - started) / STEPS
+    step = (clock() - started) / STEPS
     task = trainer.data.task(trainer.loader.names[0])
     field = trainer.model.adapt(task.support)
     view = camera.resized(camera.select(task.query.cameras, [0]), SIDE, SIDE)
     field.render(view)  # what is empty is found once an object
-    started = time.perf_counter()
+    started = clock()
     field.render(view)
-    _wait()
-    return _Measured(step, (time.perf_counter() - started) / SIDE**2, trainer.objective.rays_per_step / step)
+    return _Measured(step, (clock() - started) / SIDE**2, trainer.objective.rays_per_step / step)
 
 
 def _trainer(runner: Runner, experiment: Experiment, trained: Trained) -> Trainer:
@@ -117,8 +115,3 @@ def _trainer(runner: Runner, experiment: Experiment, trained: Trained) -> Traine
         return Trainer(model, data, chosen.training)
     reference = trained.reference and _trainer(runner, experiment, trained.reference).model
     return initialisation_trainer(model, data, chosen.training, None, reference)
-
-
-def _wait() -> None:
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Annotated, ClassVar
 
 import torch
@@ -273,11 +272,18 @@ class ImageBasedField(Field):
             return found.rows, found.coverage, found
         return torch.cat([found.rows, *self._features(points)], 1), found.coverage, found
 
-    @cached_property
+    @property
     def _cells(self) -> Float[Tensor, "channel x y z"] | None:
-        """The grid, with the numbers of a cell side by side in memory."""
+        """The grid, with the numbers of a cell side by side in memory: copied once, and anew where it has changed."""
         grid = self.parameters.get("grid.weight")
-        return None if grid is None else grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2)
+        if grid is None:
+            return None
+        state = grid.data_ptr(), 0 if grid.is_inference() else grid._version
+        kept = self.__dict__.get("_kept_cells")
+        if kept is None or kept[0] != state:
+            kept = state, grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2)
+            self.__dict__["_kept_cells"] = kept  # threads that come at once copy the same
+        return kept[1]
 
     def _features(self, points: Tensor) -> list[Float[Tensor, "point number"]]:
         """Those of the grid, the first through a sigmoid."""

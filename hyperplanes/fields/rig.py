@@ -70,7 +70,8 @@ class Rig:
 def match(rig: Float[Tensor, "plane 3"], standing: Float[Tensor, "view 3"]) -> Int[Tensor, " plane"]:
     """The view of each plane: together as near as can be to where the views of the training stood.
 
-    More views than planes: none stands at two. Fewer: some stand at several, as evenly as their numbers allow.
+    More views than planes: none stands at two. Fewer: each stands at as many at most as it takes to fill all planes,
+    and one that is far from all of them may stand at none.
 
     Args:
         rig: camera directions of the planes in training, on the CPU.

@@ -71,4 +71,6 @@ class RunningStandardisation(nn.Module):
             return
         before = codes - self.mean
         self.mean += weight * before.mean(0)
-        self.variance += weight * ((before * (codes - self.mean)).mean(0) - self.variance)
+        # a single object of the first step has no variance: the first that is measured replaces that of the start
+        first = bool(self.steps == 2) and bool((self.variance == 1).all())
+        self.variance += (1.0 if first else weight) * ((before * (codes - self.mean)).mean(0) - self.variance)

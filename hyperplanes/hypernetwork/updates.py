@@ -41,6 +41,9 @@ class LowRankUpdate(nn.Module):
 
     def __init__(self, shape: torch.Size, rank: int) -> None:
         super().__init__()
+        if len(shape) > 2:
+            expected = "update: expected 'full' for layers with a grid of features"
+            raise ValueError(f"{expected}, {tuple(shape)}, got 'low_rank'; name other layers")
         self.rank = rank if len(shape) == 2 else 0
         self.size = shape[0] * (1 + self.rank)
         if self.rank:

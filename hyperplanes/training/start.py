@@ -57,6 +57,8 @@ def start_training(
     tasks = TasksOnDevice(data, torch.device(device))
     if matching:
         found = None if reference is None else HyperPlanes.from_pretrained(reference)
+        if reference is not None and not _goes_on(reference, folder):
+            _note(reference, folder)
         return initialisation_trainer(model, tasks, training, folder, found)
     if reference is not None:
         _begin_with(model, reference, folder)
@@ -75,12 +77,7 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
     Raises:
         ValueError: weights of another model, or a training that began with others.
     """
-    note, weights = folder / INITIAL, checkpoint_folder(reference) / "model.safetensors"
-    if (folder / "training.json").exists():
-        known = read_json(note) if note.exists() else {}
-        if weights.exists() and known.get("sha256") != sha256(weights.read_bytes()):
-            began = known.get("checkpoint", "random weights")
-            raise ValueError(f"checkpoint: expected what the training in {folder} began with, {began}, got {reference}")
+    if _goes_on(reference, folder):
         return
     found = HyperPlanes.from_pretrained(reference)
     if model.gate is None:  # a gating network is trained after the model, on what that shows
@@ -99,7 +96,29 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
             f"{', '.join(differing[:MOST])}{', ...' * (len(differing) > MOST)}; give {known}"
         )
     model.load_state_dict(found.state_dict())
-    write_json(note, {"checkpoint": str(reference), "sha256": sha256(weights.read_bytes())})
+    _note(reference, folder)
+
+
+def _goes_on(reference: Path, folder: Path) -> bool:
+    """Whether a training in a folder goes on; a reference is then compared with the one that it began with.
+
+    Raises:
+        ValueError: another one.
+    """
+    if not (folder / "training.json").exists():
+        return False
+    note, weights = folder / INITIAL, checkpoint_folder(reference) / "model.safetensors"
+    known = read_json(note) if note.exists() else {}
+    if weights.exists() and known.get("sha256") != sha256(weights.read_bytes()):
+        began = known.get("checkpoint", "random weights")
+        raise ValueError(f"checkpoint: expected what the training in {folder} began with, {began}, got {reference}")
+    return True
+
+
+def _note(reference: Path, folder: Path) -> None:
+    """Write into the folder of a new training which weights it begins with, or is to match."""
+    weights = checkpoint_folder(reference) / "model.safetensors"
+    write_json(folder / INITIAL, {"checkpoint": str(reference), "sha256": sha256(weights.read_bytes())})
 
 
 def _check_views(model: HyperPlanes, tasks: Tasks) -> None:

@@ -129,12 +129,12 @@ class Trainer:
                 self._write(self.folder, found)
             if saving:
                 self.save()
-            if stopping:
-                return
             if reporting:
                 left = speed.seconds_left(step)
                 seen = (None, None, None) if found is None else (found.psnr, found.diagnostics, found.ssim)
                 yield Progress(step, config.steps, loss, rays_per_second, seen[0], left, seen[1], seen[2])
+            if stopping:
+                return
 
     def take_step(self) -> float:
         """One step of the optimisers on freshly drawn objects and rays; returns the loss."""

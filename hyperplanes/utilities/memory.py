@@ -18,8 +18,10 @@ def available_memory() -> int | None:
         lines = Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
         found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
         group = Path("/sys/fs/cgroup")
-        limit, used = ((group / f"memory.{name}").read_text().strip() for name in ("max", "current"))
-        found += [int(limit) - int(used)] if limit.isdigit() else []
+        limit, used, kinds = ((group / f"memory.{name}").read_text().strip() for name in ("max", "current", "stat"))
+        # files that the kernel keeps, and gives back when asked for
+        cached = dict(line.split() for line in kinds.splitlines()).get("inactive_file", "0")
+        found += [int(limit) - int(used) + int(cached)] if limit.isdigit() else []
     except (OSError, ValueError):
         pass
     if not found and hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:

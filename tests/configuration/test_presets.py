@@ -10,6 +10,7 @@ from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.configuration.compatibility import check_model, check_training
 from hyperplanes.configuration.presets import PRESETS, preset
 from hyperplanes.fields import find_targets
+from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.hypernetwork import ConvNet, ResNet101
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.training import Trainer
@@ -122,3 +123,31 @@ def test_what_a_hypernetwork_learns_is_not_asked_of_a_method_without_one(method)
 def test_an_unknown_preset_is_refused():
     with pytest.raises(ValueError, match="preset: expected one of quick, .*, got 'huge'"):
         preset("huge")
+
+
+@pytest.mark.parametrize("first", ["mv_meta", "maml", "autoencoder", "hyperplanes"])
+@pytest.mark.parametrize("second", ["nerf", "point_multiplane", "autoencoder", "mv_meta", "image_based"])
+def test_another_method_leaves_nothing_of_the_first_one(first, second):
+    made = preset("quick").by_method(first).by_method(second)
+    assert made.model.method == preset("quick").by_method(second).model.method
+    check_model(made.model)
+    check_training(made.training, made.model)
+
+
+def test_a_field_that_knows_planes_by_their_places_has_nothing_of_one_that_takes_any_views():
+    small = preset("small")
+    model = replace(
+        small.model, gated=True, stacked=False, hull_share=0.2, azimuth=0.3, symmetry=Symmetry(Plane((1.0, 0.0, 0.0)))
+    )
+    check_model(replace(small, model=model).by_method("point_multiplane").model)
+
+
+def test_another_field_for_the_same_method_keeps_the_settings_of_the_method():
+    chosen = preset("quick").by_method("mv_meta")
+    initialisation = replace(chosen.model.initialisation, inner_steps=7, inner_rate=0.1)
+    training = replace(chosen.training, learning_rate=0.01, rays=256, tasks=2)
+    changed = replace(chosen, model=replace(chosen.model, initialisation=initialisation), training=training)
+    made = changed.by_method("mv_meta", "point_multiplane")
+    assert made.model.target == "point_multiplane"
+    assert made.model.initialisation == initialisation
+    assert made.training == training

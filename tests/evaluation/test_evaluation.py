@@ -1,6 +1,7 @@
 """Source of truth: a constant error, whose PSNR is -20 log10 of it, and means by hand."""
 
 import json
+import math
 from dataclasses import dataclass, replace
 
 import pytest
@@ -8,6 +9,8 @@ import torch
 
 from hyperplanes.adaptation import NearestView, Pictures
 from hyperplanes.evaluation import ObjectScore, Score, evaluate
+from hyperplanes.evaluation.figures import PictureGrid
+from hyperplanes.evaluation.tables import rows
 from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 from tests.reference_rendering import Balls, small_model
 
@@ -142,3 +145,28 @@ def test_pictures_are_compared_in_the_precision_of_the_data():
     assert evaluate("nearest_view", NearestView(), Double(), ["test0"]).objects[0].psnr == pytest.approx(
         score.psnr, abs=1e-4
     )
+
+
+def test_seeds_of_a_perfect_row_have_no_deviation():
+    """A query view that is a support view is copied: infinite PSNR by every seed."""
+    seed = Score("nearest_view", (ObjectScore("one", math.inf, 1.0, 0.0, 0.0, math.inf),))
+    row = replace(seed, seeds=(seed, seed))
+    assert row.deviation("psnr") is None
+    assert row.deviation("ssim") == 0
+    assert "inf" in headings_and_rows(row)
+
+
+def headings_and_rows(row):
+    return " ".join(cell for line in rows([row]) for cell in line)
+
+
+def test_an_object_that_one_method_failed_on_is_left_out_of_the_pictures(tmp_path):
+    data, grid = Balls(test=2), PictureGrid()
+    one, two = (data.task(name) for name in data.names("test"))
+    for method, tasks in (("a", (one, two)), ("b", (two,))):
+        for task in tasks:
+            grid.add(method, 0, task, Pictures(task.query.images, task.query.masks, task.query.masks, 0))
+    grid.save(tmp_path / "grid.svg")
+    text = (tmp_path / "grid.svg").read_text()
+    assert two.name in text
+    assert one.name not in text

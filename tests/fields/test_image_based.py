@@ -204,3 +204,15 @@ def test_every_parameter_has_a_gradient():
 def test_no_view_at_all_is_refused():
     with pytest.raises(ValueError, match="at least one view"):
         network().bind(Parameters(), None)
+
+
+@torch.no_grad()
+def test_a_field_whose_grid_changes_in_place_says_something_else():
+    target = ImageBasedNeRF(ImageBasedConfig(depth=2, width=64, planes=2, grid=4, cells=4))
+    views, parameters = coloured(3), Parameters.of(target)
+    field, (points, _) = bound(target, views, parameters), queries()
+    before = field.density(points)
+    parameters["grid.weight"].add_(torch.randn(parameters["grid.weight"].shape, generator=torch.Generator()))
+    after = field.density(points)
+    assert not torch.allclose(before, after)
+    torch.testing.assert_close(after, bound(target, views, parameters).density(points))

@@ -15,6 +15,7 @@ from hyperplanes.hypernetwork import (
     ImageHyperNetworkConfig,
     Observed,
 )
+from hyperplanes.hypernetwork.updates import LowRankUpdate
 from hyperplanes.hypernetwork.weights import LowRankReader
 
 CONFIG = ImageHyperNetworkConfig(views=3, normalisation="group", code=8, depth=2, width=16)
@@ -289,3 +290,8 @@ def test_reading_the_papers_network_takes_few_numbers():
     theta = sum(value.numel() for value in target.parameters())
     assert theta * 128 > 75e6
     assert sum(value.numel() for value in reader.parameters()) < 120_000
+
+
+def test_a_grid_of_features_has_no_low_rank_update():
+    with pytest.raises(ValueError, match=r"update: expected 'full' for layers with a grid of features, \(4, 8, 8, 8\)"):
+        LowRankUpdate(torch.Size((4, 8, 8, 8)), 2)

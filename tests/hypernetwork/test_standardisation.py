@@ -28,6 +28,14 @@ def test_the_first_steps_are_averaged_evenly():
     assert layer.mean.item() == pytest.approx(3.0)
 
 
+def test_the_variance_of_single_objects_is_that_of_the_objects():
+    """Not that of the start, which is 10,000 times as large."""
+    generator, layer = torch.Generator().manual_seed(0), RunningStandardisation((2,))
+    for _ in range(40):
+        layer(0.01 * torch.randn(1, 2, generator=generator))
+    assert (layer.variance.sqrt() / 0.01).sub(1).abs().max() < 0.5
+
+
 def test_one_object_a_step_is_enough():
     layer = RunningStandardisation((3,))
     assert layer(torch.ones(1, 3)).isfinite().all()

@@ -152,7 +152,30 @@ def test_a_reference_that_does_not_fit_is_refused(tmp_path):
         initialisation_trainer(model, Balls(), FAST, None, other)
 
 
-@pytest.mark.parametrize(("name", "value"), [("random_background", True), ("empty_points", 64)])
+def test_matching_goes_on_with_the_reference_that_it_began_with(tmp_path):
+    model_of("mv_meta").save(tmp_path / "one")
+    other = model_of("mv_meta")
+    with torch.no_grad():
+        other.networks["fine"].colour.bias.add_(1)
+    other.save(tmp_path / "other")
+    config, begin = replace(FAST, steps=2), model_of("mv_matched").config
+    list(start_training(begin, config, Balls(), tmp_path / "out", reference=tmp_path / "one").run())
+    longer = replace(config, steps=3)
+    assert start_training(begin, longer, Balls(), tmp_path / "out", reference=tmp_path / "one").step == 2
+    with pytest.raises(
+        ValueError, match=r"checkpoint: expected what the training in .* began with, .*one, got .*other"
+    ):
+        start_training(begin, longer, Balls(), tmp_path / "out", reference=tmp_path / "other")
+
+
+def test_planes_are_hidden_by_no_learned_initialisation():
+    model = model_of("mv_meta")
+    model.config = replace(model.config, plane_dropout=0.5)
+    with pytest.raises(ValueError, match="model.plane_dropout: expected 0 for mv_meta"):
+        initialisation_trainer(model, Balls(), FAST, None)
+
+
+@pytest.mark.parametrize(("name", "value"), [("random_background", True), ("empty_points", 64), ("antialias", True)])
 def test_what_inner_steps_do_not_do_is_refused(name, value):
     with pytest.raises(ValueError, match=f"training.{name}: expected .* for mv_meta"):
         initialisation_trainer(model_of("mv_meta"), Balls(), replace(FAST, **{name: value}), None)

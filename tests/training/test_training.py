@@ -849,3 +849,10 @@ def test_views_in_double_precision_are_trained_on_as_in_single(tmp_path):
 
     losses = [Trainer(awaken(small_model()), data, replace(FAST, steps=1)).take_step() for data in (Balls(), Double())]
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+
+
+def test_a_validation_of_the_step_that_a_training_stops_at_is_reported():
+    trainer = Trainer(small_model(), Balls(), with_(steps=6, evaluate_every=2))
+    trainer.stopping = True
+    trainer.take_step()
+    assert [progress.step for progress in trainer.run()] == [2]

@@ -92,6 +92,13 @@ def test_every_field_of_every_configuration_can_be_set_by_an_option(base):
         assert {name for name in entries if now[name] != entries[name]} == {path}
 
 
+def test_a_whole_does_not_take_the_place_of_a_part_that_was_given_before():
+    part, whole = ["--model.network.depth", "3"], ["--model.network", "{width: 4}"]
+    assert parse_options([*whole, *part]) == {"model": {"network": {"width": 4, "depth": 3}}}
+    with pytest.raises(SettingsError, match="given beside a part of it; leave one of them out"):
+        parse_options([*part, *whole])
+
+
 def test_one_number_is_a_list_of_one_where_a_list_is_expected():
     made = changed(preset("small"), parse_options(["--training.views", "5"]))
     assert made.training.views == (5,)

@@ -1,0 +1,16 @@
+"""Seconds of what is done, and not of what is queued."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+
+__all__ = ["clock"]
+
+
+def clock() -> float:
+    """The performance counter in seconds, when all that was queued on a GPU is done."""
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter()
