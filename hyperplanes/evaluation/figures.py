@@ -60,7 +60,15 @@ class PictureGrid:
         found[method] = to_pixels(pictures.images[view : view + 1])[0]
 
     def save(self, path: Path) -> None:
-        """Draw the grid, of the objects that no method failed on which shows any of them."""
+        """Draw the grid, of the objects that no method failed on.
+
+        Where there is no such object, it is drawn of the methods that failed on none.
+
+        Args:
+            path: of the picture (PNG, SVG or PDF).
+        """
         columns = list(dict.fromkeys(name for row in self.seen.values() for name in row))
-        whole = {name: [row[each] for each in columns] for name, row in self.seen.items() if len(row) == len(columns)}
-        save_figure(draw_grid(list(whole.values()), columns, list(whole)), path)
+        whole = {name: row for name, row in self.seen.items() if len(row) == len(columns)}
+        if not whole:
+            whole, columns = self.seen, [name for name in columns if all(name in row for row in self.seen.values())]
+        save_figure(draw_grid([[row[each] for each in columns] for row in whole.values()], columns, list(whole)), path)

@@ -170,3 +170,8 @@ def test_an_object_that_one_method_failed_on_is_left_out_of_the_pictures(tmp_pat
     text = (tmp_path / "grid.svg").read_text()
     assert two.name in text
     assert one.name not in text
+    grid.add("c", 0, one, Pictures(one.query.images, one.query.masks, one.query.masks, 0))
+    grid.save(tmp_path / "grid.svg")  # no object that all three have
+    text = (tmp_path / "grid.svg").read_text()
+    assert one.name in text
+    assert two.name in text
