@@ -10,7 +10,7 @@ from PIL import Image
 
 from hyperplanes.adaptation.base import hull
 from hyperplanes.data import DataError, read_task, read_views
-from hyperplanes.data.pictures.images import opacity_of, read_image
+from hyperplanes.data.pictures.images import image_header, opacity_of, read_image
 from hyperplanes.data.pictures.masks import match_masks
 from hyperplanes.data.pictures.posed import Posed
 from hyperplanes.export.images import orbit_cameras
@@ -265,3 +265,15 @@ def test_a_mask_says_by_its_alpha_what_its_colours_do_not(mask, has_alpha, opaci
     pixels = np.full((2, 2, 4), grey, np.uint8)
     pixels[..., 3] = alpha
     assert (opacity_of(pixels, has_alpha) == opacity).all()
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_tiff_that_is_stored_on_its_side_is_refused(orientation, tmp_path):
+    picture = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    Image.fromarray(picture).save(tmp_path / "0.tiff", tiffinfo={274: orientation})
+    if orientation == 1:
+        np.testing.assert_array_equal(read_image(tmp_path / "0.tiff")[0][..., 0], picture)
+        return
+    for read in (image_header, read_image):
+        with pytest.raises(DataError, match="expected a TIFF that is stored upright, found orientation 6"):
+            read(tmp_path / "0.tiff")

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
+from PIL.TiffImagePlugin import TiffImageFile
 from torch import Tensor
 
 from hyperplanes.utilities.files import DataError, check_regular
@@ -191,6 +192,10 @@ def _open(path: Path) -> Image.Image:
         raise
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(path, "an image", f"something else ({error})", _REMEDY) from error
+    orientation = image.tag_v2.get(_ORIENTATION, 1) if isinstance(image, TiffImageFile) else 1
+    if orientation != 1:  # Pillow turns such files itself, and mixes up the pixels of those that are not compressed
+        image.close()
+        raise DataError(path, "a TIFF that is stored upright", f"orientation {orientation}", "save it again, as PNG")
     if image.height * image.width > LARGEST_IMAGE:
         size = f"{image.width} x {image.height}"
         image.close()
