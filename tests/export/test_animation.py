@@ -5,7 +5,7 @@ import torch
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.animation import choose_representation
-from hyperplanes.export.baking import BakedScene
+from hyperplanes.export.baking import BakedScene, default_side
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
@@ -35,3 +35,12 @@ def test_voxels_draw_long_animations_of_many_views(frames, side, shown, represen
     found = choose_representation(FIELD, views, cameras, representation, make=lambda *_: VOXELS)
     assert isinstance(found, BakedScene) == by_voxels
     assert choose_representation(found, views, cameras, representation) is found or not by_voxels
+
+
+def test_voxels_have_the_size_that_the_views_were_seen_by():
+    """Larger pictures show no more: between the rays of the views' pixels voxels would be what they began as."""
+    lens, sides = camera.symmetric_intrinsics(64, 64, 0.8), []
+    views = Views(torch.ones(25, 3, 64, 64), camera.pinhole(lens, torch.eye(4).expand(25, 4, 4), 64, 64))
+    larger = camera.resized(camera.select(views.cameras, [0]), 256, 256)
+    choose_representation(FIELD, views, larger, "voxels", make=lambda field, views, side: sides.append(side) or VOXELS)
+    assert sides == [default_side((64, 64))]
