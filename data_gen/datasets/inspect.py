@@ -141,7 +141,7 @@ def _sparse(folder: Path, posed: Any) -> Any:
             errors = dict(zip((frame["file_path"] for frame in frames), model.errors_of_cameras(), strict=True))
             found = replace(found, error=model.reprojection_error, errors=errors)
     turn = y_up_from(posed.support.up or guess_up(posed.support.cameras) or "y")[:3, :3].numpy()
-    return replace(found, places=found.places @ turn.T)
+    return replace(found, places=(found.places - np.asarray(posed.support.origin)) @ turn.T)
 
 
 def _trial(views: Any) -> list[str]:

@@ -138,15 +138,21 @@ def read_path(
     """
     from hyperplanes.data.camera_path import read_camera_path
     from hyperplanes.data.dataset import locate_scene
+    from hyperplanes.data.formats.recognise import read_posed
     from hyperplanes.data.upright import upright_cameras
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.utilities.files import read_json
 
     listed = locate_scene(scene) / "transforms.json"
-    found = read_camera_path(path, transforms, read_json(listed) if listed.is_file() else None)
+    document = read_json(listed) if listed.is_file() else None
+    found = read_camera_path(path, transforms, document)
+    cameras = upright_cameras(found.cameras, up)
+    away = (camera.centres(cameras) - cameras.extrinsics.new_tensor(shown.bounds.centre)).norm(dim=1)
+    if float(away.min()) > FAR * shown.bounds.radius:  # as where the scene lies far from the origin and was shifted
+        found = read_camera_path(path, transforms, document, read_posed(locate_scene(scene)).origin)
+        cameras = upright_cameras(found.cameras, up)
     for note in found.notes:
         console.warn(f"{path}: {note}")
-    cameras = upright_cameras(found.cameras, up)
     height, width = camera.image_size(cameras)
     if size is not None:
         scale = size / max(height, width)
@@ -162,6 +168,9 @@ def read_path(
         )
     return cameras, found.seconds
 
+
+FAR = 100
+"""Radii from the middle of the scene beyond which all cameras of a path may be those of another world."""
 
 LARGEST_UNASKED = 400
 """Pixels along the longer side above which the pictures of a camera path take long."""

@@ -9,7 +9,7 @@ config.yml says how.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,10 @@ class CameraPath:
 
 @checked
 def read_camera_path(
-    path: str | Path, transforms: str | Path | None = None, scene: Mapping[str, Any] | None = None
+    path: str | Path,
+    transforms: str | Path | None = None,
+    scene: Mapping[str, Any] | None = None,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> CameraPath:
     """The cameras of a path that nerfstudio wrote.
 
@@ -58,6 +61,7 @@ def read_camera_path(
             is in the world of the data where absent.
         scene: the content of the transforms.json of the data, whose `applied_transform` and `applied_scale` tell its
             world from the one that `transforms` begins with.
+        origin: of the world in which the cameras are wanted, in that of the data (`Posed.origin`).
 
     Returns:
         Perspective cameras, principal points in the middle.
@@ -89,6 +93,7 @@ def read_camera_path(
         focal[index] = height / 2 / math.tan(math.radians(angle) / 2)
     if transforms is not None:
         poses = _to_data(poses, Path(transforms), scene or {})
+    poses[:, :3, 3] -= np.asarray(origin)
     matrices = np.tile(np.eye(3), (len(frames), 1, 1))
     matrices[:, 0, 0] = matrices[:, 1, 1] = focal
     matrices[:, :2, 2] = (width - 1) / 2, (height - 1) / 2

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from hyperplanes.commands.console import Console
+from hyperplanes.commands.scene import read_path, read_scene
 from hyperplanes.data import read_task, read_views
 from hyperplanes.data.formats.recognise import read_posed_task
 from hyperplanes.data.formats.transforms_document import transforms_document
@@ -91,6 +93,7 @@ def test_a_scene_at_coordinates_of_a_map_loses_no_pixel(scene, tmp_path):
     near = read_task(scene.write(tmp_path / "near"))
     far = read_posed_task(scene.write(tmp_path / "far", document))
     origin = np.array(re.findall(r"[-\d.]+", far.notes[0].split(": ")[1])[:3], float)
+    np.testing.assert_allclose(far.support.origin, origin)
     np.testing.assert_allclose(far.support.bounds.centre, scene.centre + offset - origin, atol=1e-9)
     assert far.query.bounds == far.support.bounds
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) - 0.5
@@ -101,6 +104,14 @@ def test_a_scene_at_coordinates_of_a_map_loses_no_pixel(scene, tmp_path):
             shown, reference.cameras.project(points.expand(len(half), -1, -1)), atol=0.01, rtol=0
         )
     assert not any("shifted" in note for note in read_posed_task(tmp_path / "near").notes)
+    assert read_posed_task(tmp_path / "near").support.origin == (0.0, 0.0, 0.0)
+    # a camera path of the same poses, in the world of the files
+    frames = [{"camera_to_world": each["transform_matrix"], "fov": 60.0} for each in document["frames"]]
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"render_width": 8, "render_height": 8, "camera_path": frames}))
+    task, up = read_scene(tmp_path / "far", Console(silent=True), all_views=True)
+    cameras, _ = read_path(path, None, None, task.support, up, tmp_path / "far", Console(silent=True))
+    torch.testing.assert_close(cameras.extrinsics, task.support.cameras.extrinsics, atol=1e-3, rtol=0)
 
 
 def test_train_and_test_files_are_support_and_query(scene, tmp_path):

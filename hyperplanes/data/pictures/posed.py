@@ -41,6 +41,7 @@ class Posed:
         depths: (view, 2), the nearest and farthest distance that the files state, or None.
         notes: what a person should know of the reading, a sentence each: what was left out, turned or scaled.
         up: as in `Views`.
+        origin: of this world, in that of the files.
     """
 
     rgba: UInt8[Tensor, "view 4 height width"]
@@ -51,6 +52,7 @@ class Posed:
     depths: Float[Tensor, "view 2"] | None = None
     notes: tuple[str, ...] = ()
     up: str | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @cached_property
     def bounds(self) -> Sphere:
@@ -192,8 +194,8 @@ def posed(
     rgba = torch.from_numpy(np.ascontiguousarray(np.stack(pictures).transpose(0, 3, 1, 2)))
     height, width = rgba.shape[2:]
     offset = _far_offset(camera_from_world, bounds)
+    x, y, z = offset.tolist()
     if offset.any():
-        x, y, z = offset.tolist()
         camera_from_world = camera_from_world.copy()
         camera_from_world[:, :3, 3] += camera_from_world[:, :3, :3] @ offset
         if bounds is not None:
@@ -206,7 +208,7 @@ def posed(
         )
     except ValueError as error:
         raise DataError(source, "usable cameras", str(error), "export the cameras again") from error
-    return Posed(rgba, cameras, has_alpha, bounds, names, depths, notes)
+    return Posed(rgba, cameras, has_alpha, bounds, names, depths, notes, origin=(x, y, z))
 
 
 def _far_offset(camera_from_world: npt.NDArray[np.float64], bounds: Sphere | None) -> npt.NDArray[np.float64]:
