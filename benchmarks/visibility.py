@@ -18,7 +18,7 @@ from benchmarks.objects import held_out
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry.chosen_views import Visibility
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility import VisibilityPlanes, choose_torch
 from hyperplanes.geometry.volume import volume_of
 from hyperplanes.views import join_views
 
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> int:
 
         def plain(planes: VisibilityPlanes = planes, at=points, along=directions) -> Visibility:
             with torch.no_grad():
-                return planes._choose_torch(at, along, BEST, NEAREST + 1, planes.depth_opacity)
+                return choose_torch(planes, at, along, BEST, NEAREST + 1, planes.depth_opacity)
 
         first, second = compiled(), plain()
         agreeing = float((first.best.penalty - second.best.penalty).abs().lt(1e-3).float().mean())

@@ -13,7 +13,7 @@ import torch
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.finding_symmetry import find_symmetry
-from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
+from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.geometry.kernels.threads import side_by_side
 from hyperplanes.geometry.reflections import Symmetry
@@ -98,8 +98,7 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
     views = network.to_own(support).resized(SIZE)
     placed = [Placed(each.views(views), each.symmetry(symmetry, views.bounds), each) for each in rotations]
     trials = [(each, held_out) for each in placed for held_out in range(FOLDS)]
-    with in_use(network):  # once: threads that each entered and left it would switch the others back to training
-        found = side_by_side(lambda trial: _quality(network, *trial), trials, views.images.device)
+    found = side_by_side(lambda trial: _quality(network, *trial), trials, views.images.device)
     qualities = [sum(found[start : start + FOLDS]) / FOLDS for start in range(0, len(found), FOLDS)]
     if not smallest:
         qualities[0] += GAIN

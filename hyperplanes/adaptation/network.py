@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from threading import Lock
 
 import torch
 from torch import Tensor, nn
@@ -206,13 +207,30 @@ class HyperPlanesNetwork(nn.Module):
         return pixels[views.masks.flatten()[pixels] != views.masks.new_tensor(UNKNOWN)]
 
 
+_in_use: dict[nn.Module, tuple[int, dict[nn.Module, bool]]] = {}
+"""By how many threads modules are used, and which of their parts were trained before."""
+
+_counting = Lock()
+
+
 @contextmanager
 def in_use(module: nn.Module) -> Generator[None]:
-    """The module as it is used and not trained (batch statistics), and afterwards as it was."""
-    before = {part: part.training for part in module.modules()}
-    module.eval()
+    """The module as it is used and not trained (batch statistics), and afterwards as it was.
+
+    Several threads may use it at once: it is as it was again when the last of them has ended.
+    """
+    with _counting:
+        users, before = _in_use.get(module, (0, {part: part.training for part in module.modules()}))
+        _in_use[module] = users + 1, before
+        if not users:
+            module.eval()
     try:
         yield
     finally:
-        for part, training in before.items():
-            part.training = training
+        with _counting:
+            users, before = _in_use.pop(module)
+            if users > 1:
+                _in_use[module] = users - 1, before
+            else:
+                for part, training in before.items():
+                    part.training = training

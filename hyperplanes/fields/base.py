@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -23,6 +23,8 @@ from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.views import Views
 
 __all__ = ["Field", "MLPField", "Target", "TargetConfig"]
+
+Made = TypeVar("Made")
 
 
 @checked_fields
@@ -261,11 +263,17 @@ class Field:
     def _packed(self, layers: Sequence[Layer]) -> PackedLayers | None:
         """The layers for the kernel: packed once, and anew where weights have changed in place."""
         values = [value for layer in layers for value in layer]
+        return self._kept(
+            "packed", values, lambda: PackedLayers.of(layers, self.target.skip, mixed_precision=self.mixed_precision)
+        )
+
+    def _kept(self, name: str, values: Sequence[Tensor], make: Callable[[], Made]) -> Made:
+        """What is made of some tensors: made once, and anew where they have changed in place."""
         state = [(value.data_ptr(), 0 if value.is_inference() else value._version) for value in values]
-        kept = self.__dict__.get("_kept")
+        kept = self.__dict__.get(f"_kept_{name}")
         if kept is None or kept[0] != state:
-            kept = state, PackedLayers.of(layers, self.target.skip, mixed_precision=self.mixed_precision)
-            self.__dict__["_kept"] = kept  # threads that come at once pack the same
+            kept = state, make()
+            self.__dict__[f"_kept_{name}"] = kept  # threads that come at once make the same
         return kept[1]
 
     def __getstate__(self) -> dict[str, Any]:

@@ -278,12 +278,7 @@ class ImageBasedField(Field):
         grid = self.parameters.get("grid.weight")
         if grid is None:
             return None
-        state = grid.data_ptr(), 0 if grid.is_inference() else grid._version
-        kept = self.__dict__.get("_kept_cells")
-        if kept is None or kept[0] != state:
-            kept = state, grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2)
-            self.__dict__["_kept_cells"] = kept  # threads that come at once copy the same
-        return kept[1]
+        return self._kept("cells", [grid], lambda: grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2))
 
     def _features(self, points: Tensor) -> list[Float[Tensor, "point number"]]:
         """Those of the grid, the first through a sigmoid."""

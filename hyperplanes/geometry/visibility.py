@@ -5,12 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -39,7 +40,7 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.transforms import transform_of
 
-__all__ = ["VisibilityPlanes", "fading", "margins"]
+__all__ = ["VisibilityPlanes", "choose_torch", "fading", "margins"]
 
 POINTS = 512  # that one call of the kernel works on
 CUTTING = 0.02  # of the shorter side of a picture: as many pixels of the object along a border are cut by it
@@ -77,11 +78,12 @@ class VisibilityPlanes:
         matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
-        self._masked = torch.zeros(len(images), dtype=torch.bool, device=images.device)
-        self._handicaps = images.new_zeros(len(images))
-        self._margins = images.new_zeros(len(images), 4) if masks is None else margins(masks).to(images)
-        self._are_cut = bool(self._margins.any())
-        self._penalties = Penalties()
+        self._against = _Against(
+            torch.zeros(len(images), dtype=torch.bool, device=images.device),
+            images.new_zeros(len(images)),
+            images.new_zeros(len(images), 4) if masks is None else margins(masks).to(images),
+            Penalties(),
+        )
 
     def __len__(self) -> int:
         return len(self.colours)
@@ -107,9 +109,9 @@ class VisibilityPlanes:
         Args:
             views: their indices.
         """
-        result = copy.copy(self)
+        masked = self._against.masked
+        result = self._with(masked=masked.index_fill(0, views.to(masked.device), True))
         result.colours = self.colours.mask_views(views)
-        result._masked = self._masked.index_fill(0, views.to(self._masked.device), True)
         return result
 
     def with_penalties(self, penalties: Penalties) -> VisibilityPlanes:
@@ -118,9 +120,7 @@ class VisibilityPlanes:
         Args:
             penalties: what counts against a view, and how much.
         """
-        result = copy.copy(self)
-        result._penalties = penalties
-        return result
+        return self._with(penalties=penalties)
 
     def with_handicaps(self, handicaps: Float[Tensor, " view"]) -> VisibilityPlanes:
         """The same planes, whose views have other penalties beside those of points.
@@ -128,8 +128,12 @@ class VisibilityPlanes:
         Args:
             handicaps: added to the penalty of each view wherever it shows a point.
         """
+        return self._with(handicaps=handicaps.to(self._against.handicaps))
+
+    def _with(self, **changes: Any) -> VisibilityPlanes:
+        """The same planes, against whose views something else counts."""
         result = copy.copy(self)
-        result._handicaps = handicaps.to(self._handicaps)
+        result._against = replace(self._against, **changes)
         return result
 
     def with_surface(self, voxels: Occupancy) -> VisibilityPlanes:
@@ -166,7 +170,7 @@ class VisibilityPlanes:
             The views. All of them are looked at; colours are looked up by who wants them.
         """
         best, nearest = min(best, len(self)), min(nearest + 1, len(self)) if directions is not None else 0
-        choose = self._choose_compiled if self.has_kernels(points) else self._choose_torch
+        choose = self._choose_compiled if self.has_kernels(points) else partial(choose_torch, self)
         if not best and not nearest:  # no view is returned, and depths do not count
             return choose(points, directions, 0, 0, self.maps)
         if self._surface is None or directions is None:
@@ -182,14 +186,15 @@ class VisibilityPlanes:
 
     def _limits(self) -> list[float]:
         """The numbers by which the kernels judge."""
-        per_radius, own = 1 / self.occupancy.bounds.radius, self._penalties
+        per_radius, own = 1 / self.occupancy.bounds.radius, self._against.penalties
         limits = [self.colours.nearest, per_radius, self.tolerance, own.deepest, own.partly, WHOLE, UNSEEN, ANGLE]
         return [*limits, own.steep, own.highest, own.least, 1 / _margin(*self.maps.shape[1:3]), CUT, BEYOND]
 
     def shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, 0 where hidden, its handicap and margins."""
-        shown = (~self._masked).to(self._cameras)
-        return torch.cat([self._cameras, torch.stack([shown, self._handicaps]), self._margins.T])
+        against = self._against
+        shown = (~against.masked).to(self._cameras)
+        return torch.cat([self._cameras, torch.stack([shown, against.handicaps]), against.margins.T])
 
     def _choose_compiled(
         self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
@@ -265,41 +270,91 @@ class VisibilityPlanes:
         parallel_for(lambda a, b: kernel(*fixed, a, b), count, POINTS)
         return Described(rows, coverage, near, weights, colours)
 
-    def _choose_torch(
-        self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
-    ) -> Visibility:
-        """As `choose`, in plain PyTorch."""
-        # depth and opacity of every view where the point falls: (point, view)
-        planes = self.colours.with_images(depth_opacity.permute(0, 3, 1, 2))
-        found = planes.lookup(points, return_directions=True)
-        rays, distances = found.directions, found.distances
-        assert rays is not None
-        assert distances is not None
-        valid = found.valid & ~self._masked
-        depth, coverage = found.colours.unbind(-1)
-        coverage = torch.where(valid, coverage, 1.0)
-        # how far behind the surface, in radii, and what that and a broken mask cost
-        behind = torch.where(valid, (distances - depth) / self.occupancy.bounds.radius, 0.0)
-        own = self._penalties
-        penalty = (own.steep * (behind - self.tolerance)).clamp(own.least, own.deepest)
-        penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self._handicaps
-        if self._are_cut:
-            cut = fading(self._margins, found.coordinates, depth_opacity.shape[1:3])
-            penalty = torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
-        penalty = torch.where(valid, penalty, UNSEEN)
 
-        def chosen(score: Tensor, count: int) -> ChosenViews:
-            if not count:
-                score = score[:, :0]  # nothing to sort
-            index = score.sort(stable=True, dim=1).indices[:, :count]
-            along = rays.gather(1, index[..., None].expand(-1, -1, 3))
-            return ChosenViews(index, along, *(each.gather(1, index) for each in (behind, coverage, penalty)))
+def choose_torch(
+    planes: VisibilityPlanes, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
+) -> Visibility:
+    """As `VisibilityPlanes.choose`, in plain PyTorch, by given depths and opacities.
 
-        near = None
-        if directions is not None:
-            angle = torch.acos((rays * directions[:, None]).sum(-1).clamp(-1, 1))
-            near = chosen(angle + ANGLE * penalty.clamp_min(0), nearest)
-        return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
+    Args:
+        planes: the views.
+        points: in the world.
+        directions: along which they are seen, or None.
+        best: how many views.
+        nearest: likewise.
+        depth_opacity: by which views are judged.
+    """
+    # depth and opacity of every view where the point falls: (point, view)
+    maps = planes.colours.with_images(depth_opacity.permute(0, 3, 1, 2))
+    found = maps.lookup(points, return_directions=True)
+    rays, distances = found.directions, found.distances
+    assert rays is not None
+    assert distances is not None
+    valid = found.valid & ~planes._against.masked
+    depth, coverage = found.colours.unbind(-1)
+    coverage = torch.where(valid, coverage, 1.0)
+    # how far behind the surface, in radii, and what that and a broken mask cost
+    behind = torch.where(valid, (distances - depth) / planes.occupancy.bounds.radius, 0.0)
+    penalty = planes._against.penalty(behind - planes.tolerance, coverage, found.coordinates, depth_opacity.shape[1:3])
+    penalty = torch.where(valid, penalty, UNSEEN)
+
+    def chosen(score: Tensor, count: int) -> ChosenViews:
+        if not count:
+            score = score[:, :0]  # nothing to sort
+        index = score.sort(stable=True, dim=1).indices[:, :count]
+        along = rays.gather(1, index[..., None].expand(-1, -1, 3))
+        return ChosenViews(index, along, *(each.gather(1, index) for each in (behind, coverage, penalty)))
+
+    near = None
+    if directions is not None:
+        angle = torch.acos((rays * directions[:, None]).sum(-1).clamp(-1, 1))
+        near = chosen(angle + ANGLE * penalty.clamp_min(0), nearest)
+    return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
+
+
+@dataclass(frozen=True)
+class _Against:
+    """What counts against the views of planes.
+
+    Attributes:
+        masked: those that see nothing.
+        handicaps: added to the penalty of each wherever it shows a point.
+        margins: as `margins` returns them.
+        penalties: how much counts.
+    """
+
+    masked: Bool[Tensor, " view"]
+    handicaps: Float[Tensor, " view"]
+    margins: Float[Tensor, "view 4"]
+    penalties: Penalties
+
+    @cached_property
+    def _cut(self) -> bool:
+        """Whether a border cuts the object in any view."""
+        return bool(self.margins.any())
+
+    def penalty(
+        self,
+        behind: Float[Tensor, "point view"],
+        coverage: Float[Tensor, "point view"],
+        coordinates: Float[Tensor, "point view 2"],
+        size: Sequence[int],
+    ) -> Float[Tensor, "point view"]:
+        """The penalty of each view that shows a point; `visibility.choose` has the same as a kernel.
+
+        Args:
+            behind: how far the point lies behind the surface that the view sees, in radii beyond the tolerance.
+            coverage: the opacity of its mask there.
+            coordinates: as in `fading`.
+            size: likewise.
+        """
+        own = self.penalties
+        penalty = (own.steep * behind).clamp(own.least, own.deepest)
+        penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self.handicaps
+        if not self._cut:
+            return penalty
+        cut = fading(self.margins, coordinates, size)
+        return torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes, InitialisationConfig, ModelConfig, checkpoints
+from hyperplanes.adaptation.network import in_use
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import camera_from_world, centres, look_at, pinhole, viewing_directions
@@ -402,3 +403,16 @@ def test_a_new_model_leaves_the_generators_of_all_devices_alone(monkeypatch):
     one, other = HyperPlanes(ModelConfig()), HyperPlanes(ModelConfig())
     assert torch.equal(torch.random.get_rng_state(), before)
     assert all(torch.equal(value, other.state_dict()[name]) for name, value in one.state_dict().items())
+
+
+def test_a_module_is_in_use_until_the_last_of_its_users_has_ended():
+    model = small_model().train()
+    model.networks.eval()
+    first, second = in_use(model), in_use(model)
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert not any(part.training for part in model.modules())
+    second.__exit__(None, None, None)
+    assert model.training
+    assert not model.networks.training

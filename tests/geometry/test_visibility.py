@@ -1,6 +1,7 @@
 """Source of truth: a ball, whose depth is known in closed form, and loops over points, views and steps."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -193,7 +194,7 @@ def test_a_picture_fades_out_by_where_its_lens_shows_a_point():
     views, (points, _) = ball_views(cameras), queries(500)
     given = views.images, views.cameras, views.masks, ball()
     fading_out, whole = VisibilityPlanes(*given), VisibilityPlanes(*given)
-    whole._margins = torch.zeros_like(whole._margins)
+    whole._against = replace(whole._against, margins=torch.zeros_like(whole._against.margins))
     found, plain = (_penalties_of(each.choose(points, best=5).best, 4) for each in (fading_out, whole))
     # by hand: the row where the lens shows the point, and how far it lies in the margin of the lower border
     matrix = projection_matrices(pinholes)[4]
