@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.inputs import check_channels_first, check_indices
+from hyperplanes.geometry.inputs import Selection, as_selection, check_channels_first, check_indices
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.utilities.arguments import checked, kind_of
@@ -105,19 +105,15 @@ class Views:
         """The pictures and where their cameras stand, for notebooks."""
         return show_views(repr(self), self.images, self.cameras, self.bounds)
 
-    def __getitem__(self, index: slice | list[int] | Int[Tensor, " chosen"]) -> Views:
-        whole = isinstance(index, Tensor) and not (index.is_floating_point() or index.is_complex())
-        if not (isinstance(index, slice | list) or whole):
-            remedy = f"; use [[{index}]]" if isinstance(index, int) else ""
-            raise ValueError(f"views: expected a slice, a list or a tensor of indices, got {kind_of(index)}{remedy}")
-        names = self.names
+    def __getitem__(self, index: Selection) -> Views:
+        chosen, names = as_selection(index, len(self), "views"), self.names
         if names:
-            chosen = torch.arange(len(self))[index.cpu() if isinstance(index, Tensor) else index]
-            names = tuple(names[i] for i in chosen.reshape(-1).tolist())
+            places = torch.arange(len(self))[chosen.cpu() if isinstance(chosen, Tensor) else chosen]
+            names = tuple(names[place] for place in places.tolist())
         return self._derived(
-            images=self.images[index],
-            cameras=camera.select(self.cameras, index),
-            masks=None if self.masks is None else self.masks[index],
+            images=self.images[chosen],
+            cameras=camera.select(self.cameras, chosen),
+            masks=None if self.masks is None else self.masks[chosen],
             names=names,
         )
 
@@ -143,6 +139,8 @@ class Views:
     @checked
     def resized(self, longest: int) -> Views:
         """The views scaled down so that the longer side of a picture has so many pixels; smaller ones as they are."""
+        if longest < 1:
+            raise ValueError(f"longest: expected at least 1 pixel, got {longest}")
         scale = longest / max(self.size)
         if scale >= 1:
             return self

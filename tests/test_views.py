@@ -6,7 +6,7 @@ import jaxtyping
 import pytest
 import torch
 
-from hyperplanes.geometry.cameras import centres, select
+from hyperplanes.geometry.cameras import centres, cropped, image_size, pinhole, resized, select
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, Views
 from tests.reference_rendering import ring
@@ -26,7 +26,12 @@ def views(size=(6, 9), **others):
         (slice(1, None, 2), [1, 3]),
         ([2, 0], [2, 0]),
         (torch.tensor([3, 3]), [3, 3]),
+        (torch.tensor([0, -1], dtype=torch.int32), [0, 3]),
+        (torch.tensor([1, 0], dtype=torch.uint8), [1, 0]),
+        ([True, False, False, True], [0, 3]),
+        (torch.tensor([False, True, True, False]), [1, 2]),
         (slice(0, 0), []),
+        ([], []),
     ],
 )
 def test_chosen_views_keep_their_cameras_masks_and_names(index, chosen):
@@ -38,6 +43,23 @@ def test_chosen_views_keep_their_cameras_masks_and_names(index, chosen):
     assert torch.equal(part.masks, whole.masks[chosen])
     assert torch.equal(part.cameras.extrinsics, whole.cameras.extrinsics[chosen])
     assert part.bounds == whole.bounds
+
+
+@pytest.mark.parametrize(
+    ("index", "message"),
+    [
+        (2, r"views: expected a slice, a list or a tensor of indices \(chosen\), got 2; use \[\[2\]\]"),
+        (torch.tensor(2), "views: expected a slice, a list or a tensor of indices"),
+        (["a"], "views: expected a slice, a list or a tensor of indices"),
+        (torch.tensor([0.0]), "views: expected a slice, a list or a tensor of indices"),
+        ([4], "views: expected indices of 4 views, got 4 to 4"),
+        ([-5, 0], "views: expected indices of 4 views, got -5 to 0"),
+        ([True, False], "views: expected 4 booleans, one each, got 2"),
+    ],
+)
+def test_what_chooses_no_views_is_refused_in_one_sentence(index, message):
+    with pytest.raises(ValueError, match=message):
+        views()[index]
 
 
 def test_views_without_masks_or_names():
@@ -110,6 +132,23 @@ def test_views_in_another_precision_and_their_memory():
     # 4 views of 6 x 9 pixels, 3 + 1 numbers of 8 bytes
     assert double.nbytes == 4 * 6 * 9 * 4 * 8
     assert replace(double, masks=None).nbytes == 4 * 6 * 9 * 3 * 8
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_halves_keep_the_size_of_the_pictures(dtype):
+    half = views((6, 2049)).to(dtype=dtype)
+    assert half.images.dtype == half.cameras.intrinsics.dtype == dtype
+    assert image_size(half.cameras) == half.size
+    assert image_size(pinhole(torch.eye(3), torch.eye(4, dtype=dtype)[None], 6, 2049)) == (6, 2049)
+
+
+def test_pictures_have_a_pixel_at_least():
+    for no_size in (0, -5):
+        with pytest.raises(ValueError, match=f"longest: expected at least 1 pixel, got {no_size}"):
+            views().resized(no_size)
+        for change in (resized, cropped):
+            with pytest.raises(ValueError, match=f"image size: expected at least 1 x 1, got {no_size} x 4"):
+                change(views().cameras, no_size, 4)
 
 
 def test_no_pixel_to_draw_from_is_refused():

@@ -99,7 +99,7 @@ def blend_views(
         directions: unit vectors along which the points are seen.
         nearest: how many views, at most all.
     """
-    if planes.can_describe(points):
+    if planes.can_describe(points, directions):
         near = planes.describe(points, directions, Reading(0, nearest, 0, 0, 0.0), planes.occupancy.bounds)
         weights, colours = near.near_weights.softmax(1), near.near_colours
     else:

@@ -13,13 +13,14 @@ from torch import Tensor, nn
 from torch.nn.functional import linear, relu, softplus
 
 from hyperplanes.fields.encoding import encode, encoded_size
-from hyperplanes.fields.layers import Layer, PackedLayers, has_mixed_precision, wants_values_alone
+from hyperplanes.fields.layers import Layer, PackedLayers, has_mixed_precision
 from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.transforms import wants_values_alone
 from hyperplanes.views import Views
 
 __all__ = ["Field", "MLPField", "Target", "TargetConfig"]
@@ -246,7 +247,8 @@ class Field:
         """The layers before the heads, with the skip connection of NeRF in their middle."""
         names = [f"layers.{index}" for index in range(self.target.config.depth)]
         layers = [(self.parameters[f"{name}.weight"], self.parameters[f"{name}.bias"]) for name in names]
-        if wants_values_alone(inputs, layers):
+        values = (inputs, *(value for layer in layers for value in layer))
+        if wants_values_alone(*values) and not torch.is_autocast_enabled("cpu"):
             packed = self._packed(layers)
             if packed is not None and packed.takes(inputs):
                 return packed(inputs)
@@ -268,7 +270,10 @@ class Field:
         )
 
     def _kept(self, name: str, values: Sequence[Tensor], make: Callable[[], Made]) -> Made:
-        """What is made of some tensors: made once, and anew where they have changed in place."""
+        """What is made of some tensors: made once, and anew where they have changed in place.
+
+        Inference tensors do not count their changes, and are taken to have none.
+        """
         state = [(value.data_ptr(), 0 if value.is_inference() else value._version) for value in values]
         kept = self.__dict__.get(f"_kept_{name}")
         if kept is None or kept[0] != state:

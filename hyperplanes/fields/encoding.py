@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hyperplanes.geometry.chosen_views import COMPUTED
+
 __all__ = ["encoded_size", "encode"]
 
 
@@ -17,7 +19,8 @@ def encoded_size(frequencies: int, size: int = 3) -> int:
 def encode(values: Float[Tensor, "*vectors"], frequencies: int, dim: int = -1) -> Float[Tensor, "*encoded"]:
     """(v, sin(2^0 v), ..., sin(2^(L-1) v), cos(2^0 v), ..., cos(2^(L-1) v)) (NeRF, Eq. 4, without its factor pi).
 
-    Only the first sine and cosine are computed; the others follow by doubling the angle.
+    Only every COMPUTED-th sine and cosine is computed; the others follow by doubling the angle, which multiplies their
+    errors, too.
 
     Args:
         values: coordinates within about [-1, 1].
@@ -29,9 +32,15 @@ def encode(values: Float[Tensor, "*vectors"], frequencies: int, dim: int = -1) -
     """
     if frequencies == 0:
         return values
-    sine, cosine = [values.sin()], [values.cos()]
-    for _ in range(frequencies - 1):
-        sine_now, cosine_now = sine[-1], cosine[-1]
-        sine.append(2 * sine_now * cosine_now)
-        cosine.append(1 - 2 * sine_now.square())
+    sine: list[Tensor] = []
+    cosine: list[Tensor] = []
+    for octave in range(frequencies):
+        if octave % COMPUTED == 0:
+            angle = values * 2**octave
+            sine.append(angle.sin())
+            cosine.append(angle.cos())
+        else:
+            sine_now, cosine_now = sine[-1], cosine[-1]
+            sine.append(2 * sine_now * cosine_now)
+            cosine.append(1 - 2 * sine_now.square())
     return torch.cat([values, *sine, *cosine], dim)

@@ -27,6 +27,7 @@ from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, resampled_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.transforms import wants_values_alone
 from hyperplanes.views import Views
 
 __all__ = ["ImageBasedConfig", "ImageBasedField", "ImageBasedNeRF", "FeatureGrid"]
@@ -215,7 +216,7 @@ class ImageBasedField(Field):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
         """Colour in [0, 1] and density per world unit at points seen along unit directions."""
-        if self._is_described(points):
+        if self._is_described(points, directions):
             # one kernel: the best views of each point (point, input), the nearest ones (point, blended, ...)
             inputs, coverage, near = self._read(points, directions)
             hidden = self.trunk(inputs)
@@ -247,7 +248,7 @@ class ImageBasedField(Field):
     def colour_of(self, hidden: HiddenPoints, directions: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
         """Colour in [0, 1] as seen along unit directions."""
         points, config = hidden.points, self.target.config
-        if self._is_described(points):
+        if self._is_described(points, directions):
             near = self.planes.describe(points, directions, replace(self._reading, best=0), self.bounds)
             return self._coloured(hidden.values, near)
         visibility = self.planes.choose(points, directions, best=0, nearest=config.blended)
@@ -258,15 +259,15 @@ class ImageBasedField(Field):
         config = self.target.config
         return Reading(config.planes, config.blended, config.point_frequencies, config.direction_frequencies, FALLOFF)
 
-    def _is_described(self, points: Tensor) -> bool:
+    def _is_described(self, points: Tensor, directions: Tensor | None = None) -> bool:
         """Whether one kernel writes what the network reads; not of fields that read something else."""
         plain = type(self) is ImageBasedField and self.dtype == torch.float32 == points.dtype
-        return plain and isinstance(self.planes, VisibilityPlanes) and self.planes.can_describe(points)
+        return plain and isinstance(self.planes, VisibilityPlanes) and self.planes.can_describe(points, directions)
 
     def _read(self, points: Tensor, directions: Tensor | None = None) -> tuple[Tensor, Tensor, Described]:
         """The inputs of the trunk, the least coverage, and what the colour head reads where there are directions."""
         grid = self.parameters.get("grid.weight")
-        learned = grid is not None and grid.requires_grad and torch.is_grad_enabled()
+        learned = grid is not None and not wants_values_alone(grid)
         found = self.planes.describe(points, directions, self._reading, self.bounds, None if learned else self._cells)
         if not learned:
             return found.rows, found.coverage, found

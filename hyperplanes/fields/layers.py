@@ -13,31 +13,13 @@ from torch import Tensor
 
 from hyperplanes.geometry.kernels.compiling import compile_kernel, layers_module
 from hyperplanes.geometry.kernels.threads import parallel_for
-from hyperplanes.utilities.transforms import transform_of
 
-__all__ = ["Layer", "PackedLayers", "has_mixed_precision", "wants_values_alone"]
+__all__ = ["Layer", "PackedLayers", "has_mixed_precision"]
 
 Layer = tuple[Tensor, Tensor]
 """Weights (width, input) and biases (width,)."""
 
 POINTS = 480  # that one call of a kernel works on: eight blocks of those for AVX-512, three of that for AMX
-
-
-def wants_values_alone(inputs: Tensor, layers: Sequence[Layer]) -> bool:
-    """Whether nothing but the values of layers is wanted: no gradient, no graph, no other precision.
-
-    Args:
-        inputs: of the first layer.
-        layers: that they go through.
-    """
-    given = (inputs, *(value for layer in layers for value in layer))
-    if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu"):
-        return False
-    if torch.jit.is_tracing():  # pyright: ignore[reportPrivateImportUsage]
-        return False
-    if torch.is_grad_enabled() and any(value.requires_grad for value in given):
-        return False
-    return not transform_of(*given)
 
 
 def has_mixed_precision() -> bool:

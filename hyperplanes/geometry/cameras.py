@@ -12,11 +12,12 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.inputs import Selection, as_selection
 from hyperplanes.geometry.poses import fibonacci_sphere, look_at, opencv_from_opengl, opengl_from_opencv, orbit
 from hyperplanes.utilities.arguments import checked
 
@@ -83,15 +84,24 @@ def pinhole(
     views = pose.shape[0]
     if intrinsics.ndim == 3 and intrinsics.shape[0] not in (1, views):
         raise ValueError(f"intrinsics: expected one matrix or {views}, one a pose, got {intrinsics.shape[0]}")
-    if height < 1 or width < 1:
-        raise ValueError(f"image size: expected at least 1 x 1, got {height} x {width}")
+    _check_size(height, width)
     calibration = intrinsics.to(pose).expand(views, 3, 3)
     with torch.no_grad():
         _check_numbers(calibration, pose)
     full = torch.eye(4, dtype=pose.dtype, device=pose.device).repeat(views, 1, 1)
     full = torch.cat([torch.cat([calibration, full[:, :3, 3:]], dim=2), full[:, 3:]], dim=1)
-    size = torch.ones(views, dtype=pose.dtype, device=pose.device)
+    size = torch.ones(views, dtype=_size_dtype(pose.dtype), device=pose.device)
     return PinholeCamera(full, pose, size * height, size * width)
+
+
+def _check_size(height: int, width: int) -> None:
+    if height < 1 or width < 1:
+        raise ValueError(f"image size: expected at least 1 x 1, got {height} x {width}")
+
+
+def _size_dtype(dtype: torch.dtype) -> torch.dtype:
+    """That of heights and widths beside other numbers: halves would round them from 257 or 2,049 pixels on."""
+    return torch.promote_types(dtype, torch.float32)
 
 
 def _check_numbers(calibration: Tensor, pose: Tensor) -> None:
@@ -190,7 +200,8 @@ def camera_directions(cameras: PinholeCamera, centre: tuple[float, float, float]
 def scale(cameras: PinholeCamera) -> float:
     """A length that small distances are compared with: how far the cameras stand from their middle, on average.
 
-    Of cameras in one place it is their distance from the world's origin, and 1 where they stand there.
+    Cameras in one place do not tell how large their scene is. For them it is a hundredth of their distance from the
+    world's origin, which may be far away, and 1 where they stand there.
 
     >>> scale(pinhole(torch.eye(3), orbit(4, 2.0, 0.0), 1, 1))
     2.0
@@ -200,7 +211,7 @@ def scale(cameras: PinholeCamera) -> float:
     eyes = centres(cameras).detach().double()
     spread = float((eyes - eyes.mean(0)).norm(dim=-1).mean())
     distance = float(eyes.norm(dim=-1).mean())
-    return spread if spread > 1e-6 * distance else distance or 1.0
+    return spread if spread > 1e-6 * distance else 0.01 * distance or 1.0
 
 
 def viewing_directions(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
@@ -208,10 +219,12 @@ def viewing_directions(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
     return camera_from_world(cameras)[:, 2, :3]
 
 
-def _rebuilt(cameras: PinholeCamera, change: Callable[[Tensor], Tensor]) -> PinholeCamera:
-    """The cameras with every tensor they hold changed, lenses included."""
-    values = (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
-    bare = PinholeCamera(*(change(value) for value in values))
+def _rebuilt(
+    cameras: PinholeCamera, change: Callable[[Tensor], Tensor], change_size: Callable[[Tensor], Tensor] | None = None
+) -> PinholeCamera:
+    """The cameras with every tensor they hold changed, lenses included; heights and widths in another way, if given."""
+    values = [change(value) for value in (cameras.intrinsics, cameras.extrinsics)]
+    bare = PinholeCamera(*values, *((change_size or change)(value) for value in (cameras.height, cameras.width)))
     return DistortedCamera(bare, change(cameras.distortion)) if isinstance(cameras, DistortedCamera) else bare
 
 
@@ -221,9 +234,10 @@ def _with_lens_of(cameras: PinholeCamera, bare: PinholeCamera) -> PinholeCamera:
 
 
 @checked
-def select(cameras: PinholeCamera, index: slice | list[int] | Int[Tensor, " chosen"]) -> PinholeCamera:
-    """The cameras at `index`, in that order."""
-    return _rebuilt(cameras, lambda value: value[index])
+def select(cameras: PinholeCamera, index: Selection) -> PinholeCamera:
+    """The cameras at `index`, in that order, or those for which it is True. Indices of none raise ValueError."""
+    chosen = as_selection(index, cameras.batch_size, "cameras")
+    return _rebuilt(cameras, lambda value: value[chosen])
 
 
 def concatenate(batches: list[PinholeCamera]) -> PinholeCamera:
@@ -253,8 +267,13 @@ def concatenate(batches: list[PinholeCamera]) -> PinholeCamera:
 def to(
     cameras: PinholeCamera, device: torch.device | str | None = None, dtype: torch.dtype | None = None
 ) -> PinholeCamera:
-    """The cameras on another device or in another precision."""
-    return _rebuilt(cameras, lambda value: value.to(device=device, dtype=dtype))
+    """The cameras on another device or in another precision; sizes of pictures are in single precision at least."""
+    of_size = None if dtype is None else _size_dtype(dtype)
+    return _rebuilt(
+        cameras,
+        lambda value: value.to(device=device, dtype=dtype),
+        lambda value: value.to(device=device, dtype=of_size),
+    )
 
 
 @checked
@@ -273,7 +292,11 @@ def moved(cameras: PinholeCamera, motion: Float[Tensor, "4 4"]) -> PinholeCamera
 
 @checked
 def cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
-    """The cameras of images whose right and lower borders were moved; calibration and distortion stay."""
+    """The cameras of images whose right and lower borders were moved; calibration and distortion stay.
+
+    A size of no pixel raises ValueError.
+    """
+    _check_size(height, width)
     bare = PinholeCamera(
         cameras.intrinsics,
         cameras.extrinsics,
@@ -288,12 +311,13 @@ def resized(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     """The cameras of the same images scaled to another size.
 
     The image borders, not the pixel centres, stay in place: c' = s (c + 1/2) - 1/2, which is not what
-    `PinholeCamera.scale` does.
+    `PinholeCamera.scale` does. A size of no pixel raises ValueError.
 
     >>> small = pinhole(symmetric_intrinsics(64, 64, 0.7), torch.eye(4)[None], 64, 64)
     >>> intrinsics(resized(small, 128, 128))[0, :2, 2].tolist()
     [63.5, 63.5]
     """
+    _check_size(height, width)
     old_height, old_width = image_size(cameras)
     scale = cameras.intrinsics.new_tensor([width / old_width, height / old_height])
     matrix = cameras.intrinsics.clone()

@@ -16,6 +16,7 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays, cast
+from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["first_hits"]
 
@@ -46,7 +47,8 @@ def first_hits(
     far = (camera.centres(cameras) - centre).norm(dim=1) + occupancy.bounds.radius
     result = far[:, None, None].repeat(1, height, width)
     masks = torch.ones_like(result) if masks is None else torch.as_tensor(masks, device=device)[:, 0]
-    compiled = result.device.type == "cpu" and result.dtype == torch.float32 and find_spec("numba")
+    kind = result.device.type == "cpu" and result.dtype == torch.float32
+    compiled = kind and find_spec("numba") and are_plain(result)
     together = max(1, RAYS_AT_ONCE // (height * width))
     for first in range(0, len(masks), together):
         found = (masks[first : first + together] > 0).nonzero()  # view, row, column

@@ -5,20 +5,30 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry import lookup_torch
 from hyperplanes.geometry.distortion import DistortedCamera, distorted_pixels
-from hyperplanes.geometry.inputs import ArrayLike, as_images, as_indices, as_points, check_indices
+from hyperplanes.geometry.inputs import (
+    ArrayLike,
+    Selection,
+    as_images,
+    as_indices,
+    as_points,
+    as_selection,
+    check_indices,
+)
 from hyperplanes.geometry.lookup import Lookup, choose, lookup
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.packed_images import PackedImages, pack
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["MIN_Z", "ImagePlanes", "Lookup"]
 
@@ -44,8 +54,8 @@ class ImagePlanes:
         Args:
             images: (view, channel, height, width), any number of channels; 8-bit ones are divided by 255. Three
                 channels in [0, 1] that need no gradient may be read from a copy packed into 32 bits a pixel, exact for
-                8-bit images and within 1/2046 for others. Those that are not contiguous are copied, so that changes in
-                place do not reach the planes.
+                8-bit images and within 1/2046 for others. NumPy arrays, inference tensors and what is not contiguous
+                are copied, so that changes in place do not reach the planes.
             cameras: one an image, of the images' size.
             background: colour of points outside an image.
             backend: of the lookup; the fastest available where absent.
@@ -54,7 +64,11 @@ class ImagePlanes:
         Raises:
             ValueError: images of another number or size than the cameras, or of another number of dimensions.
         """
+        uncounted = isinstance(images, np.ndarray) or images.is_inference()  # changes that no packed copy would notice
         images = as_images(images, size=camera.image_size(cameras) if cameras.batch_size else None)
+        if uncounted:
+            with torch.inference_mode(False):
+                images = images.clone()
         if len(images) != cameras.batch_size:
             raise ValueError(f"images: expected one a camera, {cameras.batch_size}, got {len(images)}")
         if len(images) and camera.image_size(cameras) != tuple(images.shape[2:]):
@@ -81,15 +95,17 @@ class ImagePlanes:
         """The images and where their cameras stand, for notebooks."""
         return show_views(repr(self), self.images, self.cameras)
 
-    def mask_views(self, views: Int[Tensor, " masked"]) -> ImagePlanes:
+    def mask_views(self, views: Selection) -> ImagePlanes:
         """The same planes, some more of which show no point: their colours are the background, and nothing is valid.
 
         Args:
-            views: their indices.
+            views: their indices, or whether each of all views is masked.
         """
-        masked = torch.zeros(len(self), dtype=torch.bool).index_fill_(0, views.cpu(), True).to(self.images.device)
+        chosen = as_selection(views, len(self), "views")
         result = copy.copy(self)
-        result.masked = masked if self.masked is None else masked | self.masked
+        before = self.images.new_zeros(len(self), dtype=torch.bool) if self.masked is None else self.masked
+        result.masked = before.clone()
+        result.masked[chosen] = True
         return result
 
     def with_images(self, images: Float[Tensor, "view channel height width"]) -> ImagePlanes:
@@ -97,7 +113,13 @@ class ImagePlanes:
 
         Args:
             images: of the same number and size, with any number of channels.
+
+        Raises:
+            ValueError: images of another number or size.
         """
+        if images.ndim != 4 or (len(images), *images.shape[2:]) != (len(self), *self.images.shape[2:]):
+            expected = f"({len(self)}, channel, {self.images.shape[2]}, {self.images.shape[3]})"
+            raise ValueError(f"images: expected shape {expected}, got {tuple(images.shape)}")
         result = copy.copy(self)
         result.images, result.exact, result.masked, result._packed = images.contiguous(), True, None, None
         return result
@@ -167,9 +189,8 @@ class ImagePlanes:
         """
         if self.exact or self.images.requires_grad or self.images.device.type != "cpu" or points.dtype != torch.float32:
             return None
-        if torch.compiler.is_compiling() or (self.backend or choose(points, self.images)) != "cpu":
+        if not are_plain(points, self.images) or (self.backend or choose(points, self.images)) != "cpu":
             return None
-        version = 0 if self.images.is_inference() else self.images._version
-        if self._packed is None or self._packed[0] != version:
-            self._packed = version, pack(self.images)
+        if self._packed is None or self._packed[0] != self.images._version:
+            self._packed = self.images._version, pack(self.images)
         return self._packed[1]

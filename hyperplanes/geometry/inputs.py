@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -9,12 +10,16 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from hyperplanes.utilities.arguments import kind_of
+
 __all__ = [
     "ArrayLike",
+    "Selection",
     "as_images",
     "as_indices",
     "as_matrices",
     "as_points",
+    "as_selection",
     "as_tensor",
     "check_channels_first",
     "check_indices",
@@ -25,6 +30,10 @@ MOST_COLOURS = 4
 
 ArrayLike: TypeAlias = Tensor | npt.NDArray[Any]
 """A tensor, or a NumPy array of the same shape."""
+
+
+Selection: TypeAlias = slice | Sequence[int] | Sequence[bool] | Tensor
+"""Which of several: their indices, or a boolean for each."""
 
 
 def as_tensor(name: str, value: ArrayLike) -> Tensor:
@@ -151,6 +160,48 @@ def as_indices(views: ArrayLike, points: Tensor) -> Tensor:
     if views.ndim != 2 or len(views) != len(points):
         raise ValueError(f"views: expected shape ({len(points)}, chosen), a row a point, got {tuple(views.shape)}")
     return views.to(points.device, torch.int64)
+
+
+def as_selection(index: Selection, count: int, name: str) -> slice | Tensor:
+    """Which of so many are meant by a slice, by indices, or by whether each is.
+
+    Args:
+        index: indices from -count to count - 1, or one boolean each.
+        count: how many there are.
+        name: of the argument, for messages.
+
+    Returns:
+        A slice, or indices on the device of `index`.
+
+    Raises:
+        ValueError: anything else.
+
+    >>> as_selection([True, False, True], 3, "views")
+    tensor([0, 2])
+    """
+    if isinstance(index, slice):
+        return index
+    remedy = f"; use [[{index}]]" if isinstance(index, int) else ""
+    expected = f"{name}: expected a slice, a list or a tensor of indices (chosen)"
+    try:
+        chosen = torch.as_tensor(index) if isinstance(index, Sequence | Tensor) else None
+    except (TypeError, ValueError, RuntimeError):
+        chosen = None
+    if chosen is None or chosen.ndim != 1:
+        raise ValueError(f"{expected}, got {kind_of(index)}{remedy}")
+    if not len(chosen):
+        return chosen.long()
+    if chosen.dtype == torch.bool:
+        if len(chosen) != count:
+            raise ValueError(f"{name}: expected {count} booleans, one each, got {len(chosen)}")
+        return chosen.nonzero()[:, 0]
+    if chosen.is_floating_point() or chosen.is_complex():
+        raise ValueError(f"{expected}, got {kind_of(chosen)}")
+    if chosen.device.type == "cpu":  # elsewhere it would be waited for
+        least, most = int(chosen.min()), int(chosen.max())
+        if least < -count or most >= count:
+            raise ValueError(f"{name}: expected indices of {count} {name}, got {least} to {most}")
+    return chosen.long()
 
 
 def check_indices(values: Tensor, count: int, name: str = "views", what: str = "planes") -> None:

@@ -42,8 +42,9 @@ def most_symmetric_plane(voxels: Occupancy) -> Plane:
     """
     if not voxels.occupied.any():
         raise ValueError("voxels: expected some that are occupied, got none")
+    voxels = voxels.with_even_side()
     fine = voxels.occupied.float()
-    coarse = max_pool3d(fine[None], 2)[0] if min(fine.shape) > 1 else fine
+    coarse = max_pool3d(fine[None], 2)[0]
     blocks = Occupancy(coarse > 0, voxels.bounds)
     points, surface = _points_of(blocks, COARSE), _points_of(voxels.surface(), FINE)
 

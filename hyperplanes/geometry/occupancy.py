@@ -21,6 +21,7 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["Occupancy", "ball_extent", "carve", "dilate", "full", "ranges"]
 
@@ -89,6 +90,15 @@ class Occupancy:
     def surface_centres(self) -> Float[Tensor, "voxel 3"]:
         """World positions of the centres of the voxels of `surface`, computed once."""
         return self.surface().centres()
+
+    def with_even_side(self) -> Occupancy:
+        """The same voxels in a grid that blocks of 2 x 2 x 2 fill: of an odd side it is one empty voxel longer."""
+        side = self.occupied.shape[0]
+        if side % 2 == 0:
+            return self
+        radius = self.bounds.radius + self.voxel / 2
+        x, y, z = (value + self.voxel / 2 for value in self.bounds.centre)  # the lower corner stays
+        return Occupancy(pad(self.occupied, (0, 1, 0, 1, 0, 1)), Sphere((x, y, z), radius))
 
     def dilated(self, voxels: int = 1) -> Occupancy:
         """The grid grown by some voxels in every direction."""
@@ -181,8 +191,8 @@ def carve(
     if isinstance(cameras, DistortedCamera):
         raise ValueError("cameras: expected pinholes to carve with, got lens distortion; undistort the masks first")
     matrices, calibrations = camera.projection_matrices(cameras).float(), camera.intrinsics(cameras).float()
-    compiled = masks.device.type == "cpu" and find_spec("numba") and masks[0:1].numel() < 2**30  # pixels in 32 bits
-    carver = _carve_compiled if compiled else _carve_torch
+    fits = masks.device.type == "cpu" and masks[0:1].numel() < 2**30  # pixels in 32 bits
+    carver = _carve_compiled if fits and find_spec("numba") and are_plain(masks, matrices) else _carve_torch
     given = full(bounds, side, masks.device) if within is None else within
     if (given.bounds, len(given.occupied), given.occupied.device) != (bounds, side, masks.device):
         found = f"{len(given.occupied)} in {given.bounds} on {given.occupied.device}"

@@ -138,7 +138,7 @@ def reflected_cameras(cameras: PinholeCamera, plane: Plane) -> PinholeCamera:
     pose, (height, width) = camera.camera_from_world(cameras), camera.image_size(cameras)
     # a reflection of the world and one of the camera's x axis make a rotation again
     flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=torch.float64))
-    moved = (flip @ pose.detach().double().cpu() @ plane.reflection).to(pose)
+    moved = (flip @ pose.cpu().double() @ plane.reflection).to(pose)
     matrix = camera.intrinsics(cameras).clone()
     matrix[:, 0, 1] = -matrix[:, 0, 1]
     matrix[:, 0, 2] = width - 1 - matrix[:, 0, 2]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -34,11 +34,12 @@ from hyperplanes.geometry.chosen_views import (
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.inputs import Selection
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.transforms import transform_of
+from hyperplanes.utilities.transforms import are_plain, wants_values_alone, without_derivatives
 
 __all__ = ["VisibilityPlanes", "choose_torch", "fading", "margins"]
 
@@ -71,10 +72,9 @@ class VisibilityPlanes:
     ) -> None:
         self.colours = ImagePlanes(images, cameras)
         self.occupancy = occupancy
-        maps = images.new_ones(*images[:, 0].shape, 2)
-        if masks is not None:
-            maps[..., 1] = masks[:, 0]
-        self._maps = _Maps(maps, cameras, occupancy)
+        self._maps = _Maps(
+            torch.ones_like(images[:, 0]) if masks is None else masks[:, 0].to(images), cameras, occupancy
+        )
         matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
@@ -103,15 +103,15 @@ class VisibilityPlanes:
         """The side of a voxel in radii of the scene: what depths are exact to."""
         return 2 / self.occupancy.occupied.shape[0]
 
-    def mask_views(self, views: Int[Tensor, " masked"]) -> VisibilityPlanes:
+    def mask_views(self, views: Selection) -> VisibilityPlanes:
         """The same planes, some more of which see nothing: no point is valid there, and its colour is the background.
 
         Args:
-            views: their indices.
+            views: their indices, or whether each of all views is masked.
         """
-        masked = self._against.masked
-        result = self._with(masked=masked.index_fill(0, views.to(masked.device), True))
-        result.colours = self.colours.mask_views(views)
+        colours = self.colours.mask_views(views)
+        result = self._with(masked=colours.masked)
+        result.colours = colours
         return result
 
     def with_penalties(self, penalties: Penalties) -> VisibilityPlanes:
@@ -148,7 +148,7 @@ class VisibilityPlanes:
         result._surface = torch.stack([distances.to(opacity), opacity], -1)
         return result
 
-    @torch.no_grad()
+    @without_derivatives()
     def choose(
         self,
         points: Float[Tensor, "point 3"],
@@ -179,10 +179,12 @@ class VisibilityPlanes:
         return replace(choose(points, None, best, 0, self.depth_opacity), nearest=near.nearest) if best else near
 
     def has_kernels(self, points: Tensor) -> bool:
-        """Whether the kernels take these points: single precision, on the CPU, pinhole cameras."""
+        """Whether the kernels take these points: single precision, on the CPU, pinhole cameras, no transform."""
+        opacity = self._maps.opacity
         pinholes = not isinstance(self.colours.cameras, DistortedCamera)
-        compiled = find_spec("numba") and points.device.type == "cpu" and self.maps.numel() < 2**31
-        return bool(compiled) and points.dtype == torch.float32 == self.maps.dtype and pinholes
+        compiled = find_spec("numba") and points.device.type == "cpu" and 2 * opacity.numel() < 2**31
+        kind = bool(compiled) and points.dtype == torch.float32 == opacity.dtype
+        return kind and pinholes and are_plain(points, opacity)
 
     def _limits(self) -> list[float]:
         """The numbers by which the kernels judge."""
@@ -214,14 +216,19 @@ class VisibilityPlanes:
         chosen = [ChosenViews(each, *_split(value)) for each, value in zip(views, values, strict=True)]
         return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
 
-    def can_describe(self, points: Float[Tensor, "point 3"]) -> bool:
-        """Whether `describe` takes these points: those that the kernels take, where no gradient goes through them."""
-        given = (points, *(getattr(self.colours.cameras, name) for name in ("intrinsics", "extrinsics")))
-        if type(self) is not VisibilityPlanes or torch.compiler.is_compiling() or transform_of(points):
+    def can_describe(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"] | None = None
+    ) -> bool:
+        """Whether `describe` takes these points: those that the kernels take, where no derivative is wanted.
+
+        Args:
+            points: in the world.
+            directions: along which they are seen, where there are any.
+        """
+        given = [points, self.colours.cameras.intrinsics, self.colours.cameras.extrinsics]
+        if not wants_values_alone(*given, *([] if directions is None else [directions])):
             return False
-        if torch.is_grad_enabled() and any(each.requires_grad for each in given):
-            return False
-        if not self.has_kernels(points) or self.colours.background != 1.0:
+        if type(self) is not VisibilityPlanes or not self.has_kernels(points) or self.colours.background != 1.0:
             return False
         return self.colours.packed_images(points) is not None
 
@@ -357,25 +364,41 @@ class _Against:
         return torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
 
 
-@dataclass(frozen=True)
 class _Maps:
     """Depth and opacity of the pixels of planes and of all their copies.
 
-    Attributes:
-        values: (view, row, column, 2), whose depths are 1 until they are asked for: opacities alone say what is held.
+    Args:
+        opacity: of the masks.
         cameras: of the views.
         occupancy: whose first voxel along a ray gives the depth.
     """
 
-    values: Float[Tensor, "view height width 2"]
-    cameras: PinholeCamera
-    occupancy: Occupancy
+    def __init__(
+        self, opacity: Float[Tensor, "view height width"], cameras: PinholeCamera, occupancy: Occupancy
+    ) -> None:
+        self._cameras, self._occupancy = cameras, occupancy
+        self._values = torch.stack([torch.ones_like(opacity), opacity], -1)
+        self._complete = False
 
-    @cached_property
+    @property
+    def values(self) -> Float[Tensor, "view height width 2"]:
+        """The depths, which are 1 until they are asked for, and the opacities."""
+        return self._values
+
+    @property
+    def opacity(self) -> Float[Tensor, "view height width"]:
+        """Of the masks."""
+        return self._values[..., 1]
+
+    @property
     def complete(self) -> Float[Tensor, "view height width 2"]:
-        """The values with their depths."""
-        self.values[..., 0] = first_hits(self.occupancy, self.cameras, self.values[..., 1][:, None])
-        return self.values
+        """The values with their depths, which are computed once; anew under transforms, whose tensors end with them."""
+        if self._complete:
+            return self._values
+        values = torch.stack([first_hits(self._occupancy, self._cameras, self.opacity[:, None]), self.opacity], -1)
+        if are_plain():
+            self._values, self._complete = values, True
+        return values
 
 
 def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 4"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import conv3d, interpolate, pad, silu
 
-from hyperplanes.utilities.transforms import transform_of
+from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["VolumeNetwork"]
 
@@ -45,8 +45,8 @@ class _Convolution(nn.Conv3d):
 
 def _has_onednn(value: Tensor) -> bool:
     """Whether oneDNN may be asked for by name: in single precision on a CPU, by no compiler and under no transform."""
-    plain = (value.device.type, value.dtype) == ("cpu", torch.float32) and not torch.compiler.is_compiling()
-    return plain and torch.backends.mkldnn.is_available() and torch.backends.mkldnn.enabled and not transform_of(value)
+    kind = (value.device.type, value.dtype) == ("cpu", torch.float32)
+    return kind and torch.backends.mkldnn.is_available() and torch.backends.mkldnn.enabled and are_plain(value)
 
 
 class _Pointwise(nn.Conv3d):

@@ -18,7 +18,7 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy, ball_extent
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.transforms import transform_of
+from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["footprint", "pixels_across"]
 
@@ -47,8 +47,8 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
     seen = torch.zeros(len(matrices), height, width, dtype=torch.bool, device=points.device)
     if not len(points):
         return seen
-    compiled = points.device.type == "cpu" and find_spec("numba") and points.dtype in (torch.float32, torch.float64)
-    mark = _mark_compiled if compiled and not transform_of(matrices) else _mark_torch
+    kind = points.device.type == "cpu" and points.dtype in (torch.float32, torch.float64)
+    mark = _mark_compiled if kind and find_spec("numba") and are_plain(matrices) else _mark_torch
     mark(seen, points, matrices, calibrations, occupancy.voxel)
     return seen
 

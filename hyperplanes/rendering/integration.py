@@ -124,13 +124,18 @@ def _has_importance(scene: Scene, samples: PackedSamples) -> bool:
 def _by_importance(
     scene: Scene, rays: Rays, samples: PackedSamples, stop: float, generator: torch.Generator
 ) -> Rendered:
-    """The pixels of all samples, and an unbiased estimate of their gradient from those that matter.
+    """The pixels of all samples, and an estimate of their gradient from those that matter.
 
     Densities are evaluated without gradients, and not at all behind what leaves less than `stop` of the light. The
     gradients that go through a sample are about proportional to its weight w, since those of softplus are to a small
     density. So it is differentiated with probability p = min(1, w / DIFFERENTIATED), and what goes through it is
     multiplied by 1 / p (importance sampling): a quarter of the samples of a car. The others keep their weights, and the
     mean colour of the ray stands for theirs, 1 % of the pixel.
+
+    The weights of all samples make the estimate unbiased but for those colours: the mean gradient differs by 0.05 to
+    1 % from that with the colours of all samples (fields of `small` of three objects, before and after 100 steps), and
+    by 7 % where weights are random and all is haze. With the colours of all samples 100 steps end 0.03 ± 0.02 dB
+    higher (16 objects, 25 views, two seeds), in more time.
     """
     field, count = scene.field, len(rays)
     assert isinstance(field, SplitField)

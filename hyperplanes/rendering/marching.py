@@ -18,7 +18,7 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.samplers import DenseSamples, PackedSamples
 from hyperplanes.utilities.arguments import checked_fields
-from hyperplanes.utilities.transforms import transform_of
+from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["RayMarching", "march"]
 
@@ -113,27 +113,34 @@ def march(rays: Rays, occupancy: Occupancy, step: float, generator: torch.Genera
     """One sample every `step` along each ray, in the middle of the step, where the grid is occupied.
 
     Args:
-        rays: with near <= far.
+        rays: where near is not below far, there are no samples.
         occupancy: which voxels are sampled.
         step: distance between samples in world units.
         generator: shifts each ray's samples by one random fraction of a step; on the CPU.
 
     Returns:
         The samples in occupied voxels.
+
+    Raises:
+        ValueError: rays without an end, or no step, as of a sphere without a radius.
     """
+    longest = float((rays.far - rays.near).max()) if len(rays) else 0.0
+    if not math.isfinite(longest):
+        raise ValueError(f"rays: expected finite near and far, got some that are {longest} long")
+    if not 0 < step < math.inf:
+        raise ValueError(f"step: expected more than 0 and finite, got {step}")
     offset = torch.full((len(rays),), 0.5, dtype=rays.near.dtype)
     if generator is not None:
         offset = torch.rand(len(rays), generator=generator, dtype=rays.near.dtype)
     start = rays.near + offset.to(rays.near) * step
-    longest = float((rays.far - rays.near).max()) if len(rays) else 0.0
     walk = _walk_compiled if _has_kernel(rays) else _walk_torch
-    return PackedSamples(*walk(rays, start, occupancy, step, int(longest / step) + 1), step)
+    return PackedSamples(*walk(rays, start, occupancy, step, max(0, int(longest / step)) + 1), step)
 
 
 def _has_kernel(rays: Rays) -> bool:
     """Whether the kernel takes these rays."""
     kind = rays.near.dtype in (torch.float32, torch.float64) and rays.near.device.type == "cpu"
-    return kind and bool(find_spec("numba")) and not torch.compiler.is_compiling() and not transform_of(rays.origins)
+    return kind and bool(find_spec("numba")) and are_plain(rays.origins)
 
 
 def _walk_compiled(

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.geometry.occupancy import Occupancy, dilate, ranges
-from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["RefinedOccupancy", "refine"]
 
@@ -187,11 +186,6 @@ def _dilated(grid: Occupancy, filled: Tensor, margin: int) -> Tensor:
 
 
 def _halved(occupancy: Occupancy) -> Occupancy:
-    """The grid of half the side, rounded up; a voxel is occupied where any of its eight was.
-
-    An odd side leaves the last of its voxels with a half outside: the cube grows by one fine voxel there.
-    """
-    pooled = torch.nn.functional.max_pool3d(occupancy.occupied[None, None].float(), 2, ceil_mode=True)[0, 0] > 0
-    radius = len(pooled) * occupancy.voxel
-    x, y, z = (value - occupancy.bounds.radius + radius for value in occupancy.bounds.centre)
-    return Occupancy(pooled, Sphere((x, y, z), radius))
+    """The grid of half the side, rounded up; a voxel is occupied where any of its eight was."""
+    even = occupancy.with_even_side()
+    return Occupancy(torch.nn.functional.max_pool3d(even.occupied[None].float(), 2)[0] > 0, even.bounds)

@@ -1,12 +1,15 @@
-"""Function transforms of PyTorch, which neither compiled kernels nor some of its own operations know."""
+"""What is wanted of tensors beside values, and no compiled kernel knows: derivatives, function transforms, graphs."""
 
 from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-__all__ = ["transform_of"]
+__all__ = ["are_plain", "transform_of", "wants_values_alone", "without_derivatives"]
 
 
 def transform_of(*tensors: Tensor) -> str | None:
@@ -18,3 +21,27 @@ def transform_of(*tensors: Tensor) -> str | None:
     if any(forward_ad.unpack_dual(value).tangent is not None for value in tensors):
         return "forward-mode derivatives"
     return None
+
+
+def are_plain(*tensors: Tensor) -> bool:
+    """Whether the memory of these tensors can be read now: no graph is compiled or traced, and no transform is active.
+
+    Gradients may be wanted.
+    """
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # pyright: ignore[reportPrivateImportUsage]
+        return False
+    return not transform_of(*tensors)
+
+
+def wants_values_alone(*tensors: Tensor) -> bool:
+    """Whether nothing but the values of what is computed of these tensors is wanted: no derivative, no graph."""
+    if torch.is_grad_enabled() and any(value.requires_grad for value in tensors):
+        return False
+    return are_plain(*tensors)
+
+
+@contextmanager
+def without_derivatives() -> Generator[None, None, None]:
+    """As `torch.no_grad`, of forward-mode derivatives, too."""
+    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
+        yield

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from threading import Thread
 
 import pytest
 import torch
@@ -257,3 +258,17 @@ def test_a_guide_keeps_what_few_views_do_not_show(adapted, seen):
     assert lost[1] > lost[0] + 3
     many = Views(truth.repeat(6, 1, 1, 1), camera.select(others, [0, 1, 2] * 6))
     assert render_guide(adapted, many) is None
+
+
+def test_a_ray_beside_the_voxels_and_nearly_parallel_to_an_axis_ends(baked):
+    """A component of 1e-20, as products of cosines have it, asks for more steps than there are numbers."""
+    rays = Rays(
+        torch.tensor([[2.0, 0.0, -3.0]]), torch.tensor([[-1e-20, 0.0, 1.0]]), torch.tensor([2.0]), torch.tensor([4.0])
+    )
+    shaded, seen = shade_voxels(baked.values, baked.centres(), rays.origins[0]), []
+    grid = VoxelGrid.of(baked.index, baked.bounds)
+    worker = Thread(target=lambda: seen.append(render_voxels(grid, shaded, rays, step=0.01)), daemon=True)
+    worker.start()
+    worker.join(30)
+    assert seen, "still stepping"
+    assert seen[0].opacity.tolist() == [0.0]

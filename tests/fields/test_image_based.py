@@ -173,7 +173,7 @@ def test_the_kernel_reads_what_plain_pytorch_does(count, grid, monkeypatch):
             yield each.colour_of(hidden[::3], directions[::3]), each.density_of(hidden)
 
     compiled = list(outputs())
-    monkeypatch.setattr(VisibilityPlanes, "can_describe", lambda planes, points: False)
+    monkeypatch.setattr(VisibilityPlanes, "can_describe", lambda planes, *_: False)
     for found, expected in zip(compiled, outputs(), strict=True):
         for one, other in zip(found, expected, strict=True):
             torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
@@ -187,7 +187,7 @@ def test_gradients_are_those_of_plain_pytorch(monkeypatch):
         colour, density = field(points, directions)
         loss = (colour - 0.3).square().sum() + density.log1p().sum()
         gradients.append(torch.autograd.grad(loss, list(target.parameters())))
-        monkeypatch.setattr(VisibilityPlanes, "can_describe", lambda planes, points: False)
+        monkeypatch.setattr(VisibilityPlanes, "can_describe", lambda planes, *_: False)
     for one, other in zip(*gradients, strict=True):
         torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
 
@@ -216,3 +216,63 @@ def test_a_field_whose_grid_changes_in_place_says_something_else():
     after = field.density(points)
     assert not torch.allclose(before, after)
     torch.testing.assert_close(after, bound(target, views, parameters).density(points))
+
+
+def derivatives_of(value, leaf):
+    return torch.autograd.grad(value.square().sum(), leaf)[0]
+
+
+def test_directions_are_differentiated_with_points_that_are_not(monkeypatch):
+    field, (points, directions), found = bound(network(), coloured(5)), queries(), []
+    for _ in range(2):
+        leaf = directions.clone().requires_grad_()
+        colour, _ = field(points, leaf)
+        found.append([derivatives_of(colour, leaf), derivatives_of(field.colour_of(field.hidden(points), leaf), leaf)])
+        monkeypatch.setattr(VisibilityPlanes, "can_describe", lambda planes, *_: False)
+    assert found[0][0].abs().sum() > 0.1
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")  # of torch.func.jvp
+def test_function_transforms_find_what_autograd_does():
+    target, views, (points, directions) = (
+        network(config=ImageBasedConfig(**{**asdict(SMALL), "grid": 3})),
+        coloured(4),
+        queries(60),
+    )
+    parameters = Parameters.of(target).detach()
+    occupancy = carve(views.masks, views.cameras, views.bounds, 16)
+
+    def loss(name):
+        def of(value):
+            given = {**parameters, name: value} if name else parameters
+            field = bound(target, views, Parameters(given), occupancy)  # with depths of its own
+            return field(points, directions if name else value)[0].square().sum()
+
+        return of
+
+    for name in ("layers.0.weight", "grid.weight", ""):
+        start = parameters[name] if name else directions
+        leaf, tangent = (
+            start.clone().requires_grad_(),
+            torch.randn(start.shape, generator=torch.Generator().manual_seed(0)),
+        )
+        expected = torch.autograd.grad(loss(name)(leaf), leaf)[0]
+        torch.testing.assert_close(torch.func.grad(loss(name))(start), expected, atol=1e-3, rtol=1e-3)
+        if name == "grid.weight":  # PyTorch has no forward derivative of grid_sample: it says so, and drops none
+            with pytest.raises(NotImplementedError):
+                torch.func.jvp(loss(name), (start,), (tangent,))
+            continue
+        along = torch.func.jvp(loss(name), (start,), (tangent,))[1]
+        torch.testing.assert_close(along, (expected * tangent).sum(), atol=1e-3, rtol=1e-3)
+
+
+@torch.no_grad()
+def test_the_kernel_encodes_many_octaves_as_pytorch_does(monkeypatch):
+    config = ImageBasedConfig(**{**asdict(SMALL), "point_frequencies": 20, "direction_frequencies": 18})
+    field, (points, directions) = bound(network(config=config), coloured(4)), queries()
+    compiled = field(points, directions)
+    monkeypatch.setattr(VisibilityPlanes, "can_describe", lambda planes, *_: False)
+    for one, other in zip(compiled, field(points, directions), strict=True):
+        torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-3)

@@ -289,3 +289,64 @@ def test_other_images_of_the_same_cameras_are_looked_up_where_the_first_are():
     expected = ImagePlanes(other, ours, 0.25, exact=True).lookup(points)
     assert torch.equal(found.colours, expected.colours)
     assert torch.equal(found.valid, expected.valid)
+
+
+@pytest.mark.parametrize("chosen", [False, True])
+def test_no_channel_leaves_the_gradients_of_places(chosen):
+    points, ours, images = scene(points=20)
+    views = torch.randint(0, 5, (20, 2), generator=torch.Generator().manual_seed(1)) if chosen else None
+    found = []
+    for backend in BACKENDS:
+        leaf = points.clone().requires_grad_()
+        seen = ImagePlanes(images[:, :0], ours, backend=backend).lookup(leaf, views)
+        found.append(torch.autograd.grad(seen.coordinates.sum(), leaf)[0])
+    torch.testing.assert_close(*found, rtol=1e-3, atol=1e-3)
+
+
+def test_what_does_not_count_its_changes_is_copied():
+    points, ours, images = scene()
+    with torch.inference_mode():
+        unseen = images.clone()
+        planes = ImagePlanes(unseen, ours)
+        expected = planes.lookup(points).colours
+        unseen.fill_(1.0)
+        assert torch.equal(planes.lookup(points).colours, expected)
+    array = images.numpy().copy()
+    planes = ImagePlanes(array, ours)
+    before = [planes.lookup(points).colours, planes.lookup(points.double()).colours]
+    array[:] = 1.0
+    after = [planes.lookup(points).colours, planes.lookup(points.double()).colours]
+    assert all(torch.equal(*each) for each in zip(before, after, strict=True))
+
+
+def test_a_single_camera_sees_what_is_before_it_wherever_the_origin_is():
+    for far in (0.0, 1e3, 1e5):
+        pose = cameras.look_at(torch.tensor([[far, 0.0, 3.0]]), target=(far, 0.0, 0.0)).double()
+        one = cameras.pinhole(cameras.symmetric_intrinsics(9, 13, 0.7), pose, 9, 13)
+        planes = ImagePlanes(torch.rand(1, 3, 9, 13, dtype=torch.double), one)
+        ahead, behind = [far, 0.0, 0.0], [far, 0.0, 6.0]
+        assert planes.lookup(torch.tensor([ahead, behind], dtype=torch.double)).valid[:, 0].tolist() == [True, False]
+
+
+def test_masked_views_and_other_images_have_to_fit():
+    points, ours, images = scene()
+    planes = ImagePlanes(images, ours)
+    for masked in (torch.tensor([1, 3]), [1, 3], [False, True, False, True, False]):
+        assert not planes.mask_views(masked).lookup(points).valid[:, [1, 3]].any()
+    with pytest.raises(ValueError, match="views: expected indices of 5 views, got 7 to 7"):
+        planes.mask_views([7])
+    for other in (images[:4], images[..., :5]):
+        with pytest.raises(ValueError, match=r"images: expected shape \(5, channel, 9, 13\)"):
+            planes.with_images(other)
+
+
+def test_images_may_be_under_a_transform():
+    points, ours, images = scene(points=10)
+    stack = torch.stack([images, 0.5 * images])
+
+    def summed(each):
+        return ImagePlanes(each, ours).lookup(points).colours.square().sum()
+
+    torch.testing.assert_close(
+        torch.func.vmap(summed)(stack), torch.stack([summed(each) for each in stack]), rtol=1e-3, atol=0
+    )

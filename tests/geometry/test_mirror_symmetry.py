@@ -49,3 +49,13 @@ def test_a_single_voxel_has_a_plane_through_it():
     found = most_symmetric_plane(one)
     height = float(one.centres()[0] @ torch.tensor(found.normal)) - found.offset
     assert abs(height) < 2 / 8
+
+
+@pytest.mark.parametrize("side", [3, 9, 33])
+def test_a_voxel_at_the_last_border_of_an_odd_grid_has_a_plane_through_it(side):
+    """Blocks of 2 x 2 x 2 voxels leave a slab over there."""
+    one = Occupancy(torch.zeros(side, side, side, dtype=torch.bool), Sphere((0.5, 0.0, -0.2), 2.0))
+    one.occupied[-1, side // 2, -1] = True
+    found = most_symmetric_plane(one)
+    height = float(one.centres()[0] @ torch.tensor(found.normal)) - found.offset
+    assert abs(height) < one.voxel

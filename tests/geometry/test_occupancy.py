@@ -177,3 +177,12 @@ def test_the_surface_has_a_face_at_an_empty_voxel_or_at_the_border():
         around = [(x + 1, y, z), (x - 1, y, z), (x, y + 1, z), (x, y - 1, z), (x, y, z + 1), (x, y, z - 1)]
         bare = any(min(each) < 0 or max(each) > 6 or not grid[each] for each in around)
         assert bool(found[x, y, z]) == (bool(grid[x, y, z]) and bare)
+
+
+@pytest.mark.parametrize("side", [4, 5])
+def test_an_odd_grid_gets_one_more_voxel_and_keeps_the_places_of_the_others(side):
+    bounds = Sphere((0.5, -1.0, 0.0), 2.0)
+    grid = Occupancy(torch.rand(side, side, side, generator=torch.Generator().manual_seed(0)) < 0.4, bounds)
+    even = grid.with_even_side()
+    assert len(even.occupied) == 2 * math.ceil(side / 2)
+    torch.testing.assert_close(even.centres(), grid.centres())

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from hyperplanes.geometry.cameras import camera_from_world, centres, intrinsics
+from hyperplanes.geometry.cameras import camera_from_world, centres, intrinsics, with_poses
 from hyperplanes.geometry.distortion import DistortedCamera, distorted
 from hyperplanes.geometry.reflections import Plane, Symmetry, reflected_cameras
 from tests.reference_rendering import ring
@@ -90,3 +90,15 @@ def test_by_a_quarter_turn_the_z_axis_is_mapped_onto_the_x_axis():
 def test_several_planes_are_vertical_and_meet_in_the_axis(plane, order, message):
     with pytest.raises(ValueError, match=message):
         Symmetry(plane, order)
+
+
+def test_poses_are_differentiated_through():
+    cameras = ring(3, SIZE)
+    pose = camera_from_world(cameras).clone().requires_grad_()
+    cameras = with_poses(cameras, pose)
+    normal = torch.tensor(TILTED.normal)
+    heights = [(centres(each) @ normal).sum() for each in (cameras, reflected_cameras(cameras, TILTED))]
+    own, reflected = (torch.autograd.grad(each, pose, retain_graph=True)[0] for each in heights)
+    assert own[:, :3, 3].abs().sum() > 0.1
+    # a camera that moves towards the plane has a mirror image that moves towards it from the other side
+    torch.testing.assert_close(reflected[:, :3, 3], -own[:, :3, 3], atol=1e-5, rtol=0)

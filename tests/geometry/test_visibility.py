@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from threading import Thread
 
 import pytest
 import torch
@@ -301,3 +302,34 @@ def test_points_that_are_not_finite_are_seen_by_no_view_and_leave_the_others_as_
             for name in ("views", "behind", "coverage", "penalty"):
                 torch.testing.assert_close(getattr(part, name)[other], getattr(clean, name)[other], rtol=0, atol=0)
     assert not shown.choose(spoiled, directions, best=3).number[~other].any()
+
+
+def test_rays_from_so_far_away_that_a_step_is_lost_in_rounding_end():
+    far = camera_at((0.0, 0.0, 1e6), SIZE)
+    far.intrinsics[:, :2, :2] *= 1e6 / 3
+    depths = []
+    worker = Thread(target=lambda: depths.append(first_hits(ball(side=16), far)), daemon=True)
+    worker.start()
+    worker.join(30)
+    assert depths, "still stepping"
+    assert depths[0].min() >= 1e6 - 1
+
+
+def test_planes_made_in_inference_mode_are_used_outside_of_it():
+    points, directions = queries(50)
+    with torch.inference_mode():
+        made = planes()
+    torch.testing.assert_close(made.depth_opacity, planes().depth_opacity)
+    found = made.choose(points, directions, best=2, nearest=2)
+    torch.testing.assert_close(found.coverage, planes().choose(points, best=2).coverage)
+
+
+def test_a_hull_is_carved_and_its_depth_found_under_transforms():
+    views = ball_views(ring(3, SIZE))
+
+    def both(scale):
+        hull = carve(views.masks, views.cameras, Sphere(), 16)
+        return scale * first_hits(hull, views.cameras).sum(), (hull.occupied.sum(), scale)
+
+    _, (count, _) = torch.func.grad(both, has_aux=True)(torch.tensor(2.0))
+    assert int(count) == int(carve(views.masks, views.cameras, Sphere(), 16).occupied.sum())

@@ -158,3 +158,12 @@ def test_only_part_of_a_sphere_is_walked_beyond_it_nothing():
 
 def test_denser_samples_of_pictures_stay_within_what_a_sampler_takes():
     assert RayMarching(6000).for_rendering(400).steps == 1 << 14
+
+
+def test_rays_have_an_end_and_steps_a_length_and_backward_ones_no_sample():
+    for far in (math.inf, math.nan):
+        with pytest.raises(ValueError, match="rays: expected finite near and far"):
+            march(straight([2.0], [far]), full(Sphere(), 2), 0.5)
+    with pytest.raises(ValueError, match=r"step: expected more than 0 and finite, got 0\.0"):
+        RayMarching(8).place(straight([2.0], [4.0]), full(Sphere(radius=0.0), 2))
+    assert not len(march(straight([4.0, 3.0], [2.0, 3.0]), full(Sphere(), 2), 0.5))

@@ -11,6 +11,7 @@ from typing import no_type_check
 
 import numpy as np
 
+from hyperplanes.geometry.chosen_views import COMPUTED
 from hyperplanes.geometry.kernels.blocks import inlined
 from hyperplanes.geometry.kernels.llvm import load, load_int
 from hyperplanes.geometry.kernels.visibility import (
@@ -77,12 +78,15 @@ def _encode(row, at, x, y, z, frequencies):
     at += 3
     if frequencies:
         for axis in range(3):
-            value = row[at - 3 + axis]
-            sine, cosine = number(math.sin(value)), number(math.cos(value))
+            value, sine, cosine = row[at - 3 + axis], number(0), number(0)
             for octave in range(frequencies):
+                if octave % COMPUTED == 0:
+                    angle = value * number(1 << octave)
+                    sine, cosine = number(math.sin(angle)), number(math.cos(angle))
+                else:
+                    sine, cosine = number(2) * sine * cosine, number(1) - number(2) * sine * sine
                 row[at + 3 * octave + axis] = sine
                 row[at + 3 * (frequencies + octave) + axis] = cosine
-                sine, cosine = number(2) * sine * cosine, number(1) - number(2) * sine * sine
     return at + 6 * frequencies
 
 

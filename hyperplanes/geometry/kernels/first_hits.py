@@ -24,12 +24,15 @@ def first_hits(origins, directions, near, far, step, corner, per_unit, occupied,
         y0 = (origins[ray, 1] - corner[1]) * per_unit
         z0 = (origins[ray, 2] - corner[2]) * per_unit
         x1, y1, z1 = directions[ray, 0] * per_unit, directions[ray, 1] * per_unit, directions[ray, 2] * per_unit
-        found, t = far[ray], near[ray] + half * step
-        while t < far[ray]:
+        found, sample = far[ray], 0
+        while True:
+            t = near[ray] + (number(sample) + half) * step
+            if not t < far[ray]:
+                break
             x, y, z = x0 + t * x1, y0 + t * y1, z0 + t * z1
             if x >= 0 and y >= 0 and z >= 0 and x < side and y < side and z < side:
                 if occupied[np.int64(x), np.int64(y), np.int64(z)]:
                     found = t
                     break
-            t += step
+            sample += 1
         nearest[ray] = found

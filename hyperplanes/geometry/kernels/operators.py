@@ -98,7 +98,7 @@ class _Points:
         if self.position is None:
             return memory.strided(gradient)
         flat = np.zeros((gradient.shape[2], self.total), memory.number(gradient))
-        flat[:, self.position] = gradient.detach().numpy().transpose(2, 0, 1).reshape(len(flat), -1)
+        flat[:, self.position] = gradient.detach().numpy().transpose(2, 0, 1).reshape(len(flat), self.position.size)
         return flat.reshape(-1), (1, 0, self.total)
 
 

@@ -38,14 +38,16 @@ def _corner(index, cell_x, cell_y, cell_z, x, y, z, corner):
 @inlined
 @no_type_check
 def _inside(empty, origin, along, first, last, step):
-    """The first sample of a ray in the box of all cells, and the t at which the ray leaves the box."""
+    """The first sample of a ray in the box of all cells, and the t at which it leaves it; none where it is beside."""
     enter, zero = first, np.float32(0.0)
     for axis in range(3):
         if along[axis] != zero:
             near, far = -origin[axis] / along[axis], (np.float32(empty.shape[axis]) - origin[axis]) / along[axis]
             enter, last = max(enter, min(near, far)), min(last, max(near, far))
         elif origin[axis] < zero or origin[axis] > np.float32(empty.shape[axis]):
-            last = enter
+            return 0, first
+    if not enter <= last:  # where a ray is nearly parallel to an axis, `enter` may be no number of samples
+        return 0, first
     return int(math.ceil((enter - first) / step)), last
 
 
