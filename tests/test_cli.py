@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+import tyro
 from PIL import Image
 from rendered_here import rendered_here
 from small_demo import demo_folder, demo_preset, first_object
@@ -27,7 +29,7 @@ from data_gen.rendering.renderers import RendererError
 from hyperplanes.adaptation import HullBlend, HyperPlanes
 from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
 from hyperplanes.cli import main
-from hyperplanes.commands import adapt, find_verbs
+from hyperplanes.commands import adapt, find_verbs, render
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.configuration.fine_tuning import FineTuning
@@ -222,6 +224,13 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ),
         ([*RENDER, "--dataparser-transforms", "OUT/a"], ["--dataparser-transforms: expected --camera-path"]),
         ([*BAKE, "OUT/bk.safetensors", "--orbit", "0"], ["--orbit: expected at least 1 frame, got 0"]),
+        (["export", *RENDER[1:], "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
+        (["export", *RENDER[1:], "--what", "mesh", "--size", "64"], ["--size: expected --what turntable, whose"]),
+        (["export", *RENDER[1:], "--what"], ["--what: expected at least one of images, turntable, mesh, page"]),
+        (
+            ["demo", "--quick-check", "--objects", "9", "--out", "OUT/demo"],
+            ["--objects: expected none with --quick-check, which has its own"],
+        ),
         (["inspect", "OUT/none"], ["OUT/none: expected a data set, posed images, a checkpoint", "found nothing"]),
     ],
 )
@@ -243,7 +252,11 @@ def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, cap
 
 @pytest.mark.parametrize(
     ("verb", "out", "more"),
-    [("render", "photos/images", []), ("export", "photos", ["--what", "images"])],
+    [
+        ("render", "photos/images", []),
+        ("export", "photos", ["--what", "images"]),
+        ("bake", "photos/images/car.safetensors", ["--orbit", "2"]),
+    ],
 )
 def test_pictures_are_not_written_over_those_that_are_read(verb, out, more, tmp_path, monkeypatch, capsys):
     shutil.copytree(locate_scene("example-car"), tmp_path / "photos")
@@ -487,10 +500,14 @@ def test_adapt_names_the_command_that_shows_its_weights_the_same_views(given, tm
     task, _ = read_scene(Path(scene), Console(silent=True))
     monkeypatch.setattr(adapt, "read_object", lambda *_: (task, "y"))
     monkeypatch.setattr(adapt, "load_adaptable", lambda *_, **__: small)
-    assert main(["adapt", "--views", scene, "--checkpoint", "small", "--out", str(tmp_path / "out"), *given]) == 0
+    assert main(["adapt", "--views", scene, "--checkpoint", "small", "--out", str(tmp_path / "my out"), *given]) == 0
     proposed = capsys.readouterr().out.splitlines()[-1]
-    assert all(option in proposed for option in given)
-    assert proposed.count("--") == 3 + len(given)
+    command = shlex.split(proposed.removeprefix("next: "))
+    assert command[:2] == ["hyperplanes", "render"]
+    proposed = tyro.cli(render.Arguments, args=command[2:])
+    assert (proposed.checkpoint, proposed.views) == (tmp_path / "my out", Path(scene))
+    taken = {name: getattr(proposed, name) for name in ("all_views", "learn_background", "refine_poses")}
+    assert [name for name, value in taken.items() if value] == [name.strip("-").replace("-", "_") for name in given]
 
 
 def test_seeds_of_trainings_and_of_gradient_steps_in_every_kind_of_file(tmp_path, capsys):
@@ -621,6 +638,31 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     assert "expected a checkpoint's folder to adapt with, got a file" in complaint(capsys)
     assert main([*command, "--voxels", "7"]) == 2
     assert "7" in complaint(capsys)
+
+
+def test_a_turntable_of_voxels_that_are_not_fitted_is_of_the_field(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def noted(field, views, cameras, representation="auto", **_):
+        asked.append(representation)
+        return field
+
+    monkeypatch.setattr("hyperplanes.export.animation.choose_representation", noted)
+    views = ["--checkpoint", str(demo_folder()), "--views", str(first_object(demo_folder()))]
+    for fit in ("0", "2"):
+        out = ["--out", str(tmp_path), "--what", "turntable", "--frames", "1", "--fit", fit, "--size", "8"]
+        assert main(["export", *views, *out]) == 0
+    assert asked == ["field", "auto"]
+
+
+def test_a_video_that_cannot_be_encoded_is_refused_before_anything_is_rendered(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    views = ["--checkpoint", str(demo_folder()), "--views", str(first_object(demo_folder()))]
+    for verb, more in (("render", ["--orbit", "2"]), ("bake", ["--orbit", "2"]), ("export", ["--what", "turntable"])):
+        out = tmp_path / ("voxels.safetensors" if verb == "bake" else "out")
+        assert main([verb, *views, "--out", str(out), "--turntable", "mp4", *more]) == 2
+        assert "mp4: expected the package imageio-ffmpeg, found none" in complaint(capsys)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_paper_protocol_is_rendered_and_evaluated_when_asked_for(tmp_path, capsys):

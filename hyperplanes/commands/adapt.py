@@ -17,6 +17,7 @@ from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
 from hyperplanes.commands.options import Free, ObjectArguments
 from hyperplanes.commands.scene import read_object, refuse_sources
 from hyperplanes.commands.writing import refuse_checkpoint, writes_to
+from hyperplanes.utilities.shell import command_line
 
 __all__ = ["Arguments", "run"]
 
@@ -48,13 +49,11 @@ def run(arguments: Arguments) -> int:
     field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)
     assert isinstance(field, AdaptedField)
     model.with_weights_of(field).save(arguments.out)
-    more = "" if up == "y" else f" --up={up}"
-    more += " --all-views" if arguments.all_views else ""
-    more += " --learn-background" if arguments.learn_background else ""
-    more += " --refine-poses" if arguments.refine_poses else ""
-    more += "" if arguments.downscale is None else f" --downscale {arguments.downscale}"
+    same = [] if up == "y" else [f"--up={up}"]
+    same += ["--all-views"] * arguments.all_views + ["--learn-background"] * arguments.learn_background
+    same += ["--refine-poses"] * arguments.refine_poses
+    same += [] if arguments.downscale is None else ["--downscale", arguments.downscale]
+    given = ["--checkpoint", arguments.out, "--views", arguments.views]
     console.say(f"{arguments.out}: the weights of {task.name}")
-    console.say(
-        f"next: hyperplanes render --checkpoint {arguments.out} --views {arguments.views}{more} --out new-views"
-    )
+    console.say(f"next: {command_line('hyperplanes', 'render', given, same, '--out', 'new-views')}")
     return 0

@@ -12,14 +12,14 @@ Example:
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, bake_field, load_adaptable, refuse_baked
 from hyperplanes.commands.options import ObjectArguments, OptionalInt, check_orbit, optional
-from hyperplanes.commands.scene import read_object
+from hyperplanes.commands.scene import read_object, refuse_sources
 from hyperplanes.commands.writing import refuse_checkpoint, writes_to
 from hyperplanes.utilities.formatting import format_duration
 
@@ -54,13 +54,22 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
     return time.perf_counter() - started, result
 
 
-@writes_to(lambda arguments: arguments.out.parent)
+def _refuse_sources(arguments: Arguments, names: Sequence[str] = ()) -> None:
+    """As `refuse_sources`, where a turntable is written, which would be read as a picture of the scene."""
+    if arguments.orbit is not None:
+        refuse_sources(arguments.out.parent, arguments.views, names)
+
+
+@writes_to(
+    lambda arguments: arguments.out.parent,
+    check=_refuse_sources,
+)
 def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.baking import BakedScene, coarsening
-    from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
+    from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, to_pixels
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.utilities.errors import prefix_errors
     from hyperplanes.utilities.metrics import psnr
@@ -72,12 +81,15 @@ def run(arguments: Arguments) -> int:
         raise ValueError(f"--out: expected a name that ends in .safetensors, got {arguments.out}; add the ending")
     refuse_checkpoint(arguments.out, arguments.checkpoint)
     check_orbit(arguments.orbit, arguments.size)
+    if arguments.orbit is not None:
+        require_encoder(arguments.turntable)
     with prefix_errors("--voxels"):
         coarsening(arguments.voxels)
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "bake")
     model = load_adaptable(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     task, _ = read_object(arguments, model, console)
+    _refuse_sources(arguments, task.query.names)
     shown, query = task.support.to(device), task.query
     field, _ = adapt_to(model, shown, task.name, console, steps=arguments.steps)
     assert isinstance(field, AdaptedField)

@@ -22,6 +22,7 @@ import tyro
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration
+from hyperplanes.utilities.shell import command_line
 
 if TYPE_CHECKING:
     from hyperplanes.commands.console import Bar
@@ -82,8 +83,7 @@ def run(arguments: Arguments) -> int:
     console.say(f"masks: {captured.mask}")
     console.say(f"up: by {captured.up_from}")
     console.say(f"{captured.folder}: a scene, in {format_duration(time.perf_counter() - started)}; for a turntable:")
-    console.say(
-        f"  hyperplanes render --checkpoint small --views {captured.folder} --all-views --orbit 48 "
-        f"--out {captured.folder}/turntable" + (" --learn-background" if captured.mask == "none" else "")
-    )
+    given = ["--checkpoint", "small", "--views", captured.folder, "--all-views", "--orbit", 48]
+    given += ["--out", captured.folder / "turntable"] + ["--learn-background"] * (captured.mask == "none")
+    console.say(f"  {command_line('hyperplanes', 'render', given)}")
     return 0

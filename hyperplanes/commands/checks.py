@@ -27,6 +27,12 @@ REQUIRED = {
     "safetensors": "safetensors",
     "jaxtyping": "jaxtyping",
     "PIL": "pillow",
+    "matplotlib": "matplotlib",
+    "jinja2": "jinja2",
+    "networkx": "networkx",
+    "collada": "pycollada",
+    "fast_simplification": "fast-simplification",
+    "lightning_fabric": "lightning-fabric",
     "rich": "rich",
     "tyro": "tyro",
     "cattrs": "cattrs",
@@ -36,15 +42,17 @@ REQUIRED = {
 """What everything needs: modules and the packages they come from."""
 
 OPTIONAL = {
-    "matplotlib": "plots of benchmarks and cameras",
-    "tensorboard": "train --tensorboard",
-    "ray": "data generation on a cluster",
-    "DracoPy": "meshes that Draco compressed",
-    "viser": "view",
-    "imageio_ffmpeg": "turntables as MP4 and WebM",
-    "huggingface_hub": "models on the Hugging Face hub",
+    "tensorboard": ("watch", "train --tensorboard"),
+    "ray": ("ray", "data generation on a cluster"),
+    "DracoPy": ("draco", "meshes that Draco compressed"),
+    "viser": ("viz", "view"),
+    "imageio_ffmpeg": ("video", "turntables as MP4 and WebM, videos for capture"),
+    "huggingface_hub": ("hub", "models on the Hugging Face hub"),
+    "pycolmap": ("photos", "capture: the poses of photographs"),
+    "onnxruntime": ("photos", "capture: masks by a network"),
+    "cv2": ("photos", "capture: masks by colour"),
 }
-"""What some things need: modules, each the package of its name, and what for."""
+"""What some things need: modules, each the extra that installs it, and what for."""
 
 SMALLEST_FREE = 2 * 2**30
 
@@ -134,10 +142,10 @@ def _disk(folder: Path) -> Check:
 
 
 def _optional(module: str) -> Check:
-    purpose = OPTIONAL[module]
+    extra, purpose = OPTIONAL[module]
     there = find_spec(module) is not None
     detail = f"{_version(module)}: {purpose}" if there else f"absent: {purpose}"
-    return Check(module, there, False, detail, f"pip install {module}")
+    return Check(module, there, False, detail, f"pip install 'hyperplanes[{extra}]'")
 
 
 def _version(module: str) -> str:

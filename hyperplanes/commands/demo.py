@@ -84,7 +84,13 @@ def settings_of(arguments: Arguments) -> DemoSettings:
         what = f"got {arguments.meshes}, which is {found}"
         raise ValueError(f"--meshes: expected a folder of mesh files, {what}; check the path")
     if arguments.quick_check:
-        return replace(DemoSettings.quick_check(arguments.seed), meshes=arguments.meshes)
+        usual = Arguments()
+        for name in ("objects", "held_out", "resolution", "preset", "steps"):
+            if getattr(arguments, name) != getattr(usual, name):
+                option = f"--{name.replace('_', '-')}"
+                raise ValueError(f"{option}: expected none with --quick-check, which has its own; leave it out")
+        small = DemoSettings.quick_check(arguments.seed)
+        return replace(small, meshes=arguments.meshes, class_name=arguments.class_name)
     if not 1 < arguments.held_out < arguments.objects:
         raise ValueError(
             "expected --held-out above 1, so that updates can be swapped, and below --objects, "

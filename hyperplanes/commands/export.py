@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, bake_field, load_source, render_views
-from hyperplanes.commands.options import ObjectArguments, OptionalInt, optional
+from hyperplanes.commands.options import ObjectArguments, OptionalInt, check_orbit, optional
 from hyperplanes.commands.scene import read_object, refuse_sources
 from hyperplanes.commands.writing import writes_to
 
@@ -86,12 +86,18 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.animation import choose_representation
     from hyperplanes.export.baking import coarsening, default_side
-    from hyperplanes.export.images import encode_animation, orbit_cameras, save_images, to_pixels
+    from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, save_images, to_pixels
     from hyperplanes.export.mesh import check_voxels
     from hyperplanes.export.page import page_of, save_page, turning_picture
     from hyperplanes.utilities.errors import prefix_errors
     from hyperplanes.utilities.writing import write_whole
 
+    if not arguments.what:
+        raise ValueError("--what: expected at least one of images, turntable, mesh, page, splats, points, got none")
+    turned = arguments.frames if "turntable" in arguments.what else None
+    check_orbit(turned, arguments.size, orbits=("--what turntable",))
+    if turned:
+        require_encoder(arguments.turntable)
     if arguments.level is not None and not arguments.level > 0:
         raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")
     if "mesh" in arguments.what:
@@ -115,12 +121,12 @@ def run(arguments: Arguments) -> int:
 
     if "images" in arguments.what:
         paths = save_images(render_views(field, query.cameras, console).images, out / "images", query.names)
-        poses = "shown" if arguments.all_views else "query"
-        console.say(f"{out / 'images'}: {len(paths)} pictures of the {poses} poses")
+        console.say(f"{out / 'images'}: {len(paths)} pictures of the {_judges(arguments)} poses")
     if "turntable" in arguments.what:
         path = out / f"turntable.{arguments.turntable}"
         cameras = orbit_cameras(shown, arguments.frames, size=arguments.size)
-        drawing = choose_representation(field, shown, cameras, make=voxels)
+        # voxels that are not fitted show less than the field
+        drawing = choose_representation(field, shown, cameras, "auto" if arguments.fit else "field", make=voxels)
         pictures = render_views(drawing, cameras, console)
         write_whole(path, encode_animation(to_pixels(pictures.images), arguments.turntable))
         console.say(f"{path}: {arguments.frames} frames")
@@ -150,6 +156,11 @@ def run(arguments: Arguments) -> int:
     return 0
 
 
+def _judges(arguments: Arguments) -> str:
+    """Which views what is exported is compared with: those that the field was made of, or others."""
+    return "shown" if arguments.all_views else "query"
+
+
 def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:
     """The splats of voxels, with a line on how they look beside them."""
     from hyperplanes.export.baking import BakedScene
@@ -168,7 +179,7 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
         asked = query[:8].to("cpu")
         pictures = splats.render(asked.cameras), BakedScene(baked).render(asked.cameras).images
         ours, voxels = (float(psnr(part.clamp(0, 1), asked.images).mean()) for part in pictures)
-        quality = f"; {ours:.2f} dB PSNR on {len(asked)} views, the voxels {voxels:.2f} dB"
+        quality = f"; {ours:.2f} dB PSNR on {len(asked)} {_judges(arguments)} views, the voxels {voxels:.2f} dB"
     path = save_splats(splats, arguments.out / f"splats.{arguments.splat_format}")
     console.say(f"{path}: {len(splats.means):,} splats, {path.stat().st_size / 1e6:.1f} MB{quality}")
 
@@ -196,11 +207,10 @@ def _write_mesh(solid: AdaptedField, shown: Views, query: Views, arguments: Argu
         save_mesh(surface, path)
         console.say(f"{path}: {len(surface.vertices):,} vertices, {len(surface.faces):,} faces")
     found = agreement(surface, solid, query.cameras)
-    poses = "shown" if arguments.all_views else "query"
     console.say(
-        f"{path}: its silhouettes overlap the rendered ones of {len(query)} {poses} views by {found.overlap:.1%} "
-        f"(intersection over union), and {found.depth:.1%} of what both cover is as far away; cut at density "
-        f"{level:.3g}"
+        f"{path}: its silhouettes overlap the rendered ones of {len(query)} {_judges(arguments)} views by "
+        f"{found.overlap:.1%} (intersection over union), and {found.depth:.1%} of what both cover is as far away; cut "
+        f"at density {level:.3g}"
     )
     if found.overlap < GOOD_OVERLAP:
         console.warn(f"{path}: parts are missing or too large; more --voxels, another --level, or --steps 100")

@@ -86,13 +86,14 @@ class ObjectArguments:
     device: str = "auto"
 
 
-def check_orbit(orbit: int | None, size: int | None, *others: str) -> None:
+def check_orbit(orbit: int | None, size: int | None, *others: str, orbits: tuple[str, ...] = ("--orbit",)) -> None:
     """Refuse frames and pixels of an orbit that cannot be rendered.
 
     Args:
         orbit: frames around the object, None for no orbit.
         size: pixels along the longer side of its pictures, None for that of the images.
-        others: options beside --orbit whose pictures may have that size.
+        others: options beside these whose pictures may have that size.
+        orbits: the options that ask for an orbit.
 
     Raises:
         ValueError: no frame, no pixel, or a size of no orbit.
@@ -100,7 +101,7 @@ def check_orbit(orbit: int | None, size: int | None, *others: str) -> None:
     if orbit is not None and orbit < 1:
         raise ValueError(f"--orbit: expected at least 1 frame, got {orbit}")
     if size is not None and orbit is None:
-        those = " or ".join(["--orbit", *others])
+        those = " or ".join([*orbits, *others])
         raise ValueError(f"--size: expected {those}, whose pictures it is for, got {size} without; leave it out")
     if size is not None and size < 1:
         raise ValueError(f"--size: expected at least 1 pixel, got {size}")

@@ -161,7 +161,11 @@ def _representation(arguments: Arguments, asked: Asked) -> Representation:
 
 
 def _check(arguments: Arguments) -> None:
-    """Refuse options of a camera path or an orbit that say nothing together."""
+    """Refuse options of a camera path or an orbit that say nothing together, or cannot be encoded here."""
+    from hyperplanes.export.images import require_encoder
+
+    if arguments.camera_path is not None or arguments.orbit is not None:
+        require_encoder(arguments.turntable)
     if arguments.representation == "voxels" and arguments.protocol != "default":
         raise ValueError(
             "--protocol: expected none with --representation voxels, which are not sampled so; leave one out"

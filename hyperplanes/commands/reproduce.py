@@ -28,6 +28,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalInt
 from hyperplanes.commands.runs import make_runner, make_workers
 from hyperplanes.commands.writing import writes_to
+from hyperplanes.utilities.shell import command_line
 
 if TYPE_CHECKING:
     from hyperplanes.evaluation import ObjectScore
@@ -153,8 +154,7 @@ def run(arguments: Arguments) -> int:
 
 
 def _command(arguments: Arguments, seeds: int) -> str:
-    data = f" --data {' '.join(arguments.data)}" if arguments.data else ""
-    legacy = " --legacy" if arguments.legacy else ""
-    only = "".join(f" {each!r}" if " " in each else f" {each}" for each in arguments.only)
-    only = f" --only{only}" if only else ""
-    return f"hyperplanes reproduce {arguments.name} --scale {arguments.scale} --seeds {seeds}{only}{legacy}{data}"
+    scale = ["--scale", arguments.scale, "--seeds", seeds]
+    only = ["--only", *arguments.only] if arguments.only else []
+    data = ["--data", *arguments.data] if arguments.data else []
+    return command_line("hyperplanes", "reproduce", arguments.name, scale, only, ["--legacy"] * arguments.legacy, data)

@@ -44,6 +44,7 @@ from hyperplanes.commands.writing import writes_to
 from hyperplanes.utilities.formatting import format_duration, format_rate
 from hyperplanes.utilities.interrupts import SIGNALS, HungUp, listened_to
 from hyperplanes.utilities.processes import is_first_process
+from hyperplanes.utilities.shell import command_line
 
 if TYPE_CHECKING:
     from hyperplanes.configuration.presets import Preset
@@ -312,7 +313,6 @@ def _run(arguments: Arguments) -> int:
                 board.close()
     console.say(f"{arguments.out}: trained for {trainer.step} steps")
     if held_out:
-        console.say(
-            f"next: hyperplanes evaluate --data {arguments.data[0]} --checkpoint {arguments.out} --method {method}"
-        )
+        given = ["--data", arguments.data[0], "--checkpoint", arguments.out, "--method", method]
+        console.say(f"next: {command_line('hyperplanes', 'evaluate', given)}")
     return 0

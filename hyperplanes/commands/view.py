@@ -28,6 +28,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import bake_field, load_source
 from hyperplanes.commands.options import OptionalInt, ViewsUp
 from hyperplanes.commands.scene import prepare_task, read_scene
+from hyperplanes.utilities.interrupts import Terminated
 
 if TYPE_CHECKING:
     import torch
@@ -84,8 +85,9 @@ def run(arguments: Arguments) -> int:
     """Serve the page until Ctrl-C."""
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.baking import BakedScene
-    from hyperplanes.export.live import LiveViewer
+    from hyperplanes.export.live import LiveViewer, require_viewer
 
+    require_viewer()
     warnings.filterwarnings(
         "ignore", "Queued a .* on a closed connection", UserWarning
     )  # viser's, of visitors who left
@@ -101,16 +103,18 @@ def run(arguments: Arguments) -> int:
     try:
         if isinstance(source, BakedScene):
             viewer.show(source, f"{len(source.field.values):,} baked voxels")
-            _show_others(others, shown, viewer, console)
+            _show_others(others, shown, viewer, wanted, console)
             wanted.get()  # until Ctrl-C
             return 0
         number = len(shown)
         while True:
             _adapt(source, shown[:number], arguments, viewer, wanted, console)
-            _show_others(others, shown[:number], viewer, console)
+            _show_others(others, shown[:number], viewer, wanted, console)
             number = wanted.get()
             while not wanted.empty():
                 number = wanted.get()
+    except Terminated:
+        raise
     except KeyboardInterrupt:
         console.say("ended")
     finally:
@@ -129,8 +133,13 @@ def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
     return {name: make_method(name, checkpoints, device=device) for name in arguments.compare}
 
 
-def _show_others(others: Mapping[str, Adapter], shown: Views, viewer: LiveViewer, console: Console) -> None:
+def _show_others(
+    others: Mapping[str, Adapter], shown: Views, viewer: LiveViewer, wanted: queue.SimpleQueue[int], console: Console
+) -> None:
+    """Shows the other methods one after the other; ends early where another number of views is wanted."""
     for name, adapter in others.items():
+        if not wanted.empty():
+            return
         console.say(f"adapting {name}")
         viewer.show_other(name, adapter.adapt(shown))
 

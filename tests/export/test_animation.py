@@ -6,12 +6,14 @@ import torch
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.animation import choose_representation
 from hyperplanes.export.baking import BakedScene, default_side
+from hyperplanes.export.images import orbit_cameras
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.views import Views
+from tests.reference_rendering import ball_views, ring
 
 FIELD = AdaptedField(lambda points, directions: (points, points[:, 0]), full(Sphere(), 4), RayMarching(steps=8))
 VOXELS = BakedField(torch.full((4, 4, 4), -1, dtype=torch.int32), torch.zeros(0, 28), Sphere())
@@ -44,3 +46,9 @@ def test_voxels_have_the_size_that_the_views_were_seen_by():
     larger = camera.resized(camera.select(views.cameras, [0]), 256, 256)
     choose_representation(FIELD, views, larger, "voxels", make=lambda field, views, side: sides.append(side) or VOXELS)
     assert sides == [default_side((64, 64))]
+
+
+def test_turntables_have_a_pixel_at_least():
+    for size in (0, -7):
+        with pytest.raises(ValueError, match=f"size: expected at least 1 pixel, got {size}"):
+            orbit_cameras(ball_views(ring(3, (8, 8))), 2, size=size)

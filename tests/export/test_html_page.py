@@ -68,6 +68,18 @@ def test_the_page_shows_what_the_baked_form_shows(baked, views, tmp_path):
     assert float(psnr(shown, truth)) > 38
 
 
+@pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
+def test_viewers_beyond_what_browsers_draw_at_once_show_pictures_and_the_page_stays(views, tmp_path):
+    small = bake(AdaptedField(two_balls, full(SPHERE, 8), RayMarching(16)), side=8)
+    boxes = [f'<div style="width:40px;float:left">{page_of(small, views)}</div>' for _ in range(18)]
+    count = "sessionStorage.loads = Number(sessionStorage.loads || 0) + 1; document.title = sessionStorage.loads"
+    page = save_page("\n".join([*boxes, f"<script>{count}</script>"]), tmp_path / "page.html", "many")
+    command = [str(chromium), *FLAGS, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.resolve().as_uri()]
+    seen = subprocess.run(command, check=True, capture_output=True, timeout=300, text=True).stdout
+    assert (seen.count('data-shown="voxels"'), seen.count('data-shown="picture"')) == (12, 6)
+    assert "<title>1</title>" in seen
+
+
 def test_a_page_is_one_file_that_asks_for_nothing(baked, views, tmp_path):
     picture = turning_picture(baked, views, frames=2, size=32)
     text = save_page(page_of(baked, views, picture=picture), tmp_path / "page.html", "Two <balls>").read_text()

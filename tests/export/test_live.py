@@ -1,7 +1,9 @@
 """The page by viser. Source of truth: our own cameras, and a client's messages counted through viser's interface."""
 
 import math
+import threading
 import urllib.request
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -46,3 +48,53 @@ def test_the_page_is_served_and_closed():
             assert b"<html" in answer.read()
     finally:
         viewer.stop()
+
+
+@pytest.mark.parametrize(("fov", "aspect"), [(0.7, 0.0), (0.7, math.nan), (0.7, math.inf), (0.0, 1.0), (math.pi, 1.0)])
+def test_a_page_without_a_size_has_no_camera(fov, aspect):
+    with pytest.raises(ValueError, match="camera: expected an aspect above 0 and an angle below 180 degrees"):
+        viewed_camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), fov, aspect, 16)
+
+
+def test_a_very_wide_page_gets_a_picture_of_bounded_width():
+    height, width = camera.image_size(viewed_camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 0.7, 100.0, 1024))
+    assert width <= live.WIDEST
+    assert width / height == pytest.approx(100, rel=0.02)
+
+
+class Visitor:
+    """A visitor of the page, whose pictures are counted."""
+
+    def __init__(self, aspect):
+        self.client_id, self.scene, self.pictures, self.drawn = id(self), self, 0, threading.Event()
+        self.camera = SimpleNamespace(
+            wxyz=torch.tensor([1.0, 0.0, 0.0, 0.0]), position=torch.tensor([0.0, 0.0, -3.0]), fov=0.7, aspect=aspect
+        )
+
+    def set_background_image(self, picture, kind, jpeg_quality):
+        self.pictures += 1
+        self.drawn.set()
+
+
+def test_one_visitor_without_a_size_does_not_stop_the_pictures_of_others():
+    class Shown:
+        def render(self, cameras):
+            ones = torch.ones(1, 1, *camera.image_size(cameras))
+            return Pictures(0.5 * ones.expand(1, 3, -1, -1), ones, ones, 0)
+
+    broken, whole = Visitor(0.0), Visitor(1.5)
+    page = object.__new__(LiveViewer)  # without a server
+    page._shown, page._others, page._chosen, page._height = Shown(), {}, live.ALONE, 48
+    page._changed, page._stopped, page._note = threading.Condition(), False, SimpleNamespace(content="")
+    page._versions = {broken.client_id: (0.0, 0.0), whole.client_id: (1e-9, 1e-9)}
+    page._server = SimpleNamespace(get_clients=lambda: {each.client_id: each for each in (broken, whole)})
+    worker = threading.Thread(target=page._draw, daemon=True)
+    worker.start()
+    assert whole.drawn.wait(20)
+    assert not broken.pictures
+    assert "a picture could not be drawn: camera: expected an aspect above 0" in page._note.content
+    with page._changed:
+        page._stopped = True
+        page._changed.notify()
+    worker.join(20)
+    assert not worker.is_alive()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.shell import command_line
 
 __all__ = ["photographs_folder", "refuse_unposed"]
 
@@ -26,10 +27,11 @@ def refuse_unposed(path: Path) -> None:
     """
     packed = _packed(path)
     if packed is not None:
-        remedy = f"unpack it (unzip {packed} -d capture), then give that folder"
+        remedy = f"unpack it ({command_line('unzip', packed, '-d', 'capture')}), then give that folder"
         raise DataError(path, "the folder of an export", f"{packed.name}, which is packed", remedy)
     if path.is_file() and path.suffix.lower() in _VIDEOS:
-        remedy = f"find the poses of its frames: hyperplanes capture {path} --out scene, then give scene"
+        command = command_line("hyperplanes", "capture", path, "--out", "scene")
+        remedy = f"find the poses of its frames: {command}, then give scene"
         raise DataError(path, "posed images", "a video", remedy)
     home, count = _photographs(path)
     if count:
@@ -37,7 +39,7 @@ def refuse_unposed(path: Path) -> None:
             path,
             "camera poses beside the photographs (transforms.json, or a COLMAP model in sparse/0)",
             f"{count} photograph{'s' if count > 1 else ''} and no poses",
-            f"find them: hyperplanes capture {home} --out NEW, then give NEW",
+            f"find them: {command_line('hyperplanes', 'capture', home, '--out', 'NEW')}, then give NEW",
         )
 
 

@@ -36,6 +36,7 @@ from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.environment import environment
 from hyperplanes.utilities.formatting import format_duration
+from hyperplanes.utilities.shell import command_line
 from hyperplanes.utilities.writing import write_json, write_whole
 from hyperplanes.views import Task, Views
 
@@ -90,12 +91,12 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
         facts=[("weights", f"{PACKAGED}, which comes with the package"), ("objects", ", ".join(names))],
         commands=[
             (
-                "a turntable of your own posed images (transforms.json beside them)",
-                f"hyperplanes render --checkpoint {PACKAGED} --views photos/ --out new-views --orbit 48 --all-views",
+                "a turntable of your own posed images (a folder with transforms.json)",
+                f"hyperplanes render --checkpoint {PACKAGED} --views scene --out new-views --orbit 48 --all-views",
             ),
             (
                 "the same after 100 steps on those images, which makes it sharper",
-                f"hyperplanes render --checkpoint {PACKAGED} --views photos/ --out sharper --steps 100 --all-views",
+                f"hyperplanes render --checkpoint {PACKAGED} --views scene --out sharper --steps 100 --all-views",
             ),
         ],
     )
@@ -204,6 +205,7 @@ def _describe(
     diagnostics = Diagnostics.of_json(read_json(folder / "hyperplanes" / "diagnostics.json"))
     gap = one_step.mean("psnr") - scores["hyperplanes_swapped"].mean("psnr")
     shown, side = len(exhibits[0].support), settings.resolution
+    given = ["--checkpoint", folder, "--views", "scene"]
     return Report(
         title=TITLE,
         lead=f"A hypernetwork looks at a few of {shown} posed images of a {settings.class_name} and writes the weights "
@@ -226,14 +228,14 @@ def _describe(
         "more than that of another object.",
         facts=_how_it_was_made(settings, folder, runner),
         commands=[
-            ("this page again, or what is left of it after an interruption", f"hyperplanes demo --out {folder}"),
+            ("this page again, or what is left of it after an interruption", settings.command(folder)),
             (
-                "a turntable of your own posed images (transforms.json beside them)",
-                f"hyperplanes render --checkpoint {folder} --views photos/ --out new-views --orbit 48",
+                "a turntable of your own posed images (a folder with transforms.json)",
+                command_line("hyperplanes", "render", given, "--out", "new-views", "--orbit", 48),
             ),
             (
-                "a mesh with coloured vertices",
-                f"hyperplanes export --checkpoint {folder} --views photos/ --out model --what mesh --mesh-format glb",
+                "a mesh with a texture",
+                command_line("hyperplanes", "export", given, "--out", "model", "--what", "mesh"),
             ),
         ],
     )

@@ -10,6 +10,7 @@ from hyperplanes.experiments.experiment import Cell, Experiment, Trained
 from hyperplanes.experiments.scales import Scale
 from hyperplanes.methods import at_steps, describe_method
 from hyperplanes.rendering.renderer import RayMarching
+from hyperplanes.utilities.shell import command_line
 
 __all__ = ["MODELS", "PACKAGED", "TUNED", "DemoSettings", "describe_row"]
 
@@ -175,6 +176,19 @@ class DemoSettings:
             held_out=1,
             data={**dict.fromkeys(self.first, drawn), "meshes": {**drawn, "meshes": str(self.meshes)}},
         )
+
+    def command(self, out: Path) -> str:
+        """The command that makes, or goes on with, a demonstration of these settings.
+
+        Args:
+            out: its folder.
+        """
+        usual = DemoSettings.quick_check() if self.tiny else DemoSettings()
+        options = [] if self.class_name == usual.class_name else ["--class", self.class_name]
+        for name in ("objects", "held_out", "resolution", "preset", "steps", "seed", "meshes"):
+            if getattr(self, name) != getattr(usual, name):
+                options += [f"--{name.replace('_', '-')}", getattr(self, name)]
+        return command_line("hyperplanes", "demo", "--out", out, ["--quick-check"] * self.tiny, options)
 
     @classmethod
     def quick_check(cls, seed: int = 0) -> DemoSettings:

@@ -1,0 +1,23 @@
+"""Commands that a person is to copy into a shell."""
+
+from __future__ import annotations
+
+import shlex
+
+__all__ = ["command_line"]
+
+
+def command_line(*words: object) -> str:
+    """The words of a command, quoted where a shell would divide or replace them.
+
+    >>> from pathlib import Path
+    >>> command_line("hyperplanes", "view", Path("my scene"))
+    "hyperplanes view 'my scene'"
+    >>> command_line("hyperplanes", "view", "scene", ["--steps", 100])
+    'hyperplanes view scene --steps 100'
+
+    Args:
+        words: one after the other, lists and tuples word by word.
+    """
+    parts = (word if isinstance(word, list | tuple) else [word] for word in words)
+    return shlex.join(str(word) for part in parts for word in part)

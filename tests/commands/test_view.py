@@ -1,0 +1,67 @@
+"""`view` with a page that notes what it is told. Source of truth: what the verb's help says."""
+
+import os
+import signal
+import threading
+
+import pytest
+
+from hyperplanes.cli import main
+from hyperplanes.commands import view
+from hyperplanes.export import live
+
+
+class NotingViewer:
+    """A page that nobody opens."""
+
+    address = "http://127.0.0.1:0"
+    made = []
+
+    def __init__(self, views, port, on_number, others):
+        self.views, self.on_number, self.others = views, on_number, others
+        self.notes, self.shown_others, self.stopped = [], [], False
+        self.all_shown = threading.Event()
+        NotingViewer.made.append(self)
+
+    def show(self, shown, note):
+        self.notes.append(note)
+
+    def show_other(self, name, shown):
+        self.shown_others.append(name)
+        if name == self.others[-1]:
+            self.all_shown.set()
+
+    def stop(self):
+        self.stopped = True
+
+
+@pytest.fixture
+def viewer(monkeypatch):
+    monkeypatch.setattr(live, "require_viewer", lambda: None)
+    monkeypatch.setattr(live, "LiveViewer", NotingViewer)
+    NotingViewer.made.clear()
+    return NotingViewer
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_ctrl_c_is_how_a_page_ends_and_a_termination_says_so(number, code, viewer, monkeypatch):
+    monkeypatch.setattr(view, "load_source", lambda *_, **__: None)
+
+    def adapt(model, shown, arguments, page, wanted, console):
+        threading.Thread(target=lambda: os.kill(os.getpid(), number)).start()
+
+    monkeypatch.setattr(view, "_adapt", adapt)
+    monkeypatch.setattr(view, "prepare_task", lambda arguments, task, *_, **__: task)
+    assert main(["view", "example-car", "--fit", "0"]) == code
+    assert viewer.made[0].stopped
+
+
+def test_other_methods_give_way_to_another_number_of_views(monkeypatch):
+    class Slow:
+        def adapt(self, shown):
+            wanted.put(2)  # somebody moves the slider meanwhile
+            return shown
+
+    wanted, page = view.queue.SimpleQueue(), NotingViewer(None, 0, None, ["one", "two"])
+    view._show_others({"one": Slow(), "two": Slow()}, None, page, wanted, view.Console(silent=True))
+    assert page.shown_others == ["one"]
