@@ -2,9 +2,9 @@
 
     python -m benchmarks adapting --views data/chair --json FILE
 
-Each way begins with reading the files and ends with something that renders: the packaged model in one step; its field
-as voxels that are fitted to the views; and, as the reference, fine-tuning of the model. Rendering the views that are
-compared is not part of the time.
+Each way begins with reading the files and ends with something that renders: the packaged model in one forward pass; its
+field as voxels that are fitted to the views; and, as the reference, fine-tuning of the model. Rendering the views that
+are compared is not part of the time.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def main(arguments: list[str]) -> int:
     read = partial(read_task, chosen.views) if chosen.views else partial(_car, 32 if chosen.quick else 200)
     model = HyperPlanes.from_pretrained(chosen.checkpoint)
 
-    ways: dict[str, Callable[[Views], Renderable]] = {"one step": model.adapt}
+    ways: dict[str, Callable[[Views], Renderable]] = {"one forward pass": model.adapt}
     for fit in chosen.fit:
         ways[f"voxels, {fit} steps"] = partial(_voxels, model, chosen.side, fit)
     if chosen.steps:

@@ -113,7 +113,7 @@ def _baked(result: Result) -> str:
         size = f", {row['size']}" if "size" in row else ""
         name = f"{NAMES[row['name']]} ({row['objects']}){size}, {row['views']} views"
         lines.append([name, *quality, *times, _seconds(row["bake_seconds"] + row["fit_seconds"])])
-    headings = ["field, one step", "voxels as baked", "fitted", "a view by the field", "by voxels", "made in"]
+    headings = ["field, one forward pass", "voxels as baked", "fitted", "a view by the field", "by voxels", "made in"]
     return markdown_table(["", *headings], lines)
 
 
@@ -351,7 +351,9 @@ def _views_tuned(*results: Result) -> str:
             scores = [rows[method, count]["psnr"] for method in ("hull_blend", "one_step", "100_steps", "scratch_100")]
             objects = rows["one_step", count]["objects"]
             lines.append([f"{name} ({objects})", str(count), *(f"{score:.2f}" for score in scores)])
-    return markdown_table(["", "views", "`hull_blend`", "one step", "100 steps", "100 from random weights"], lines)
+    return markdown_table(
+        ["", "views", "`hull_blend`", "one forward pass", "100 steps", "100 from random weights"], lines
+    )
 
 
 def _captures(result: Result) -> str:

@@ -184,7 +184,7 @@ def _overview() -> str:
     verbs = "\n".join(f"  {name:<{width}}  {verb.about}" for name, verb in found.items())
     return (
         "usage: hyperplanes VERB [OPTIONS]\n\n"
-        "A hypernetwork looks at a few posed images of an object and writes a NeRF of it in one step.\n\n"
+        "A hypernetwork looks at a few posed images of an object and writes a NeRF of it in one forward pass.\n\n"
         f"verbs (`hyperplanes VERB --help` says more):\n{verbs}\n\n"
         f"examples:\n{EXAMPLES}\n\n"
         "options:\n"

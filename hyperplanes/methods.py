@@ -186,7 +186,7 @@ METHODS: dict[str, Method] = {
     "multiplane": _shared_weights("multiplane", "MultiPlaneNeRF"),
     "point_multiplane": _shared_weights("point_multiplane", "PointMultiPlaneNeRF"),
     "hyperplanes": Method(
-        "HyperPlanes in one step",
+        "HyperPlanes in one forward pass",
         _of_checkpoint("hyperplanes"),
         "optional",
         tuned="HyperPlanes",

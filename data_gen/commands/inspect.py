@@ -73,7 +73,8 @@ def checkpoint_lines(folder: Path) -> list[str]:
         )
         weights = sum(p.numel() for p in model.hypernetwork.parameters())
         lines.append(f"hypernetwork: {what}, {weights:,} weights")
-        lines.append(f"diagnostics: {recorded_diagnostics(folder) or 'not recorded; `hyperplanes train` does'}")
+        missing = "not recorded; `hyperplanes train` does, with two held-out objects or more"
+        lines.append(f"diagnostics: {recorded_diagnostics(folder) or missing}")
     else:
         lines.append("hypernetwork: none, the same weights for every object")
     if (folder / "training.json").exists():

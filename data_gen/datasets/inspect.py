@@ -155,8 +155,8 @@ def _trial(views: Any) -> list[str]:
     if found is None:
         return []
     return [
-        f"tried: in one step `small` shows four views that it was not given at {found[0]:.1f} dB (64 pixels), the "
-        f"nearest view copied has {found[1]:.1f}; 20 is a blurred likeness, 30 is hard to tell from a photograph"
+        f"tried: in one forward pass `small` shows four views that it was not given at {found[0]:.1f} dB (64 pixels), "
+        f"the nearest view copied has {found[1]:.1f}; 20 is a blurred likeness, 30 is hard to tell from a photograph"
     ]
 
 

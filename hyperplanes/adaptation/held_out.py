@@ -63,7 +63,7 @@ class Trial:
 
     Attributes:
         context: of the views that are shown.
-        learned: the field of one step.
+        learned: the field of one forward pass.
         pixels: of the others, within the hull of those that are shown.
     """
 

@@ -45,7 +45,7 @@ class HyperPlanes(HyperPlanesNetwork):
     @checked
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The field of one object in a single step: theta + delta (HyperPlanes, Eq. 6).
+        """The field of one object in one forward pass: theta + delta (HyperPlanes, Eq. 6).
 
         Where `config.symmetric` says so, reflections of the views of an object that looks symmetric count as views, too
         (`adaptation.symmetry`), and it is adapted to in its canonical frame (`adaptation.canonical_frame`). Where

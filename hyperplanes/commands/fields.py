@@ -146,7 +146,7 @@ def adapt_to(
     rendered = field.unrotated if isinstance(field, RotatedField) else field
     if rendered is not field:
         how += ", rotated into its canonical frame"
-    how += ", averaged with the visual hull" if isinstance(rendered, StackedField) else ""
+    how += ", averaged with hull_blend" if isinstance(rendered, StackedField) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")
     return field, warned

@@ -1,4 +1,4 @@
-"""New views of one object from a few posed images: the model adapts to them in one step, or some more with --steps.
+"""New views of one object from a few posed images: one forward pass of a model, and gradient steps with --steps.
 
 The images come as a folder with transforms.json (Blender's, nerfstudio's), a COLMAP model, what Polycam, Record3D,
 KIRI Engine, RealityCapture or Metashape export, a scene of LLFF, IDR or NSVF, or an object of any data set. The model

@@ -53,7 +53,7 @@ class Arguments:
         steps: Fine-tuning steps on the views.
         fit: Gradient steps that fit the baked voxels to the views; 0 shows the field itself and bakes nothing.
         compare: Methods of `hyperplanes evaluate` to see beside the model on the right half of the page, such as
-            hull_blend, nearest_view, hyperplanes (the model after one step), or scratch_100.
+            hull_blend, nearest_view, hyperplanes (the model without gradient steps), or scratch_100.
         port: Of the page on this machine.
         learn_background: For photographs without masks: fit the object (the sphere at the centre of the scene) and the
             background together, and take what the object covers as masks.

@@ -197,7 +197,7 @@ def _iterations() -> Experiment:
             cells.append(Cell(f"{name}: NeRF", str(steps), on, f"nerf_scratch_{steps}", CLASSES[name]))
     return Experiment(
         "iterations",
-        "One step of HyperPlanes against iterations of NeRF on the same object",
+        "One forward pass of HyperPlanes against iterations of NeRF on the same object",
         "fig:single_update_vs_nerf",
         128,
         EPOCHS_128,

@@ -1,7 +1,7 @@
 """What the cameras cannot see into, made dense, so that a surface closes around it.
 
 Two things make a part of a field opaque: high density, and low density through a long way. A level of density finds the
-first, `fill_hidden` the second. Walls of fog, which a field after one step of the hypernetwork has, were holes without
+first, `fill_hidden` the second. Walls of fog, which a field of one forward pass has, were holes without
 it.
 """
 
@@ -22,9 +22,9 @@ __all__ = ["fill_hidden"]
 
 HIDDEN = 0.35
 """Opacity in front of a point from which on a camera does not see it. The camera with the clearest look decides, so 0.5
-leaves dents in walls of fog. Of two cars after one step, seen from seven places, 94.0 % of the pixels were as far away
-as rendered, 94 % with 0.5, 90 % with 0.2, and 93 % by a level alone, which left holes; a chair that was fine-tuned for
-60 steps stayed as it was (94.6 %)."""
+leaves dents in walls of fog. Of two cars after one forward pass, seen from seven places, 94.0 % of the pixels were as
+far away as rendered, 94 % with 0.5, 90 % with 0.2, and 93 % by a level alone, which left holes; a chair that was
+fine-tuned for 60 steps stayed as it was (94.6 %)."""
 
 
 @torch.no_grad()

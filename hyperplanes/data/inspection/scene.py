@@ -78,6 +78,7 @@ class SceneReport:
         shown: how many views show a place of the hull's surface, in the median, or None without masks.
         rarely_shown: share of that surface that fewer than three views show, or None.
         sparse: points of a reconstruction, or None.
+        masked: whether the views have masks.
     """
 
     views: tuple[ViewReport, ...]
@@ -88,6 +89,7 @@ class SceneReport:
     shown: float | None
     rarely_shown: float | None
     sparse: SparsePoints | None = None
+    masked: bool = True
 
     @property
     def worst(self) -> list[ViewReport]:
@@ -133,6 +135,8 @@ class SceneReport:
 
     def expectation(self) -> str:
         """What pictures made of these views will be like, in words."""
+        if not self.masked:
+            return "poor pictures: there are no masks, which packaged models need; --learn-background makes rough ones"
         unseen = [side for side, share in (("above", self.above), ("below", self.below)) if share < 0.25]
         if self.covered < 0.25:
             text = "good pictures only from near where the views stand; other sides are guessed"
@@ -206,6 +210,7 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
         None if shown is None else float(shown.median()),
         None if shown is None else float((shown < 3).double().mean()),
         sparse,
+        views.masks is not None,
     )
 
 

@@ -77,7 +77,7 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
         lead=f"The packaged model {PACKAGED!r} looks at posed images of an object, any number of them from anywhere, "
         "and writes the weights of a field that can be looked at from anywhere. Nothing was trained for this page.",
         figures=[
-            (f"{scores[best].mean('psnr'):.2f} dB", f"PSNR from {most} views, in a single step"),
+            (f"{scores[best].mean('psnr'):.2f} dB", f"PSNR from {most} views, after one forward pass"),
             (f"{scores[f'views_{fewest}'].mean('psnr'):.2f} dB", f"from {fewest} views"),
             (format_duration(scores[best].mean("adapt_seconds")), f"from {most} images to a field"),
             (format_duration(scores[best].mean("render_seconds")), f"a view of {height} x {width} pixels"),
@@ -104,7 +104,7 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
 
 
 def _round(model: HyperPlanes, support: Views, cameras: PinholeCamera) -> Pixels:
-    """The frames of a turntable in one step.
+    """The frames of a turntable after one forward pass.
 
     By the field: for so few small frames baking and fitting voxels takes longer than 36 frames of 160x160 by the field
     (13 s of one core) and shows less (1.0 dB on the query views of a held-out car).
@@ -211,7 +211,7 @@ def _describe(
         lead=f"A hypernetwork looks at a few of {shown} posed images of a {settings.class_name} and writes the weights "
         "of a field that can be looked at from anywhere.",
         figures=[
-            (f"{one_step.mean('psnr'):.2f} dB", "PSNR on held-out objects after a single step"),
+            (f"{one_step.mean('psnr'):.2f} dB", "PSNR on held-out objects after one forward pass"),
             (f"{one_step.mean('ssim'):.3f}", "SSIM of the same views"),
             (format_duration(one_step.mean("adapt_seconds")), f"from {shown} images to a field"),
             (format_duration(one_step.mean("render_seconds")), f"a view of {side} x {side} pixels"),
