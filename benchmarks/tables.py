@@ -349,8 +349,9 @@ def _views_tuned(*results: Result) -> str:
     for name, rows in found.items():
         for count in counts:
             scores = [rows[method, count]["psnr"] for method in ("hull_blend", "one_step", "100_steps", "scratch_100")]
-            objects = rows["one_step", count]["objects"]
-            lines.append([f"{name} ({objects})", str(count), *(f"{score:.2f}" for score in scores)])
+            objects, seeds = rows["one_step", count]["objects"], rows["100_steps", count].get("seeds", 1)
+            how_many = f"{objects}" if seeds == 1 else f"{objects}, {seeds} seeds"
+            lines.append([f"{name} ({how_many})", str(count), *(f"{score:.2f}" for score in scores)])
     return markdown_table(
         ["", "views", "`hull_blend`", "one forward pass", "100 steps", "100 from random weights"], lines
     )

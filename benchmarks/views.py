@@ -46,7 +46,7 @@ from hyperplanes.adaptation.symmetry import ReflectedHullBlend
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Inputs, Shown
-from hyperplanes.evaluation import ObjectScore, Score, evaluate
+from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
 from hyperplanes.geometry.volume import CHANNELS
@@ -72,6 +72,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 3, 5, 10, 25], help="numbers of support views")
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="of fine-tuning, and of the same field "
                         "from random weights")  # fmt: skip
+    parser.add_argument("--seeds", type=int, default=1, help="of the steps; the mean over them counts")
     parser.add_argument("--coarse", action="store_true", help="these by the grid of features as it is, too")
     parser.add_argument("--objects", type=int, default=3, help="of each data set")
     parser.add_argument("--inputs", type=int, nargs="+", metavar="VIEW", help="instead of --counts: these views by "
@@ -108,20 +109,19 @@ def main(arguments: list[str]) -> int:
             shown = _Rotated(inputs or Shown(data, count, chosen.query or 3), chosen.rotated)
             steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
             plain: Score | None = None
-            made_by = adapters(model, shown, names, chosen.methods, steps, coarse=chosen.coarse)
-            for method in sorted(made_by, key=lambda name: name != "hull_blend"):  # others are compared with it
-                adapter = made_by[method]
+            by_seed = [
+                adapters(model, shown, names, chosen.methods, steps, coarse=chosen.coarse, seed=seed)
+                for seed in range(chosen.seeds)
+            ]
+            for method in sorted(by_seed[0], key=lambda name: name != "hull_blend"):  # others are compared with it
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
                 row |= {"suite": suite} if suite else {}
                 row |= {"rotated": chosen.rotated} if chosen.rotated else {}
                 made = seen.setdefault(count, []) if method == "one_step" else []
-                score = evaluate(
-                    method,
-                    adapter,
-                    shown,
-                    names,
-                    partial(_keep, made),
-                )
+                without_steps = method == "one_step" or method in METHODS | PARTS
+                tried = [each[method] for each in (by_seed[:1] if without_steps else by_seed)]
+                score = merge_seeds([evaluate(method, each, shown, names, partial(_keep, made)) for each in tried])
+                row |= {"seeds": len(tried)} if len(tried) > 1 else {}
                 row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
                 row["worst"] = min(each.psnr for each in score.objects)
                 plain = score if method == "hull_blend" else plain
@@ -236,9 +236,16 @@ def _best_median_worst(seen: Mapping[int, Sequence[tuple[Tensor, Tensor]]]) -> l
 
 
 def adapters(
-    model: HyperPlanes, shown: Tasks, names: list[str], wanted: list[str], steps: list[int], *, coarse: bool = False
+    model: HyperPlanes,
+    shown: Tasks,
+    names: list[str],
+    wanted: list[str],
+    steps: list[int],
+    *,
+    coarse: bool = False,
+    seed: int = 0,
 ) -> Mapping[str, Adapter]:
-    """The rows by name."""
+    """The rows by name; the seed is that of gradient steps."""
     found: dict[str, Adapter] = {}
     for name in wanted:
         needs_others = name == "swapped" and (model.hypernetwork is None or len(names) < 2)
@@ -246,12 +253,13 @@ def adapters(
             found[name] = (METHODS | PARTS)[name](model, shown, names)
     found["one_step"] = model
     for each in steps:
-        found[f"{each}_steps"] = tuned = FineTuned(model, each)
+        settings = FineTuning(seed=seed)
+        found[f"{each}_steps"] = tuned = FineTuned(model, each, settings)
         if "ungated" in wanted:
             found[f"{each}_steps_ungated"] = _Ungated(tuned)
-        found[f"scratch_{each}"] = FromScratch(model, each)
+        found[f"scratch_{each}"] = FromScratch(model, each, settings)
         if coarse:
-            settings = FineTuning(cells=0)
+            settings = replace(settings, cells=0)
             found[f"{each}_steps_coarse"] = FineTuned(model, each, settings)
             found[f"scratch_{each}_coarse"] = FromScratch(model, each, settings)
     return found

@@ -80,8 +80,15 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     HyperPlanes(MODEL).save(tmp_path / "model")
     options = ["--checkpoint", str(tmp_path / "model"), "--data", str(demo_folder() / "data"), "--objects", "1"]
     options += ["--query", "1", "--methods", "ungated", "--counts", "1", "2", "--steps", "1", "--coarse"]
-    assert views.main([*options, "--json", str(tmp_path / "rows.json")]) == 0
-    rows = [(row["views"], row["name"]) for row in json.loads((tmp_path / "rows.json").read_text())["rows"]]
+    found = []
+    for seeds in ("1", "2"):
+        assert views.main([*options, "--seeds", seeds, "--json", str(tmp_path / "rows.json")]) == 0
+        found.append(json.loads((tmp_path / "rows.json").read_text())["rows"])
+    for one, two in zip(*found, strict=True):  # the first seed and the mean of two, where there are steps
+        tuned = "steps" in one["name"] or "scratch" in one["name"]
+        assert two.get("seeds") == (2 if tuned else None)
+        assert (one["psnr"] != two["psnr"]) == tuned
+    rows = [(row["views"], row["name"]) for row in found[0]]
     both = ["ungated", "one_step"]
     tuned = ["1_steps", "1_steps_ungated", "scratch_1", "1_steps_coarse", "scratch_1_coarse"]
     expected = {1: both, 2: [*both, *tuned]}
