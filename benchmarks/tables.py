@@ -326,12 +326,18 @@ def _views_over(*results: Result) -> str:
     for name, rows in found.items():
         cells = []
         for row in (rows.get(("one_step", count)) for count in counts):
-            cell = f"{row['over_hull_blend']:+.2f}" if row else "-"
-            if row and "over_hull_blend_low" in row:
-                cell += f" ({row['over_hull_blend_low']:+.1f} to {row['over_hull_blend_high']:+.1f})"
-            cells.append(cell)
+            cells.append(_above(row or {}, "over_hull_blend"))
         lines.append([name, *cells])
     return _table_of_views(counts, lines)
+
+
+def _above(row: dict[str, Any], name: str) -> str:
+    """A difference and, over several objects, its 95 % interval."""
+    if name not in row:
+        return "-"
+    if f"{name}_low" not in row:
+        return f"{row[name]:+.2f}"
+    return f"{row[name]:+.2f} ({row[f'{name}_low']:+.1f} to {row[f'{name}_high']:+.1f})"
 
 
 def _views_summary(*results: Result) -> str:
@@ -351,10 +357,10 @@ def _views_tuned(*results: Result) -> str:
             scores = [rows[method, count]["psnr"] for method in ("hull_blend", "one_step", "100_steps", "scratch_100")]
             objects, seeds = rows["one_step", count]["objects"], rows["100_steps", count].get("seeds", 1)
             how_many = f"{objects}" if seeds == 1 else f"{objects}, {seeds} seeds"
-            lines.append([f"{name} ({how_many})", str(count), *(f"{score:.2f}" for score in scores)])
-    return markdown_table(
-        ["", "views", "`hull_blend`", "one forward pass", "100 steps", "100 from random weights"], lines
-    )
+            over = _above(rows["100_steps", count], "over_scratch_100")
+            lines.append([f"{name} ({how_many})", str(count), *(f"{score:.2f}" for score in scores), over])
+    headings = ["views", "`hull_blend`", "one forward pass", "100 steps", "100 from random weights", "over these"]
+    return markdown_table(["", *headings], lines)
 
 
 def _captures(result: Result) -> str:

@@ -9,8 +9,9 @@ are shown, as far apart as they stand. The rows: the nearest of them copied; the
 (where there are masks), of views alone and with their reflections; the same field from random weights; the model
 without its hypernetwork, with the update of another object of the data set, with its own alone, averaged with the
 visual hull by one share an object, without reflections of views, without a canonical frame, with one ray a pixel, in
-single precision, and as it is used; and fine-tuned. Beside each mean stands how far it lies above `hull_blend`, with
-the 95 % interval of that difference over the objects (paired, Student's t).
+single precision, and as it is used; and fine-tuned. Beside each mean stands how far it lies above `hull_blend`, and
+steps above as many from random weights, with the 95 % interval of that difference over the objects (paired, Student's
+t).
 
 With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
 Image are compared, has 251 views on a spiral, of which view 64, or views 64 and 128, are shown.
@@ -108,12 +109,12 @@ def main(arguments: list[str]) -> int:
             inputs = Inputs(data, tuple(chosen.inputs), chosen.query) if chosen.inputs else None
             shown = _Rotated(inputs or Shown(data, count, chosen.query or 3), chosen.rotated)
             steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
-            plain: Score | None = None
+            scores: dict[str, Score] = {}
             by_seed = [
                 adapters(model, shown, names, chosen.methods, steps, coarse=chosen.coarse, seed=seed)
                 for seed in range(chosen.seeds)
             ]
-            for method in sorted(by_seed[0], key=lambda name: name != "hull_blend"):  # others are compared with it
+            for method in sorted(by_seed[0], key=_after_its_references):
                 row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
                 row |= {"suite": suite} if suite else {}
                 row |= {"rotated": chosen.rotated} if chosen.rotated else {}
@@ -124,9 +125,9 @@ def main(arguments: list[str]) -> int:
                 row |= {"seeds": len(tried)} if len(tried) > 1 else {}
                 row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
                 row["worst"] = min(each.psnr for each in score.objects)
-                plain = score if method == "hull_blend" else plain
-                if plain is not None and plain is not score:
-                    row |= _above(score, plain)
+                for reference in ("hull_blend", f"scratch_{method.removesuffix('_steps')}"):
+                    row |= _above(score, scores[reference]) if reference in scores else {}
+                scores[method] = score
                 rows.append(row)
                 print(rows[-1], flush=True)
         sheet += _best_median_worst(seen)
@@ -196,12 +197,17 @@ def made_by(suite: str, path: Path) -> str:
     return f"hyperplanes generate {options} --out {path}" if options else "hand: chair of the NeRF synthetic scenes"
 
 
-def _above(score: Score, plain: Score) -> Row:
-    """By how much a method exceeds `hull_blend`, with the interval over the objects where there are several."""
-    found = compare(score, plain)
-    row: Row = {"over_hull_blend": found.mean}
+def _after_its_references(method: str) -> int:
+    """Sorts methods such that those come first that others are compared with."""
+    return 0 if method == "hull_blend" else 1 if method.startswith("scratch_") else 2
+
+
+def _above(score: Score, reference: Score) -> Row:
+    """By how much a method exceeds another one, with the interval over the objects where there are several."""
+    found, name = compare(score, reference), f"over_{reference.method}"
+    row: Row = {name: found.mean}
     if found.low is not None and found.high is not None:
-        row |= {"over_hull_blend_low": found.low, "over_hull_blend_high": found.high}
+        row |= {f"{name}_low": found.low, f"{name}_high": found.high}
     return row
 
 

@@ -88,10 +88,13 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
         tuned = "steps" in one["name"] or "scratch" in one["name"]
         assert two.get("seeds") == (2 if tuned else None)
         assert (one["psnr"] != two["psnr"]) == tuned
+        if one["name"] == "1_steps":
+            scratch = next(row for row in found[0] if row["name"] == "scratch_1")
+            assert one["over_scratch_1"] == pytest.approx(one["psnr"] - scratch["psnr"])
     rows = [(row["views"], row["name"]) for row in found[0]]
     both = ["ungated", "one_step"]
-    tuned = ["1_steps", "1_steps_ungated", "scratch_1", "1_steps_coarse", "scratch_1_coarse"]
-    expected = {1: both, 2: [*both, *tuned]}
+    tuned = ["1_steps", "1_steps_ungated", "1_steps_coarse"]
+    expected = {1: both, 2: ["scratch_1", "scratch_1_coarse", *both, *tuned]}
     assert rows == [(count, name) for count, names in expected.items() for name in names]
 
 
