@@ -359,7 +359,14 @@ def _views_tuned(*results: Result) -> str:
             how_many = f"{objects}" if seeds == 1 else f"{objects}, {seeds} seeds"
             over = _above(rows["100_steps", count], "over_scratch_100")
             lines.append([f"{name} ({how_many})", str(count), *(f"{score:.2f}" for score in scores), over])
-    headings = ["views", "`hull_blend`", "one forward pass", "100 steps", "100 from random weights", "over these"]
+    headings = [
+        "views",
+        "`hull_blend`",
+        "one forward pass",
+        "100 steps",
+        "100 from random weights",
+        "over random weights",
+    ]
     return markdown_table(["", *headings], lines)
 
 

@@ -95,6 +95,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--quick", action="store_true", help="one count and object: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)
+    if chosen.seeds < 1:
+        parser.error(f"--seeds: expected at least 1, got {chosen.seeds}")
     folders = suite_folders(parser, chosen)
     if chosen.quick:
         chosen.counts, chosen.objects, chosen.query = [3], 2, 1

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jaxtyping
+import numpy as np
 import pytest
 import torch
 
@@ -29,6 +30,7 @@ def views(size=(6, 9), **others):
         (torch.tensor([0, -1], dtype=torch.int32), [0, 3]),
         (torch.tensor([1, 0], dtype=torch.uint8), [1, 0]),
         ([True, False, False, True], [0, 3]),
+        (np.array([2, 1], np.uint16), [2, 1]),
         (torch.tensor([False, True, True, False]), [1, 2]),
         (slice(0, 0), []),
         ([], []),
@@ -48,10 +50,10 @@ def test_chosen_views_keep_their_cameras_masks_and_names(index, chosen):
 @pytest.mark.parametrize(
     ("index", "message"),
     [
-        (2, r"views: expected a slice, a list or a tensor of indices \(chosen\), got 2; use \[\[2\]\]"),
-        (torch.tensor(2), "views: expected a slice, a list or a tensor of indices"),
-        (["a"], "views: expected a slice, a list or a tensor of indices"),
-        (torch.tensor([0.0]), "views: expected a slice, a list or a tensor of indices"),
+        (2, r"views: expected a slice, a list, a tensor or an array of indices \(chosen\), got 2; use \[\[2\]\]"),
+        (torch.tensor(2), "views: expected a slice, a list, a tensor or an array of indices"),
+        (["a"], "views: expected a slice, a list, a tensor or an array of indices"),
+        (torch.tensor([0.0]), "views: expected a slice, a list, a tensor or an array of indices"),
         ([4], "views: expected indices of 4 views, got 4 to 4"),
         ([-5, 0], "views: expected indices of 4 views, got -5 to 0"),
         ([True, False], "views: expected 4 booleans, one each, got 2"),

@@ -111,7 +111,7 @@ def _elsewhere(folder: Path) -> str:
             return f"there are some in {home}: give that folder"
         if child.is_file() and child.suffix.lower() in VIDEO_SUFFIXES:
             return f"there is a video in it: give {child}"
-    return "20 to 60 from all around are a good number"
+    return "40 to 75 from all around are a good number"
 
 
 def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[list[Photograph], list[str]]:

@@ -47,9 +47,9 @@ ENOUGH = 0.8  # of the photographs: with fewer registered, there is advice
 QUALITY = 96  # of JPEG, without subsampled colours
 
 ADVICE = (
-    "walk around the object in small steps, about 10 degrees apart, so that neighbouring photographs show mostly the "
-    "same, and no more than 20 degrees from one height to the next; keep the light and the object still; leave "
-    "something with texture around it, such as a newspaper under it"
+    "walk around the object in small steps, 20 degrees or less, so that neighbouring photographs show mostly the same, "
+    "also from one height to the next; keep the light and the object still; leave something with texture around it, "
+    "such as a newspaper under it"
 )
 
 

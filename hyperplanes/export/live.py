@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -22,6 +23,8 @@ from hyperplanes.utilities.errors import MissingPackageError
 from hyperplanes.views import Views
 
 __all__ = ["LiveViewer", "beside", "require_viewer", "viewed_camera"]
+
+LOG = logging.getLogger(__name__)
 
 SECONDS = 0.15  # that a picture may take while the camera moves
 IDLE = 0.4  # seconds after which a camera that stands still gets a larger picture
@@ -118,7 +121,7 @@ class LiveViewer:
         self._views = views.to("cpu", torch.float32)
         self._server = viser.ViserServer("127.0.0.1", port, label="HyperPlanes", verbose=False)
         self._server.scene.set_up_direction(upward(self._views.cameras))
-        self._note = self._server.gui.add_markdown("")
+        self._note, self._text = self._server.gui.add_markdown(""), ""
         self._add_frusta()
         if on_number is not None:
             slider = self._server.gui.add_slider("support views", 1, len(views), 1, len(views))
@@ -144,7 +147,7 @@ class LiveViewer:
             note: about it, beside the picture.
         """
         with self._changed:
-            self._shown = shown
+            self._shown, self._text = shown, note
             self._note.content = note
             self._draw_anew()
 
@@ -244,15 +247,20 @@ class LiveViewer:
                 self._versions.pop(visitor, None)
                 continue
             try:
-                self._draw_for(client, shown, other, still)
+                drawn = self._draw_for(client, shown, other, still)
+                note = self._text
             except Exception as error:  # of one visitor and one picture: the page goes on
-                self._note.content = f"a picture could not be drawn: {error}"
-                with self._changed:  # not again until the camera moves or the field changes
-                    if self._versions.get(visitor, (0.0, 0.0))[0] == moved:
-                        self._versions[visitor] = (moved, math.inf)
+                LOG.exception("a picture of the page could not be drawn")
+                drawn, note = False, f"a picture could not be drawn: {error}"
+            with self._changed:
+                if self._note.content != note:
+                    self._note.content = note
+                # not again until the camera moves or the field changes
+                if not drawn and self._versions.get(visitor, (0.0, 0.0))[0] == moved:
+                    self._versions[visitor] = (moved, math.inf)
 
-    def _draw_for(self, client: object, shown: Shown, other: Shown | None, still: bool) -> None:
-        """One picture for one visitor.
+    def _draw_for(self, client: object, shown: Shown, other: Shown | None, still: bool) -> bool:
+        """One picture for one visitor; False where the visitor's page has no size.
 
         Args:
             client: viser's handle of the visitor.
@@ -262,6 +270,8 @@ class LiveViewer:
         """
         height = min(LARGEST, round(self._height * (SHARPER if still else 1)))
         eye = client.camera  # pyright: ignore
+        if not (0 < eye.aspect < math.inf and 0 < eye.fov < math.pi):
+            return False
         seen = viewed_camera(eye.wxyz.tolist(), eye.position.tolist(), eye.fov, eye.aspect, height)
         started = time.perf_counter()
         found = shown.render(seen)
@@ -271,6 +281,7 @@ class LiveViewer:
             self._height = round(min(LARGEST / SHARPER, max(SMALLEST, self._height * min(1.5, max(0.5, ratio)))))
         # without loss where it stands still: blocks of JPEG would be taken for the field's
         client.scene.set_background_image(picture, "png" if still else "jpeg", jpeg_quality=90)  # pyright: ignore
+        return True
 
 
 def _quaternion(matrix: Float[Tensor, "3 3"]) -> tuple[float, float, float, float]:

@@ -323,7 +323,8 @@ window.showVoxels ||= (() => {
   }
 
   const LIVE = 12; // viewers that draw at once: browsers keep some 16 WebGL contexts, and drop the oldest
-  const viewers = [];
+  const RETRIES = 3; // after a context was lost, a second apart; then the viewer waits for a tap
+  let viewers = [];
 
   // Voxels in an element, whose picture stands there while they are not drawn.
   class Viewer {
@@ -335,18 +336,39 @@ window.showVoxels ||= (() => {
       this.orbit = new Orbit(this.scene);
       this.spinning = !fixed && !matchMedia("(prefers-reduced-motion)").matches;
       this.visible = this.live = false;
+      this.retries = RETRIES;
+      this.used = 0; // when it was last tapped or started
     }
 
     // Take a context and draw; what cannot be shown leaves the picture.
     async start() {
       this.live = true;
+      this.used = performance.now();
       try {
         await this.begin();
+        this.element.removeAttribute("title");
       } catch (problem) {
         this.stop();
         this.broken = true;
         this.element.title = `shown as a picture: ${problem.message}`;
       }
+    }
+
+    // The browser took the context away.
+    lose() {
+      this.focused = document.activeElement === this.canvas;
+      this.stop();
+      if (this.retries-- > 0) setTimeout(() => balance(), 1000);
+      else this.broken = true;
+    }
+
+    // Somebody wants to turn it: another one gives way, if need be.
+    wake() {
+      this.visible = true;
+      this.broken = false;
+      this.retries = RETRIES;
+      this.used = performance.now();
+      if (!this.live) balance(this);
     }
 
     // Give the context back, and show the picture.
@@ -358,7 +380,7 @@ window.showVoxels ||= (() => {
         if (this.picture) this.element.append(this.picture);
         this.gl?.getExtension("WEBGL_lose_context")?.loseContext();
       }
-      this.canvas = this.gl = null;
+      this.canvas = this.gl = this.ask = null;
       this.element.dataset.shown = "picture";
     }
 
@@ -370,7 +392,7 @@ window.showVoxels ||= (() => {
       Object.assign(this, { canvas, gl });
       canvas.addEventListener("webglcontextlost", (event) => {
         event.preventDefault();
-        if (this.canvas === canvas) this.stop();
+        if (this.canvas === canvas) this.lose();
       });
       const data = await inflate(element.querySelector("script[type='text/plain']").textContent);
       if (this.canvas !== canvas) return; // stopped meanwhile
@@ -419,17 +441,23 @@ window.showVoxels ||= (() => {
       canvas.tabIndex = 0;
       canvas.setAttribute("aria-label", "Turn by dragging or the arrow keys, zoom by the wheel or two fingers");
       control(canvas, orbit, () => { this.spinning = false; moving = 12; ask(); });
+      if (this.focused) canvas.focus();
+      this.focused = false;
       this.resized = new ResizeObserver(ask);
       this.resized.observe(element);
     }
   }
 
-  // Start viewers that can be seen; for more than LIVE of them, those beyond the borders of the window give way.
-  function balance() {
-    for (const viewer of viewers.filter((each) => each.visible && !each.live && !each.broken)) {
-      const live = viewers.filter((each) => each.live);
+  // Start viewers that can be seen, as many as LIVE: those beyond the borders of the window give way, and to one that
+  // is tapped the one that was used longest ago.
+  function balance(tapped) {
+    for (const viewer of viewers.filter((each) => !each.element.isConnected)) viewer.stop();
+    viewers = viewers.filter((each) => each.element.isConnected);
+    const waiting = viewers.filter((each) => each.visible && !each.live && !each.broken);
+    for (const viewer of tapped ? [tapped] : waiting) {
+      const live = viewers.filter((each) => each.live).sort((a, b) => a.used - b.used);
       if (live.length >= LIVE) {
-        const idle = live.find((each) => !each.visible);
+        const idle = live.find((each) => !each.visible) || (tapped && live[0]);
         if (!idle) return;
         idle.stop();
       }
@@ -454,7 +482,7 @@ window.showVoxels ||= (() => {
         if (viewer.visible && viewer.live) viewer.ask?.();
         balance();
       }).observe(element);
-      element.addEventListener("pointerdown", balance);
+      element.addEventListener("pointerdown", () => viewer.wake());
     }
     if (viewers.filter((each) => each.live).length < LIVE) await viewer.start();
     else element.dataset.shown = "picture";

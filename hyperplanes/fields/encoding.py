@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hyperplanes.geometry.chosen_views import COMPUTED
+from hyperplanes.geometry.chosen_views import OCTAVES
 
 __all__ = ["encoded_size", "encode"]
 
@@ -19,8 +19,8 @@ def encoded_size(frequencies: int, size: int = 3) -> int:
 def encode(values: Float[Tensor, "*vectors"], frequencies: int, dim: int = -1) -> Float[Tensor, "*encoded"]:
     """(v, sin(2^0 v), ..., sin(2^(L-1) v), cos(2^0 v), ..., cos(2^(L-1) v)) (NeRF, Eq. 4, without its factor pi).
 
-    Only every COMPUTED-th sine and cosine is computed; the others follow by doubling the angle, which multiplies their
-    errors, too.
+    Of every OCTAVES octaves the first sine and cosine are computed; the others follow by doubling the angle, which
+    multiplies their errors, too. Halves are computed in single precision.
 
     Args:
         values: coordinates within about [-1, 1].
@@ -32,15 +32,16 @@ def encode(values: Float[Tensor, "*vectors"], frequencies: int, dim: int = -1) -
     """
     if frequencies == 0:
         return values
+    exact = values.to(torch.promote_types(values.dtype, torch.float32))
     sine: list[Tensor] = []
     cosine: list[Tensor] = []
     for octave in range(frequencies):
-        if octave % COMPUTED == 0:
-            angle = values * 2**octave
+        if octave % OCTAVES == 0:
+            angle = exact * 2**octave
             sine.append(angle.sin())
             cosine.append(angle.cos())
         else:
             sine_now, cosine_now = sine[-1], cosine[-1]
             sine.append(2 * sine_now * cosine_now)
             cosine.append(1 - 2 * sine_now.square())
-    return torch.cat([values, *sine, *cosine], dim)
+    return torch.cat([values, *(each.to(values) for each in (*sine, *cosine))], dim)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.inputs import Selection, as_selection
+from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.poses import fibonacci_sphere, look_at, opencv_from_opengl, opengl_from_opencv, orbit
 from hyperplanes.utilities.arguments import checked
 
@@ -29,6 +30,7 @@ __all__ = [
     "fibonacci_sphere",
     "image_size",
     "intrinsics",
+    "least_depth",
     "look_at",
     "opencv_from_opengl",
     "opengl_from_opencv",
@@ -36,7 +38,6 @@ __all__ = [
     "pinhole",
     "projection_matrices",
     "resized",
-    "scale",
     "select",
     "camera_directions",
     "symmetric_intrinsics",
@@ -197,21 +198,25 @@ def camera_directions(cameras: PinholeCamera, centre: tuple[float, float, float]
     return torch.nn.functional.normalize(standing - standing.new_tensor(centre), dim=-1)
 
 
-def scale(cameras: PinholeCamera) -> float:
-    """A length that small distances are compared with: how far the cameras stand from their middle, on average.
+def least_depth(cameras: PinholeCamera) -> float:
+    """The depth in the frame of a camera from which on a point lies before it, in world units.
 
-    Cameras in one place do not tell how large their scene is. For them it is a hundredth of their distance from the
-    world's origin, which may be far away, and 1 where they stand there.
+    It is MIN_Z of how far the cameras stand from their middle on average, so that a scene gives the same picture in
+    metres and in micrometres. Cameras in one place do not tell how large their scene is, and the world's origin may be
+    far away: for them it is what rounding leaves of their distance from it, and MIN_Z where they stand there.
 
-    >>> scale(pinhole(torch.eye(3), orbit(4, 2.0, 0.0), 1, 1))
-    2.0
+    >>> least_depth(pinhole(torch.eye(3), orbit(4, 2.0, 0.0), 1, 1))
+    0.0002
     """
     if not cameras.batch_size:
-        return 1.0
-    eyes = centres(cameras).detach().double()
+        return MIN_Z
+    standing = centres(cameras).detach()
+    eyes = standing.double()
     spread = float((eyes - eyes.mean(0)).norm(dim=-1).mean())
     distance = float(eyes.norm(dim=-1).mean())
-    return spread if spread > 1e-6 * distance else 0.01 * distance or 1.0
+    if spread > 1e-6 * distance:
+        return MIN_Z * spread
+    return 4 * torch.finfo(standing.dtype).eps * distance or MIN_Z
 
 
 def viewing_directions(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:

@@ -11,11 +11,11 @@ from torch import Tensor
 __all__ = [
     "ANGLE",
     "BEYOND",
-    "COMPUTED",
     "CUT",
     "DEEPEST",
     "FADING",
     "MARGIN",
+    "OCTAVES",
     "PARTLY",
     "SMALLEST_ANGLE",
     "UNSEEN",
@@ -36,7 +36,7 @@ CUT = 0.03  # penalty in the middle of the margin; 3 at the border
 BEYOND = 1.01  # margins from where it begins, at which the penalty would be infinite
 FADING = 10.0  # of the weights of views, with their penalty
 ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
-COMPUTED = 8  # octaves of an encoding from one computed sine to the next; the others follow by doubling the angle
+OCTAVES = 8  # of an encoding from one computed sine to the next; the others follow by doubling the angle
 SMALLEST_ANGLE = 1e-2  # between a view and a direction, in radians: nearer ones count as that far
 
 

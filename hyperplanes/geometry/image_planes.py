@@ -64,23 +64,20 @@ class ImagePlanes:
         Raises:
             ValueError: images of another number or size than the cameras, or of another number of dimensions.
         """
-        uncounted = isinstance(images, np.ndarray) or images.is_inference()  # changes that no packed copy would notice
+        given = images
         images = as_images(images, size=camera.image_size(cameras) if cameras.batch_size else None)
-        if uncounted:
-            with torch.inference_mode(False):
-                images = images.clone()
         if len(images) != cameras.batch_size:
             raise ValueError(f"images: expected one a camera, {cameras.batch_size}, got {len(images)}")
         if len(images) and camera.image_size(cameras) != tuple(images.shape[2:]):
             raise ValueError(
                 f"images: expected the cameras' size {camera.image_size(cameras)}, got {tuple(images.shape[2:])}"
             )
-        self.images = images.contiguous()  # as kernels read them
+        self.images = _counting(images.contiguous(), given)  # as kernels read them
         self.cameras = cameras
         self.background = background
         self.backend = backend
         self.exact = exact
-        self.nearest = MIN_Z * camera.scale(cameras)
+        self.nearest = camera.least_depth(cameras)
         self.masked: Bool[Tensor, " view"] | None = None
         self._packed: tuple[int, PackedImages | None] | None = None
 
@@ -133,8 +130,7 @@ class ImagePlanes:
     ) -> Lookup:
         """Projects every point onto the planes and interpolates the colours there.
 
-        A point counts as behind a camera where z in its frame is below 1e-4 of `cameras.scale`, so that a scene gives
-        the same picture in metres and in micrometres.
+        A point counts as behind a camera where z in its frame is below `cameras.least_depth`.
 
         Args:
             points: (point, 3) in the world.
@@ -194,3 +190,17 @@ class ImagePlanes:
         if self._packed is None or self._packed[0] != self.images._version:
             self._packed = self.images._version, pack(self.images)
         return self._packed[1]
+
+
+def _counting(images: Tensor, given: ArrayLike) -> Tensor:
+    """Images whose changes in place are counted, so that what is packed of them can be packed again: a copy if needed.
+
+    Args:
+        images: that a caller's became.
+        given: the caller's.
+    """
+    shared = isinstance(given, np.ndarray) and np.may_share_memory(images.numpy(), given)
+    if not (shared or images.is_inference()):
+        return images
+    with torch.inference_mode(False):
+        return images.clone()

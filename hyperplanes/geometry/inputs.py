@@ -32,7 +32,7 @@ ArrayLike: TypeAlias = Tensor | npt.NDArray[Any]
 """A tensor, or a NumPy array of the same shape."""
 
 
-Selection: TypeAlias = slice | Sequence[int] | Sequence[bool] | Tensor
+Selection: TypeAlias = slice | Sequence[int] | ArrayLike
 """Which of several: their indices, or a boolean for each."""
 
 
@@ -182,29 +182,28 @@ def as_selection(index: Selection, count: int, name: str) -> slice | Tensor:
     if isinstance(index, slice):
         return index
     remedy = f"; use [[{index}]]" if isinstance(index, int) else ""
-    expected = f"{name}: expected a slice, a list or a tensor of indices (chosen)"
+    expected = f"{name}: expected a slice, a list, a tensor or an array of indices (chosen)"
     try:
-        chosen = torch.as_tensor(index) if isinstance(index, Sequence | Tensor) else None
+        chosen = torch.as_tensor(index) if isinstance(index, Sequence | np.ndarray | Tensor) else None
     except (TypeError, ValueError, RuntimeError):
         chosen = None
     if chosen is None or chosen.ndim != 1:
         raise ValueError(f"{expected}, got {kind_of(index)}{remedy}")
-    if not len(chosen):
-        return chosen.long()
     if chosen.dtype == torch.bool:
         if len(chosen) != count:
             raise ValueError(f"{name}: expected {count} booleans, one each, got {len(chosen)}")
         return chosen.nonzero()[:, 0]
-    if chosen.is_floating_point() or chosen.is_complex():
+    if len(chosen) and (chosen.is_floating_point() or chosen.is_complex()):
         raise ValueError(f"{expected}, got {kind_of(chosen)}")
+    chosen = chosen.long()
     if chosen.device.type == "cpu":  # elsewhere it would be waited for
-        least, most = int(chosen.min()), int(chosen.max())
-        if least < -count or most >= count:
-            raise ValueError(f"{name}: expected indices of {count} {name}, got {least} to {most}")
-    return chosen.long()
+        check_indices(chosen, count, name, name, from_end=True)
+    return chosen
 
 
-def check_indices(values: Tensor, count: int, name: str = "views", what: str = "planes") -> None:
+def check_indices(
+    values: Tensor, count: int, name: str = "views", what: str = "planes", *, from_end: bool = False
+) -> None:
     """Check that all are indices of so many; under `torch.compile` and `torch.func` values cannot be looked at.
 
     Called once a lookup, right before indexing: one pass over the indices is up to 2 % of its time.
@@ -214,11 +213,12 @@ def check_indices(values: Tensor, count: int, name: str = "views", what: str = "
         count: of what they are of.
         name: of the argument, for the message.
         what: they are of, for the message.
+        from_end: negative ones count from the end.
 
     Raises:
         ValueError: the index of none.
     """
     if not torch.compiler.is_compiling() and not torch._C._are_functorch_transforms_active() and values.numel():
         least, most = (int(value) for value in torch.aminmax(values))
-        if least < 0 or most >= count:
+        if least < (-count if from_end else 0) or most >= count:
             raise ValueError(f"{name}: expected indices of {count} {what}, got {least} to {most}")

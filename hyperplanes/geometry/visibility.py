@@ -39,7 +39,13 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.transforms import are_plain, wants_values_alone, without_derivatives
+from hyperplanes.utilities.transforms import (
+    are_plain,
+    is_transformed,
+    outside_transforms,
+    wants_values_alone,
+    without_derivatives,
+)
 
 __all__ = ["VisibilityPlanes", "choose_torch", "fading", "margins"]
 
@@ -180,11 +186,12 @@ class VisibilityPlanes:
 
     def has_kernels(self, points: Tensor) -> bool:
         """Whether the kernels take these points: single precision, on the CPU, pinhole cameras, no transform."""
-        opacity = self._maps.opacity
-        pinholes = not isinstance(self.colours.cameras, DistortedCamera)
-        compiled = find_spec("numba") and points.device.type == "cpu" and 2 * opacity.numel() < 2**31
-        kind = bool(compiled) and points.dtype == torch.float32 == opacity.dtype
-        return kind and pinholes and are_plain(points, opacity)
+        return self._takes_kernels(points) and are_plain(points)
+
+    def _takes_kernels(self, points: Tensor) -> bool:
+        maps = self._maps.values
+        kind = points.dtype == torch.float32 == maps.dtype and points.device.type == "cpu" and maps.numel() < 2**31
+        return kind and bool(find_spec("numba")) and not isinstance(self.colours.cameras, DistortedCamera)
 
     def _limits(self) -> list[float]:
         """The numbers by which the kernels judge."""
@@ -225,10 +232,10 @@ class VisibilityPlanes:
             points: in the world.
             directions: along which they are seen, where there are any.
         """
+        if type(self) is not VisibilityPlanes or not self._takes_kernels(points) or self.colours.background != 1.0:
+            return False
         given = [points, self.colours.cameras.intrinsics, self.colours.cameras.extrinsics]
         if not wants_values_alone(*given, *([] if directions is None else [directions])):
-            return False
-        if type(self) is not VisibilityPlanes or not self.has_kernels(points) or self.colours.background != 1.0:
             return False
         return self.colours.packed_images(points) is not None
 
@@ -392,13 +399,22 @@ class _Maps:
 
     @property
     def complete(self) -> Float[Tensor, "view height width 2"]:
-        """The values with their depths, which are computed once; anew under transforms, whose tensors end with them."""
+        """The values with their depths, which are computed once.
+
+        To function transforms they are constants, but where a transform made the tensors, which end with it.
+        """
         if self._complete:
             return self._values
-        values = torch.stack([first_hits(self._occupancy, self._cameras, self.opacity[:, None]), self.opacity], -1)
-        if are_plain():
-            self._values, self._complete = values, True
-        return values
+        given = (self._values, self._occupancy.occupied, self._cameras.extrinsics, self._cameras.intrinsics)
+        if is_transformed(*given):
+            return self._computed()
+        with outside_transforms():
+            self._values, self._complete = self._computed(), True
+        return self._values
+
+    def _computed(self) -> Float[Tensor, "view height width 2"]:
+        depth = first_hits(self._occupancy, self._cameras, self.opacity[:, None])
+        return torch.stack([depth, self.opacity], -1)
 
 
 def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 4"]:

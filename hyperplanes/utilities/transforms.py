@@ -7,9 +7,17 @@ from contextlib import contextmanager
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd import forward_ad
 
-__all__ = ["are_plain", "transform_of", "wants_values_alone", "without_derivatives"]
+__all__ = [
+    "are_plain",
+    "is_transformed",
+    "outside_transforms",
+    "transform_of",
+    "wants_values_alone",
+    "without_derivatives",
+]
 
 
 def transform_of(*tensors: Tensor) -> str | None:
@@ -44,4 +52,19 @@ def wants_values_alone(*tensors: Tensor) -> bool:
 def without_derivatives() -> Generator[None, None, None]:
     """As `torch.no_grad`, of forward-mode derivatives, too."""
     with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
+        yield
+
+
+def is_transformed(*tensors: Tensor) -> bool:
+    """Whether a transform of `torch.func` has made one of these tensors: others are constants to it."""
+    return any(is_functorch_wrapped_tensor(value) for value in tensors)
+
+
+@contextmanager
+def outside_transforms() -> Generator[None, None, None]:
+    """Computes as if no transform of `torch.func` were active; of constants alone (`is_transformed`)."""
+    if not torch._C._are_functorch_transforms_active():
+        yield
+        return
+    with torch._C._DisableFuncTorch():
         yield

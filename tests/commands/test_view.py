@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+import time
 
 import pytest
 
@@ -47,8 +48,18 @@ def viewer(monkeypatch):
 def test_ctrl_c_is_how_a_page_ends_and_a_termination_says_so(number, code, viewer, monkeypatch):
     monkeypatch.setattr(view, "load_source", lambda *_, **__: None)
 
+    rounds = []
+
+    def end(page):
+        os.kill(os.getpid(), number)
+        time.sleep(10)
+        if not page.stopped:  # swallowed: the page would wait for ever
+            page.on_number(1)
+
     def adapt(model, shown, arguments, page, wanted, console):
-        threading.Thread(target=lambda: os.kill(os.getpid(), number)).start()
+        rounds.append(page)
+        assert len(rounds) == 1, "went on"
+        threading.Thread(target=end, args=[page], daemon=True).start()
 
     monkeypatch.setattr(view, "_adapt", adapt)
     monkeypatch.setattr(view, "prepare_task", lambda arguments, task, *_, **__: task)

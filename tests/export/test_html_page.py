@@ -3,6 +3,7 @@
 Source of truth: `BakedScene`, which the CPU renders. Needs Chromium, whose software renderer has WebGL 2.
 """
 
+import re
 import shutil
 import subprocess
 
@@ -68,16 +69,55 @@ def test_the_page_shows_what_the_baked_form_shows(baked, views, tmp_path):
     assert float(psnr(shown, truth)) > 38
 
 
+STORY = """
+const boxes = [...document.querySelectorAll(".voxels")], told = [];
+const wait = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
+const state = (box) => box.dataset.shown === "voxels" ? "v" : "p";
+const tell = (what) => told.push(what + " " + boxes.map(state).join(""));
+const lose = (box) => box.querySelector("canvas").getContext("webgl2").getExtension("WEBGL_lose_context").loseContext();
+const tap = (box) => box.dispatchEvent(new PointerEvent("pointerdown"));
+sessionStorage.loads = Number(sessionStorage.loads || 0) + 1;
+(async () => {
+  await wait(2000);
+  tell("loaded");
+  boxes[0].querySelector("canvas").focus();
+  lose(boxes[0]);
+  await wait(100);
+  tell("lost");
+  await wait(2500);
+  tell("again");
+  told.push(boxes[0].contains(document.activeElement) ? "focused" : "not focused");
+  tap(boxes[13]);
+  await wait(1000);
+  tell("tapped");
+  boxes[5].remove();
+  tap(boxes[12]);
+  await wait(1000);
+  tell("removed");
+  document.title = [...told, "loads " + sessionStorage.loads].join(", ");
+})();
+"""
+
+
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_viewers_beyond_what_browsers_draw_at_once_show_pictures_and_the_page_stays(views, tmp_path):
+def test_of_many_viewers_twelve_draw_and_what_is_tapped_or_lost_comes_back(views, tmp_path):
     small = bake(AdaptedField(two_balls, full(SPHERE, 8), RayMarching(16)), side=8)
-    boxes = [f'<div style="width:40px;float:left">{page_of(small, views)}</div>' for _ in range(18)]
-    count = "sessionStorage.loads = Number(sessionStorage.loads || 0) + 1; document.title = sessionStorage.loads"
-    page = save_page("\n".join([*boxes, f"<script>{count}</script>"]), tmp_path / "page.html", "many")
+    fragment = page_of(small, views, picture=turning_picture(small, views, frames=1, size=8))
+    boxes = [f'<div style="width:40px;float:left">{fragment}</div>' for _ in range(18)]
+    page = save_page("\n".join([*boxes, f"<script>{STORY}</script>"]), tmp_path / "page.html", "many")
     command = [str(chromium), *FLAGS, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.resolve().as_uri()]
-    seen = subprocess.run(command, check=True, capture_output=True, timeout=300, text=True).stdout
-    assert (seen.count('data-shown="voxels"'), seen.count('data-shown="picture"')) == (12, 6)
-    assert "<title>1</title>" in seen
+    seen = subprocess.run(command, check=True, capture_output=True, timeout=100, text=True).stdout
+    told = re.search("<title>(.*?)</title>", seen)[1].split(", ")
+    states = dict(each.split(" ") for each in told if " v" in each or " p" in each)
+    assert states["loaded"] == "v" * 12 + "p" * 6
+    assert states["lost"] == "p" + "v" * 11 + "p" * 6
+    assert states["again"] == states["loaded"]
+    assert states["tapped"].count("v") == 12
+    assert states["tapped"][13] == "v"
+    assert states["removed"].count("v") >= 12  # what was removed may say that it was drawn
+    assert states["removed"][12] == "v"
+    assert "focused" in told
+    assert told[-1] == "loads 1"
 
 
 def test_a_page_is_one_file_that_asks_for_nothing(baked, views, tmp_path):

@@ -2,7 +2,9 @@
 
 import math
 import threading
+import time
 import urllib.request
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import pytest
@@ -76,25 +78,58 @@ class Visitor:
         self.drawn.set()
 
 
-def test_one_visitor_without_a_size_does_not_stop_the_pictures_of_others():
-    class Shown:
-        def render(self, cameras):
-            ones = torch.ones(1, 1, *camera.image_size(cameras))
-            return Pictures(0.5 * ones.expand(1, 3, -1, -1), ones, ones, 0)
+class Grey:
+    """A field whose pictures are grey, but for one that fails."""
 
-    broken, whole = Visitor(0.0), Visitor(1.5)
-    page = object.__new__(LiveViewer)  # without a server
-    page._shown, page._others, page._chosen, page._height = Shown(), {}, live.ALONE, 48
-    page._changed, page._stopped, page._note = threading.Condition(), False, SimpleNamespace(content="")
-    page._versions = {broken.client_id: (0.0, 0.0), whole.client_id: (1e-9, 1e-9)}
-    page._server = SimpleNamespace(get_clients=lambda: {each.client_id: each for each in (broken, whole)})
+    def __init__(self):
+        self.fails = False
+
+    def render(self, cameras):
+        if self.fails:
+            self.fails = False
+            raise RuntimeError("out of memory")
+        ones = torch.ones(1, 1, *camera.image_size(cameras))
+        return Pictures(0.5 * ones.expand(1, 3, -1, -1), ones, ones, 0)
+
+
+@contextmanager
+def drawing(visitors, shown):
+    """A page without a server, while its thread draws."""
+    page = object.__new__(LiveViewer)
+    page._shown, page._others, page._chosen, page._height, page._text = shown, {}, live.ALONE, 48, "25 views"
+    page._changed, page._stopped, page._note = threading.Condition(), False, SimpleNamespace(content="25 views")
+    page._versions = {each.client_id: (0.0, 0.0) for each in visitors}
+    page._server = SimpleNamespace(get_clients=lambda: {each.client_id: each for each in visitors})
     worker = threading.Thread(target=page._draw, daemon=True)
     worker.start()
-    assert whole.drawn.wait(20)
-    assert not broken.pictures
-    assert "a picture could not be drawn: camera: expected an aspect above 0" in page._note.content
-    with page._changed:
-        page._stopped = True
-        page._changed.notify()
-    worker.join(20)
-    assert not worker.is_alive()
+    try:
+        yield page
+    finally:
+        with page._changed:
+            page._stopped = True
+            page._changed.notify()
+        worker.join(20)
+        assert not worker.is_alive()
+
+
+def test_one_visitor_without_a_size_does_not_stop_the_pictures_of_others():
+    broken, whole = Visitor(0.0), Visitor(1.5)
+    with drawing([broken, whole], Grey()) as page:
+        assert whole.drawn.wait(20)
+        assert not broken.pictures
+        assert page._note.content == "25 views"
+
+
+def test_a_picture_that_fails_is_noted_until_the_next_one(caplog):
+    visitor, shown = Visitor(1.5), Grey()
+    shown.fails = True
+    with drawing([visitor], shown) as page:
+        deadline = time.monotonic() + 20
+        while page._note.content == "25 views" and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert page._note.content == "a picture could not be drawn: out of memory"
+        assert not visitor.pictures
+        page.show(shown, "26 views")
+        assert visitor.drawn.wait(20)
+        assert page._note.content == "26 views"
+    assert "out of memory" in caplog.text

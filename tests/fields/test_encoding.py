@@ -32,3 +32,10 @@ def test_the_value_itself_comes_first():
 def test_gradients():
     values = torch.rand(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
     assert torch.autograd.gradcheck(lambda v: encode(v, 4), values)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_halves_of_many_octaves_are_rounded_and_no_more(dtype):
+    values = torch.tensor([[1.0, 0.3, -1.0]]).to(dtype)
+    expected = encode(values.double(), 32)
+    torch.testing.assert_close(encode(values, 32).double(), expected, atol=torch.finfo(dtype).eps, rtol=0)

@@ -311,6 +311,9 @@ def test_what_does_not_count_its_changes_is_copied():
         expected = planes.lookup(points).colours
         unseen.fill_(1.0)
         assert torch.equal(planes.lookup(points).colours, expected)
+        eight, last = (255 * images).round().byte(), images.permute(0, 2, 3, 1).contiguous()
+        for other in (eight, last.permute(0, 3, 1, 2)):  # which become other tensors on the way
+            assert ImagePlanes(other, ours).lookup(points).colours.shape == expected.shape
     array = images.numpy().copy()
     planes = ImagePlanes(array, ours)
     before = [planes.lookup(points).colours, planes.lookup(points.double()).colours]
@@ -320,7 +323,7 @@ def test_what_does_not_count_its_changes_is_copied():
 
 
 def test_a_single_camera_sees_what_is_before_it_wherever_the_origin_is():
-    for far in (0.0, 1e3, 1e5):
+    for far in (0.0, 1e3, 1e5, 1e7):
         pose = cameras.look_at(torch.tensor([[far, 0.0, 3.0]]), target=(far, 0.0, 0.0)).double()
         one = cameras.pinhole(cameras.symmetric_intrinsics(9, 13, 0.7), pose, 9, 13)
         planes = ImagePlanes(torch.rand(1, 3, 9, 13, dtype=torch.double), one)

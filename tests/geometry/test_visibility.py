@@ -324,6 +324,24 @@ def test_planes_made_in_inference_mode_are_used_outside_of_it():
     torch.testing.assert_close(found.coverage, planes().choose(points, best=2).coverage)
 
 
+def test_under_a_transform_depths_of_constant_planes_are_computed_once(monkeypatch):
+    computed, (points, directions) = [], queries(20)
+
+    def counted(*given):
+        computed.append(given)
+        return first_hits(*given)
+
+    monkeypatch.setattr(module, "first_hits", counted)
+    shown = planes()
+
+    def score(scale):
+        return scale * sum(shown.choose(points, directions, best=2, nearest=2).coverage.sum() for _ in range(3))
+
+    torch.func.grad(score)(torch.tensor(2.0))
+    assert len(computed) == 1
+    torch.testing.assert_close(shown.depth_opacity, planes().depth_opacity)
+
+
 def test_a_hull_is_carved_and_its_depth_found_under_transforms():
     views = ball_views(ring(3, SIZE))
 

@@ -11,7 +11,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from hyperplanes.geometry.chosen_views import COMPUTED
+from hyperplanes.geometry.chosen_views import OCTAVES
 from hyperplanes.geometry.kernels.blocks import inlined
 from hyperplanes.geometry.kernels.llvm import load, load_int
 from hyperplanes.geometry.kernels.visibility import (
@@ -80,7 +80,7 @@ def _encode(row, at, x, y, z, frequencies):
         for axis in range(3):
             value, sine, cosine = row[at - 3 + axis], number(0), number(0)
             for octave in range(frequencies):
-                if octave % COMPUTED == 0:
+                if octave % OCTAVES == 0:
                     angle = value * number(1 << octave)
                     sine, cosine = number(math.sin(angle)), number(math.cos(angle))
                 else:
