@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -111,26 +111,16 @@ def main(arguments: list[str]) -> int:
             inputs = Inputs(data, tuple(chosen.inputs), chosen.query) if chosen.inputs else None
             shown = _Rotated(inputs or Shown(data, count, chosen.query or 3), chosen.rotated)
             steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
-            scores: dict[str, Score] = {}
+            made = seen.setdefault(count, [])
+            about: Row = {"data": path.resolve().name, "views": count, "objects": len(names)}
+            about |= {"suite": suite} if suite else {}
+            about |= {"rotated": chosen.rotated} if chosen.rotated else {}
             by_seed = [
                 adapters(model, shown, names, chosen.methods, steps, coarse=chosen.coarse, seed=seed)
                 for seed in range(chosen.seeds)
             ]
-            for method in sorted(by_seed[0], key=_after_its_references):
-                row: Row = {"name": method, "data": path.resolve().name, "views": count, "objects": len(names)}
-                row |= {"suite": suite} if suite else {}
-                row |= {"rotated": chosen.rotated} if chosen.rotated else {}
-                made = seen.setdefault(count, []) if method == "one_step" else []
-                without_steps = method == "one_step" or method in METHODS | PARTS
-                tried = [each[method] for each in (by_seed[:1] if without_steps else by_seed)]
-                score = merge_seeds([evaluate(method, each, shown, names, partial(_keep, made)) for each in tried])
-                row |= {"seeds": len(tried)} if len(tried) > 1 else {}
-                row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
-                row["worst"] = min(each.psnr for each in score.objects)
-                for reference in ("hull_blend", f"scratch_{method.removesuffix('_steps')}"):
-                    row |= _above(score, scores[reference]) if reference in scores else {}
-                scores[method] = score
-                rows.append(row)
+            for row in _measured(by_seed, shown, names, made):
+                rows.append(about | row)
                 print(rows[-1], flush=True)
         sheet += _best_median_worst(seen)
     finish("views", rows, chosen.json)
@@ -139,6 +129,33 @@ def main(arguments: list[str]) -> int:
         sheet = [pad(row, (0, widest - row.shape[2]), value=1.0) for row in sheet]
         write_whole(chosen.pictures, encode_png(to_pixels(torch.cat(sheet, 1)[None])[0], small=True))
     return 0
+
+
+def _measured(
+    by_seed: Sequence[Mapping[str, Adapter]], shown: Tasks, names: list[str], made: list[tuple[Tensor, Tensor]]
+) -> Iterator[Row]:
+    """A row for each method; those with steps are the mean over seeds.
+
+    Args:
+        by_seed: the methods by the names of their rows, for every seed.
+        shown: the tasks.
+        names: the objects.
+        made: takes the query views and what one forward pass makes of them.
+    """
+    scores: dict[str, Score] = {}
+    for method in sorted(by_seed[0], key=_after_its_references):
+        without_steps = method == "one_step" or method in METHODS | PARTS
+        tried = [each[method] for each in (by_seed[:1] if without_steps else by_seed)]
+        keep = partial(_keep, made) if method == "one_step" else None
+        score = merge_seeds([evaluate(method, each, shown, names, keep) for each in tried])
+        row: Row = {"name": method}
+        row |= {"seeds": len(tried)} if len(tried) > 1 else {}
+        row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
+        row["worst"] = min(each.psnr for each in score.objects)
+        for reference in ("hull_blend", f"scratch_{method.removesuffix('_steps')}"):
+            row |= _above(score, scores[reference]) if reference in scores else {}
+        scores[method] = score
+        yield row
 
 
 def _keep(made: list[tuple[Tensor, Tensor]], _: ObjectScore, task: Task, pictures: Pictures, field: Renderable) -> None:
