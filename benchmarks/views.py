@@ -134,13 +134,16 @@ def main(arguments: list[str]) -> int:
 def _measured(
     by_seed: Sequence[Mapping[str, Adapter]], shown: Tasks, names: list[str], made: list[tuple[Tensor, Tensor]]
 ) -> Iterator[Row]:
-    """A row for each method; those with steps are the mean over seeds.
+    """Measure the methods one after the other.
 
     Args:
         by_seed: the methods by the names of their rows, for every seed.
         shown: the tasks.
         names: the objects.
         made: takes the query views and what one forward pass makes of them.
+
+    Yields:
+        The row of each method; of one with steps the mean over the seeds.
     """
     scores: dict[str, Score] = {}
     for method in sorted(by_seed[0], key=_after_its_references):
