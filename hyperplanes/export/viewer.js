@@ -479,6 +479,7 @@ window.showVoxels ||= (() => {
     if (!fixed) {
       new IntersectionObserver((seen) => {
         viewer.visible = seen.at(-1).isIntersecting;
+        if (viewer.visible && !viewers.includes(viewer)) viewers.push(viewer); // put back where it was taken from
         if (viewer.visible && viewer.live) viewer.ask?.();
         balance();
       }).observe(element);
