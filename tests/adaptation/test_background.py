@@ -92,6 +92,7 @@ def test_view_shows_the_object_alone(scene, monkeypatch, tmp_path):
         shown.append(support)
         raise KeyboardInterrupt
 
+    monkeypatch.setattr(live, "require_viewer", lambda: None)
     monkeypatch.setattr(live, "LiveViewer", lambda support, *rest: shown.append(support) or Mock())
     monkeypatch.setattr(view, "load_source", lambda *rest, **named: None)
     monkeypatch.setattr(view, "_adapt", interrupted)
