@@ -56,7 +56,7 @@ MORE = {"baked": ["--objects", "2", "--query", "4", "--counts", "25", "3"]}
 
 _METHODS = ["--methods", "nearest_view", "hull_blend", "hull_blend_reflected", "unreflected"]
 _TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", *_METHODS]
-_TUNED = ["--query", "2", "--steps", "100", "--methods", "hull_blend"]
+_TUNED = ["--counts", "3", "25", "--query", "2", "--steps", "100", "--methods", "hull_blend"]
 OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_procedural": (["procedural"], _TEN),
     "views_cc0": (["cc0"], _TEN),
@@ -72,8 +72,8 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
         ["--objects", "5", "--query", "2", "--counts", "2", "3", "5", "12", "--rotated", "33"]
         + ["--methods", "hull_blend", "hull_blend_reflected", "unreflected", "unrotated"],
     ),
-    "views_tuned_3": (["procedural", "cc0", "random", "posed"], ["--objects", "5", "--counts", "3", *_TUNED]),
-    "views_tuned": (["procedural", "cc0", "random", "posed"], ["--objects", "3", "--counts", "25", *_TUNED]),
+    "views_tuned": (["procedural", "cc0", "random"], ["--objects", "10", *_TUNED]),
+    "views_tuned_posed": (["posed"], ["--seeds", "5", *_TUNED]),
 }
 """Results of `views` by suites below --root, and its options, in place of `views` by --data."""
 

@@ -432,7 +432,7 @@ SOURCES = {
     "views": OF_VIEWS,
     "views_over": OF_VIEWS,
     "views_srn": ("views_srn", "views_srn_2"),
-    "views_tuned": ("views_tuned_3", "views_tuned"),
+    "views_tuned": ("views_tuned", "views_tuned_posed"),
     "views_summary": OF_VIEWS,
 }
 """Files of rows of tables that are not made of the file of their name."""
