@@ -58,7 +58,7 @@ def viewed_camera(
     Raises:
         ValueError: numbers that no camera has, as browsers send them of a page without a size.
     """
-    if not (0 < aspect < math.inf and 0 < fov < math.pi):
+    if not _has_size(fov, aspect):
         raise ValueError(f"camera: expected an aspect above 0 and an angle below 180 degrees, got {aspect}, {fov}")
     height = max(1, min(height, round(WIDEST / aspect)))
     pose = torch.eye(4)
@@ -68,6 +68,11 @@ def viewed_camera(
     focal = height / 2 / math.tan(fov / 2)
     intrinsics = torch.tensor([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
     return camera.pinhole(intrinsics, pose[None], height, width)
+
+
+def _has_size(fov: float, aspect: float) -> bool:
+    """Whether these are of a page that can be seen."""
+    return 0 < aspect < math.inf and 0 < fov < math.pi
 
 
 def beside(left: Pictures, right: Pictures) -> Float[Tensor, "view 3 height width"]:
@@ -270,7 +275,7 @@ class LiveViewer:
         """
         height = min(LARGEST, round(self._height * (SHARPER if still else 1)))
         eye = client.camera  # pyright: ignore
-        if not (0 < eye.aspect < math.inf and 0 < eye.fov < math.pi):
+        if not _has_size(eye.fov, eye.aspect):
             return False
         seen = viewed_camera(eye.wxyz.tolist(), eye.position.tolist(), eye.fov, eye.aspect, height)
         started = time.perf_counter()

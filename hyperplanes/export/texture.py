@@ -18,8 +18,8 @@ from torch.nn.functional import grid_sample, max_pool2d, normalize
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.mesh import Surface
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.against import fading, margins
 from hyperplanes.geometry.rays import cast, pixel_grid
-from hyperplanes.geometry.visibility import fading, margins
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 

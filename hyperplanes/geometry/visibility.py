@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.against import Against, margin, margins
 from hyperplanes.geometry.chosen_views import (
     ANGLE,
     BEYOND,
     CUT,
     FADING,
-    MARGIN,
     SMALLEST_ANGLE,
     UNSEEN,
     WHOLE,
@@ -47,10 +46,9 @@ from hyperplanes.utilities.transforms import (
     without_derivatives,
 )
 
-__all__ = ["VisibilityPlanes", "choose_torch", "fading", "margins"]
+__all__ = ["VisibilityPlanes", "choose_torch"]
 
 POINTS = 512  # that one call of the kernel works on
-CUTTING = 0.02  # of the shorter side of a picture: as many pixels of the object along a border are cut by it
 
 
 class VisibilityPlanes:
@@ -84,7 +82,7 @@ class VisibilityPlanes:
         matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
-        self._against = _Against(
+        self._against = Against(
             torch.zeros(len(images), dtype=torch.bool, device=images.device),
             images.new_zeros(len(images)),
             images.new_zeros(len(images), 4) if masks is None else margins(masks).to(images),
@@ -197,7 +195,7 @@ class VisibilityPlanes:
         """The numbers by which the kernels judge."""
         per_radius, own = 1 / self.occupancy.bounds.radius, self._against.penalties
         limits = [self.colours.nearest, per_radius, self.tolerance, own.deepest, own.partly, WHOLE, UNSEEN, ANGLE]
-        return [*limits, own.steep, own.highest, own.least, 1 / _margin(*self.maps.shape[1:3]), CUT, BEYOND]
+        return [*limits, own.steep, own.highest, own.least, 1 / margin(*self.maps.shape[1:3]), CUT, BEYOND]
 
     def shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, 0 where hidden, its handicap and margins."""
@@ -326,51 +324,6 @@ def choose_torch(
     return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
 
 
-@dataclass(frozen=True)
-class _Against:
-    """What counts against the views of planes.
-
-    Attributes:
-        masked: those that see nothing.
-        handicaps: added to the penalty of each wherever it shows a point.
-        margins: as `margins` returns them.
-        penalties: how much counts.
-    """
-
-    masked: Bool[Tensor, " view"]
-    handicaps: Float[Tensor, " view"]
-    margins: Float[Tensor, "view 4"]
-    penalties: Penalties
-
-    @cached_property
-    def _cut(self) -> bool:
-        """Whether a border cuts the object in any view."""
-        return bool(self.margins.any())
-
-    def penalty(
-        self,
-        behind: Float[Tensor, "point view"],
-        coverage: Float[Tensor, "point view"],
-        coordinates: Float[Tensor, "point view 2"],
-        size: Sequence[int],
-    ) -> Float[Tensor, "point view"]:
-        """The penalty of each view that shows a point; `visibility.choose` has the same as a kernel.
-
-        Args:
-            behind: how far the point lies behind the surface that the view sees, in radii beyond the tolerance.
-            coverage: the opacity of its mask there.
-            coordinates: as in `fading`.
-            size: likewise.
-        """
-        own = self.penalties
-        penalty = (own.steep * behind).clamp(own.least, own.deepest)
-        penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self.handicaps
-        if not self._cut:
-            return penalty
-        cut = fading(self.margins, coordinates, size)
-        return torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
-
-
 class _Maps:
     """Depth and opacity of the pixels of planes and of all their copies.
 
@@ -415,43 +368,6 @@ class _Maps:
     def _computed(self) -> Float[Tensor, "view height width 2"]:
         depth = first_hits(self._occupancy, self._cameras, self.opacity[:, None])
         return torch.stack([depth, self.opacity], -1)
-
-
-def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 4"]:
-    """The pixels from the left, right, upper and lower border of each picture within which it fades out.
-
-    Args:
-        masks: opacity in [0, 1]. A border cuts the object where it has some pixels that are whole, not one (of a mask
-            that is not clean, or UNKNOWN as in a reflection).
-
-    Returns:
-        0 where a border does not cut the object.
-    """
-    height, width = masks.shape[2:]
-    whole = masks[:, 0] >= WHOLE
-    borders = whole[:, :, 0], whole[:, :, -1], whole[:, 0], whole[:, -1]
-    cut = torch.stack([each.sum(1) >= max(2, CUTTING * min(height, width)) for each in borders], 1)
-    return _margin(height, width) * cut
-
-
-def fading(margins: Float[Tensor, "view 4"], coordinates: Float[Tensor, "point view 2"], size: Sequence[int]) -> Tensor:
-    """How far into a margin points lie: 0 inside of all, 1 at the border (point, view).
-
-    Args:
-        margins: of `margins`.
-        coordinates: (column, row) in [-1, 1], from the first pixel's centre to the last one's.
-        size: height and width of the pictures.
-    """
-    height, width = size
-    last = coordinates.new_tensor([width - 1, height - 1])
-    pixels = torch.minimum(((coordinates + 1) * last / 2).clamp_min(0), last)
-    inside = torch.stack([pixels, last - pixels], -1).flatten(-2)  # left, right, upper, lower
-    return (margins - inside).amax(-1).clamp_min(0) / _margin(height, width)
-
-
-def _margin(height: int, width: int) -> float:
-    """Of a picture of this size, in pixels."""
-    return MARGIN * min(height, width)
 
 
 def _split(values: Float[Tensor, "point chosen 6"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -8,7 +8,7 @@ from torch.nn.functional import max_pool2d
 
 from hyperplanes.adaptation import HullBlend, hull_blend
 from hyperplanes.adaptation.base import hull
-from hyperplanes.geometry import Sphere, visibility
+from hyperplanes.geometry import Sphere, against
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
 from hyperplanes.geometry.chosen_views import ANGLE
 from hyperplanes.geometry.occupancy import Occupancy, full
@@ -98,7 +98,7 @@ def test_no_seam_is_seen_where_the_border_of_a_picture_cuts_the_object(monkeypat
         return float(column.diff().abs().max())
 
     smooth = steepest()
-    monkeypatch.setattr(visibility, "CUTTING", 10.0)  # as if nothing cut it
+    monkeypatch.setattr(against, "CUTTING", 10.0)  # as if nothing cut it
     assert steepest() > 3 * smooth
 
 

@@ -10,13 +10,14 @@ import torch
 from hyperplanes.adaptation.hull_blend import blend_views
 from hyperplanes.geometry import Sphere, carve, cast
 from hyperplanes.geometry import visibility as module
+from hyperplanes.geometry.against import fading, margins
 from hyperplanes.geometry.cameras import centres, concatenate, projection_matrices
 from hyperplanes.geometry.chosen_views import ANGLE, BEYOND, CUT, DEEPEST, MARGIN, PARTLY, UNSEEN, WHOLE, Penalties
 from hyperplanes.geometry.distortion import distorted, distorted_pixels
 from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import pixel_grid
-from hyperplanes.geometry.visibility import VisibilityPlanes, fading, margins
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from tests.reference_rendering import ball_views, camera_at, ring
 
 SIZE = (20, 24)

@@ -1,0 +1,120 @@
+"""Tables of the benchmark `views`: PSNR by object, method and number of views."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.reporting import Row
+from hyperplanes.utilities.tables import markdown_table
+
+__all__ = ["NAMES", "Result", "views", "views_over", "views_summary", "views_tuned"]
+
+Result = dict[str, Any]
+"""A file of results: what was measured where, and its rows."""
+
+SUMMARY = (3, 5, 25)  # numbers of views in README
+NAMES = {
+    "cars": "cars",
+    "chairs": "chairs",
+    "planes": "planes",
+    "spacecraft": "spacecraft",
+    "lamps": "lamps",
+    "random-unseen": "compositions of random shapes",
+    "chair": "the Blender chair",
+}
+"""Data sets of the suites, as the pages call them."""
+METHODS = {
+    "nearest_view": "the nearest view",
+    "hull_blend": "`hull_blend`",
+    "hull_blend_reflected": "`hull_blend` with reflections",
+    "swapped": "the update of another object",
+    "unreflected": "`small` without reflections",
+    "unrotated": "`small` without a canonical frame",
+    "one_step": "**`small`**",
+}
+"""Rows of the table of views, in its order."""
+
+
+RowsOfViews = dict[tuple[str, int], Row]  # by method and number of views
+
+
+def _of_views(results: tuple[Result, ...]) -> tuple[dict[str, RowsOfViews], list[int]]:
+    """Rows of every data set, by the name that the pages call it, and all numbers of views."""
+    found: dict[str, RowsOfViews] = {}
+    for row in (row for result in results for row in result["rows"]):
+        name = NAMES[row["data"].removeprefix("cc0-")]
+        if row["suite"] == "cc0" or row["data"].startswith("cc0-"):
+            name = f"CC0 {name}"
+        found.setdefault(name, {})[row["name"], row["views"]] = row
+    return found, sorted({count for rows in found.values() for _, count in rows})
+
+
+def _table_of_views(counts: list[int], lines: list[list[str]]) -> str:
+    return markdown_table(["", *(f"{count} view{'s' if count > 1 else ''}" for count in counts)], lines)
+
+
+def views(*results: Result) -> str:
+    """Every method by its numbers of views."""
+    found, counts = _of_views(results)
+    lines = []
+    for name, rows in found.items():
+        number = next(iter(rows.values()))["objects"]
+        for method, label in METHODS.items():
+            scores = [rows.get((method, count)) for count in counts]
+            if any(scores):
+                cells = (f"{row['psnr']:.2f}" if row else "-" for row in scores)
+                lines.append([f"{name} ({number}): {label}", *cells])
+    return _table_of_views(counts, lines)
+
+
+def views_over(*results: Result) -> str:
+    """How far one forward pass of `small` is above `hull_blend`."""
+    found, counts = _of_views(results)
+    lines = []
+    for name, rows in found.items():
+        cells = []
+        for row in (rows.get(("one_step", count)) for count in counts):
+            cells.append(_above(row or {}, "over_hull_blend"))
+        lines.append([name, *cells])
+    return _table_of_views(counts, lines)
+
+
+def _above(row: dict[str, Any], name: str) -> str:
+    """A difference and, over several objects, its 95 % interval."""
+    if name not in row:
+        return "-"
+    if f"{name}_low" not in row:
+        return f"{row[name]:+.2f}"
+    return f"{row[name]:+.2f} ({row[f'{name}_low']:+.1f} to {row[f'{name}_high']:+.1f})"
+
+
+def views_summary(*results: Result) -> str:
+    """`small` and, in parentheses, `hull_blend`: the table of README."""
+    found, _ = _of_views(results)
+    lines = []
+    for name, rows in found.items():
+        pairs = ((rows["one_step", count], rows["hull_blend", count]) for count in SUMMARY)
+        lines.append([name, *(f"{ours['psnr']:.1f} ({blended['psnr']:.1f})" for ours, blended in pairs)])
+    return _table_of_views(list(SUMMARY), lines)
+
+
+def views_tuned(*results: Result) -> str:
+    """Gradient steps from `small` beside as many from random weights."""
+    found, counts = _of_views(results)
+    lines = []
+    for name, rows in found.items():
+        for count in counts:
+            scores = [rows[method, count]["psnr"] for method in ("hull_blend", "one_step", "100_steps", "scratch_100")]
+            objects, seeds = rows["one_step", count]["objects"], rows["100_steps", count].get("seeds", 1)
+            how_many = f"{objects}" if seeds == 1 else f"{objects}, {seeds} seeds"
+            over = _above(rows["100_steps", count], "over_scratch_100")
+            lines.append([f"{name} ({how_many})", str(count), *(f"{score:.2f}" for score in scores), over])
+    headings = [
+        "views",
+        "`hull_blend`",
+        "one forward pass",
+        "100 steps",
+        "100 from random weights",
+        "over random weights",
+    ]
+    return markdown_table(["", *headings], lines)

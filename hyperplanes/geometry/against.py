@@ -1,0 +1,99 @@
+"""What counts against the views of a point: how far it lies behind what they see, their masks, and borders that cut."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hyperplanes.geometry.chosen_views import BEYOND, CUT, MARGIN, WHOLE, Penalties
+
+__all__ = ["Against", "fading", "margin", "margins"]
+
+CUTTING = 0.02  # of the shorter side of a picture: as many pixels of the object along a border are cut by it
+
+
+@dataclass(frozen=True)
+class Against:
+    """What counts against the views of planes.
+
+    Attributes:
+        masked: those that see nothing.
+        handicaps: added to the penalty of each wherever it shows a point.
+        margins: as `margins` returns them.
+        penalties: how much counts.
+    """
+
+    masked: Bool[Tensor, " view"]
+    handicaps: Float[Tensor, " view"]
+    margins: Float[Tensor, "view 4"]
+    penalties: Penalties
+
+    @cached_property
+    def _cut(self) -> bool:
+        """Whether a border cuts the object in any view."""
+        return bool(self.margins.any())
+
+    def penalty(
+        self,
+        behind: Float[Tensor, "point view"],
+        coverage: Float[Tensor, "point view"],
+        coordinates: Float[Tensor, "point view 2"],
+        size: Sequence[int],
+    ) -> Float[Tensor, "point view"]:
+        """The penalty of each view that shows a point; `visibility.choose` has the same as a kernel.
+
+        Args:
+            behind: how far the point lies behind the surface that the view sees, in radii beyond the tolerance.
+            coverage: the opacity of its mask there.
+            coordinates: as in `fading`.
+            size: likewise.
+        """
+        own = self.penalties
+        penalty = (own.steep * behind).clamp(own.least, own.deepest)
+        penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self.handicaps
+        if not self._cut:
+            return penalty
+        cut = fading(self.margins, coordinates, size)
+        return torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
+
+
+def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 4"]:
+    """The pixels from the left, right, upper and lower border of each picture within which it fades out.
+
+    Args:
+        masks: opacity in [0, 1]. A border cuts the object where it has some pixels that are whole, not one (of a mask
+            that is not clean, or UNKNOWN as in a reflection).
+
+    Returns:
+        0 where a border does not cut the object.
+    """
+    height, width = masks.shape[2:]
+    whole = masks[:, 0] >= WHOLE
+    borders = whole[:, :, 0], whole[:, :, -1], whole[:, 0], whole[:, -1]
+    cut = torch.stack([each.sum(1) >= max(2, CUTTING * min(height, width)) for each in borders], 1)
+    return margin(height, width) * cut
+
+
+def fading(margins: Float[Tensor, "view 4"], coordinates: Float[Tensor, "point view 2"], size: Sequence[int]) -> Tensor:
+    """How far into a margin points lie: 0 inside of all, 1 at the border (point, view).
+
+    Args:
+        margins: of `margins`.
+        coordinates: (column, row) in [-1, 1], from the first pixel's centre to the last one's.
+        size: height and width of the pictures.
+    """
+    height, width = size
+    last = coordinates.new_tensor([width - 1, height - 1])
+    pixels = torch.minimum(((coordinates + 1) * last / 2).clamp_min(0), last)
+    inside = torch.stack([pixels, last - pixels], -1).flatten(-2)  # left, right, upper, lower
+    return (margins - inside).amax(-1).clamp_min(0) / margin(height, width)
+
+
+def margin(height: int, width: int) -> float:
+    """The width of a margin of a picture of this size, in pixels."""
+    return MARGIN * min(height, width)
