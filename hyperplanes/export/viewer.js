@@ -335,7 +335,8 @@ window.showVoxels ||= (() => {
       this.picture = element.querySelector("img");
       this.orbit = new Orbit(this.scene);
       this.spinning = !fixed && !matchMedia("(prefers-reduced-motion)").matches;
-      this.visible = this.live = false;
+      this.visible = undefined; // until the browser says so
+      this.live = false;
       this.retries = RETRIES;
       this.used = 0; // when it was last tapped or started
     }
@@ -457,13 +458,25 @@ window.showVoxels ||= (() => {
     for (const viewer of tapped ? [tapped] : waiting) {
       const live = viewers.filter((each) => each.live).sort((a, b) => a.used - b.used);
       if (live.length >= LIVE) {
-        const idle = live.find((each) => !each.visible) || (tapped && live[0]);
+        const idle = live.find((each) => each.visible === false) || (tapped && live[0]);
         if (!idle) return;
         idle.stop();
       }
       viewer.start();
     }
   }
+
+  // One for all viewers: what the browser says of several at once is known of all before one gives way.
+  const owners = new WeakMap(); // the viewer of an element
+  const observer = new IntersectionObserver((entries) => {
+    for (const entry of entries) {
+      const viewer = owners.get(entry.target);
+      viewer.visible = entry.isIntersecting;
+      if (viewer.visible && !viewers.includes(viewer)) viewers.push(viewer); // put back where it was taken from
+      if (viewer.visible && viewer.live) viewer.ask?.();
+    }
+    balance();
+  });
 
   return async function showVoxels(element) {
     const fixed = addressed();
@@ -477,12 +490,8 @@ window.showVoxels ||= (() => {
     }
     viewers.push(viewer);
     if (!fixed) {
-      new IntersectionObserver((seen) => {
-        viewer.visible = seen.at(-1).isIntersecting;
-        if (viewer.visible && !viewers.includes(viewer)) viewers.push(viewer); // put back where it was taken from
-        if (viewer.visible && viewer.live) viewer.ask?.();
-        balance();
-      }).observe(element);
+      owners.set(element, viewer);
+      observer.observe(element);
       element.addEventListener("pointerdown", () => viewer.wake());
     }
     if (viewers.filter((each) => each.live).length < LIVE) await viewer.start();
