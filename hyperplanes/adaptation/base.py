@@ -160,7 +160,7 @@ class AdaptedField:
         Args:
             cameras: any number, one image size, on any device and in any precision.
             sampling: another sampler than that of the field, whose samples are denser for pictures where it marches.
-            antialias: three rays through each pixel at an edge; where absent, where it marches.
+            antialias: five rays through each pixel at an edge; where absent, where it marches.
             mixed_precision: a network of single precision may multiply numbers of bfloat16 (`Field.mixed_precision`);
                 otherwise the field decides.
 

@@ -26,7 +26,7 @@ class TrainingConfig:
         reference_objects: further objects a step, of which only the HyperPlanes are read. The hypernetwork standardises
             codes by the objects of the step, and cannot tell what one object alone has in common with the others.
         rays: query pixels an object and step.
-        antialias: each of these pixels is the mean of three rays, as pictures have them at edges. What is trained by
+        antialias: each of these pixels is the mean of three rays; pictures have five at edges. What is trained by
             one ray a pixel shows the mean over its area by a soft surface.
         views: numbers of support views, for a field that takes any number of them. Each episode shows one of these
             numbers of random views of its object, support and query alike, and draws rays from others. Empty: all

@@ -18,7 +18,7 @@ from hyperplanes.utilities.arguments import checked, checked_fields, kind_of
 __all__ = ["SUBPIXELS", "Rays", "Sphere", "cast", "pixel_grid"]
 
 SUBPIXELS = ((0.0, 0.0), (-0.25, -0.25), (0.25, 0.25))
-"""Places in a pixel, from its centre, whose rays have the mean of its area as their mean, nearly."""
+"""Places in a pixel, from its centre, whose rays have the mean of its area as their mean, nearly: those of training."""
 
 
 @checked_fields

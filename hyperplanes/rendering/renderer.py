@@ -88,7 +88,7 @@ def render(
             cameras. Without gradients rays are rendered in chunks, so that memory does not grow with their number, and
             `RayMarching` stops where they are opaque.
         chunk: rays at once where no gradient is kept; as many as suit the sampler and the device where absent.
-        antialias: for cameras, three rays through each pixel that differs much from a neighbour; where absent, by
+        antialias: for cameras, five rays through each pixel that differs much from a neighbour; where absent, by
             `RayMarching` without gradients. The paper's protocol is one ray a pixel.
 
     Returns:
