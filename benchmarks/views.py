@@ -9,9 +9,9 @@ are shown, as far apart as they stand. The rows: the nearest of them copied; the
 (where there are masks), of views alone and with their reflections; the same field from random weights; the model
 without its hypernetwork, with the update of another object of the data set, with its own alone, averaged with the
 visual hull by one share an object, without reflections of views, without a canonical frame, with one ray a pixel, in
-single precision, and as it is used; and fine-tuned. Beside each mean stands how far it lies above `hull_blend`, and
-steps above as many from random weights, with the 95 % interval of that difference over the objects (paired, Student's
-t).
+single precision, with residual correction (of steps, too), and as it is used; and fine-tuned. Beside each mean stands
+how far it lies above `hull_blend`, steps above as many from random weights, and what is corrected above what is not,
+with the 95 % interval of that difference over the objects (paired, Student's t).
 
 With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
 Image are compared, has 251 views on a spiral, of which view 64, or views 64 and 128, are shown.
@@ -40,6 +40,7 @@ from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Rendera
 from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.residuals import WithResiduals
 from hyperplanes.adaptation.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.swapped import Swapped
@@ -155,7 +156,8 @@ def _measured(
         row |= {"seeds": len(tried)} if len(tried) > 1 else {}
         row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
         row["worst"] = min(each.psnr for each in score.objects)
-        for reference in ("hull_blend", f"scratch_{method.removesuffix('_steps')}"):
+        uncorrected = "one_step" if method == "residuals" else method.removesuffix("_residuals")
+        for reference in ("hull_blend", f"scratch_{method.removesuffix('_steps')}", uncorrected):
             row |= _above(score, scores[reference]) if reference in scores else {}
         scores[method] = score
         yield row
@@ -221,6 +223,8 @@ def made_by(suite: str, path: Path) -> str:
 
 def _after_its_references(method: str) -> int:
     """Sorts methods such that those come first that others are compared with."""
+    if method.endswith("residuals"):
+        return 3
     return 0 if method == "hull_blend" else 1 if method.startswith("scratch_") else 2
 
 
@@ -283,6 +287,8 @@ def adapters(
     for each in steps:
         settings = FineTuning(seed=seed)
         found[f"{each}_steps"] = tuned = FineTuned(model, each, settings)
+        if "residuals" in wanted:
+            found[f"{each}_steps_residuals"] = WithResiduals(tuned)
         if "ungated" in wanted:
             found[f"{each}_steps_ungated"] = _Ungated(tuned)
         found[f"scratch_{each}"] = FromScratch(model, each, settings)
@@ -403,6 +409,7 @@ METHODS = {
     "unreflected": lambda model, *_: _Unreflected(model),
     "unrotated": lambda model, *_: _Unrotated(model),
     "one_ray": lambda model, *_: _Rendered(model, {"antialias": False}),
+    "residuals": lambda model, *_: WithResiduals(model),
     "single_precision": lambda model, *_: _Rendered(model, {"mixed_precision": False}),
 }
 

@@ -7,6 +7,7 @@ from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromS
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.nearest_view import NearestView
+from hyperplanes.adaptation.residuals import ResidualField, WithResiduals
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.initialisation import InitialisationConfig
@@ -25,9 +26,11 @@ __all__ = [
     "ModelConfig",
     "NearestView",
     "Pictures",
-    "SupportContext",
     "Renderable",
+    "ResidualField",
+    "SupportContext",
     "Swapped",
+    "WithResiduals",
     "diagnose",
     "swap_gap",
 ]
