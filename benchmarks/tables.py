@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.view_tables import NAMES, Result, views, views_over, views_summary, views_tuned
+from benchmarks.view_tables import NAMES, Result, views, views_over, views_residuals, views_summary, views_tuned
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.tables import markdown_table
 from hyperplanes.utilities.writing import write_whole
@@ -327,6 +327,7 @@ SOURCES = {
     "views": OF_VIEWS,
     "views_over": OF_VIEWS,
     "views_srn": ("views_srn", "views_srn_2"),
+    "views_residuals": ("views_residuals", "views_residuals_posed"),
     "views_tuned": ("views_tuned", "views_tuned_posed"),
     "views_summary": OF_VIEWS,
 }
@@ -354,6 +355,7 @@ TABLES: dict[str, Callable[..., str]] = {
     "views_srn": views,
     "views_rotated": views,
     "views_summary": views_summary,
+    "views_residuals": views_residuals,
     "views_tuned": views_tuned,
 }
 """What makes the table of each benchmark of its rows."""

@@ -7,7 +7,7 @@ from typing import Any
 from benchmarks.reporting import Row
 from hyperplanes.utilities.tables import markdown_table
 
-__all__ = ["NAMES", "Result", "views", "views_over", "views_summary", "views_tuned"]
+__all__ = ["NAMES", "Result", "views", "views_over", "views_residuals", "views_summary", "views_tuned"]
 
 Result = dict[str, Any]
 """A file of results: what was measured where, and its rows."""
@@ -96,6 +96,20 @@ def views_summary(*results: Result) -> str:
         pairs = ((rows["one_step", count], rows["hull_blend", count]) for count in SUMMARY)
         lines.append([name, *(f"{ours['psnr']:.1f} ({blended['psnr']:.1f})" for ours, blended in pairs)])
     return _table_of_views(list(SUMMARY), lines)
+
+
+def views_residuals(*results: Result) -> str:
+    """One forward pass of `small`, and its pictures corrected by the residuals of the support views."""
+    found, counts = _of_views(results)
+    lines = []
+    for name, rows in found.items():
+        for count in (each for each in counts if ("residuals", each) in rows):
+            scores = [rows[method, count]["psnr"] for method in ("hull_blend", "one_step", "residuals")]
+            over = _above(rows["residuals", count], "over_one_step")
+            objects = rows["residuals", count]["objects"]
+            lines.append([f"{name} ({objects})", str(count), *(f"{score:.2f}" for score in scores), over])
+    headings = ["views", "`hull_blend`", "one forward pass", "with residuals", "gain"]
+    return markdown_table(["", *headings], lines)
 
 
 def views_tuned(*results: Result) -> str:

@@ -8,11 +8,11 @@ Rendering"): from where the support views see the same surface, the more the clo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,35 +22,38 @@ from torch import Tensor
 from hyperplanes.adaptation.base import Adapter, Pictures, Renderable
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.rays import Rays, cast, pixel_grid
+from hyperplanes.geometry.rays import cast, pixel_grid
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.memory import require_memory
 from hyperplanes.views import Views
 
 __all__ = ["ResidualField", "WithResiduals"]
 
-SHARPNESS = 10.0  # of weights over the angle between rays: a third at 27 degrees
-WIDEST = 0.5  # cosine of the angle between viewing directions from which on a support view counts: 60 degrees
+SHARPNESS = 10.0  # of weights over 1 - the cosine of the angle between rays: a third at 27 degrees
+WIDEST = 0.5  # of that, from which on the weight is 0: 60 degrees
 TOLERANCE = 0.06  # of the radius, by which a support view may see a surface in front or behind, at a weight of 1 / e
 DOUBT = 0.03  # weight of no residual at all
 FAINT, SOLID = 0.01, 1 / 3  # opacity of a pixel from which on it is corrected, and from which on wholly
-PIXELS = 1 << 14  # corrected at once
+PAIRS = 1 << 18  # of a pixel and a support view, at once
+VIEWS = 8  # support views that are rendered together
+
+_rendering = Lock()  # support views: two threads that need the same ones render them once
 
 
 @dataclass(frozen=True)
 class ResidualField:
     """A field whose pictures are corrected by its support views; opacity and depth stay those of the field.
 
-    The support views near a new one are rendered when they are first needed, and kept.
+    The support views near a new one are rendered when they are first needed, and kept: 20 bytes a pixel.
 
     Attributes:
-        uncorrected: the field, on the device of the views.
+        uncorrected: the field.
         views: its support views, with their colours over what the field renders behind the object.
     """
 
     uncorrected: Renderable
     views: Views
-    _residuals: dict[int, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
-    _lock: Any = field(default_factory=Lock, init=False, repr=False, compare=False)
+    _known: set[int] = field(default_factory=set, init=False, repr=False, compare=False)
 
     @checked
     @torch.no_grad()
@@ -58,60 +61,87 @@ class ResidualField:
         """The pictures of cameras, with what the field lacks in the support views.
 
         Args:
-            cameras: any number, one image size.
+            cameras: any number, one image size, on any device and in any precision.
 
         Returns:
             One picture a camera, with colours in [0, 1].
         """
-        pictures, near = self.uncorrected.render(cameras), self._near(cameras)
-        self._compute(near.any(0).nonzero()[:, 0].tolist())
-        images = pictures.images.clone()
+        pictures = self.uncorrected.render(cameras)
+        images, cameras = pictures.images.clone(), camera.to(cameras, pictures.images.device)
         pixels = pixel_grid(*camera.image_size(cameras), images.device)
-        for view, chosen in enumerate(each.nonzero()[:, 0].tolist() for each in near):
-            if not chosen:
-                continue
-            maps = torch.stack([self._residuals[each] for each in chosen])
-            planes = ImagePlanes(maps, camera.select(self.views.cameras, chosen), 0.0, exact=True)
+        for view in range(len(images)):
             opacity, depth = (each[view].flatten() for each in (pictures.opacity, pictures.depth))
-            for part in ((opacity > FAINT) & (depth > 0)).nonzero()[:, 0].split(PIXELS):
-                rays = cast(cameras, torch.full_like(part, view), pixels[part], self.views.bounds)
-                whole = (opacity[part] / SOLID).clamp(max=1)
-                images[view].view(3, -1)[:, part] += (whole[:, None] * self._blended(planes, rays, depth[part])).T
+            seen = ((opacity > FAINT) & (depth > 0)).nonzero()[:, 0]
+            rays = cast(cameras, torch.full_like(seen, view), pixels[seen], self.views.bounds)
+            added = self._blended(rays.at(depth[seen].to(rays.directions)), rays.directions).to(images)
+            images[view].view(3, -1)[:, seen] += added.T * (opacity[seen] / SOLID).clamp(max=1)
         return replace(pictures, images=images.clamp(0, 1))
 
-    def _near(self, cameras: PinholeCamera) -> Bool[Tensor, "camera view"]:
-        """The support views that look at the scene from the side of each camera."""
-        towards = camera.camera_directions(cameras, self.views.bounds.centre).to(self._directions)
-        return towards @ self._directions.T > WIDEST
+    @torch.no_grad()
+    def prepare(self, on_view: Callable[[int], None] | None = None) -> None:
+        """Render all support views now, instead of when they are needed.
+
+        Args:
+            on_view: called with how many of them are done.
+        """
+        for view in range(len(self.views)):
+            self._compute([view])
+            if on_view is not None:
+                on_view(view + 1)
+
+    def _blended(self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]) -> Tensor:
+        """The weighted mean of the residuals of support views at points that are seen in these directions."""
+        points, directions = points.to(self._planes.images), directions.to(self._planes.images)
+        size = max(1, PAIRS // len(self.views))
+        parts = list(zip(points.split(size), directions.split(size), strict=True))
+        near = torch.zeros(len(self.views), dtype=torch.bool, device=points.device)
+        for part in parts:
+            near |= self._near(*part)
+        chosen = near.nonzero()[:, 0]
+        if not len(chosen):
+            return torch.zeros_like(points)
+        self._compute(chosen.tolist())
+        blended = []
+        for places, along in parts:
+            found = self._planes.lookup(places, chosen.expand(len(places), -1), return_directions=True)
+            assert found.directions is not None
+            assert found.distances is not None
+            residual, moment, opacity = found.colours.split([3, 1, 1], -1)
+            apart = found.distances - (moment / opacity.clamp_min(1e-3)).squeeze(-1)
+            aside = 1 - (found.directions * along[:, None]).sum(-1)
+            weights = (torch.exp(-SHARPNESS * aside) - math.exp(-SHARPNESS * WIDEST)).clamp_min(0)
+            # outside of a picture opacity is 0, so that the surface seems to be at the camera, and the weight is 0
+            weights = weights * torch.exp(-(apart / (TOLERANCE * self.views.bounds.radius)).square())
+            blended.append((weights[..., None] * residual).sum(1) / (weights.sum(1, keepdim=True) + DOUBT))
+        return torch.cat(blended)
+
+    def _near(self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]) -> Bool[Tensor, " view"]:
+        """The support views that one of the points has a weight of."""
+        offsets = points[:, None] - camera.centres(self._planes.cameras).to(points)
+        cosines = (torch.nn.functional.normalize(offsets, dim=-1) * directions[:, None]).sum(-1)
+        return (1 - cosines < WIDEST).any(0)
+
+    def _compute(self, chosen: list[int]) -> None:
+        """Residual, depth times opacity, and opacity of support views that are not known yet."""
+        with _rendering:
+            missing = [view for view in chosen if view not in self._known]
+            for first in range(0, len(missing), VIEWS):
+                some = missing[first : first + VIEWS]
+                own = self.uncorrected.render(camera.select(self._planes.cameras, some))
+                lacking = self.views.images[some].to(own.images) - own.images
+                maps = torch.cat([lacking, own.depth * own.opacity, own.opacity], 1)
+                self._planes.images[some] = maps.to(self._planes.images)
+                self._known.update(some)
 
     @cached_property
-    def _directions(self) -> Float[Tensor, "view 3"]:
-        """Unit vectors from the centre of the scene to the cameras of the support views."""
-        return self.views.camera_directions
-
-    def _compute(self, chosen: Sequence[int]) -> None:
-        """Of support views whose residuals are not known yet: these, depth times opacity, and opacity."""
-        with self._lock:
-            missing = [view for view in chosen if view not in self._residuals]
-            if missing:
-                views = self.views[missing]
-                own = self.uncorrected.render(views.cameras)
-                lacking = views.images.to(own.images) - own.images
-                maps = torch.cat([lacking, own.depth * own.opacity, own.opacity], 1)
-                self._residuals.update(zip(missing, maps, strict=True))
-
-    def _blended(self, planes: ImagePlanes, rays: Rays, depth: Float[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:
-        """The weighted mean of the residuals of support views where rays end."""
-        points = rays.at(depth.to(rays.directions)).float()
-        found = planes.lookup(points, return_directions=True)
-        assert found.directions is not None
-        assert found.distances is not None
-        residual, moment, opacity = found.colours.split([3, 1, 1], -1)
-        apart = found.distances - (moment / opacity.clamp_min(1e-3)).squeeze(-1)
-        aside = 1 - (found.directions * rays.directions.to(points)[:, None]).sum(-1)
-        weights = torch.exp(-(apart / (TOLERANCE * self.views.bounds.radius)).square() - SHARPNESS * aside)
-        weights = (weights * found.valid)[..., None]
-        return (weights * residual).sum(1) / (weights.sum(1) + DOUBT)
+    def _planes(self) -> ImagePlanes:
+        """What is known of the support views."""
+        count, (height, width) = len(self.views), self.views.size
+        require_memory(
+            "views", f"{count} of {width}x{height}", 20 * count * height * width, "show fewer or smaller ones"
+        )
+        maps = self.views.images.new_zeros(count, 5, height, width)
+        return ImagePlanes(maps, self.views.cameras, 0.0, exact=True)
 
 
 @dataclass(frozen=True)

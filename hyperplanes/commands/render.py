@@ -67,8 +67,8 @@ class Arguments(ObjectArguments):
         representation: What draws the pictures: the field itself, or voxels that are baked from it and fitted to the
             shown views, which takes half a minute once and milliseconds a picture. auto takes voxels for an orbit or
             a path of so many pictures that they are drawn sooner so, where 16 views or more are shown.
-        residuals: Add to the pictures what the field lacks where the shown views see the same places: the shown views
-            near a picture are rendered first, once. From 25 views it brings some tenths of a decibel.
+        residuals: Add to the pictures what the field lacks where the shown views see the same places. All shown views
+            are rendered for that first. From 25 views it brings some tenths of a decibel.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
             marching through what is not empty.
     """
@@ -129,6 +129,8 @@ def run(arguments: Arguments) -> int:
     field = choose_representation(field, shown, asked.cameras, _representation(arguments, asked), make=make)
     if arguments.residuals:
         field = ResidualField(field, shown)
+        with console.bar("residuals") as bar:
+            field.prepare(lambda done: bar.show(done, len(shown), "shown views"))
     started = time.perf_counter()
     pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / asked.cameras.batch_size
@@ -147,8 +149,9 @@ def run(arguments: Arguments) -> int:
     if scores is None and not isinstance(source, BakedScene) and (arguments.steps == 0 or warned):
         scores = held_out_psnr(source, shown)
         if scores is not None:
+            without = " and residuals" if arguments.residuals else ""
             console.say(
-                f"without fine-tuning, on support views left out for this: {scores[0]:.2f} dB PSNR, "
+                f"without fine-tuning{without}, on support views left out for this: {scores[0]:.2f} dB PSNR, "
                 f"copying the nearest view {scores[1]:.2f} dB"
             )
             scores = scores if arguments.steps == 0 else None

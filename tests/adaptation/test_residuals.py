@@ -1,6 +1,8 @@
 """Sources of truth: a loop over pixels and support views, and a ball whose pictures are known."""
 
+import copy
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -69,29 +71,54 @@ def test_a_field_of_a_wrong_colour_is_corrected_and_by_other_views_it_is_not(sup
 
 def test_of_what_a_field_shows_already_nothing_is_added(query):
     grey = ball((0.5, 0.5, 0.5))
-    shown = grey.render(ring(12, SIZE))
-    views = Views(shown.images, ring(12, SIZE), None, Sphere())
+    shown = grey.render(ring(6, SIZE))
+    views = Views(shown.images, ring(6, SIZE), None, Sphere())
     torch.testing.assert_close(
         ResidualField(grey, views).render(query.cameras).images, grey.render(query.cameras).images, atol=1e-6, rtol=0
     )
 
 
-def test_a_pixel_has_the_weighted_residuals_of_a_loop_over_the_views(support):
-    grey, asked = ball((0.5, 0.5, 0.5)), camera_at((0.4, 0.8, 2.9), SIZE)
-    plain, found = grey.render(asked), ResidualField(grey, support).render(asked).images[0]
-    own = grey.render(support.cameras)
-    checked = 0
-    for row, column in [(8, 12), (12, 12), (14, 9), (12, 15)]:
+def scene(name):
+    """A field, its support views and a new camera."""
+    if name == "ball":
+        return ball((0.5, 0.5, 0.5)), ball_views(ring(24, SIZE)), camera_at((0.4, 0.8, 2.9), SIZE)
+    # mist beside the origin, and support views so near that they show parts of it
+    centre, bounds = (3.0, -2.0, 1.0), Sphere((3.0, -2.0, 1.0), 2.0)
+
+    def mist(points, directions):
+        away = (points - points.new_tensor(centre)).norm(dim=-1)
+        return torch.full_like(points, 0.5), 0.12 * (away < 1.2)
+
+    there = torch.eye(4)
+    there[:3, 3] = torch.tensor(centre)
+    near, asked = (camera.moved(each, there) for each in (ring(24, SIZE, angle=0.4), camera_at((0.5, 1.5, 5.8), SIZE)))
+    images = 0.3 * torch.rand(24, 3, *SIZE, generator=torch.Generator().manual_seed(0))
+    return AdaptedField(mist, full(bounds, 24), RayMarching(96, 0.0)), Views(images, near, None, bounds), asked
+
+
+@pytest.mark.parametrize("name", ["ball", "mist"])
+def test_a_pixel_has_the_weighted_residuals_of_a_loop_over_the_views(name):
+    field, support, asked = scene(name)
+    plain, found = field.render(asked), ResidualField(field, support).render(asked).images[0]
+    own, faint, outside, changed = field.render(support.cameras), 0, 0, 0
+    for row, column in (plain.opacity[0, 0] > residuals.FAINT).nonzero().tolist()[:: 9 if name == "ball" else 3]:
         depth, opacity = (float(each[0, 0, row, column]) for each in (plain.depth, plain.opacity))
+        if not depth:
+            continue
         ray = cast(asked, torch.tensor([0]), torch.tensor([[column, row]]), support.bounds)
         point = ray.origins[0] + depth * ray.directions[0]
         total, weights = torch.zeros(3), residuals.DOUBT
         for view in range(len(support)):
             one = camera.select(support.cameras, [view])
-            if towards(one) @ towards(asked) <= residuals.WIDEST:
-                continue
+            offset = point - camera.centres(one)[0].to(point)
+            aside = 1 - float(offset @ ray.directions[0].to(offset) / offset.norm())
             x, y = one.project(point[None].to(one.extrinsics))[0].tolist()
-            left, top = math.floor(x), math.floor(y)
+            if aside >= residuals.WIDEST:
+                continue
+            if not (0 <= x <= SIZE[1] - 1 and 0 <= y <= SIZE[0] - 1):
+                outside += 1
+                continue
+            left, top = min(math.floor(x), SIZE[1] - 2), min(math.floor(y), SIZE[0] - 2)
             share = {
                 (top + j, left + i): abs(1 - i - (x - left)) * abs(1 - j - (y - top)) for i in (0, 1) for j in (0, 1)
             }
@@ -100,15 +127,16 @@ def test_a_pixel_has_the_weighted_residuals_of_a_loop_over_the_views(support):
                 lacking += part * (support.images - own.images)[view, :, at, along]
                 moment += part * float(own.depth[view, 0, at, along] * own.opacity[view, 0, at, along])
                 covered += part * float(own.opacity[view, 0, at, along])
-            offset = point - camera.centres(one)[0].to(point)
             apart = (float(offset.norm()) - moment / max(covered, 1e-3)) / (residuals.TOLERANCE * support.bounds.radius)
-            cosine = float(offset @ ray.directions[0].to(offset) / offset.norm())
-            weight = math.exp(-(apart**2) + residuals.SHARPNESS * (cosine - 1))
+            angular = math.exp(-residuals.SHARPNESS * aside) - math.exp(-residuals.SHARPNESS * residuals.WIDEST)
+            weight = angular * math.exp(-(apart**2))
             total, weights = total + weight * lacking, weights + weight
         expected = plain.images[0, :, row, column] + min(1, opacity / residuals.SOLID) * total / weights
-        torch.testing.assert_close(found[:, row, column], expected.clamp(0, 1), atol=2e-4, rtol=0)
-        checked += bool((expected - plain.images[0, :, row, column]).abs().max() > 0.1)
-    assert checked == 4
+        torch.testing.assert_close(found[:, row, column], expected.clamp(0, 1), atol=1e-3, rtol=0)
+        changed += bool((expected - plain.images[0, :, row, column]).abs().max() > 0.05)
+        faint += opacity < 0.8 * residuals.SOLID
+    assert changed > 5
+    assert name == "ball" or (faint > 5 and outside > 5)
 
 
 def test_views_that_another_surface_hides_add_nothing():
@@ -131,14 +159,18 @@ def test_only_views_from_that_side_are_rendered_and_each_of_them_once(support):
     counting = Counting(ball((0.5, 0.5, 0.5)))
     corrected = ResidualField(counting, support)
     asked = camera_at((0.0, 0.0, 3.0), SIZE)
-    near = int((support.camera_directions @ towards(asked) > 0.5).sum())
+    near = int((support.camera_directions @ towards(asked) > 0.5).sum())  # of the middle of the ball
     first = corrected.render(asked).images
-    assert counting.rendered == 1 + near < 13
+    rendered = counting.rendered - 1
+    assert near <= rendered <= near + 6 < 16
     assert torch.equal(corrected.render(asked).images, first)
-    assert counting.rendered == 2 + near
+    assert counting.rendered == 2 + rendered
+    done = []
+    corrected.prepare(done.append)
+    assert done == list(range(1, 25))
+    assert counting.rendered == 2 + 24
     corrected.render(ring(24, SIZE))
-    corrected.render(ring(24, SIZE))
-    assert counting.rendered == 2 + 24 + 48
+    assert counting.rendered == 2 + 24 + 24
 
 
 def test_many_cameras_show_what_each_shows_alone_and_opacity_and_depth_stay(support, query):
@@ -150,7 +182,28 @@ def test_many_cameras_show_what_each_shows_alone_and_opacity_and_depth_stay(supp
     assert float(together.images.min()) >= 0 <= float(together.images.max()) <= 1
     for view in range(len(query)):
         alone = ResidualField(grey, support).render(camera.select(query.cameras, [view])).images[0]
-        torch.testing.assert_close(together.images[view], alone, atol=2e-3, rtol=0)
+        torch.testing.assert_close(together.images[view], alone, atol=1e-5, rtol=0)
+
+
+def test_a_view_fades_out_before_it_is_left_out():
+    field = ball((0.5, 0.5, 0.5))
+    support = ball_views(camera_at((0.0, 0.0, 3.0), SIZE))
+    added = []
+    for degrees in (30, 50, 58, 59.5, 60.5, 62, 70, 85):
+        asked = camera_at((3 * math.sin(math.radians(degrees)), 0.0, 3 * math.cos(math.radians(degrees))), SIZE)
+        plain = field.render(asked).images
+        added.append(float((ResidualField(field, support).render(asked).images - plain).abs().max()))
+    assert added[0] > 0.1
+    assert added == sorted(added, reverse=True)
+    assert all(before - after < 0.02 for before, after in pairwise(added[2:6]))
+    assert added[-1] < 1e-6
+
+
+def test_a_copy_is_independent(support, query):
+    corrected = ResidualField(ball((0.5, 0.5, 0.5)), support)
+    first = corrected.render(query.cameras).images
+    again = copy.deepcopy(corrected)
+    assert torch.equal(again.render(query.cameras).images, first)
 
 
 def test_from_the_other_side_alone_nothing_is_known():
