@@ -79,7 +79,7 @@ def test_pictures_by_another_option_are_those_of_the_same_field(method, option):
 def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     HyperPlanes(MODEL).save(tmp_path / "model")
     options = ["--checkpoint", str(tmp_path / "model"), "--data", str(demo_folder() / "data"), "--objects", "1"]
-    options += ["--query", "1", "--methods", "ungated", "--counts", "1", "2", "--steps", "1", "--coarse"]
+    options += ["--query", "1", "--methods", "ungated", "residuals", "--counts", "1", "2", "--steps", "1", "--coarse"]
     found = []
     for seeds in ("1", "2"):
         assert views.main([*options, "--seeds", seeds, "--json", str(tmp_path / "rows.json")]) == 0
@@ -91,10 +91,16 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
         if one["name"] == "1_steps":
             scratch = next(row for row in found[0] if row["name"] == "scratch_1")
             assert one["over_scratch_1"] == pytest.approx(one["psnr"] - scratch["psnr"])
+    quality = {(row["views"], row["name"]): row["psnr"] for row in found[0]}
+    for row in found[0]:  # what is corrected beside what is not
+        if row["name"].endswith("residuals"):
+            uncorrected = row["name"].removesuffix("residuals").removesuffix("_") or "one_step"
+            assert row[f"over_{uncorrected}"] == pytest.approx(row["psnr"] - quality[row["views"], uncorrected])
     rows = [(row["views"], row["name"]) for row in found[0]]
     both = ["ungated", "one_step"]
     tuned = ["1_steps", "1_steps_ungated", "1_steps_coarse"]
-    expected = {1: both, 2: ["scratch_1", "scratch_1_coarse", *both, *tuned]}
+    corrected = ["residuals", "1_steps_residuals"]
+    expected = {1: [*both, "residuals"], 2: ["scratch_1", "scratch_1_coarse", *both, *tuned, *corrected]}
     assert rows == [(count, name) for count, names in expected.items() for name in names]
 
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from threading import Lock
 
 import torch
@@ -40,20 +39,29 @@ VIEWS = 8  # support views that are rendered together
 _rendering = Lock()  # support views: two threads that need the same ones render them once
 
 
-@dataclass(frozen=True)
 class ResidualField:
     """A field whose pictures are corrected by its support views; opacity and depth stay those of the field.
 
     The support views near a new one are rendered when they are first needed, and kept: 20 bytes a pixel.
-
-    Attributes:
-        uncorrected: the field.
-        views: its support views, with their colours over what the field renders behind the object.
     """
 
-    uncorrected: Renderable
-    views: Views
-    _known: set[int] = field(default_factory=set, init=False, repr=False, compare=False)
+    def __init__(self, uncorrected: Renderable, views: Views) -> None:
+        """A field and what it was made of.
+
+        Args:
+            uncorrected: the field.
+            views: its support views, with their colours over what the field renders behind the object.
+        """
+        count, (height, width) = len(views), views.size
+        needed = 20 * count * height * width
+        require_memory("views", f"{count} of {width}x{height}", needed, "show fewer or smaller ones")
+        self.uncorrected = uncorrected
+        self.views = views
+        self._planes = ImagePlanes(views.images.new_zeros(count, 5, height, width), views.cameras, 0.0, exact=True)
+        self._known: set[int] = set()  # views whose residual, depth times opacity, and opacity the planes have
+
+    def __repr__(self) -> str:
+        return f"ResidualField({self.uncorrected!r}, {self.views!r})"
 
     @checked
     @torch.no_grad()
@@ -84,10 +92,11 @@ class ResidualField:
         Args:
             on_view: called with how many of them are done.
         """
-        for view in range(len(self.views)):
-            self._compute([view])
+        for first in range(0, len(self.views), VIEWS):
+            last = min(first + VIEWS, len(self.views))
+            self._compute(list(range(first, last)))
             if on_view is not None:
-                on_view(view + 1)
+                on_view(last)
 
     def _blended(self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]) -> Tensor:
         """The weighted mean of the residuals of support views at points that are seen in these directions."""
@@ -132,16 +141,6 @@ class ResidualField:
                 maps = torch.cat([lacking, own.depth * own.opacity, own.opacity], 1)
                 self._planes.images[some] = maps.to(self._planes.images)
                 self._known.update(some)
-
-    @cached_property
-    def _planes(self) -> ImagePlanes:
-        """What is known of the support views."""
-        count, (height, width) = len(self.views), self.views.size
-        require_memory(
-            "views", f"{count} of {width}x{height}", 20 * count * height * width, "show fewer or smaller ones"
-        )
-        maps = self.views.images.new_zeros(count, 5, height, width)
-        return ImagePlanes(maps, self.views.cameras, 0.0, exact=True)
 
 
 @dataclass(frozen=True)

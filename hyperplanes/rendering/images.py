@@ -31,7 +31,7 @@ EDGE = 0.7
 """Difference of a pixel to a neighbour, in colour or opacity, from which on further rays are cast through it; from 0.35
 on it brings next to nothing, with 0.9 half as much."""
 
-SUBPIXELS = ((0.0, 0.0), (-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+EDGE_SUBPIXELS = ((0.0, 0.0), (-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 """Places in such a pixel, from its centre: that and a rotated grid of four."""
 
 
@@ -125,11 +125,11 @@ def render_images(
         # colour and opacity of pixels at edges: the mean of five rays
         view, chosen = _edges(values[first:last, :, :4].unflatten(1, (height, width))).flatten(1).nonzero().unbind(1)
         view += first
-        offsets = pixels.new_tensor(SUBPIXELS[1:])
+        offsets = pixels.new_tensor(EDGE_SUBPIXELS[1:])
         places = (pixels[chosen] + offsets[:, None]).flatten(0, 1)
         part = rendered(view.repeat(len(offsets)), places)
         more = torch.cat([part.colour, part.opacity[:, None]], 1).to(values).unflatten(0, (len(offsets), -1)).sum(0)
-        values[view, chosen, :4] = (values[view, chosen, :4] + more) / len(SUBPIXELS)
+        values[view, chosen, :4] = (values[view, chosen, :4] + more) / len(EDGE_SUBPIXELS)
         samples += part.samples
     maps = values.reshape(cameras.batch_size, height, width, 5).permute(0, 3, 1, 2)
     return Pictures(maps[:, :3], maps[:, 3:4], maps[:, 4:], samples)

@@ -47,7 +47,7 @@ def test_pixels_at_edges_are_nearer_to_the_mean_over_their_area():
 def test_five_rays_are_nearer_than_the_three_of_training(monkeypatch):
     truth = pooled(ball, 6)[0]
     five = (picture(ball, True).images - truth).square().mean()
-    monkeypatch.setattr(images, "SUBPIXELS", SUBPIXELS)
+    monkeypatch.setattr(images, "EDGE_SUBPIXELS", SUBPIXELS)
     three = (picture(ball, True).images - truth).square().mean()
     assert five < 0.6 * three
 
@@ -60,7 +60,7 @@ def test_they_are_the_mean_of_five_rays_and_all_others_stay():
     centres = torch.stack([column, row], 1).double()
     rays = [
         render(ball, cast(CAMERAS, view, centres + centres.new_tensor(offset)), MARCH, occupancy=GRID)
-        for offset in images.SUBPIXELS
+        for offset in images.EDGE_SUBPIXELS
     ]
     mean = torch.stack([each.colour for each in rays]).mean(0)
     torch.testing.assert_close(found.images[view, :, row, column], mean.to(found.images), atol=0.02, rtol=0)
