@@ -30,7 +30,7 @@ __all__ = ["ResidualField", "WithResiduals"]
 
 SHARPNESS = 10.0  # of weights over 1 - the cosine of the angle between rays: a third at 27 degrees
 WIDEST = 0.5  # of that, from which on the weight is 0: 60 degrees
-TOLERANCE = 0.06  # of the radius, by which a support view may see a surface in front or behind, at a weight of 1 / e
+TOLERANCE = 0.25  # of the radius, by which a support view may see a surface in front or behind, at a weight of 1 / e
 DOUBT = 0.03  # weight of no residual at all
 FAINT, SOLID = 0.01, 1 / 3  # opacity of a pixel from which on it is corrected, and from which on wholly
 PAIRS = 1 << 18  # of a pixel and a support view, at once
