@@ -68,7 +68,7 @@ class Arguments(ObjectArguments):
             shown views, which takes half a minute once and milliseconds a picture. auto takes voxels for an orbit or
             a path of so many pictures that they are drawn sooner so, where 16 views or more are shown.
         residuals: Add to the pictures what the field lacks where the shown views see the same places. All shown views
-            are rendered for that first. From 25 views it brings up to 1.1 dB.
+            are rendered for that first. From 25 views it brings up to 1.2 dB.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
             marching through what is not empty.
     """
