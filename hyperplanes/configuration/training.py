@@ -31,8 +31,8 @@ class TrainingConfig:
         views: numbers of support views, for a field that takes any number of them. Each episode shows one of these
             numbers of random views of its object, support and query alike, and draws rays from others. Empty: all
             support views, in every step.
-        episodes: how many of those are at hand at a time; every step begins one and draws `tasks` of them, so that
-            views, masks and hulls are made ready once for several steps.
+        episodes: how many of those are at hand at a time for every four objects of a step. Each step begins one of
+            them and draws four, so that views, masks and hulls are made ready once for several steps.
         rotations: share of the episodes of `views` whose object is rotated about the vertical axis by a random angle. A
             grid of features and what reads it know objects as they stand in the training; photographs come with any
             heading.

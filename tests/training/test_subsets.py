@@ -1,6 +1,6 @@
 """Trainings on random numbers of random views. Source of truth: counts, and pictures whose truth is known."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import replace
 
 import pytest
@@ -12,7 +12,8 @@ from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import RayMarching
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.training.episodes.drawing import episode_object
+from hyperplanes.training.distributed import Processes
+from hyperplanes.training.episodes.drawing import draw_episodes, episode_object
 from hyperplanes.training.episodes.episode import QUERIES, prepare_subset
 from hyperplanes.views import Task, Views
 from tests.reference_rendering import Balls, ball_views, ring, small_model
@@ -63,6 +64,23 @@ def test_a_step_draws_of_the_episodes_at_hand_and_each_is_drawn_several_times():
         assert all(step <= number < step + 6 for number in drawn)
         numbers.update(drawn)
     assert sum(numbers[number] for number in range(6, 200)) / 194 == pytest.approx(3, abs=0.1)  # as many as tasks
+
+
+def test_every_four_objects_of_a_step_draw_from_episodes_of_their_own():
+    at_hand, steps, shares = 6, 50, defaultdict[int, set[int]](set)
+    drawn_often = Counter[int]()
+    for step in range(steps):
+        drawn = draw_episodes(12, at_hand, step, torch.Generator().manual_seed(step))
+        assert len(set(drawn)) == 12
+        drawn_often.update(drawn)
+        for process in range(3):
+            shares[process].update(Processes(process, 3).share(drawn))
+    assert [{number % 3 for number in shares[process]} for process in range(3)] == [{0}, {1}, {2}]  # none has another's
+    begun = [drawn_often[number] for number in range(3 * at_hand, 3 * steps)]
+    assert sum(begun) / len(begun) == pytest.approx(4, abs=0.1)  # as often as with four objects a step
+    assert draw_episodes(4, at_hand, 7, torch.Generator().manual_seed(7)) == [
+        7 + place for place in torch.randperm(at_hand, generator=torch.Generator().manual_seed(7))[:4].tolist()
+    ]
 
 
 def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):

@@ -14,6 +14,7 @@ from hyperplanes.geometry.rays import Sphere
 __all__ = [
     "draw",
     "draw_balanced",
+    "draw_episodes",
     "episode_generator",
     "episode_object",
     "object_generator",
@@ -22,6 +23,9 @@ __all__ = [
 ]
 
 EPISODES, ORDERS = 1, 2  # set the streams of these apart from those of rays
+
+OBJECTS_A_STREAM = 4
+"""Objects of a step that share the episodes at hand; further ones have others."""
 
 
 def step_generator(seed: int, step: int) -> torch.Generator:
@@ -83,6 +87,30 @@ def draw_balanced(classes: Mapping[str, Sequence[str]], count: int, generator: t
     order = [known[index] for index in _places(len(known), count, generator)]
     drawn = {name: iter(draw(classes[name], order.count(name), generator)) for name in sorted(set(order))}
     return [next(drawn[name]) for name in order]
+
+
+def draw_episodes(count: int, at_hand: int, step: int, generator: torch.Generator) -> list[int]:
+    """Numbers of the episodes of a step, different ones.
+
+    Every four objects of a step draw from a stream of episodes of their own, so that an episode is drawn as often
+    however many objects a step has, and processes that share the objects of a step share the streams.
+
+    Args:
+        count: how many.
+        at_hand: episodes of each stream that there are at a time; every step begins one more.
+        step: steps done before.
+        generator: of the draws.
+
+    Returns:
+        Those of the first stream, then those of the next.
+    """
+    streams = max(1, count // OBJECTS_A_STREAM)
+    drawn: list[int] = []
+    for stream in range(streams):
+        own = count * (stream + 1) // streams - count * stream // streams
+        places = torch.randperm(max(at_hand, own), generator=generator)[:own]
+        drawn += [(step + place) * streams + stream for place in places.tolist()]
+    return drawn
 
 
 def episode_object(classes: Mapping[str, Sequence[str]], number: int, seed: int) -> str:

@@ -19,6 +19,7 @@ from hyperplanes.training.episodes.augmentation import draw_rotation, rotated_vo
 from hyperplanes.training.episodes.drawing import (
     draw,
     draw_balanced,
+    draw_episodes,
     episode_generator,
     episode_object,
     object_generator,
@@ -86,6 +87,8 @@ class EpisodeLoader:
         self._prefetcher = Prefetcher(self._load, self.cache)
         self._volumes: LRUCache[Tensor] = LRUCache(config.memory // 2)
         self._lock = threading.Lock()  # of `_volumes`, which the prefetching thread uses too
+        # PyTorch loads its linear algebra for GPUs when it is first asked for, which fails in two threads at a time
+        torch.linalg.det(torch.eye(3, device=model.rig.device))
 
     def batch(self, step: int) -> Batch:
         """The objects of a step, ready; the first time it is asked for, an object is made ready here and now.
@@ -133,8 +136,7 @@ class EpisodeLoader:
         config, generator = self.config, step_generator(self.config.seed, step)
         count = config.tasks + reference_objects(self.model, config)
         if config.views:
-            places = torch.randperm(max(config.episodes, count), generator=generator)[:count]
-            return [self._numbered(step + place) for place in places.tolist()]
+            return [self._numbered(number) for number in draw_episodes(count, config.episodes, step, generator)]
         if self.classes:
             return draw_balanced(self.classes, count, generator)
         return draw(self.names, count, generator)
