@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
@@ -13,6 +14,7 @@ from hyperplanes.export.baking import BakedScene
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Rays
+from hyperplanes.rendering.images import EDGE_SUBPIXELS, pixels_at_edges
 from hyperplanes.rendering.voxels import voxel_gradients
 from hyperplanes.utilities.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
@@ -20,7 +22,8 @@ from hyperplanes.views import Views
 __all__ = ["STEPS", "fit_voxels", "render_guide"]
 
 STEPS = 80
-RAYS = 8192
+PIXELS = 8192  # of a step
+EDGE = 0.25  # difference of a pixel to one beside it, in colour or mask, from which on it is the mean of five rays
 DENSITY_RATE = 0.05  # of optical depth through a voxel
 COLOUR_RATE = 0.01
 DECAY = 0.1  # of both rates, from the first step to the last
@@ -62,23 +65,24 @@ def fit_voxels(
     *,
     guide: Views | None = None,
     steps: int = STEPS,
-    rays: int = RAYS,
+    pixels: int = PIXELS,
     seed: int = 0,
     on_step: Callable[[int], None] | None = None,
 ) -> BakedField:
-    """The voxels after gradient steps (Adam) on the squared error of rays of the views.
+    """The voxels after gradient steps (Adam) on the squared error of pixels of the views.
 
     A field loses 1 to 3 dB by being baked, since voxels interpolate what a network and lookups computed; fitting the
-    voxels brings them back, and more with 25 views. No voxel is added or taken away. Steps begin with an optical
-    depth of at most LARGEST_DEPTH a voxel, which is worth 0.2 dB from 25 views of `small` (docs/export.md).
+    voxels brings them back, and more with 25 views. Pixels at edges are the mean of five rays, as they are rendered: by
+    one ray a pixel surfaces become soft. No voxel is added or taken away. Steps begin with an optical depth of at most
+    LARGEST_DEPTH a voxel. What both are worth: docs/benchmarks.md, "Baked voxels".
 
     Args:
         baked: where it starts; on the CPU.
         views: posed images of the object, on any device.
-        guide: renderings of the field from other places, from `render_guide`; the fewer views, the more rays of these.
+        guide: renderings of the field from other places, from `render_guide`; the fewer views, the more of its pixels.
         steps: gradient steps.
-        rays: of each step, drawn from all views; no more than there are pixels that show something.
-        seed: of the rays.
+        pixels: of each step, drawn from all views; no more than there are that show something.
+        seed: of the pixels.
         on_step: told the number of steps done.
 
     Returns:
@@ -86,10 +90,10 @@ def fit_voxels(
     """
     scene, voxel = BakedScene(baked), 2 * baked.bounds.radius / baked.side
     share = max(0.0, 1 - len(views) / ENOUGH) if guide is not None else 0.0
-    sources = [_Source.of(views, scene, rays, 1 - share)]
+    sources = [_Source.of(views, scene, pixels, 1 - share)]
     if guide is not None and share:
-        sources.append(_Source.of(guide, scene, rays, share))
-    if not steps or not sum(source.rays for source in sources):
+        sources.append(_Source.of(guide, scene, pixels, share))
+    if not steps or not sum(source.pixels for source in sources):
         return baked
     # optical depth of a voxel and coefficients, each with its own rate
     depth, colour = (baked.values[:, :1] * voxel).clamp(SMALLEST_DEPTH, LARGEST_DEPTH), baked.values[:, 1:].clone()
@@ -102,9 +106,11 @@ def fit_voxels(
     generator = torch.Generator().manual_seed(seed)
     for step in range(steps):
         # squared error of some rays, and its gradient by the kernel
-        drawn, truth = _draw(sources, generator)
+        drawn, truth, counts = _draw(sources, generator)
         values[:, :1], values[:, 1:], basis = depth / voxel, colour, spherical_harmonics(drawn.directions)
-        _, gradient = voxel_gradients(scene.grid, values, drawn, basis, truth, step=voxel, out=gradients, stop=STOP)
+        _, gradient = voxel_gradients(
+            scene.grid, values, drawn, basis, truth, step=voxel, counts=counts, out=gradients, stop=STOP
+        )
         depth.grad.copy_(gradient[:, :1] / voxel)
         colour.grad.copy_(gradient[:, 1:])
         descent.step()
@@ -117,22 +123,40 @@ def fit_voxels(
 
 @dataclass(frozen=True)
 class _Source:
-    """Views, those of their pixels that may show a voxel, and how many rays of a step are drawn from these."""
+    """Views, those of their pixels that may show a voxel, which of these lie at edges, and how many a step draws."""
 
     views: Views
-    live: Tensor
-    rays: int
+    live: Int[Tensor, " pixel"]
+    at_edge: Bool[Tensor, " pixel"]
+    pixels: int
 
     @classmethod
-    def of(cls, views: Views, scene: BakedScene, rays: int, share: float) -> _Source:
-        """With a share of the rays, and no more than there are such pixels."""
+    def of(cls, views: Views, scene: BakedScene, pixels: int, share: float) -> _Source:
+        """With a share of the pixels, and no more than there are that show something."""
         views = replace(views.to("cpu", torch.float32), bounds=scene.field.bounds)
         live = scene.footprint(views.cameras).flatten().nonzero()[:, 0]
-        return cls(views, live, min(round(share * rays), len(live)))
+        seen = views.images if views.masks is None else torch.cat([views.images, views.masks], 1)
+        at_edge = pixels_at_edges(seen.permute(0, 2, 3, 1), EDGE).flatten()[live]
+        return cls(views, live, at_edge, min(round(share * pixels), len(live)))
+
+    def draw(self, generator: torch.Generator) -> tuple[Rays, Tensor, Tensor]:
+        """Rays of some pixels, pixel after pixel, their true colours, and how many rays each pixel has."""
+        drawn = torch.randint(len(self.live), (self.pixels,), generator=generator)
+        at_edge = self.at_edge[drawn]
+        counts = torch.where(at_edge, len(EDGE_SUBPIXELS), 1)
+        # one ray through each centre, and through the other places of pixels at edges
+        centre, truth, _ = self.views.rays_at(self.live[drawn])
+        others, _, _ = self.views.rays_at(self.live[drawn[at_edge]], subpixels=EDGE_SUBPIXELS[1:])
+        pixel = torch.arange(len(drawn))
+        order = torch.cat([pixel, pixel[at_edge].repeat(len(EDGE_SUBPIXELS) - 1)]).argsort(stable=True)
+        return _joined([centre, others])[order], truth, counts
 
 
-def _draw(sources: list[_Source], generator: torch.Generator) -> tuple[Rays, Tensor]:
-    """Rays of all sources, and the colours that their pixels have."""
-    parts = [it.views.sample_rays(it.rays, generator=generator, among=it.live) for it in sources if it.rays]
-    rays = Rays(*(torch.cat([getattr(part, each.name) for part, _ in parts]) for each in fields(Rays)))
-    return rays, torch.cat([colours for _, colours in parts])
+def _draw(sources: Sequence[_Source], generator: torch.Generator) -> tuple[Rays, Tensor, Tensor]:
+    """As `_Source.draw`, of all sources."""
+    rays, truth, counts = zip(*(source.draw(generator) for source in sources if source.pixels), strict=True)
+    return _joined(rays), torch.cat(truth), torch.cat(counts)
+
+
+def _joined(parts: Sequence[Rays]) -> Rays:
+    return Rays(*(torch.cat([getattr(part, each.name) for part in parts]) for each in fields(Rays)))

@@ -18,7 +18,7 @@ from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.utilities.memory import require_memory
 
-__all__ = ["Pictures", "join_pictures", "render_images"]
+__all__ = ["EDGE_SUBPIXELS", "Pictures", "join_pictures", "pixels_at_edges", "render_images"]
 
 BYTES_OF_VIEW, BYTES_KEPT = 200, 32
 """That a pixel takes: of rays, while its view is rendered, and of the pictures of all views."""
@@ -123,7 +123,8 @@ def render_images(
         if not antialias:
             continue
         # colour and opacity of pixels at edges: the mean of five rays
-        view, chosen = _edges(values[first:last, :, :4].unflatten(1, (height, width))).flatten(1).nonzero().unbind(1)
+        seen = values[first:last, :, :4].unflatten(1, (height, width))
+        view, chosen = pixels_at_edges(seen, EDGE).flatten(1).nonzero().unbind(1)
         view += first
         offsets = pixels.new_tensor(EDGE_SUBPIXELS[1:])
         places = (pixels[chosen] + offsets[:, None]).flatten(0, 1)
@@ -150,14 +151,21 @@ def _groups(rays: Sequence[int]) -> list[int]:
     return [*bounds, len(rays)]
 
 
-def _edges(values: Float[Tensor, "view height width value"]) -> Bool[Tensor, "view height width"]:
-    """The pixels one of whose values differs by EDGE or more from that of the pixel beside, above or below."""
+def pixels_at_edges(
+    values: Float[Tensor, "view height width value"], least: float
+) -> Bool[Tensor, "view height width"]:
+    """The pixels one of whose values differs that much from the value of the pixel beside, above or below.
+
+    Args:
+        values: of pictures.
+        least: difference.
+    """
     found = torch.zeros(values.shape[:3], dtype=torch.bool, device=values.device)
     for one, other, differing in (
         (found[:, 1:], found[:, :-1], values.diff(dim=1)),
         (found[:, :, 1:], found[:, :, :-1], values.diff(dim=2)),
     ):
-        beside = (differing.abs() >= EDGE).any(-1)
+        beside = (differing.abs() >= least).any(-1)
         one |= beside
         other |= beside
     return found

@@ -136,21 +136,23 @@ def voxel_gradients(
     values: Float[Tensor, "row 28"],
     rays: Rays,
     basis: Float[Tensor, "ray 9"],
-    truth: Float[Tensor, "ray 3"],
+    truth: Float[Tensor, "pixel 3"],
     *,
     step: float,
+    counts: Int[Tensor, " pixel"] | None = None,
     out: Float[Tensor, "thread row 28"] | None = None,
     stop: float = STOP,
 ) -> tuple[float, Float[Tensor, "row 28"]]:
-    """The mean squared error of the pixels of `render_voxels`, and its gradient with respect to `values`.
+    """The mean squared error of pixels, and its gradient with respect to `values`.
 
     Args:
         grid: as there.
         values: density and 3 x 9 coefficients of every row.
-        rays: as there.
+        rays: as there, pixel after pixel.
         basis: spherical harmonics of every ray's direction.
         truth: what the pixels should be.
         step: as there.
+        counts: rays of each pixel, at least one, whose mean it is; one each where absent.
         out: a gradient for each thread of PyTorch, to be written over; the first becomes the result.
         stop: as there.
 
@@ -158,19 +160,20 @@ def voxel_gradients(
         The error, and its gradient.
     """
     kernel, threads = compile_function(voxel_rays.add_gradients), torch.get_num_threads()
-    chunk = max(1, -(-len(rays) // threads))  # one a thread, each with a gradient of its own
+    chunk = max(1, -(-len(truth) // threads))  # one a thread, each with a gradient of its own
     found = torch.empty(threads, *values.shape) if out is None else out
     found.zero_()
-    arrays = (*_arrays(grid, values, rays), basis.contiguous().numpy())
+    pixels = torch.arange(len(rays) + 1) if counts is None else pad(counts.cumsum(0), (1, 0))
+    arrays = (*_arrays(grid, values, rays), basis.contiguous().numpy(), pixels.numpy())
     numbers, colours = _numbers(step, stop), truth.float().contiguous().numpy()
 
     def work(first: int, last: int) -> float:
         return kernel(*arrays, *numbers, colours, found[first // chunk].numpy(), first, last)
 
-    error = sum(parallel_for(work, len(rays), chunk))
+    error = sum(parallel_for(work, len(truth), chunk))
     for other in found[1:]:
         found[0] += other
-    return error / (3 * len(rays)), found[0].div_(3 * len(rays))
+    return error / (3 * len(truth)), found[0].div_(3 * len(truth))
 
 
 def _arrays(grid: VoxelGrid, values: Tensor, rays: Rays) -> tuple[npt.NDArray[Any], ...]:

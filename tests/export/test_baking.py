@@ -6,6 +6,7 @@ from threading import Thread
 
 import pytest
 import torch
+from torch.nn.functional import avg_pool2d
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export import voxel_fitting
@@ -225,7 +226,7 @@ def test_fitting_brings_back_colours_and_densities(adapted, seen):
     faded = replace(whole, values=0.9 * whole.values)
     others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
     truth, steps = adapted.render(others).images, []
-    fitted = fit_voxels(faded, Views(shown, CAMERAS), steps=30, rays=1024, on_step=steps.append)
+    fitted = fit_voxels(faded, Views(shown, CAMERAS), steps=30, pixels=1024, on_step=steps.append)
     before, after = (float(psnr(BakedScene(each).render(others).images, truth).mean()) for each in (faded, fitted))
     assert after > before + 5
     assert steps == list(range(1, 31))
@@ -240,9 +241,30 @@ def test_fitting_begins_with_voxels_that_rays_pass_through(adapted, seen, monkey
     truth, found = adapted.render(others).images, []
     for bound in (voxel_fitting.LARGEST_DEPTH, math.inf):
         monkeypatch.setattr(voxel_fitting, "LARGEST_DEPTH", bound)
-        fitted = fit_voxels(opaque, Views(seen.images, CAMERAS), steps=30, rays=1024)
+        fitted = fit_voxels(opaque, Views(seen.images, CAMERAS), steps=30, pixels=1024)
         found.append(float(psnr(BakedScene(fitted).render(others).images, truth).mean()))
     assert found[0] > found[1] + 1
+
+
+def test_fitting_by_one_ray_a_pixel_makes_edges_soft(monkeypatch):
+    """Pictures whose pixels are the mean of their area, as photographs are, of a ball with a hard surface."""
+    ball = AdaptedField(
+        lambda points, _: (points * 0, 500.0 * (points.norm(dim=-1) < 0.6)), full(Sphere(), 48), RayMarching(192)
+    )
+    whole, found = bake(ball, side=64), []
+    shown, truth = (_means_of_areas(ball, count) for count in (16, 3))
+    for edge in (voxel_fitting.EDGE, math.inf):
+        monkeypatch.setattr(voxel_fitting, "EDGE", edge)
+        fitted = fit_voxels(whole, shown, steps=60, pixels=2048)
+        found.append(float(psnr(BakedScene(fitted).render(truth.cameras).images, truth.images).mean()))
+    assert found[0] > found[1] + 1
+
+
+def _means_of_areas(adapted, count):
+    """Pictures of 48x48, of 16 rays a pixel."""
+    cameras = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(count, 3.0), 48, 48)
+    fine = adapted.render(camera.resized(cameras, 192, 192), antialias=False).images
+    return Views(avg_pool2d(fine, 4), cameras)
 
 
 def test_a_guide_keeps_what_few_views_do_not_show(adapted, seen):
@@ -253,7 +275,7 @@ def test_a_guide_keeps_what_few_views_do_not_show(adapted, seen):
     darker = Views(0.8 * seen.images, CAMERAS)[:2]
     others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
     truth = adapted.render(others).images
-    alone, guided = (fit_voxels(whole, darker, guide=each, steps=30, rays=1024) for each in (None, guide))
+    alone, guided = (fit_voxels(whole, darker, guide=each, steps=30, pixels=1024) for each in (None, guide))
     lost = [float(psnr(BakedScene(each).render(others).images, truth).mean()) for each in (alone, guided)]
     assert lost[1] > lost[0] + 3
     many = Views(truth.repeat(6, 1, 1, 1), camera.select(others, [0, 1, 2] * 6))

@@ -72,7 +72,7 @@ def test_pixels_at_edges_are_those_that_differ_from_one_beside_above_or_below(va
     # Brute force: a loop over pixels, of one value at a time.
     values = torch.zeros(2, 5, 4, 4)
     values[..., value] = torch.rand(2, 5, 4, generator=torch.Generator().manual_seed(value))
-    found = images._edges(values)
+    found = images.pixels_at_edges(values, images.EDGE)
     for view, row, column in found.new_ones(found.shape).nonzero().tolist():
         beside = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
         differences = [

@@ -221,80 +221,100 @@ def render(index, shaded, empty, origins, directions, near, far, step, stopped, 
 
 @no_type_check
 def add_gradients(  # noqa: PLR0913
-    index, values, empty, origins, directions, near, far, basis, step, stopped, background, truth, gradient, start, stop
-):
-    """Adds the gradient of the squared errors of rays start..stop to `gradient`; returns the sum of the errors."""
+    index, values, empty, origins, directions, near, far, basis, pixels, step, stopped, background, truth, gradient,
+    start, stop,
+):  # fmt: skip
+    """Adds the gradient of the squared errors of pixels start..stop to `gradient`; returns the sum of the errors.
+
+    A pixel is the mean of the rays `pixels[i]` to `pixels[i + 1]`.
+    """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     mixed = np.empty(NUMBERS, np.float32)
     by_number = np.zeros(NUMBERS, np.float32)  # of a sample, by its interpolated numbers; density has its own way
-    places = np.empty((MAX_SAMPLES, 3), np.float32)
-    densities, before = np.empty(MAX_SAMPLES, np.float32), np.empty(MAX_SAMPLES, np.float32)
-    colours = np.empty((MAX_SAMPLES, 3), np.float32)  # before they are clamped
+    most = 1  # rays of a pixel
+    for pixel in range(start, stop):
+        most = max(most, pixels[pixel + 1] - pixels[pixel])
+    counts, behind = np.empty(most, np.int64), np.empty(most, np.float32)  # samples, and transmittance behind the last
+    places = np.empty((most, MAX_SAMPLES, 3), np.float32)
+    densities, before = np.empty((most, MAX_SAMPLES), np.float32), np.empty((most, MAX_SAMPLES), np.float32)
+    colours = np.empty((most, MAX_SAMPLES, 3), np.float32)  # before they are clamped
     total = 0.0
-    for ray in range(start, stop):
-        origin = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-        along = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        first, last = near[ray] + half * step, far[ray]
-        per_cell = one / (max(abs(along[0]), abs(along[1]), abs(along[2])) * step)
-        transmittance, opacity = one, zero
+    for pixel in range(start, stop):
+        first_ray, rays = pixels[pixel], pixels[pixel + 1] - pixels[pixel]
         red, green, blue = zero, zero, zero
-        sample, last = _inside(empty, origin, along, first, last, step)
-        count = 0
         # Forward, as `render`; the samples are kept.
-        while transmittance > stopped and count < MAX_SAMPLES:
-            sample, x, y, z, density = _next_sample(
-                index, values, empty, origin, along, first, last, step, per_cell, sample, mixed
-            )
-            if density <= zero:
-                break
-            r, g, b = _colour(basis, ray, mixed, density)
-            places[count, 0], places[count, 1], places[count, 2] = x, y, z
-            colours[count, 0], colours[count, 1], colours[count, 2] = r, g, b
-            densities[count] = density
-            before[count] = transmittance
-            _, transmittance, red, green, blue, opacity = _composite(
-                transmittance, density * step, r, g, b, red, green, blue, opacity
-            )
-            count += 1
-        # Twice the difference from the truth.
-        wrong_r = np.float32(2.0) * (red + (one - opacity) * background - truth[ray, 0])
-        wrong_g = np.float32(2.0) * (green + (one - opacity) * background - truth[ray, 1])
-        wrong_b = np.float32(2.0) * (blue + (one - opacity) * background - truth[ray, 2])
-        total += 0.25 * (wrong_r * wrong_r + wrong_g * wrong_g + wrong_b * wrong_b)
+        for place in range(rays):
+            ray = first_ray + place
+            origin = origins[ray, 0], origins[ray, 1], origins[ray, 2]
+            along = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+            first, last = near[ray] + half * step, far[ray]
+            per_cell = one / (max(abs(along[0]), abs(along[1]), abs(along[2])) * step)
+            transmittance, opacity = one, zero
+            sample, last = _inside(empty, origin, along, first, last, step)
+            count = 0
+            while transmittance > stopped and count < MAX_SAMPLES:
+                sample, x, y, z, density = _next_sample(
+                    index, values, empty, origin, along, first, last, step, per_cell, sample, mixed
+                )
+                if density <= zero:
+                    break
+                r, g, b = _colour(basis, ray, mixed, density)
+                places[place, count, 0], places[place, count, 1], places[place, count, 2] = x, y, z
+                colours[place, count, 0], colours[place, count, 1], colours[place, count, 2] = r, g, b
+                densities[place, count] = density
+                before[place, count] = transmittance
+                _, transmittance, red, green, blue, opacity = _composite(
+                    transmittance, density * step, r, g, b, red, green, blue, opacity
+                )
+                count += 1
+            counts[place], behind[place] = count, transmittance
+            shown = (one - opacity) * background
+            red, green, blue = red + shown, green + shown, blue + shown
+        # The difference of their mean from the truth, and the derivative of its square by each ray.
+        share = one / np.float32(rays)
+        wrong_r, wrong_g, wrong_b = (
+            red * share - truth[pixel, 0],
+            green * share - truth[pixel, 1],
+            blue * share - truth[pixel, 2],
+        )
+        total += wrong_r * wrong_r + wrong_g * wrong_g + wrong_b * wrong_b
+        share *= np.float32(2.0)
+        wrong_r, wrong_g, wrong_b = share * wrong_r, share * wrong_g, share * wrong_b
         # Backward, from the last sample to the first; `behind_it` is what the samples behind contribute.
-        behind_it = zero
-        for kept in range(count - 1, -1, -1):
-            density = densities[kept]
-            weight = before[kept] - transmittance
-            r, g, b = colours[kept, 0], colours[kept, 1], colours[kept, 2]
-            shown = (
-                wrong_r * (min(max(r, zero), one) - background)
-                + wrong_g * (min(max(g, zero), one) - background)
-                + wrong_b * (min(max(b, zero), one) - background)
-            )
-            by_density = step * (transmittance * shown - behind_it)
-            transmittance = before[kept]
-            behind_it += weight * shown
-            by_red = weight * wrong_r if zero < r < one else zero
-            by_green = weight * wrong_g if zero < g < one else zero
-            by_blue = weight * wrong_b if zero < b < one else zero
-            for number in range(HARMONICS):
-                of_basis = basis[ray, number]
-                by_number[1 + number] = of_basis * by_red
-                by_number[1 + HARMONICS + number] = of_basis * by_green
-                by_number[1 + 2 * HARMONICS + number] = of_basis * by_blue
-            mean = by_red * r + by_green * g + by_blue * b
-            # The share of each voxel around the sample in its density and its colour.
-            x, y, z = places[kept, 0], places[kept, 1], places[kept, 2]
-            cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
-            x, y, z = x - np.float32(cell_x), y - np.float32(cell_y), z - np.float32(cell_z)
-            for corner in range(8):
-                row, at_corner = _corner(index, cell_x, cell_y, cell_z, x, y, z, corner)
-                if row < 0:
-                    continue
-                share, own = at_corner * values[row, 0] / density, zero
-                for number in range(NUMBERS):
-                    own += by_number[number] * values[row, number]
-                    gradient[row, number] += share * by_number[number]
-                gradient[row, 0] += at_corner * (by_density + (own - mean) / density)
+        for place in range(rays):
+            ray, transmittance, behind_it = first_ray + place, behind[place], zero
+            for kept in range(counts[place] - 1, -1, -1):
+                density = densities[place, kept]
+                weight = before[place, kept] - transmittance
+                r, g, b = colours[place, kept, 0], colours[place, kept, 1], colours[place, kept, 2]
+                shown = (
+                    wrong_r * (min(max(r, zero), one) - background)
+                    + wrong_g * (min(max(g, zero), one) - background)
+                    + wrong_b * (min(max(b, zero), one) - background)
+                )
+                by_density = step * (transmittance * shown - behind_it)
+                transmittance = before[place, kept]
+                behind_it += weight * shown
+                by_red = weight * wrong_r if zero < r < one else zero
+                by_green = weight * wrong_g if zero < g < one else zero
+                by_blue = weight * wrong_b if zero < b < one else zero
+                for number in range(HARMONICS):
+                    of_basis = basis[ray, number]
+                    by_number[1 + number] = of_basis * by_red
+                    by_number[1 + HARMONICS + number] = of_basis * by_green
+                    by_number[1 + 2 * HARMONICS + number] = of_basis * by_blue
+                mean = by_red * r + by_green * g + by_blue * b
+                # The share of each voxel around the sample in its density and its colour.
+                x, y, z = places[place, kept, 0], places[place, kept, 1], places[place, kept, 2]
+                cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+                x, y, z = x - np.float32(cell_x), y - np.float32(cell_y), z - np.float32(cell_z)
+                for corner in range(8):
+                    row, at_corner = _corner(index, cell_x, cell_y, cell_z, x, y, z, corner)
+                    if row < 0:
+                        continue
+                    own_share, own = at_corner * values[row, 0] / density, zero
+                    for number in range(NUMBERS):
+                        own += by_number[number] * values[row, number]
+                        gradient[row, number] += own_share * by_number[number]
+                    gradient[row, 0] += at_corner * (by_density + (own - mean) / density)
     return total
