@@ -21,6 +21,8 @@ from data_gen.meshes.triangulate import concave, fan, triangulate
 
 __all__ = ["declared_up", "read_dae"]
 
+_LUMINANCE = (0.212671, 0.715160, 0.072169)  # of red, green and blue, as COLLADA has them
+
 _NOT_DRAWN = ("lines", "linestrips", "points", "spline", "brep", "convex_mesh")
 
 
@@ -53,7 +55,7 @@ def read_dae(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     if changed:
         ElementTree.register_namespace("", namespace.strip("{}"))
         data = ElementTree.tostring(root)
-    warnings += _errors(data)
+    warnings += _not_drawn(data)
     from trimesh.exchange.dae import load_collada
 
     loaded = load_collada(io.BytesIO(data), resolver=folder)
@@ -68,13 +70,27 @@ def declared_up(data: bytes) -> str | None:
     return found.group(1).decode().lower() if found else None
 
 
-def _errors(data: bytes) -> list[str]:
-    """What pycollada finds wrong and leaves out."""
+def _not_drawn(data: bytes) -> list[str]:
+    """What pycollada finds wrong and leaves out, and surfaces that let light through, which trimesh draws opaque."""
     import collada
     from collada.common import DaeError
 
-    found = collada.Collada(io.BytesIO(data), ignore=[DaeError]).errors
-    return [f"left out: {' '.join(str(error).split())[:150] or type(error).__name__}" for error in found]
+    document = collada.Collada(io.BytesIO(data), ignore=[DaeError])
+    lines = [f"left out: {' '.join(str(error).split())[:150] or type(error).__name__}" for error in document.errors]
+    for effect in document.effects:
+        opacity = _opacity(effect)
+        if opacity < 1:
+            lines.append(f"effect {effect.id!r}: drawn opaque, its opacity of {opacity:.2g} left out")
+    return lines
+
+
+def _opacity(effect: Any) -> float:
+    """That of a plain colour ("Determining Transparency" in the specification of COLLADA 1.4.1)."""
+    share = effect.transparency if isinstance(effect.transparency, (int, float)) else 1.0
+    through = effect.transparent if isinstance(effect.transparent, (tuple, list)) else None
+    if str(effect.opaque_mode) == "RGB_ZERO":
+        return 1.0 if through is None else 1.0 - float(np.dot(through[:3], _LUMINANCE)) * share
+    return share * (1.0 if through is None or len(through) < 4 else float(through[3]))
 
 
 def _without_controllers(root: ElementTree.Element, namespace: str, warnings: list[str]) -> int:

@@ -33,6 +33,7 @@ __all__ = [
     "convert_image",
     "linear_factor",
     "pbr_of_mtl",
+    "rgba_8bit",
     "roughness_of_exponent",
     "select_vertices",
     "texture_of",
@@ -185,11 +186,9 @@ def _textured(
         _drop_textures(data, label, warnings)
     vertex_colours = _material_vertex_colours(visual, len(mesh.vertices))
     own = material if isinstance(material, DrawnMaterial) else DrawnMaterial()
-    multiplies = data.get("baseColorTexture") is not None or own.unlit or _glows(data)
+    multiplies = colours == "gltf" or data.get("baseColorTexture") is not None or own.unlit or _glows(data)
     if vertex_colours is not None and not multiplies:
         tint = np.append(srgb_from_linear(data["baseColorFactor"][:3]), data["baseColorFactor"][3])
-        if colours == "gltf":
-            vertex_colours = convert_8bit(vertex_colours, srgb_from_linear)
         if data["alphaMode"] == "OPAQUE":
             vertex_colours[:, 3], tint[3] = 255, 1.0
         return _coloured((vertex_colours * tint).round(), "vertex", label, "scene")
@@ -236,10 +235,18 @@ def _material_vertex_colours(visual: TextureVisuals, count: int) -> npt.NDArray[
     attribute = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
     if attribute is None or len(attribute) != count:
         return None
-    attribute = np.asarray(attribute)
-    top = 1.0 if attribute.dtype.kind == "f" else float(np.iinfo(attribute.dtype).max)
-    rgba = np.full((count, 4), 255, dtype=np.uint8)
-    rgba[:, : attribute.shape[1]] = np.clip(np.round(attribute * (255.0 / top)), 0, 255)
+    return rgba_8bit(np.asarray(attribute))
+
+
+def rgba_8bit(colours: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    """RGBA of colours (vertex, 3 or 4) of any type of number: up to 1 of floating-point ones, else up to their largest.
+
+    Args:
+        colours: as a file holds them.
+    """
+    top = 1.0 if colours.dtype.kind == "f" else float(np.iinfo(colours.dtype).max)
+    rgba = np.full((len(colours), 4), 255, dtype=np.uint8)
+    rgba[:, : colours.shape[1]] = np.clip(np.round(colours * (255.0 / top)), 0, 255)
     return rgba
 
 
@@ -324,7 +331,7 @@ def convert_image(image: PIL.Image.Image, mode: str) -> PIL.Image.Image | None:
     Returns:
         The image; None for one that cannot be decoded, of which the reader of the file has warned.
     """
-    if image.format not in (None, *IMAGE_FORMATS):
+    if image.format not in (None, "MPO", *IMAGE_FORMATS):  # JPEG with further pictures behind the first
         return None
     try:
         image.load()

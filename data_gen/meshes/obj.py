@@ -291,7 +291,8 @@ def _geometry(
     if material is not None:
         keywords["visual"] = TextureVisuals(uv=uv, material=material)
     elif vertices.shape[1] >= 6 and np.isfinite(vertices[:, 3:6]).all():
-        colours = vertices[:, 3:6] * (255.0 if vertices[:, 3:6].max() <= 1.0 else 1.0)
+        every = tables["v"][:, 3:6]
+        colours = vertices[:, 3:6] * (255.0 if every[np.isfinite(every)].max() <= 1.0 else 1.0)
         keywords["vertex_colors"] = np.clip(np.round(colours), 0, 255).astype(np.uint8)
     else:
         keywords["visual"] = TextureVisuals(material=PBRMaterial(baseColorFactor=DEFAULT_COLOUR, metallicFactor=0.0))

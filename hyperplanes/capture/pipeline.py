@@ -106,7 +106,7 @@ def capture(
     if not is_video:
         _refuse_inside(out, *(path for one in photographs for path in (one.path, one.mask) if path is not None))
     photographs, pictures, opacities = _pictures(photographs, work)
-    model = _poses(pictures, is_video, work)
+    model = _poses(photographs, pictures, is_video, work)
     kept = [photographs[index] for index in model.pictures]
     if len(kept) < len(photographs):
         rest = [one.name for index, one in enumerate(photographs) if index not in set(model.pictures.tolist())]
@@ -163,9 +163,8 @@ def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
 def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photograph], list[Picture], dict[int, Path]]:
     """The photographs upright and scaled, as files, and the masks that came with them by their number."""
     max_size = work.settings.max_size
-    stamps = [(str(one.path.resolve()), one.path.stat().st_mtime, one.path.stat().st_size) for one in photographs]
     masks = [None if one.mask is None else (str(one.mask), one.mask.stat().st_mtime) for one in photographs]
-    key = fingerprint(stamps, masks, max_size, work.settings.mask in ("auto", "given"))
+    key = fingerprint(_stamps(photographs), masks, max_size, work.settings.mask in ("auto", "given"))
     folder = work.stages.folder / "pictures"
     done = work.stages.begin("pictures", key)
     if done is None:
@@ -204,12 +203,18 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
     return [photographs[index] for index in readable], pictures, opacities
 
 
-def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
-    """The largest model; other features are tried while it holds few of the pictures."""
+def _stamps(photographs: Sequence[Photograph]) -> list[tuple[str, float, int]]:
+    """What tells the files from others."""
+    return [(str(one.path.resolve()), one.path.stat().st_mtime, one.path.stat().st_size) for one in photographs]
+
+
+def _poses(photographs: Sequence[Photograph], pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
+    """The largest model; other features are tried while it holds few of the pictures. Masks have no part in it."""
     order = work.settings.order
     sequential = order == "sequence" or (order == "auto" and (is_video or len(pictures) > EXHAUSTIVE))
     how = [asdict(features) for features in ATTEMPTS]
-    key = fingerprint([asdict(picture) for picture in pictures], sequential, work.stages.key("pictures"), how)
+    shown = [asdict(picture) for picture in pictures]
+    key = fingerprint(shown, sequential, _stamps(photographs), work.settings.max_size, how)
     folder = work.stages.folder / "poses"
     done = work.stages.begin("poses", key)
     if done is not None:

@@ -124,7 +124,7 @@ def bake(
     coarser = coarsening(side)
     view = camera.fibonacci_sphere(directions, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
     # transmittance from outside to coarse voxels, along every direction
-    coarse = _resampled(adapted.refined_occupancy, side // coarser)
+    coarse = _in_sphere(_resampled(adapted.refined_occupancy, side // coarser))
     optical_depth = torch.zeros_like(coarse.occupied, dtype=view.dtype)
     optical_depth[coarse.occupied] = _density_at(adapted, coarse.centres()) * coarse.voxel
     arriving = transmittance(optical_depth, coarse.occupied.nonzero(), view)
@@ -134,7 +134,7 @@ def bake(
     row = torch.zeros(coarse.occupied.numel(), dtype=torch.long, device=view.device)
     row[coarse.occupied.flatten()] = torch.arange(len(arriving), device=view.device)
     # density and coefficients of the fine voxels in these
-    fine = _resampled(Occupancy(visible, coarse.bounds), side)
+    fine = _in_sphere(_resampled(Occupancy(visible, coarse.bounds), side))
 
     def voxels(points: Tensor) -> tuple[Tensor, Tensor]:
         some, found = _voxels(adapted, points, view, arriving[row[coarse.index(points)]], fine.voxel)
@@ -203,14 +203,17 @@ def _voxels(
 
 
 def _resampled(occupancy: Occupancy, side: int) -> Occupancy:
-    """The same region in another resolution; nothing of it is lost where that is coarser."""
-    before = occupancy.occupied.shape[0]
-    grid = occupancy.occupied[None, None].float()
-    if side < before:
-        grid = torch.nn.functional.adaptive_max_pool3d(grid, side)
-    else:
-        grid = torch.nn.functional.interpolate(grid, (side,) * 3)
+    """The same region in another resolution: each voxel that it touches."""
+    grid = torch.nn.functional.adaptive_max_pool3d(occupancy.occupied[None, None].float(), side)
     return Occupancy(grid[0, 0] > 0, occupancy.bounds)
+
+
+def _in_sphere(occupancy: Occupancy) -> Occupancy:
+    """The voxels that rays, which end at the sphere, can have samples beside."""
+    side = occupancy.occupied.shape[0]
+    along = ((torch.arange(side, device=occupancy.occupied.device) + 0.5) * (2 / side) - 1).square()
+    away = along[:, None, None] + along[:, None] + along
+    return Occupancy(occupancy.occupied & (away.sqrt() <= 1 + 2 / side), occupancy.bounds)
 
 
 def _density_at(adapted: AdaptedField, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:

@@ -70,7 +70,7 @@ def check_voxels(voxels: int) -> None:
 
 @torch.no_grad()
 def density_grid(field: AdaptedField, voxels: int = 128) -> Float[Tensor, "x y z"]:
-    """The density of a field at the corners of a grid, zero where its occupancy is empty.
+    """The density of a field at the corners of a grid, zero where its occupancy is empty and outside its sphere.
 
     Args:
         field: asked only where its occupancy may hold something.
@@ -85,7 +85,8 @@ def density_grid(field: AdaptedField, voxels: int = 128) -> Float[Tensor, "x y z
     axis = torch.linspace(-1, 1, voxels, device=device)
     grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     points = grid * bounds.radius + torch.tensor(bounds.centre, device=device)
-    live = occupancy.dilated().contains(points).nonzero()[:, 0]
+    inside = grid.norm(dim=1) <= 1  # no ray samples beyond the sphere
+    live = (occupancy.dilated().contains(points) & inside).nonzero()[:, 0]
     density = torch.zeros(len(points), device=device)
     for part in live.split(1 << 16):
         density[part] = field.density(points[part])

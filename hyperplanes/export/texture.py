@@ -117,7 +117,8 @@ def _unwrapped(
 
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
     packing.resolution, packing.padding, packing.bilinear = size, 2, True
-    atlas.add_mesh(vertices, faces)
+    low, high = vertices.min(0), vertices.max(0)  # it leaves out faces below some area, whatever the unit is
+    atlas.add_mesh((vertices - low) / max(float((high - low).max()), np.finfo(np.float32).tiny), faces)
     atlas.generate(pack_options=packing)
     origin, indices, places = atlas[0]
     return origin, indices, places.astype(np.float32), atlas.height, atlas.width

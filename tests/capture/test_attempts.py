@@ -40,7 +40,7 @@ def test_all_pairs_are_matched_where_they_are_asked_for_or_few(
     asked = []
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **how: asked.append(how["sequential"]) or Model(count))
     work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(order=order), progress=print, notes=[])
-    pipeline._poses([Picture(f"{index}.jpg", 0, (3, 4)) for index in range(count)], is_video, work)
+    pipeline._poses([], [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(count)], is_video, work)
     assert asked == [sequential]
 
 
@@ -53,7 +53,7 @@ def test_nothing_of_colmap_stays_behind(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pipeline, "find_poses", find_poses)
     work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(), progress=print, notes=[])
-    pipeline._poses([Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)], False, work)
+    pipeline._poses([], [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)], False, work)
     assert [path.name for path in sorted((tmp_path / "poses").iterdir())] == ["model.npz"]
 
 
@@ -65,6 +65,6 @@ def test_other_features_are_tried_while_too_few_pictures_are_registered(found, k
     models = iter([None if count is None else Model(count) for count in found])
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: next(models))
     work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(), progress=print, notes=[])
-    model = pipeline._poses([Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)], False, work)
+    model = pipeline._poses([], [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)], False, work)
     assert (len(model), list(models)) == (kept, [])
     assert len(work.notes) == len(found) - 1 + advised

@@ -75,14 +75,15 @@ def metashape(folder, lens="", component=True, size=(WIDTH, HEIGHT), focal=FOCAL
         f'<transform><rotation locked="1">{words(map(repr, turn.ravel().tolist()))}</rotation><translation>'
         f"{words(map(repr, shift.tolist()))}</translation><scale>{scale}</scale></transform>"
     )
-    inside = f'<components><component id="0" label="Component 1">{transform}</component></components>'
+    own = transform if component else ""
+    inside = f'<components><component id="0" label="Component 1">{own}</component></components>'
     cx, cy = CENTRE[0] + 0.5 - size[0] / 2, CENTRE[1] + 0.5 - size[1] / 2
     (folder / "scan.xml").write_text(
         '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="Chunk 1" enabled="true">'
         f'<sensors next_id="1"><sensor id="0" label="a" type="frame"><resolution width="{size[0]}" height="{size[1]}"/>'
         f'<calibration type="frame" class="adjusted"><resolution width="{size[0]}" height="{size[1]}"/><f>{focal}</f>'
         f"<cx>{cx}</cx><cy>{cy}</cy>{lens}</calibration></sensor></sensors>"
-        f'{inside if component else transform}<cameras next_id="9"><group id="0">{cameras[0]}</group>'
+        f'{inside}{"" if component else transform}<cameras next_id="9"><group id="0">{cameras[0]}</group>'
         f"{''.join(cameras[1:])}{more}</cameras></chunk></document>"
     )
 
@@ -161,7 +162,7 @@ def test_the_angles_of_realitycapture():
 
 @pytest.mark.parametrize("component", [True, False])
 def test_metashape(tmp_path, component):
-    """Turned, moved and scaled as the component, or in older files the chunk, says; groups and paths of Windows."""
+    """Turned, moved and scaled as the component says, or the chunk where that says nothing; paths of Windows."""
     more = (
         '<camera id="8" sensor_id="0" component_id="0" label="lost.JPG"/>'
         '<camera id="9" sensor_id="0" component_id="0" enabled="false" label="off"><transform>1</transform></camera>'

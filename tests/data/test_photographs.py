@@ -1,5 +1,6 @@
 """Source of truth: the ball of conftest, its files changed as cameras, phones and people change them."""
 
+import io
 import json
 import re
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
 from hyperplanes.adaptation.base import hull
 from hyperplanes.data import DataError, read_task, read_views
@@ -265,6 +267,34 @@ def test_a_mask_says_by_its_alpha_what_its_colours_do_not(mask, has_alpha, opaci
     pixels = np.full((2, 2, 4), grey, np.uint8)
     pixels[..., 3] = alpha
     assert (opacity_of(pixels, has_alpha) == opacity).all()
+
+
+def test_a_cut_out_is_a_mask_by_its_alpha():
+    """A dark object on a light ground, as programs that take away the background write it."""
+    pixels = np.full((2, 2, 4), 220, np.uint8)
+    pixels[0, 0], pixels[..., 3] = 60, 0
+    pixels[0, 0, 3] = 255
+    assert opacity_of(pixels, True).tolist() == [[255, 0], [0, 0]]
+
+
+def test_heic_is_read_once_pillow_heif_has_registered_it(tmp_path, monkeypatch):
+    # a stand-in for its opener: a PNG behind eight other bytes
+    monkeypatch.setattr(Image, "OPEN", dict(Image.OPEN))
+    monkeypatch.setattr(Image, "ID", list(Image.ID))
+    path = tmp_path / "a.heic"
+    picture = io.BytesIO()
+    Image.new("RGB", (3, 2), "red").save(picture, "PNG")
+    path.write_bytes(b"heicheic" + picture.getvalue())
+    with pytest.raises(DataError, match="expected an image"):
+        read_image(path)
+
+    def opened(file, _):
+        content = file.read()
+        file.close()
+        return PngImageFile(io.BytesIO(content[8:]))
+
+    Image.register_open("HEIF", opened, lambda prefix: prefix.startswith(b"heic"))
+    assert read_image(path)[0][0, 0].tolist() == [255, 0, 0, 255]
 
 
 @pytest.mark.parametrize("orientation", [1, 6])

@@ -13,7 +13,8 @@ from hyperplanes.commands.scene import read_path, read_scene
 from hyperplanes.data import read_task, read_views
 from hyperplanes.data.formats.recognise import read_posed_task
 from hyperplanes.data.formats.transforms_document import transforms_document
-from hyperplanes.data.formats.transforms_json import read_transforms
+from hyperplanes.data.formats.transforms_json import _lens, read_transforms
+from hyperplanes.data.pictures.undistort import distort
 from hyperplanes.geometry import cameras as camera
 
 CHAIR = Path(__file__).parents[3] / "shared/posed/chair"
@@ -53,6 +54,25 @@ def test_nerfstudio_fields_are_scaled_to_the_size_of_the_pictures(scene, tmp_pat
     document = scene.document(fl_x=100.0, fl_y=90.0, cx=30.0, cy=25.0, w=64, h=48, camera_model="OPENCV")
     matrix = camera.intrinsics(read_views(scene.write(tmp_path, document)).cameras)[0]
     assert matrix.tolist() == [[50.0, 0.0, 14.5], [0.0, 45.0, 12.0], [0.0, 0.0, 1.0]]
+
+
+def test_k4_of_nerfstudio_is_that_of_the_eighth_power_of_the_radius(scene, tmp_path):
+    """`camera_utils._compute_residual_and_jacobian` of nerfstudio: 1 + r (k1 + r (k2 + r (k3 + r k4))), r = x^2 + y^2.
+
+    OpenCV's own k4 is the first coefficient below its quotient.
+    """
+    k = (-0.1, 0.05, -0.02, 0.06)
+    lens = dict(zip(("k1", "k2", "k3", "k4"), k, strict=True))
+    square = np.linspace(0, 0.35, 50)[:, None] ** 2
+    points = np.concatenate([square**0.5, 0 * square], 1)
+    for model, factor in (
+        ("OPENCV", 1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3])))),
+        ("FULL_OPENCV", (1 + square * (k[0] + square * (k[1] + square * k[2]))) / (1 + k[3] * square)),
+    ):
+        document = scene.document(fl_x=64.0, fl_y=64.0, w=32, h=24, camera_model=model, **lens)
+        scene.write(tmp_path, document)
+        found = _lens(document, tmp_path / "none.png", tmp_path / "transforms.json")
+        np.testing.assert_allclose(distort(points, found), points * factor, atol=1e-5)
 
 
 def test_a_frames_own_calibration_wins(scene, tmp_path):

@@ -10,12 +10,12 @@ from torch.nn.functional import avg_pool2d
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export import voxel_fitting
-from hyperplanes.export.baking import BakedScene, bake
+from hyperplanes.export.baking import BakedScene, _resampled, bake
 from hyperplanes.export.voxel_fitting import fit_voxels, render_guide
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, cast
 from hyperplanes.rendering import images
 from hyperplanes.rendering.renderer import RayMarching, render
@@ -218,6 +218,26 @@ def test_compiled_transmittance_is_that_of_plain_torch():
     cells, directions = torch.randint(0, 12, (50, 3), generator=generator), camera.fibonacci_sphere(9, 1.0)[:, 2, :3]
     compiled = transmittance(optical_depth, cells, directions)
     torch.testing.assert_close(transmittance_torch(optical_depth, cells, directions), compiled)
+
+
+@pytest.mark.parametrize("side", [80, 96, 112, 128, 48])
+def test_no_region_is_lost_in_another_resolution(side):
+    occupied = torch.zeros(64, 64, 64, dtype=torch.bool)
+    occupied[21:43, 21:43, 21:43] = True
+    before = Occupancy(occupied, Sphere())
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    points = points[before.contains(points)]
+    assert len(points) > 100
+    assert _resampled(before, side).contains(points).all()
+
+
+def test_what_lies_outside_the_sphere_is_not_baked():
+    """Rays end at the sphere, so that a field was never asked there."""
+    everywhere = AdaptedField(
+        lambda points, _: (points * 0, points.new_full((len(points),), 9.0)), full(Sphere(), 16), RayMarching(32)
+    )
+    found = bake(everywhere, side=32)
+    assert found.centres().norm(dim=1).max() < 1 + 2 * 2 / 32
 
 
 def test_fitting_brings_back_colours_and_densities(adapted, seen):

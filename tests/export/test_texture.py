@@ -127,3 +127,15 @@ def test_the_file_opens_with_normals_texture_and_an_unlit_material(mesh, tmp_pat
     assert "NORMAL" in tree["meshes"][0]["primitives"][0]["attributes"]
     outward = (mesh.normals * mesh.vertices).sum(1) / np.linalg.norm(mesh.vertices, axis=1)
     assert outward.min() > math.cos(math.radians(30))
+
+
+def test_the_texture_does_not_depend_on_the_unit_of_the_world():
+    ball = trimesh.creation.icosphere(4)
+    faces = np.array(ball.faces, np.uint32)
+    for unit in (1.0, 1e-3):
+        vertices = np.array(unit * (ball.vertices + 5), np.float32)
+        _, indices, places, height, width = texture._unwrapped(vertices, faces, 256)
+        assert min(height, width) > 150
+        assert np.isfinite(places[indices]).all()
+        (a, b), (c, d) = (np.moveaxis(places[indices[:, n]] - places[indices[:, 0]], 1, 0) for n in (1, 2))
+        assert (np.abs(a * d - b * c) > 0).mean() > 0.99

@@ -17,7 +17,7 @@ from trimesh.visual.gloss import specular_to_pbr
 
 from data_gen.meshes.files import IMAGE_FORMATS
 from data_gen.meshes.gltf.container import Document, not_negative, read_uri
-from data_gen.meshes.materials import DEFAULT_COLOUR, DrawnMaterial, Wrap, convert_image
+from data_gen.meshes.materials import DEFAULT_COLOUR, DrawnMaterial, LinearMaterial, Wrap, convert_image
 from hyperplanes.utilities.colour import linear_from_srgb
 
 __all__ = ["GltfMaterial", "TextureCoordinates", "read_materials"]
@@ -163,11 +163,12 @@ def _material(values: dict[str, Any], index: int, textures: _Textures, document:
         keywords |= _from_glossiness(glossy, textures, label)
     keywords = {key: value for key, value in keywords.items() if value is not None}
     if "baseColorFactor" in keywords:
-        keywords["baseColorFactor"] = np.asarray(keywords["baseColorFactor"], dtype=np.float64)
+        keywords["baseColorFactor"] = np.clip(np.asarray(keywords["baseColorFactor"], dtype=np.float64), 0, 1)
     if "emissiveFactor" in keywords:
         strength = float(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
         keywords["emissiveFactor"] = np.asarray(keywords["emissiveFactor"], dtype=np.float64) * max(strength, 0.0)
-    material = DrawnMaterial(name=values.get("name"), **keywords)
+    kind = LinearMaterial if "baseColorFactor" in keywords else DrawnMaterial
+    material = kind(name=values.get("name"), **keywords)
     material.unlit = "KHR_materials_unlit" in extensions
     material.wrap = textures.wrap(values, base_slot)
     material.emissive_wrap = textures.wrap(values, "emissiveTexture")

@@ -14,7 +14,7 @@ from data_gen.meshes.files import MeshError
 from data_gen.meshes.gltf.accessors import as_numbers, read_accessor, read_numbers
 from data_gen.meshes.gltf.container import Document, not_negative
 from data_gen.meshes.gltf.materials import GltfMaterial, TextureCoordinates
-from data_gen.meshes.materials import EMISSIVE_UV, VERTEX_COLOUR
+from data_gen.meshes.materials import EMISSIVE_UV, VERTEX_COLOUR, rgba_8bit
 
 __all__ = ["Skinning", "read_primitive"]
 
@@ -74,9 +74,12 @@ def read_primitive(
     if material is not None:
         keywords["visual"] = _visual(attributes, material, colours)
     elif colours is not None:
-        keywords["vertex_colors"] = colours
+        keywords["vertex_colors"] = rgba_8bit(colours)
+        keywords["vertex_colors"][:, 3] = 255  # the default material is opaque
     mesh = trimesh.Trimesh(**keywords)
     mesh.metadata["one_sided"] = material is None or not material.material.doubleSided
+    if "NORMAL" not in attributes:
+        mesh.metadata["smooth"] = False  # "client implementations MUST calculate flat normals" (glTF 2.0, 3.7.2.1)
     return mesh
 
 

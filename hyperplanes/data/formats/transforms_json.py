@@ -7,9 +7,13 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
+
+from hyperplanes.data.formats.apps.calibration import brown_lens
 from hyperplanes.data.formats.transforms_document import calibration, opencv_from_opengl, stated_size
 from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.images import image_size
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
 from hyperplanes.data.pictures.undistort import distortion
@@ -182,9 +186,22 @@ def _frame(path: Path, fields: dict[str, Any], legacy: bool, flat: bool, root: P
         opencv_from_opengl(pose[None])[0],
         lambda size: calibration(fields, size, path, legacy=legacy),
         stated_size(fields, path),
-        distortion(fields, path),
+        _lens(fields, located, path),
         None if mask is None else _located(path, mask, root),
     )
+
+
+def _lens(fields: dict[str, Any], picture: Path, path: Path) -> tuple[float, ...]:
+    """OpenCV's coefficients. nerfstudio's k4 is that of Brown's r^8, but for OpenCV's own model with a quotient."""
+    stated = distortion(fields, path)
+    k1, k2, p1, p2, k3, k4, k5, k6 = stated
+    if not k4 or k5 or k6 or fields.get("camera_model") == "FULL_OPENCV":
+        return stated
+    height, width = size = stated_size(fields, path) or image_size(picture)
+    matrix = calibration(fields, size, path)
+    corners = np.array([[x, y] for x in (-0.5, width - 0.5) for y in (-0.5, height - 0.5)])
+    reach = np.linalg.norm((corners - matrix[:2, 2]) / matrix.diagonal()[:2], axis=1).max()
+    return brown_lens((k1, k2, k3, k4), (p1, p2), float(reach), path)
 
 
 def _located(path: Path, name: object, root: Path) -> Path:

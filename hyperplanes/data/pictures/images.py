@@ -35,8 +35,9 @@ __all__ = [
 LARGEST_IMAGE = 64 * 10**6
 """Pixels above which an image is refused before it is decoded."""
 
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM", "JPEG2000")
-"""What Pillow may take a picture for, whatever it is called: for some other formats it starts other programs."""
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM", "JPEG2000", "HEIF")
+"""What Pillow may take a picture for, whatever it is called: for some other formats it starts other programs. It knows
+HEIF once pillow-heif has registered it."""
 
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """Endings, in small letters, of the files that are taken for pictures."""
@@ -150,13 +151,15 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
 
 
 def opacity_of(mask: Pixels, has_alpha: bool) -> UInt8[np.ndarray, "height width"]:
-    """What a picture of a mask says: its alpha where that alone says something, else its brightest channel.
+    """What a picture of a mask says: its alpha where some of it is not opaque, else its brightest channel.
+
+    The alpha of a cut-out, a photograph whose background is transparent, is its mask.
 
     Args:
         mask: (height, width, 4), as `read_image` returns it.
         has_alpha: likewise.
     """
-    by_alpha = has_alpha and bool((mask[..., 3] < 255).any()) and not np.ptp(mask[..., :3])
+    by_alpha = has_alpha and bool((mask[..., 3] < 255).any())
     return mask[..., 3] if by_alpha else mask[..., :3].max(-1)
 
 
@@ -183,7 +186,8 @@ def _open(path: Path) -> Image.Image:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             check_regular(path)
-            image = Image.open(path, formats=FORMATS)
+            known = Image.OPEN.keys() | set(FORMATS[:-1])  # Pillow knows HEIF only once it has been registered
+            image = Image.open(path, formats=[each for each in FORMATS if each in known])
     except FileNotFoundError as error:
         raise DataError(path, "an image", "nothing", "check the name, or take the frame out") from error
     except Image.DecompressionBombError as error:

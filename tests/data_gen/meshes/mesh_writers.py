@@ -50,7 +50,11 @@ def gltf(
     if normals is not None:
         attributes["NORMAL"] = add(np.asarray(normals, dtype=np.float32), "VEC3", 5126)
     if colours is not None:
-        attributes["COLOR_0"] = add(np.asarray(colours, dtype=np.float32), "VEC4", 5126)
+        colours = np.asarray(colours)
+        components = {"uint8": 5121, "uint16": 5123}
+        kept = colours if colours.dtype.name in components else colours.astype(np.float32)
+        attributes["COLOR_0"] = add(kept, "VEC4", components.get(kept.dtype.name, 5126))
+        accessors[-1]["normalized"] = kept.dtype.kind == "u"
     header = {
         "asset": {"version": "2.0"},
         "scene": 0,

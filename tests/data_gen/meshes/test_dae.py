@@ -54,3 +54,20 @@ def test_a_controller_of_nothing_is_no_endless_loop(tmp_path):
     text = text.replace('<instance_geometry url="#g">', '<instance_controller url="#c">')
     with pytest.raises(MeshError, match="found none"):
         load_mesh(written(tmp_path, text.replace("</instance_geometry>", "</instance_controller>")))
+
+
+@pytest.mark.parametrize(
+    ("inside", "opacity"),
+    [
+        ('<transparent opaque="A_ONE"><color>1 1 1 0.25</color></transparent>', 0.25),
+        ('<transparent opaque="RGB_ZERO"><color>0.6 0.6 0.6 1</color></transparent><transparency><float>1</float>'
+         "</transparency>", 0.4),
+        ('<transparent opaque="A_ONE"><color>0 0 0 1</color></transparent><transparency><float>1</float>'
+         "</transparency>", 1.0),
+    ],
+)  # fmt: skip
+def test_what_lets_light_through_is_drawn_opaque_and_said(tmp_path, inside, opacity):
+    """ "Determining Transparency" in the specification of COLLADA 1.4.1."""
+    mesh = load_mesh(written(tmp_path, dae_text().replace("</diffuse></lambert>", f"</diffuse>{inside}</lambert>")))
+    said = (f"effect 'e': drawn opaque, its opacity of {opacity:g} left out",)
+    assert mesh.warnings == (said if opacity < 1 else ())

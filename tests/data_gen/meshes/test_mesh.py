@@ -27,6 +27,7 @@ from mesh_writers import (
 )
 
 from data_gen.meshes.find import find_meshes, safe_name
+from data_gen.meshes.materials import LINEAR_COLOUR, convert_image, linear_factor
 from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts, prepare_scene
 
 SHARED = Path(__file__).parents[3] / ".." / "shared" / "meshes"
@@ -178,13 +179,50 @@ def test_vertex_colours_stay_srgb(tmp_path):
 
 
 def test_gltf_vertex_colours_are_linear_and_tinted_by_the_material(tmp_path):
-    # 0.5 linear (128) is 188 in sRGB.
+    # "an additional linear multiplier to base color" (glTF 2.0, 3.9.2), of a material that stays as it is
     painted = np.array([[0.50196, 0.50196, 1, 1]] * 4)
-    material = {"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 1, 1]}}
+    material = {"pbrMetallicRoughness": {"baseColorFactor": [0.0018, 0, 1, 1], "roughnessFactor": 0.25}}
     mesh = load_mesh(write_glb(tmp_path / "a.glb", colours=painted, material=material))
     part = mesh_parts(mesh)[0][0]
     assert mesh.warnings == ()
+    np.testing.assert_allclose(part.visual.vertex_attributes[LINEAR_COLOUR], painted, atol=0.002)
+    np.testing.assert_allclose(linear_factor(part.visual.material), [0.0018, 0, 1, 1])
+    assert part.visual.material.roughnessFactor == 0.25
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
+def test_gltf_vertex_colours_without_a_material_are_opaque_in_every_type_of_number(tmp_path, kind):
+    # 0.5 linear is 188 in sRGB; the alpha of an opaque material is ignored (glTF 2.0, 3.9.4)
+    top = 1.0 if kind == np.float32 else np.iinfo(kind).max
+    painted = (np.array([[0.50196, 0, 1, 0.5]] * 4) * top + 0.5 * (top > 1)).astype(kind)
+    part = mesh_parts(load_mesh(write_glb(tmp_path / "a.glb", colours=painted)))[0][0]
     assert np.array_equal(part.visual.vertex_colors, [[188, 0, 255, 255]] * 4)
+
+
+def test_the_alpha_of_gltf_vertex_colours_counts_where_the_material_cuts_by_it(tmp_path):
+    painted = np.array([[1, 1, 1, 0.6]] * 4)
+    for cutoff in (0.5, 0.7):
+        material = {"alphaMode": "MASK", "alphaCutoff": cutoff}
+        mesh = load_mesh(write_glb(tmp_path / "a.glb", colours=painted, material=material))
+        visual = mesh_parts(mesh)[0][0].visual
+        assert (visual.material.alphaMode, visual.material.alphaCutoff) == ("MASK", cutoff)
+        np.testing.assert_allclose(visual.vertex_attributes[LINEAR_COLOUR][:, 3], 0.6, atol=0.002)
+
+
+def test_gltf_without_normals_is_flat(tmp_path):
+    """ "When normals are not specified, client implementations MUST calculate flat normals" (glTF 2.0, 3.7.2.1)."""
+    ball = trimesh.creation.icosphere(3)
+    for normals, smooth in ((None, False), (ball.vertex_normals, True)):
+        path = write_glb(tmp_path / "a.glb", positions=ball.vertices, faces=ball.faces, normals=normals)
+        assert mesh_parts(load_mesh(path))[0][2] == smooth
+
+
+def test_the_vertex_colours_of_an_obj_have_one_range(tmp_path):
+    """Three of the six are 1 at most: of 255, as the others say."""
+    points = [(0, 0, 0, 255, 0, 0), (1, 0, 0, 0, 200, 0), (0, 1, 0, 0, 0, 9), (0, 0, 1, 0, 0, 1), (1, 0, 1, 1, 0, 0)]
+    body = "".join(f"v {' '.join(map(str, each))}\n" for each in [*points, (0, 1, 1, 0, 1, 0)])
+    parts = mesh_parts(load_mesh(write_obj(tmp_path, body=body + "o a\nf 1 2 3\no b\nusemtl none\nf 4 5 6\n")))
+    assert {int(part.visual.vertex_colors[:, :3].max()) for part, _, _ in parts} == {255, 1}
 
 
 def test_colours_of_ply_faces_are_kept(tmp_path):
@@ -317,3 +355,14 @@ def test_all_real_meshes_load_with_their_losses_named():
     assert "wheels_01.png (not found)" in outcomes["messy_gazebo_ambulance_model_uri_ambulance"]
     assert "Textures/colormap.png (not found)" in outcomes["messy_kenney_truck_missing_texture"]
     assert outcomes["messy_teapot_quads_no_mtl"] == ""
+
+
+def test_a_jpeg_with_further_pictures_behind_the_first_is_a_texture(tmp_path):
+    """Phones write them (CIPA's multi-picture format); the first one is an ordinary JPEG."""
+    one, other = (PIL.Image.new("RGB", (8, 8), colour) for colour in ("red", "blue"))
+    one.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[other])
+    with PIL.Image.open(tmp_path / "a.jpg") as image:
+        assert image.format == "MPO"
+        found = convert_image(image, "RGB")
+    assert found is not None
+    assert found.getpixel((4, 4))[0] > 250

@@ -79,7 +79,8 @@ def read_metashape(folder: str | Path, *, downscale: int | None = None, root: Pa
     with malformed(path, "cameras of Metashape"):
         chunk = _chunk(path, root)
         sensors = {each.get("id", ""): _sensor(each, path) for each in chunk.iterfind("sensors/sensor")}
-        worlds = {each.get("id"): _similarity(each, path) for each in chunk.iterfind("components/component")}
+        moved = [each for each in chunk.iterfind("components/component") if each.find("transform") is not None]
+        worlds = {each.get("id"): _similarity(each, path) for each in moved}
         cameras = list(chunk.iterfind("cameras//camera"))
         usable = [each for each in cameras if _is_aligned(each) and sensors.get(each.get("sensor_id", "")) is not None]
         if not usable:
