@@ -60,6 +60,7 @@ class Request:
         objects: the support views of the objects that will be asked for.
         preset: the shape of fields that need no checkpoint, or its name.
         protocol: how those are sampled while they are optimised.
+        reflections: whether models may be shown views of a symmetric object together with their reflections.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Request:
     objects: Iterable[Views] = ()
     preset: str | Preset = "quick"
     protocol: str = "default"
+    reflections: bool = True
 
     def configured(self, method: str) -> ModelConfig:
         """The model of a method at the scale of the preset."""
@@ -87,7 +89,10 @@ class Request:
             raise ValueError(
                 f"method {self.name}: expected a checkpoint of {method}, got none; `hyperplanes train` makes one{alone}"
             )
-        return HyperPlanes.from_pretrained(self.checkpoints[method]).to(self.device)
+        model = HyperPlanes.from_pretrained(self.checkpoints[method]).to(self.device)
+        if not self.reflections:
+            model.config = replace(model.config, symmetric=False, symmetry=None)
+        return model
 
     @property
     def needed_steps(self) -> Steps:
@@ -307,6 +312,7 @@ def make_method(
     objects: Iterable[Views] = (),
     preset: str | Preset = "quick",
     protocol: str = "default",
+    reflections: bool = True,
 ) -> Adapter:
     """The adapter behind a method's name.
 
@@ -318,13 +324,14 @@ def make_method(
         objects: the support views of the objects that will be asked for; "hyperplanes_swapped" reads them.
         preset: the shape of the fields that need no checkpoint, or its name.
         protocol: how those are sampled while they are optimised, as in `presets.configure`.
+        reflections: whether models may be shown views of a symmetric object together with their reflections.
 
     Returns:
         An adapter; ValueError for an unknown name, or a checkpoint that the method needs and that is not given.
     """
     _, method, steps = _parse(name)
     settings = settings or FineTuning()
-    return method.make(Request(name, steps, checkpoints, device, settings, objects, preset, protocol))
+    return method.make(Request(name, steps, checkpoints, device, settings, objects, preset, protocol, reflections))
 
 
 @dataclass(frozen=True)

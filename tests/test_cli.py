@@ -204,6 +204,14 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
             ["--steps, --epochs: expected one of the two, got 3 and 1"],
         ),
         (
+            ["train", "--data", "DATA", "--training.steps", "3", "--epochs", "1", "--out", "OUT/run"],
+            ["--training.steps, --epochs: expected one of the two, got both"],
+        ),
+        *(
+            (["train", "--data", "DATA", "--cache-size", size, "--out", "OUT/run"], ["--cache-size: expected GiB"])
+            for size in ("inf", "nan", "-1")
+        ),
+        (
             ["evaluate", "--data", "DATA", "--method", "nearest_view", "--objects", "0"],
             ["--objects: expected at least 1"],
         ),
@@ -508,7 +516,7 @@ def test_a_method_that_fails_on_every_object_is_left_out_of_the_chart(tmp_path, 
     assert "hull_blend" not in chart.read_text()
 
 
-@pytest.mark.parametrize("given", [[], ["--all-views"], ["--learn-background"], ["--refine-poses"]])
+@pytest.mark.parametrize("given", [[], ["--all-views"], ["--learn-background"], ["--refine-poses"], ["--up=y"]])
 def test_adapt_names_the_command_that_shows_its_weights_the_same_views(given, tmp_path, monkeypatch, capsys):
     scene, small = str(first_object(demo_folder())), HyperPlanes.from_pretrained(demo_folder() / "hyperplanes")
     task, _ = read_scene(Path(scene), Console(silent=True))
@@ -521,7 +529,9 @@ def test_adapt_names_the_command_that_shows_its_weights_the_same_views(given, tm
     proposed = tyro.cli(render.Arguments, args=command[2:])
     assert (proposed.checkpoint, proposed.views) == (tmp_path / "my out", Path(scene))
     taken = {name: getattr(proposed, name) for name in ("all_views", "learn_background", "refine_poses")}
-    assert [name for name, value in taken.items() if value] == [name.strip("-").replace("-", "_") for name in given]
+    up = given == ["--up=y"]  # stated, though the cameras of the scene may tell something else
+    assert proposed.up == ("y" if up else "auto")
+    assert [f"--{name.replace('_', '-')}" for name, value in taken.items() if value] == ([] if up else given)
 
 
 def test_seeds_of_trainings_and_of_gradient_steps_in_every_kind_of_file(tmp_path, capsys):
@@ -648,6 +658,12 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     capsys.readouterr()
     assert main(["render", "--checkpoint", str(out), *scene, "--steps", "3"]) == 2
     assert "steps: expected 0 with a baked file" in complaint(capsys)
+    for verb, *option in (
+        *(["render", "--protocol", "paper"], ["render", "--fine-tune", "hypernetwork"], ["render", "--no-reflections"]),
+        *(["render", "--representation", "field"], ["export", "--page-voxels", "32"]),
+    ):
+        assert main([verb, "--checkpoint", str(out), *scene, *option]) == 2
+        assert f"{option[0]}: expected none with a baked file" in complaint(capsys)
     assert main(["adapt", "--checkpoint", str(out), *scene]) == 2
     assert "expected a checkpoint's folder to adapt with, got a file" in complaint(capsys)
     assert main([*command, "--voxels", "7"]) == 2

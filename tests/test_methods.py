@@ -4,6 +4,7 @@ other objects swapped by hand.
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from hyperplanes.adaptation import (
     NearestView,
     Swapped,
 )
-from hyperplanes.adaptation.checkpoints import find_checkpoints
+from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
 from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.evaluation import evaluate
@@ -59,6 +60,14 @@ def test_methods_by_name(folders):
     assert isinstance(made["hyperplanes_swapped"], Swapped)
     assert made["point_multiplane"].hypernetwork is None
     assert made["hyperplanes"].hypernetwork is not None
+
+
+def test_methods_do_without_reflections_where_they_are_told_to():
+    packaged = {"hyperplanes": find_checkpoint(Path("small"))}
+    for reflections in (True, False):
+        made = make_method("hyperplanes", packaged, reflections=reflections)
+        tuned = make_method("scratch_2", packaged, reflections=reflections)
+        assert made.config.symmetric == tuned.model.config.symmetric == reflections
 
 
 @pytest.mark.parametrize("name", ["hyperplanes", "point_multiplane", "nerf", "scratch"])

@@ -132,7 +132,7 @@ class HyperPlanes(HyperPlanesNetwork):
         beside |= {"symmetric": False, "symmetry": adapted.symmetry, "azimuth": azimuth}
         found = {"fine": learned.field.field, "coarse": learned.field.proposal}
         shape = self.target.config_of(self.target.parameters_of(found["fine"]))
-        result = HyperPlanes(replace(self.config.target_alone(), network=shape, **beside))
+        result = HyperPlanes(replace(self.config.target_alone(), network=shape, **beside)).to(self.rig)
         if result.gate is not None and learned.gate is not None:
             result.gate.load_state_dict(learned.gate.state_dict())
         result.rig.copy_(self.rig)
@@ -141,7 +141,7 @@ class HyperPlanes(HyperPlanesNetwork):
                 network.load_state_dict(network.parameters_of(found[name]))
             except RuntimeError as error:
                 raise ValueError(f"adapted: expected a field of this model, got {adapted!r}") from error
-        return result.to(self.rig).eval()
+        return result.eval()
 
     @checked
     def save(self, folder: Path | str, dtype: torch.dtype | None = None) -> None:

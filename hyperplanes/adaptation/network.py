@@ -190,9 +190,11 @@ class HyperPlanesNetwork(nn.Module):
 
     @torch.no_grad()
     def adapted_weights(self, context: SupportContext) -> Parameters:
-        """Theta + delta as they are in use, whatever mode the model is in."""
+        """Theta + delta as they are in use, whatever mode the model is in; they stay when the model is trained on."""
         with in_use(self):
-            return self.theta + self.update(context)
+            update = self.update(context)
+            found = self.theta + update
+        return Parameters((name, value if name in update else value.clone()) for name, value in found.items())
 
     def live_pixels_of(self, context: SupportContext, views: Views) -> Tensor | None:
         """Flat indices of the pixels of views that look into the hull; None where all are drawn from.

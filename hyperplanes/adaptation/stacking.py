@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -69,6 +69,12 @@ class StackedField(AdaptedField):
     def __repr__(self) -> str:
         return f"StackedField({super().__repr__()}, {self.share:.0%} of {self.other!r})"
 
+    def with_sampling(self, sampling: Sampler) -> Self:
+        """As `AdaptedField.with_sampling`, of the learned field; the visual hull keeps its own."""
+        if self.overruled:
+            return replace(self, other=self.other.with_sampling(sampling))
+        return super().with_sampling(sampling)
+
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
         """The mean of the pixels of both, as `AdaptedField.trace`."""
         own = super().trace(rays, generator, differentiable=differentiable)
@@ -86,11 +92,12 @@ class StackedField(AdaptedField):
         *,
         mixed_precision: bool = True,
     ) -> Pictures:
-        """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the field's alone."""
-        own = partial(super().render, cameras, sampling, antialias, mixed_precision=mixed_precision)
+        """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the learned field's alone."""
+        of_own, of_other = (None, sampling) if self.overruled else (sampling, None)
+        own = partial(super().render, cameras, of_own, antialias, mixed_precision=mixed_precision)
         if not self.share and self.gate is None:
             return own()
-        other = partial(self.other.render, cameras, antialias=antialias, mixed_precision=mixed_precision)
+        other = partial(self.other.render, cameras, of_other, antialias, mixed_precision=mixed_precision)
         if not (self.thread_safe and self.other.thread_safe):
             return self._mean(own(), other())
         return self._mean(*at_once(own, other, self.occupancy.occupied.device))

@@ -49,7 +49,7 @@ def run(arguments: Arguments) -> int:
     field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)
     assert isinstance(field, AdaptedField)
     model.with_weights_of(field).save(arguments.out)
-    same = [] if up == "y" else [f"--up={up}"]
+    same = [] if (arguments.up, up) == ("auto", "y") else [f"--up={up}"]
     same += ["--all-views"] * arguments.all_views + ["--learn-background"] * arguments.learn_background
     same += ["--refine-poses"] * arguments.refine_poses
     same += [] if arguments.downscale is None else ["--downscale", arguments.downscale]

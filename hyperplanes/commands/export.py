@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, bake_field, load_source, render_views
+from hyperplanes.commands.fields import adapt_to, bake_field, load_source, refuse_of_baked, render_views
 from hyperplanes.commands.options import ObjectArguments, OptionalInt, check_orbit, optional
 from hyperplanes.commands.scene import read_object, refuse_sources
 from hyperplanes.commands.writing import writes_to
@@ -108,6 +108,8 @@ def run(arguments: Arguments) -> int:
             coarsening(arguments.page_voxels)
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
+    given = {"--page-voxels": arguments.page_voxels is not None, "--no-reflections": arguments.no_reflections}
+    refuse_of_baked(source, given)
     task, _ = read_object(arguments, source, console)
     refuse_sources(out / "images", arguments.views, task.query.names)
     shown, query = task.support.to(device), task.query.to(device)

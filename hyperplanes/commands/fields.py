@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from hyperplanes.rendering.renderer import Sampler
     from hyperplanes.views import Views
 
-__all__ = ["adapt_to", "bake_field", "load_adaptable", "load_source", "refuse_baked", "render_views"]
+__all__ = ["adapt_to", "bake_field", "load_adaptable", "load_source", "refuse_baked", "refuse_of_baked", "render_views"]
 
 
 WORTH_KEEPING = 5.0  # seconds that adapting took
@@ -74,6 +74,23 @@ def refuse_baked(path: Path, verb: str) -> None:
             f"{path}: expected a checkpoint's folder to {verb} with, got a file; a baked file holds one finished "
             "object, which `render`, `export` and `inspect` take"
         )
+
+
+def refuse_of_baked(source: HyperPlanes | BakedScene, given: Mapping[str, bool]) -> None:
+    """Refuse options that say how a field is adapted, sampled or baked, of a baked file, which is finished.
+
+    Args:
+        source: of `load_source`.
+        given: whether each of some options was given, by its name.
+
+    Raises:
+        ValueError: one that was, and a baked file.
+    """
+    from hyperplanes.export.baking import BakedScene
+
+    found = [name for name, is_given in given.items() if is_given]
+    if found and isinstance(source, BakedScene):
+        raise ValueError(f"{found[0]}: expected none with a baked file, which is finished; leave it out")
 
 
 def adapt_to(
@@ -167,11 +184,12 @@ def render_views(
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.rendering.images import join_pictures
 
+    if sampling is not None and isinstance(field, AdaptedField):
+        field = field.with_sampling(sampling)
     parts = []
     with console.bar("rendering") as bar:
         for view in range(cameras.batch_size):
-            one = camera.select(cameras, [view])
-            parts.append(field.render(one, sampling) if isinstance(field, AdaptedField) else field.render(one))
+            parts.append(field.render(camera.select(cameras, [view])))
             bar.show(view + 1, cameras.batch_size, "views")
     return join_pictures(parts)
 

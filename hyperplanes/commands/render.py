@@ -22,7 +22,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, bake_field, load_source, render_views
+from hyperplanes.commands.fields import adapt_to, bake_field, load_source, refuse_of_baked, render_views
 from hyperplanes.commands.options import (
     Free,
     ObjectArguments,
@@ -119,6 +119,13 @@ def run(arguments: Arguments) -> int:
     _check(arguments)
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
+    given = {
+        "--protocol": arguments.protocol != "default",
+        "--fine-tune": arguments.fine_tune != "weights",
+        "--no-reflections": arguments.no_reflections,
+        "--representation": arguments.representation == "field",
+    }
+    refuse_of_baked(source, given)
     task, up = read_object(arguments, source, console)
     refuse_sources(arguments.out, arguments.views, task.query.names)
     shown, known = task.support.to(device), task.query.to(device)

@@ -219,6 +219,8 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
             )
         options["epochs"] = 0
     if arguments.cache_size is not None:
+        if not 0 <= arguments.cache_size < 2**20:
+            raise ValueError(f"--cache-size: expected GiB from 0 to below {2**20}, got {arguments.cache_size:g}")
         options["memory"] = int(arguments.cache_size * 2**30)
     for name, value in options.items():
         if value is not None:
@@ -227,7 +229,13 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
             except SettingsError as error:
                 raise ValueError(f"--{'cache-size' if name == 'memory' else name}: {error.problem}") from None
     try:
-        chosen = changed(chosen, parse_options(arguments.settings))
+        stated = parse_options(arguments.settings)
+        training = stated.get("training", {})
+        if "steps" in training and "epochs" not in training:
+            if arguments.epochs:
+                raise ValueError("--training.steps, --epochs: expected one of the two, got both; leave one out")
+            training["epochs"] = 0
+        chosen = changed(chosen, stated)
     except SettingsError as error:
         raise ValueError(f"--{error.path.replace('_', '-')}: {error.problem}") from None
     if arguments.support is not None:
@@ -314,5 +322,7 @@ def _run(arguments: Arguments) -> int:
     console.say(f"{arguments.out}: trained for {trainer.step} steps")
     if held_out:
         given = ["--data", arguments.data[0], "--checkpoint", arguments.out, "--method", method]
+        given += [] if arguments.support is None else ["--support", arguments.support]
+        given += ["--legacy"] * arguments.legacy
         console.say(f"next: {command_line('hyperplanes', 'evaluate', given)}")
     return 0

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import bake_field, load_source
+from hyperplanes.commands.fields import bake_field, load_source, refuse_of_baked
 from hyperplanes.commands.options import OptionalInt, ViewsUp
 from hyperplanes.commands.scene import prepare_task, read_scene
 from hyperplanes.utilities.interrupts import Terminated
@@ -93,6 +93,8 @@ def run(arguments: Arguments) -> int:
     )  # viser's, of visitors who left
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
+    if not arguments.compare:
+        refuse_of_baked(source, {"--no-reflections": arguments.no_reflections})
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
     shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
@@ -130,7 +132,8 @@ def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
     if not arguments.compare:
         return {}
     checkpoints = {"hyperplanes": find_checkpoint(arguments.checkpoint)} if not arguments.checkpoint.is_file() else {}
-    return {name: make_method(name, checkpoints, device=device) for name in arguments.compare}
+    reflections = not arguments.no_reflections
+    return {name: make_method(name, checkpoints, device=device, reflections=reflections) for name in arguments.compare}
 
 
 def _show_others(

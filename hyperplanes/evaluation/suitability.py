@@ -8,6 +8,7 @@ from hyperplanes.adaptation.base import Renderable
 from hyperplanes.adaptation.context import observe
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
+from hyperplanes.adaptation.network import in_use
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
@@ -110,5 +111,6 @@ def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
         if len(model.rig):
             cosine = (context.views.camera_directions.to(model.rig) * model.rig).sum(-1)
             angle = float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).mean())
-        codes = None if network is None else network.standardised_codes(observe([context], network.resolution))
+        with in_use(model):
+            codes = None if network is None else network.standardised_codes(observe([context], network.resolution))
     return None if codes is None else float(codes.square().mean().sqrt()), angle

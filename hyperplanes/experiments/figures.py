@@ -103,7 +103,8 @@ def _over_seeds(curves: Sequence[Curve], entry: str) -> tuple[list[tuple[float, 
             if entry in point:
                 found.setdefault(point["step"], []).append(point[entry])
     points = sorted(found.items())
-    return [(step, float(np.mean(values))) for step, values in points], [float(np.std(values)) for _, values in points]
+    deviations = [float(np.std(values, ddof=min(1, len(values) - 1))) for _, values in points]
+    return [(step, float(np.mean(values))) for step, values in points], deviations
 
 
 def _boxes(outcome: Outcome) -> Figure:

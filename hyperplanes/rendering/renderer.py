@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import contextmanager
 from itertools import pairwise
+from threading import Lock
 from typing import TypedDict, Unpack, overload
 
 import torch
@@ -170,12 +171,28 @@ def _joined(parts: list[Rendered]) -> Rendered:
 def allow_tf32(device: torch.device) -> Generator[None]:
     """On a GPU, single-precision matrix products in TF32 (10 bits of fraction, tensor cores) while the context lasts.
 
-    Pictures of the paper's networks are within 0.001 dB of those of full single precision.
+    Pictures of the paper's networks are within 0.001 dB of those of full single precision. PyTorch's setting is that of
+    the process: of several contexts at a time, the last one to end puts back what was set before the first.
     """
-    before = torch.get_float32_matmul_precision()
-    if device.type == "cuda":
-        torch.set_float32_matmul_precision("high")
+    if device.type != "cuda":
+        yield
+        return
+    with _counting:
+        if not _precisions:
+            _precisions.append(torch.get_float32_matmul_precision())
+            torch.set_float32_matmul_precision("high")
+        else:
+            _precisions.append(_precisions[0])
     try:
         yield
     finally:
-        torch.set_float32_matmul_precision(before)
+        with _counting:
+            before = _precisions.pop()
+            if not _precisions:
+                torch.set_float32_matmul_precision(before)
+
+
+_precisions: list[str] = []
+"""What was set before the first of the contexts of `allow_tf32`, once for each that lasts."""
+
+_counting = Lock()

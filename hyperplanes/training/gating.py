@@ -84,15 +84,16 @@ def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS, seed: int
     Each example counts by its error relative to that of the learned field, so that PSNR rises on all alike.
 
     Args:
-        examples: of objects, shown by all numbers of views.
+        examples: of objects, shown by all numbers of views; those of which neither picture shows anything are left out.
         steps: of EXAMPLES drawn examples and PIXELS pixels of each.
         seed: of the weights and the draws.
 
     Raises:
         ValueError: no example.
     """
+    examples = [each for each in examples if len(each.read)]
     if not examples:
-        raise ValueError("examples: expected at least one, got none")
+        raise ValueError("examples: expected one of which a picture shows anything, got none")
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)  # `torch.manual_seed` would seed GPUs, too
         gate = GatingNetwork().requires_grad_()

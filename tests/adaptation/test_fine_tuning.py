@@ -133,6 +133,27 @@ def test_steps_optimise_a_grid_of_more_cells_which_is_kept_with_the_field(cells,
     assert further.field.parameters["grid.weight"].shape[-1] == 64
 
 
+def test_a_field_stays_as_it_is_when_its_model_is_trained_on():
+    """Also by weights that no hypernetwork writes."""
+    views = ball_views(ring(4, (12, 12)))
+    for changes in ({}, {"hypernetwork": None}):
+        model = small_model(**changes)
+        field = model.adapt(views)
+        before = field.render(views.cameras).images
+        with torch.no_grad():
+            for value in model.parameters():
+                value.mul_(0.5)
+        assert torch.equal(field.render(views.cameras).images, before)
+        assert not torch.equal(model.adapt(views).render(views.cameras).images, before)
+
+
+def test_weights_of_double_precision_are_kept_as_they_are():
+    model = small_model(hypernetwork=None).double()
+    views = ball_views(ring(4, (12, 12)))
+    again = model.with_weights_of(model.adapt(views))
+    assert all(torch.equal(value, again.theta[name]) for name, value in model.theta.items())
+
+
 def test_weights_that_are_given_and_hypernetworks_keep_their_cells():
     network = ImageBasedConfig(depth=2, width=16, grid=2)
     model = small_model(target="image_based", network=network, hypernetwork=VolumeHyperNetworkConfig())

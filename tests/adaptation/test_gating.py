@@ -152,8 +152,12 @@ def test_a_fitted_gate_takes_the_picture_that_is_right():
     assert not any(each.requires_grad for each in gate.parameters())
     one, other = (fit_gate(examples, steps=2).state_dict() for _ in range(2))
     assert all(torch.equal(one[name], other[name]) for name in one)
-    with pytest.raises(ValueError, match="examples: expected at least one"):
-        fit_gate([])
+    nothing = GatingExample(*(each[:0] for each in (examples[0].read, *[torch.zeros(0, 3)] * 3)), 1.0)
+    with_nothing = fit_gate([nothing, *examples], steps=2).state_dict()
+    assert all(torch.equal(one[name], with_nothing[name]) for name in one)
+    for unusable in ([], [nothing]):
+        with pytest.raises(ValueError, match="examples: expected one of which a picture shows anything"):
+            fit_gate(unusable)
 
 
 def opacity_of(example):

@@ -278,6 +278,24 @@ def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share, gate
     assert not fresh.gated
 
 
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_another_sampler_is_the_learned_fields_alone(share):
+    learned, hull = both(ball_views(ring(5, (24, 24))))
+    stacked = stack(learned, hull, share)
+    assert stacked.overruled == (share == 0.9)
+    dense, cameras = RayMarching(3), ring(1, (12, 12), shift=1)
+    parts = stacked.with_sampling(dense)
+    parts = (parts.other, parts) if parts.overruled else (parts, parts.other)
+    assert [each.sampling for each in parts] == [dense, hull.sampling]
+    expected = stack(replace(learned, sampling=dense), hull, share)
+    for found in (stacked.with_sampling(dense).render(cameras), expected.render(cameras)):
+        torch.testing.assert_close(found.images, expected.render(cameras).images)
+    given, kept = stacked.render(cameras, RayMarching(2, 0.0)), stacked.render(cameras)
+    assert not torch.equal(given.images, kept.images)
+    of_hull = hull.render(cameras).samples
+    assert given.samples - learned.render(cameras, RayMarching(2, 0.0)).samples == of_hull
+
+
 def test_the_control_of_another_objects_update_is_stacked_as_the_object_is(monkeypatch):
     adapter, supports = model(), [ball_views(ring(6, (24, 24)), radius=radius) for radius in (0.4, 0.7)]
     swapped, cameras = Swapped(adapter, supports), ring(1, (24, 24), shift=1)

@@ -10,9 +10,10 @@ import torch
 from hyperplanes.adaptation import NearestView, Pictures
 from hyperplanes.evaluation import ObjectScore, Score, evaluate
 from hyperplanes.evaluation.figures import PictureGrid
+from hyperplanes.evaluation.suitability import suitability_warnings
 from hyperplanes.evaluation.tables import rows
 from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
-from tests.reference_rendering import Balls, small_model
+from tests.reference_rendering import Balls, awaken, ball_views, ring, small_model
 
 
 class Shifted:
@@ -175,3 +176,13 @@ def test_an_object_that_one_method_failed_on_is_left_out_of_the_pictures(tmp_pat
     text = (tmp_path / "grid.svg").read_text()
     assert one.name in text
     assert two.name in text
+
+
+def test_asking_whether_views_suit_changes_no_model_in_training():
+    """Running statistics of codes follow the objects of the training alone."""
+    model = awaken(small_model()).train()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    suitability_warnings(model, ball_views(ring(4, (12, 12))))
+    assert model.training
+    assert any("code_normalisation" in name for name in before)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())

@@ -22,6 +22,18 @@ def test_tf32_is_allowed_on_a_gpu_alone_and_while_the_context_lasts():
         assert torch.get_float32_matmul_precision() == before
 
 
+def test_of_overlapping_contexts_the_last_one_puts_the_setting_back():
+    # Those of two threads need not end in the reverse order.
+    before, gpu = torch.get_float32_matmul_precision(), torch.device("cuda")
+    first, second = allow_tf32(gpu), allow_tf32(gpu)
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert torch.get_float32_matmul_precision() == "high"
+    second.__exit__(None, None, None)
+    assert torch.get_float32_matmul_precision() == before
+
+
 def test_tf32_products_leave_pictures_as_they_are(monkeypatch):
     # Source of truth: operands rounded to 10 bits of fraction by hand, as tensor cores read them.
     model = HyperPlanes.from_pretrained("cars-64")
