@@ -42,7 +42,7 @@ class Arguments(ObjectArguments):
     """
 
     voxels: int = 256
-    fit: Annotated[int, range(10_000)] = 80
+    fit: Annotated[int, range(10_000)] = 100
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
     turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"

@@ -67,7 +67,7 @@ class Arguments(ObjectArguments):
     voxels: int = 128
     level: Annotated[float | None, optional("DENSITY")] = None
     page_voxels: OptionalInt = None
-    fit: Annotated[int, range(10_000)] = 80
+    fit: Annotated[int, range(10_000)] = 100
     points: Annotated[int, range(1, 100_000_001)] = 100_000
     splat_format: Literal["ply", "splat"] = "ply"
 

@@ -70,7 +70,7 @@ class Arguments:
     views: tyro.conf.Positional[Path]
     checkpoint: Path = Path("small")
     steps: Annotated[int, range(100_000)] = 0
-    fit: Annotated[int, range(10_000)] = 80
+    fit: Annotated[int, range(10_000)] = 100
     compare: tuple[str, ...] = ()
     port: Annotated[int, range(65_536)] = 8080
     learn_background: bool = False

@@ -21,7 +21,7 @@ from hyperplanes.views import Views
 
 __all__ = ["STEPS", "fit_voxels", "render_guide"]
 
-STEPS = 80
+STEPS = 100
 PIXELS = 8192  # of a step
 EDGE = 0.25  # difference of a pixel to one beside it, in colour or mask, from which on it is the mean of five rays
 DENSITY_RATE = 0.05  # of optical depth through a voxel

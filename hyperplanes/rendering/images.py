@@ -76,6 +76,7 @@ def render_images(
     near_far: str = "sphere",
     background: float = 1.0,
     antialias: bool = False,
+    edge: float = EDGE,
 ) -> Pictures:
     """The images of cameras, by a function that renders rays.
 
@@ -91,6 +92,7 @@ def render_images(
         near_far: as in `geometry.cast`.
         background: grey value of those pixels.
         antialias: five rays where pixels differ; the depth stays that of the centre.
+        edge: by how much they differ there.
 
     Returns:
         One picture a camera.
@@ -124,7 +126,7 @@ def render_images(
             continue
         # colour and opacity of pixels at edges: the mean of five rays
         seen = values[first:last, :, :4].unflatten(1, (height, width))
-        view, chosen = pixels_at_edges(seen, EDGE).flatten(1).nonzero().unbind(1)
+        view, chosen = pixels_at_edges(seen, edge).flatten(1).nonzero().unbind(1)
         view += first
         offsets = pixels.new_tensor(EDGE_SUBPIXELS[1:])
         places = (pixels[chosen] + offsets[:, None]).flatten(0, 1)
