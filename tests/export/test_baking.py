@@ -9,7 +9,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.export import voxel_fitting
+from hyperplanes.export import baking, voxel_fitting
 from hyperplanes.export.baking import BakedScene, _resampled, bake
 from hyperplanes.export.voxel_fitting import fit_voxels, render_guide
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
@@ -17,7 +17,6 @@ from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, cast
-from hyperplanes.rendering import images
 from hyperplanes.rendering.renderer import RayMarching, render
 from hyperplanes.rendering.transmittance import transmittance, transmittance_torch
 from hyperplanes.rendering.voxels import STOP, VoxelGrid, distance_to_filled, render_voxels, shade_voxels
@@ -60,9 +59,9 @@ def test_harmonics_are_orthonormal():
 
 
 def test_baked_pictures_have_further_rays_at_edges(baked, monkeypatch):
-    monkeypatch.setattr(images, "EDGE", 0.2)  # of a soft ball
+    monkeypatch.setattr(baking, "EDGE", 0.2)  # of a soft ball
     found = BakedScene(baked).render(CAMERAS)
-    monkeypatch.setattr(images, "EDGE", math.inf)
+    monkeypatch.setattr(baking, "EDGE", math.inf)
     plain = BakedScene(baked).render(CAMERAS)
     assert found.samples > plain.samples
     assert not torch.equal(found.opacity, plain.opacity)
