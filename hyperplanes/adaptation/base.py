@@ -26,6 +26,7 @@ from hyperplanes.rendering.refinement import RefinedOccupancy, refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
 from hyperplanes.rendering.scene import SplitField
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views
 
 __all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
@@ -146,6 +147,7 @@ class AdaptedField:
         )  # fmt: skip
 
     @checked
+    @without_autocast
     @torch.no_grad()
     def render(
         self,

@@ -23,6 +23,7 @@ from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanes", "ModelConfig"]
@@ -43,6 +44,7 @@ class HyperPlanes(HyperPlanesNetwork):
     """
 
     @checked
+    @without_autocast
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The field of one object in one forward pass: theta + delta (HyperPlanes, Eq. 6).
@@ -54,6 +56,7 @@ class HyperPlanes(HyperPlanesNetwork):
         return one_step(self, support)
 
     @checked
+    @without_autocast
     def find_symmetry(self, support: Views) -> Symmetry | None:
         """The symmetry by which the views of an object are to be reflected, where `config.symmetric` says so.
 
@@ -73,6 +76,7 @@ class HyperPlanes(HyperPlanesNetwork):
         return stacked_field(self, context, self.adapted_weights(context))
 
     @checked
+    @without_autocast
     def fine_tune(
         self,
         support: Views,

@@ -24,6 +24,7 @@ from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.rays import cast, pixel_grid
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.memory import require_memory
+from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views
 
 __all__ = ["ResidualField", "WithResiduals"]
@@ -64,6 +65,7 @@ class ResidualField:
         return f"ResidualField({self.uncorrected!r}, {self.views!r})"
 
     @checked
+    @without_autocast
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Pictures:
         """The pictures of cameras, with what the field lacks in the support views.

@@ -19,6 +19,7 @@ from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.renderer import FieldFunction, Sampler
 from hyperplanes.rendering.scene import SplitField
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views, moved
 
 __all__ = ["RotatedField", "Rotation"]
@@ -107,6 +108,7 @@ class RotatedField(AdaptedField):
         return self.unrotated.trace(rays, generator, differentiable=differentiable)
 
     @checked
+    @without_autocast
     @torch.no_grad()
     def render(
         self,

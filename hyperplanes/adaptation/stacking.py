@@ -26,6 +26,7 @@ from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.renderer import Sampler
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.precision import without_autocast
 
 __all__ = [
     "Learned",
@@ -83,6 +84,7 @@ class StackedField(AdaptedField):
         return self._mean(own, self.other.trace(rays, generator, differentiable=differentiable))
 
     @checked
+    @without_autocast
     @torch.no_grad()
     def render(
         self,

@@ -14,6 +14,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera, undistorted_pixels
 from hyperplanes.geometry.inputs import ArrayLike, as_tensor, check_indices
 from hyperplanes.utilities.arguments import checked, checked_fields, kind_of
+from hyperplanes.utilities.precision import without_autocast
 
 __all__ = ["SUBPIXELS", "Rays", "Sphere", "cast", "pixel_grid"]
 
@@ -92,6 +93,7 @@ def pixel_grid(height: int, width: int, device: torch.device | str | None = None
 
 
 @checked
+@without_autocast
 def cast(
     cameras: PinholeCamera,
     view: ArrayLike,

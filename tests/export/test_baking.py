@@ -271,7 +271,7 @@ def test_fitting_by_one_ray_a_pixel_makes_edges_soft(monkeypatch):
         lambda points, _: (points * 0, 500.0 * (points.norm(dim=-1) < 0.6)), full(Sphere(), 48), RayMarching(192)
     )
     whole, found = bake(ball, side=64), []
-    shown, truth = (_means_of_areas(ball, count) for count in (16, 3))
+    shown, truth = (_means_of_areas(ball, count) for count in (10, 3))
     for edge in (voxel_fitting.EDGE, math.inf):
         monkeypatch.setattr(voxel_fitting, "EDGE", edge)
         fitted = fit_voxels(whole, shown, steps=60, pixels=2048)
