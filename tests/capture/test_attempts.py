@@ -68,3 +68,16 @@ def test_other_features_are_tried_while_too_few_pictures_are_registered(found, k
     model = pipeline._poses([], [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)], False, work)
     assert (len(model), list(models)) == (kept, [])
     assert len(work.notes) == len(found) - 1 + advised
+
+
+def test_another_way_to_find_masks_keeps_the_poses(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: asked.append(1) or Model(20))
+    monkeypatch.setattr(pipeline.SparseModel, "load", lambda path: Model(20))
+    pictures = [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)]
+    for mask in ("auto", "given", "network", "none"):
+        stages = Stages(tmp_path)
+        stages.begin("pictures", mask)
+        work = types.SimpleNamespace(stages=stages, settings=Settings(mask=mask), progress=print, notes=[])
+        pipeline._poses([], pictures, False, work)
+    assert asked == [1]
