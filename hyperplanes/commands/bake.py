@@ -102,8 +102,9 @@ def run(arguments: Arguments) -> int:
         each.render(first)  # compiles, and finds where the field is not empty
     slow, before = _timed(lambda: field.render(query.cameras).images.clamp(0, 1).cpu())
     fast, after = _timed(lambda: scene.render(query.cameras).images.clamp(0, 1))
+    kind = "shown" if arguments.all_views else "query"
     console.say(
-        f"{len(query)} query views: {format_duration(fast / len(query))} each, "
+        f"{len(query)} {kind} views: {format_duration(fast / len(query))} each, "
         f"{slow / fast:.0f} times the field's speed; "
         f"{float(psnr(after, query.images).mean()):.2f} dB, the field {float(psnr(before, query.images).mean()):.2f} dB"
     )

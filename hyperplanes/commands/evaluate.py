@@ -135,6 +135,8 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.methods import WithSampler, at_steps, make_method
     from hyperplanes.utilities.plots import figure_kind
 
+    if not arguments.method:
+        raise ValueError("--method: expected at least one, got none")
     if arguments.curve is not None and len(arguments.steps) < 2:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
     for figure in (arguments.curve, arguments.boxes, arguments.grid):

@@ -145,7 +145,8 @@ def run(arguments: Arguments) -> int:
     paths = save_outputs(outputs, pictures, asked.cameras, arguments.out, asked.names)
     scores = None
     if asked.animation is None:
-        scores = _compared(pictures, shown, known, arguments.all_views, console)
+        finished = isinstance(source, BakedScene) or source.hypernetwork is None
+        scores = _compared(pictures, shown, known, arguments.all_views, finished, console)
     else:
         name, lasting = asked.animation
         for output in outputs:
@@ -182,6 +183,12 @@ def _check(arguments: Arguments) -> None:
 
     if arguments.camera_path is not None or arguments.orbit is not None:
         require_encoder(arguments.turntable)
+    if not arguments.rendered_output_names:
+        raise ValueError("--rendered-output-names: expected at least one of rgb, depth, normals and others, got none")
+    if arguments.turntable != "webp" and arguments.orbit is None and arguments.camera_path is None:
+        raise ValueError(
+            f"--turntable: expected --orbit or --camera-path, whose animation it is of, got {arguments.turntable} alone"
+        )
     if arguments.representation == "voxels" and arguments.protocol != "default":
         raise ValueError(
             "--protocol: expected none with --representation voxels, which are not sampled so; leave one out"
@@ -219,9 +226,12 @@ def _asked(arguments: Arguments, shown: Views, known: Views, up: str, console: C
 
 
 def _compared(
-    pictures: Pictures, shown: Views, known: Views, all_views: bool, console: Console
+    pictures: Pictures, shown: Views, known: Views, all_views: bool, finished: bool, console: Console
 ) -> tuple[float, float] | None:
-    """The mean PSNR of pictures and of the nearest views, where the model was not shown what they are compared to."""
+    """The mean PSNR of pictures and of the nearest views, where the model was not shown what they are compared to.
+
+    What was finished before, a baked file or the weights of one object, does not say which views it was made of.
+    """
     from hyperplanes.adaptation.nearest_view import NearestView
     from hyperplanes.utilities.metrics import psnr, ssim
 
@@ -230,7 +240,8 @@ def _compared(
     quality = f"{value:.2f} dB PSNR"
     if min(known.size) >= 11:
         quality += f", {float(ssim(images, known.images).mean()):.3f} SSIM"
-    how = "shown to the model as well" if all_views else "never shown to the model"
+    now = "not shown now, but perhaps before" if finished else "never shown to the model"
+    how = "shown to the model as well" if all_views else now
     console.say(f"against the {len(known)} true views, {how}: {quality}")
     if all_views:
         return None

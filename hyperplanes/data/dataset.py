@@ -214,8 +214,10 @@ def open_datasets(
         The data set, or `Datasets` of several.
 
     Raises:
-        ValueError: two folders of the same name.
+        ValueError: no folder, or two of the same name.
     """
+    if not paths:
+        raise ValueError("data: expected at least one folder, got none")
     if len(paths) == 1:
         return open_dataset(paths[0], budget, legacy=legacy)
     names = [Path(path).resolve().name for path in paths]

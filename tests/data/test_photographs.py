@@ -297,6 +297,14 @@ def test_heic_is_read_once_pillow_heif_has_registered_it(tmp_path, monkeypatch):
     assert read_image(path)[0][0, 0].tolist() == [255, 0, 0, 255]
 
 
+def test_masks_of_zeros_and_ones_are_black_and_white():
+    """As NumPy's `mask.astype(np.uint8)` has them."""
+    pixels = np.zeros((2, 2, 4), np.uint8)
+    pixels[0, :, :3], pixels[..., 3] = 1, 255
+    assert opacity_of(pixels, False).tolist() == [[255, 255], [0, 0]]
+    assert not opacity_of(np.zeros((2, 2, 4), np.uint8), False).any()
+
+
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_a_tiff_that_is_stored_on_its_side_is_refused(orientation, tmp_path):
     picture = np.arange(24, dtype=np.uint8).reshape(4, 6)

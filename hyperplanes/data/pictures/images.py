@@ -153,14 +153,16 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
 def opacity_of(mask: Pixels, has_alpha: bool) -> UInt8[np.ndarray, "height width"]:
     """What a picture of a mask says: its alpha where some of it is not opaque, else its brightest channel.
 
-    The alpha of a cut-out, a photograph whose background is transparent, is its mask.
+    The alpha of a cut-out, a photograph whose background is transparent, is its mask. Where nothing is brighter than 1,
+    that is the object.
 
     Args:
         mask: (height, width, 4), as `read_image` returns it.
         has_alpha: likewise.
     """
     by_alpha = has_alpha and bool((mask[..., 3] < 255).any())
-    return mask[..., 3] if by_alpha else mask[..., :3].max(-1)
+    opacity = mask[..., 3] if by_alpha else mask[..., :3].max(-1)
+    return opacity * np.uint8(255) if opacity.max() == 1 else opacity
 
 
 def composite_over_white(
@@ -194,6 +196,8 @@ def _open(path: Path) -> Image.Image:
         raise DataError(path, f"at most {LARGEST_IMAGE} pixels", "far more", "scale it down") from error
     except DataError:
         raise
+    except PermissionError as error:
+        raise DataError(path, "an image that may be read", "no permission", "check its permissions") from error
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(path, "an image", f"something else ({error})", _REMEDY) from error
     orientation = image.tag_v2.get(_ORIENTATION, 1) if isinstance(image, TiffImageFile) else 1
