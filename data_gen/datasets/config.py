@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from typing import Any
 
 from data_gen import SUPERSAMPLE
@@ -195,6 +196,10 @@ class GenerationConfig:
         )
         if not 0 < self.timeout < math.inf:
             raise ValueError(f"timeout: expected seconds above 0, got {self.timeout:g}")
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers: expected at least 1, got {self.workers}")
+        if self.engine == "ray" and find_spec("ray") is None:
+            raise ValueError("engine: expected ray to be installed, found no such module; pip install ray")
         _check_sizes(config)
         config.make_rig("")  # numbers that make no sense show here, not in every worker
         return replace(config, renderer=find_renderer(self.renderer).name)

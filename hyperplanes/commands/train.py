@@ -211,6 +211,8 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
     chosen = chosen.by_protocol(arguments.protocol)
     if arguments.method or arguments.field:
         chosen = chosen.by_method(arguments.method or chosen.model.method, arguments.field)
+    if arguments.epochs is not None and arguments.epochs < 1:
+        raise ValueError(f"--epochs: expected at least 1, got {arguments.epochs}")
     options = {"steps": arguments.steps, "epochs": arguments.epochs, "seed": arguments.seed}
     if arguments.steps is not None:
         if arguments.epochs:

@@ -128,7 +128,7 @@ def load_state(
     saved = read_json(path)
     _compare_data(path, saved.get("data"), data)
     try:
-        with malformed(path, "the state of a training"):
+        with malformed(path, "the state of a training", CheckpointError):
             return _load(path, saved, model, optimisers, config, may_differ, defaults)
     except DataError as error:
         raise CheckpointError(str(error)) from error
