@@ -90,9 +90,7 @@ class Request:
                 f"method {self.name}: expected a checkpoint of {method}, got none; `hyperplanes train` makes one{alone}"
             )
         model = HyperPlanes.from_pretrained(self.checkpoints[method]).to(self.device)
-        if not self.reflections:
-            model.config = replace(model.config, symmetric=False, symmetry=None)
-        return model
+        return model if self.reflections else model.without_reflections()
 
     @property
     def needed_steps(self) -> Steps:

@@ -117,13 +117,14 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
         warnings.append("the last line does not end: the file may have been cut")
     tables = {key: _table(rows[key], numbers[key], key, folder) for key in rows}
     _check_indices(groups, tables, elsewhere, folder, warnings)
+    white = _white(tables["v"])
     materials = read_materials(libraries, folder, warnings)
     wanted = {name for name, _ in groups if name is not None}
     for name in sorted(wanted - set(materials)):
         warnings.append(f"material {name!r} is defined nowhere; drawn grey")
     scene = trimesh.Scene()
     for (name, _), group in groups.items():
-        mesh = _geometry(group, tables, materials.get(name or ""), name or "no material", warnings)
+        mesh = _geometry(group, tables, white, materials.get(name or ""), name or "no material", warnings)
         scene.add_geometry(mesh, geom_name=name or "no material")
     return scene, warnings
 
@@ -271,8 +272,19 @@ def _vertices_of(corners: list[str], count: int) -> npt.NDArray[np.int64]:
     return indices[indices >= 0]
 
 
+def _white(vertices: npt.NDArray[np.float64]) -> float:
+    """What is white in the vertex colours of a file: 1, or 255 where any number is above 1."""
+    colours = vertices[:, 3:6]
+    return 255.0 if (colours[np.isfinite(colours)] > 1).any() else 1.0
+
+
 def _geometry(
-    group: _Group, tables: dict[str, npt.NDArray[np.float64]], material: Any, name: str, warnings: list[str]
+    group: _Group,
+    tables: dict[str, npt.NDArray[np.float64]],
+    white: float,
+    material: Any,
+    name: str,
+    warnings: list[str],
 ) -> trimesh.Trimesh:
     rows = np.array(group.rows, dtype=np.int64).reshape(-1, 3)
     rows[:, 1:][rows[:, 1:] >= (len(tables["vt"]), len(tables["vn"]))] = -1
@@ -291,8 +303,7 @@ def _geometry(
     if material is not None:
         keywords["visual"] = TextureVisuals(uv=uv, material=material)
     elif vertices.shape[1] >= 6 and np.isfinite(vertices[:, 3:6]).all():
-        every = tables["v"][:, 3:6]
-        colours = vertices[:, 3:6] * (255.0 if every[np.isfinite(every)].max() <= 1.0 else 1.0)
+        colours = vertices[:, 3:6] * (255.0 / white)
         keywords["vertex_colors"] = np.clip(np.round(colours), 0, 255).astype(np.uint8)
     else:
         keywords["visual"] = TextureVisuals(material=PBRMaterial(baseColorFactor=DEFAULT_COLOUR, metallicFactor=0.0))

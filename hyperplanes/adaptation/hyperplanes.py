@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Self
 
 import torch
 
@@ -42,6 +43,11 @@ class HyperPlanes(HyperPlanesNetwork):
     Raises:
         ValueError: parts that do not go together (`configuration.compatibility`).
     """
+
+    def without_reflections(self) -> Self:
+        """This model, from now on shown no reflections of the views of an object, however symmetric that looks."""
+        self.config = replace(self.config, symmetric=False, symmetry=None)
+        return self
 
     @checked
     @without_autocast

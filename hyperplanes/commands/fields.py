@@ -58,9 +58,7 @@ def load_adaptable(path: Path, device: torch.device, *, reflections: bool = True
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
 
     model = HyperPlanes.from_pretrained(find_checkpoint(path)).to(device)
-    if not reflections:
-        model.config = replace(model.config, symmetric=False, symmetry=None)
-    return model
+    return model if reflections else model.without_reflections()
 
 
 def refuse_baked(path: Path, verb: str) -> None:
