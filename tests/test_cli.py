@@ -378,14 +378,19 @@ def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
         assert f"{written[name]['psnr']:.2f} dB" in shown
 
 
-def test_checkpoints_of_one_method_in_one_folder_are_taken_by_name_and_a_folder_given_twice_is_one(tmp_path):
+def test_two_checkpoints_of_one_method_are_refused_wherever_they_are_and_a_folder_given_twice_is_one(tmp_path):
     run = demo_folder() / "hyperplanes"
     for name in ("b", "a"):
         shutil.copytree(run, tmp_path / name)
-    assert find_checkpoints([tmp_path]) == {"hyperplanes": tmp_path / "a"}
-    assert find_checkpoints([tmp_path, tmp_path / "a"]) == {"hyperplanes": tmp_path / "a"}
-    with pytest.raises(ValueError, match="expected one of each method, got .*/a and .*/b, which are both hyperplanes"):
-        find_checkpoints([tmp_path / "a", tmp_path / "b"])
+    assert find_checkpoints([tmp_path / "a", tmp_path / "a"]) == {"hyperplanes": tmp_path / "a"}
+    for folders in ([tmp_path / "a", tmp_path / "b"], [tmp_path]):
+        with pytest.raises(ValueError, match="one of each method, got .*/a and .*/b, which are both hyperplanes"):
+            find_checkpoints(folders)
+
+
+def test_a_file_of_a_checkpoint_is_refused_and_its_folder_named(tmp_path):
+    with pytest.raises(ValueError, match=r"model\.json: expected a checkpoint's folder, got a file; name the folder"):
+        find_checkpoints([demo_folder() / "hyperplanes" / "model.json"])
 
 
 def test_fields_are_optimised_on_one_posed_scene_without_a_checkpoint(tmp_path, monkeypatch):

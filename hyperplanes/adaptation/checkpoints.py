@@ -76,11 +76,13 @@ def checkpoint_folder(name: Path | str) -> Path:
     """The folder of a checkpoint, of a packaged one by its name, or of one that is downloaded from the hub.
 
     Raises:
-        CheckpointError: a bare name that is neither a folder here nor a packaged model.
+        CheckpointError: a bare name that is neither a folder here nor a packaged model, or a file.
     """
     folder = Path(name)
     if is_repository(str(name)):
         return download_checkpoint(str(name))
+    if folder.is_file():
+        raise CheckpointError(f"{name}: expected a checkpoint's folder, got a file; name the folder that it is in")
     if folder.exists() or len(folder.parts) != 1:
         return folder
     packaged = sorted(path.parent.name for path in PACKAGED.glob("*/model.json"))
@@ -100,10 +102,10 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
         folders: each a checkpoint, a folder of checkpoints such as `runs/demo`, or the name of a packaged model.
 
     Returns:
-        Folders by the names of their methods, such as "hyperplanes"; of those in one folder the first of a name counts.
+        Folders by the names of their methods, such as "hyperplanes".
 
     Raises:
-        CheckpointError: a folder that neither is nor holds a checkpoint, or two folders with the same method.
+        CheckpointError: a folder that neither is nor holds a checkpoint, or two checkpoints of the same method.
     """
     found: dict[str, Path] = {}
     for folder in map(checkpoint_folder, folders):
@@ -114,10 +116,8 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
                 f"{folder}: expected a checkpoint, found {what}; "
                 "`hyperplanes train` writes one, `hyperplanes demo` makes a small one in minutes"
             )
-        here: dict[str, Path] = {}
         for path in inside:
-            here.setdefault(ModelConfig.load(path).method, path)
-        for method, path in here.items():
+            method = ModelConfig.load(path).method
             other = found.setdefault(method, path)
             if other.resolve() != path.resolve():
                 raise CheckpointError(

@@ -15,12 +15,12 @@ __all__ = ["download_checkpoint", "is_repository", "upload_checkpoint"]
 
 FILES = ("model.json", "model.safetensors")
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+INSTALL = "pip install 'hyperplanes[hub]'"
 
 
 def is_repository(name: str) -> bool:
-    """Whether a name is looked for on the hub: user/model, no folder here, and huggingface_hub is installed."""
-    known = REPOSITORY.fullmatch(name) and not Path(name).exists()
-    return bool(known) and importlib.util.find_spec("huggingface_hub") is not None
+    """Whether a name is looked for on the hub: user/model, and nothing here is called so."""
+    return REPOSITORY.fullmatch(name) is not None and not Path(name).exists()
 
 
 def download_checkpoint(name: str) -> Path:
@@ -30,8 +30,13 @@ def download_checkpoint(name: str) -> Path:
         name: user/model.
 
     Raises:
-        CheckpointError: no such repository, or a hub that cannot be reached.
+        CheckpointError: no such repository, a hub that cannot be reached, or huggingface_hub is not installed.
     """
+    if not _is_installed():
+        raise CheckpointError(
+            f"{name}: expected a checkpoint's folder, found no such folder; `hyperplanes train` writes one, and "
+            f"a model on the Hugging Face hub needs huggingface_hub: {INSTALL}"
+        )
     from huggingface_hub import snapshot_download
 
     try:
@@ -61,9 +66,8 @@ def upload_checkpoint(save: Callable[[Path], None], name: str, *, private: bool,
     """
     if not REPOSITORY.fullmatch(name):
         raise ValueError(f"repository: expected user/model, got {name!r}")
-    if importlib.util.find_spec("huggingface_hub") is None:
-        missing = "push_to_hub: expected the package huggingface_hub, found none; pip install 'hyperplanes[hub]'"
-        raise MissingPackageError(missing)
+    if not _is_installed():
+        raise MissingPackageError(f"push_to_hub: expected the package huggingface_hub, found none; {INSTALL}")
     from huggingface_hub import HfApi
 
     api = HfApi()
@@ -71,3 +75,7 @@ def upload_checkpoint(save: Callable[[Path], None], name: str, *, private: bool,
     with tempfile.TemporaryDirectory() as folder:
         save(Path(folder))
         return str(api.upload_folder(repo_id=name, folder_path=folder, commit_message=message))
+
+
+def _is_installed() -> bool:
+    return importlib.util.find_spec("huggingface_hub") is not None

@@ -125,8 +125,13 @@ class HyperPlanesNetwork(nn.Module):
         )
 
     def to_own(self, support: Views) -> Views:
-        """The views where the weights are, in their precision or at least single."""
-        return support.to(self.rig.device, torch.promote_types(self.rig.dtype, torch.float32))
+        """The views where the weights are, in their precision; weights of less than single are a ValueError."""
+        if self.rig.dtype.itemsize < 4:
+            raise ValueError(
+                f"model: expected weights of single or double precision, got {self.rig.dtype}; make them single by "
+                "float(): what is faster in half precision is computed so"
+            )
+        return support.to(self.rig.device, self.rig.dtype)
 
     def update(self, context: SupportContext) -> Parameters:
         """The update of theta, in one forward pass (HyperPlanes, Eq. 7); empty without a hypernetwork."""

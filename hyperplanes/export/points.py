@@ -64,7 +64,7 @@ def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, coun
         At most so many, on the CPU.
 
     Raises:
-        ValueError: pictures of nothing, or a count below 1.
+        ValueError: pictures of nothing, or a count below 1 or so low that no mean is on the surface.
     """
     if count < 1:
         raise ValueError(f"count: expected at least 1 point, got {count}")
@@ -78,6 +78,8 @@ def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, coun
     values = _averaged(values, values[:, :3], bounds, count)
     found = PointCloud(values[:, :3], torch.nn.functional.normalize(values[:, 3:6], dim=-1), values[:, 6:])
     kept = _is_confirmed(found.points, surface.z.cpu(), camera.to(cameras, "cpu", torch.float32), bounds)
+    if not kept.any():
+        raise ValueError(f"count: expected more points, got {count}, so few that none of their means is on the surface")
     return PointCloud(found.points[kept], found.normals[kept], found.colours[kept])
 
 

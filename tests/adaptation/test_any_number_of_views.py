@@ -302,6 +302,11 @@ def test_a_model_in_double_precision_makes_the_same_pictures(reader):
     torch.testing.assert_close(found, picture(single, support), atol=1e-3, rtol=0)
 
 
+def test_a_model_in_half_precision_is_refused_in_one_line():
+    with pytest.raises(ValueError, match="model: expected weights of single or double precision, got torch.float16"):
+        model(**READERS["volume"]).half().adapt(views(2))
+
+
 @pytest.mark.parametrize("free", ["weights", "hypernetwork"])
 def test_the_weights_of_one_object_make_its_field_and_its_surface_again(free):
     adapter, support = model(**READERS["volume"]), views(6)

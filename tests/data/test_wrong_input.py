@@ -29,6 +29,12 @@ def test_missing_and_empty_folders(tmp_path):
         refused(action, tmp_path, match="(an empty folder|neither)")
 
 
+def test_of_a_single_view_none_can_be_left_out(scene, tmp_path):
+    one = type(scene)(views=1).write(tmp_path)
+    refused(read_task, one, match="expected two views or more, found 1; --all-views shows")
+    assert len(read_views(one)) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [

@@ -100,3 +100,5 @@ def test_what_other_views_look_through_is_no_point(pictures):
     assert float(kept.max()) < RADIUS + 0.06
     with pytest.raises(ValueError, match="pictures: expected something opaque"):
         point_cloud(Pictures(pictures.images, 0 * opacity, depth, 0), CAMERAS, Sphere())
+    with pytest.raises(ValueError, match="count: expected more points, got 1, so few"):
+        point_cloud(pictures, CAMERAS, Sphere(), 1)

@@ -119,8 +119,6 @@ def read_transforms_task(
     scene, kept = assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)
     scene = replace(scene, up=stated_up(document, files[0]))
     if query is None:
-        if len(scene) < 2:
-            raise DataError(files[0], "two frames or more", f"{len(scene)}", "add views to support or to query")
         return PosedTask.alternating(scene, name)
     halves = [[at for at, index in enumerate(kept) if (index in query) == asked] for asked in (False, True)]
     if not all(halves):
