@@ -41,7 +41,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--counts", type=int, nargs="+", default=[25], help="numbers of support views")
     parser.add_argument("--objects", type=int, default=3, help="of each data set")
     parser.add_argument("--query", type=int, default=3, help="views of each object to be judged by")
-    parser.add_argument("--side", type=int, help="voxels an axis; what `hyperplanes bake` takes when not given")
+    parser.add_argument("--side", type=int, help="voxels an axis; those of pages when not given")
     parser.add_argument("--fit", type=int, default=STEPS, help="steps of fitting (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="one object, few steps: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")

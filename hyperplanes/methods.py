@@ -156,9 +156,9 @@ def _field_scratch(name: str, request: Request) -> Adapter:
     return FieldFromScratch(config, request.needed_steps, request.settings, request.device)
 
 
-def _optimised(model: HyperPlanes, request: Request) -> FineTuned:
-    """Gradient descent from these weights, as the learned initialisations of the model are optimised."""
-    initialisation = model.config.initialisation
+def _optimised(model: HyperPlanes, request: Request, trained: ModelConfig | None = None) -> FineTuned:
+    """Gradient descent from these weights, as those of a trained model are optimised, or of the model itself."""
+    initialisation = (trained or model.config).initialisation
     assert initialisation is not None
     steps = initialisation.steps if request.steps is None else request.steps
     return FineTuned(model.to(request.device), steps, initialisation.descent(given=request.settings))
@@ -172,10 +172,7 @@ def _standard(request: Request) -> Adapter:
     model = random_model(config if trained is None else trained.config, request.settings.seed)
     if trained is not None:
         model.rig.copy_(trained.rig)
-    initialisation = (config if trained is None else trained.config).initialisation
-    assert initialisation is not None
-    steps = initialisation.steps if request.steps is None else request.steps
-    return FineTuned(model.to(request.device), steps, initialisation.descent(given=request.settings))
+    return _optimised(model, request, config if trained is None else trained.config)
 
 
 METHODS: dict[str, Method] = {

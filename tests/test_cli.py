@@ -209,6 +209,11 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         (["train", "--data", "--out", "OUT/run"], ["data: expected at least one folder, got none"]),
         ([*RENDER, "--rendered-output-names"], ["--rendered-output-names: expected at least one"]),
         ([*RENDER, "--turntable", "gif"], ["--turntable: expected --orbit or --camera-path"]),
+        ([*BAKE, "OUT/b.safetensors", "--turntable", "gif"], ["--turntable: expected --orbit, whose animation it is"]),
+        (
+            ["adapt", *RENDER[1:], "--fine-tune", "hypernetwork"],
+            ["--fine-tune: expected --steps, which optimise so, got hyper"],
+        ),
         (
             ["train", "--data", "DATA", "--training.steps", "3", "--epochs", "1", "--out", "OUT/run"],
             ["--training.steps, --epochs: expected one of the two, got both"],

@@ -57,7 +57,7 @@ def figures(model, data=None, names=("test0", "test1", "test2")):
     tasks = [(data or ManyBalls()).task(name) for name in names]
     model.eval()
     prepared = [model.prepare(task.support) for task in tasks]
-    return diagnose(model, prepared).spread, swap_gap(model, prepared, [task.query for task in tasks])[1]
+    return diagnose(model, prepared).spread, swap_gap(model, prepared, [task.query for task in tasks])
 
 
 @pytest.mark.parametrize("shape", [ALL_LAYERS, LAST_LAYERS])
@@ -149,7 +149,7 @@ def test_packaged_models_read_the_pictures(packaged):
 def swapped_cars(model, count):
     """What the update of the other car costs, in dB."""
     prepared = [model.prepare(few(task, count)) for task in cars()]
-    return swap_gap(model, prepared, [task.query[:1] for task in cars()])[1]
+    return swap_gap(model, prepared, [task.query[:1] for task in cars()])
 
 
 def test_swapping_updates_of_cars_costs_decibels():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
@@ -19,6 +18,7 @@ from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
 from data_gen.meshes.files import MESH_SUFFIXES
 from data_gen.rigs import OBJECT_RADIUS
 from hyperplanes.utilities.encoding import sha256
+from hyperplanes.utilities.environment import usable_cores
 from hyperplanes.utilities.files import DataError
 
 __all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
@@ -136,7 +136,9 @@ def _configuration(
     if isinstance(source, Procedural):
         described = asdict(source)
     else:
-        names = [[item.name, item.split, item.up] for item in items]
+        # a file that has changed since is another data set; its size tells most changes, without reading it
+        sizes = [Path(item.path).stat().st_size if item.path else 0 for item in items]
+        names = [[item.name, item.split, item.up, size] for item, size in zip(items, sizes, strict=True)]
         described = {
             "folder": Path(source.path).resolve().name,
             "meshes": len(items),
@@ -192,6 +194,5 @@ def _outcomes(
         from data_gen.datasets.ray_cluster import run_on_ray
 
         return run_on_ray(TARGET, settings, items, workers=config.workers, **limits)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers = cores if config.workers is None else config.workers
+    workers = usable_cores() if config.workers is None else config.workers
     return run_isolated(TARGET, settings, items, workers=workers, **limits)

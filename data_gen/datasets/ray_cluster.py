@@ -14,6 +14,7 @@ from typing import Any
 
 from data_gen.datasets.worker_process import process_item
 from data_gen.datasets.workers import START_SECONDS, Outcome, WorkerLost, WorkerTimeout, run_workers, worker_environment
+from hyperplanes.utilities.environment import usable_cores
 
 __all__ = ["run_on_ray"]
 
@@ -51,7 +52,7 @@ def run_on_ray(
     if started:
         options: dict[str, Any] = {"log_to_driver": False, "runtime_env": {"env_vars": worker_environment()}}
         if "RAY_ADDRESS" not in os.environ:
-            options |= {"include_dashboard": False, "num_cpus": workers or len(os.sched_getaffinity(0))}
+            options |= {"include_dashboard": False, "num_cpus": workers or usable_cores()}
         ray.init(**options)
     try:
         count = workers or int(ray.cluster_resources().get("CPU", 1))

@@ -114,8 +114,8 @@ def diagnose(model: HyperPlanes, prepared: Sequence[SupportContext]) -> Diagnost
 @torch.no_grad()
 def swap_gap(
     model: HyperPlanes, prepared: Sequence[SupportContext], queries: Sequence[Views], own: float | None = None
-) -> tuple[float, float]:
-    """PSNR of query views with each object's own update, and what the update of the next object costs, in dB.
+) -> float:
+    """What the update of the next object costs, in dB of the PSNR of query views.
 
     Args:
         model: with a hypernetwork, in evaluation mode.
@@ -124,7 +124,7 @@ def swap_gap(
         own: the PSNR with each object's own update, where it is known.
 
     Returns:
-        Mean PSNR over all views, and own minus swapped.
+        Mean PSNR over all views with each object's own update, minus that with the next one's.
     """
     updates = model.updates(prepared)
 
@@ -135,5 +135,4 @@ def swap_gap(
             values.append(psnr(field.render(query.cameras).images, query.images))
         return float(torch.cat(values).mean())
 
-    own = quality(0) if own is None else own
-    return own, own - quality(1)
+    return (quality(0) if own is None else own) - quality(1)

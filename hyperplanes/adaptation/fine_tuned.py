@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -37,9 +36,9 @@ class FineTuned:
     settings: FineTuning = field(default_factory=FineTuning)
 
     @checked
-    def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
+    def adapt(self, support: Views) -> AdaptedField:
         """The field after fine-tuning on the support views."""
-        return self.model.fine_tune(support, self.steps, self.settings, on_step=on_step)
+        return self.model.fine_tune(support, self.steps, self.settings)
 
 
 @dataclass(frozen=True)
@@ -60,13 +59,13 @@ class FromScratch:
     settings: FineTuning = field(default_factory=FineTuning)
 
     @checked
-    def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
+    def adapt(self, support: Views) -> AdaptedField:
         """The field after so many steps from random weights; views are reflected about the plane of the model."""
         symmetry = self.model.find_symmetry(support)
         fresh = random_model(replace(self.model.config, symmetric=False, symmetry=symmetry), self.settings.seed)
         fresh.rig.copy_(self.model.rig)
         settings = _rated(self.settings, fresh)
-        return fresh.to(self.model.rig).fine_tune(support, self.steps, settings, on_step=on_step)
+        return fresh.to(self.model.rig).fine_tune(support, self.steps, settings)
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class FieldFromScratch:
     device: torch.device | str = "cpu"
 
     @checked
-    def adapt(self, support: Views, on_step: Callable[[int], None] | None = None) -> AdaptedField:
+    def adapt(self, support: Views) -> AdaptedField:
         """The field after so many steps from random weights."""
         planes = (
             self.config.network.planes if find_targets()[self.config.target].permutation_invariant else len(support)
@@ -96,7 +95,7 @@ class FieldFromScratch:
         network = replace(self.config.network, planes=planes)
         fresh = random_model(replace(self.config, network=network, order="file"), self.settings.seed).to(self.device)
         settings = _rated(self.settings, fresh)
-        return fresh.fine_tune(support, self.steps, settings, on_step=on_step)
+        return fresh.fine_tune(support, self.steps, settings)
 
 
 def random_model(config: ModelConfig, seed: int) -> HyperPlanes:

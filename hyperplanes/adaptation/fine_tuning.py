@@ -79,10 +79,6 @@ def fine_tune(
     """
     support, settings = network.to_own(support), settings or FineTuning()
     check_fine_tuning(settings, steps, len(support), network.config, network.target)
-    if steps == 0:
-        if on_step is not None:
-            on_step(0)
-        return one_step(network, support)
     if steps != "auto":
         return _fine_tune_in_frame(network, support, steps, settings, None, on_step)
 

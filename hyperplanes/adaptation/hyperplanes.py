@@ -12,9 +12,8 @@ import torch
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.checkpoints import read_checkpoint, write_checkpoint
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.adaptation.descent import Descent, Variables
 from hyperplanes.adaptation.finding_symmetry import find_symmetry
-from hyperplanes.adaptation.fine_tuning import fine_tune, fine_tune_to, make_descent, one_step
+from hyperplanes.adaptation.fine_tuning import fine_tune, one_step
 from hyperplanes.adaptation.hub import upload_checkpoint
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.rotation import RotatedField
@@ -22,7 +21,6 @@ from hyperplanes.adaptation.stacking import learned_part, stacked_field
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.geometry.reflections import Symmetry
-from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views
@@ -115,14 +113,6 @@ class HyperPlanes(HyperPlanesNetwork):
             field that they ended at).
         """
         return fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
-
-    def fine_tune_to(self, context: SupportContext, steps: int, settings: FineTuning) -> AdaptedField:
-        """As `fine_tune`, of an object that is prepared, on the views that its field is shown."""
-        return fine_tune_to(self, context, steps, settings)
-
-    def descent(self, context: SupportContext, settings: FineTuning, start: Parameters) -> tuple[Descent, Variables]:
-        """Gradient descent from given weights on the views of an object, as learned initialisations take it."""
-        return make_descent(self, context, settings, start=start)
 
     def with_weights_of(self, adapted: AdaptedField) -> HyperPlanes:
         """The weights of one object as a model without a hypernetwork: its theta is theta + delta (HyperPlanes, Eq. 6).

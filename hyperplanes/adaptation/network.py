@@ -23,6 +23,7 @@ from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.seeding import seeded
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanesNetwork", "in_use"]
@@ -45,8 +46,7 @@ class HyperPlanesNetwork(nn.Module):
         super().__init__()
         make = check_model(config)
         self.config = config
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)  # `torch.manual_seed` would seed GPUs, too
+        with seeded(seed):
             self.targets: dict[str, Target] = {"fine": make(config.network)}
             if config.coarse_network:
                 self.targets["coarse"] = make(config.network)

@@ -69,9 +69,10 @@ class Muon(Optimizer):
             for value in moved:
                 momentum = self.state[value].setdefault("momentum", torch.zeros_like(value))
                 momentum.lerp_(value.grad, 1 - group["momentum"])
-            # products of small matrices, which one thread each computes faster than all of them together
+            # on a CPU products of small matrices, which one thread each computes faster than all of them together
+            run = parallel_map if all(value.device.type == "cpu" for value in moved) else map
             ahead = [value.grad.lerp(self.state[value]["momentum"], group["momentum"]) for value in moved]
-            for value, direction in zip(moved, parallel_map(orthogonalise, ahead), strict=True):
+            for value, direction in zip(moved, run(orthogonalise, ahead), strict=True):
                 value.add_(direction, alpha=-group["lr"] * max(1, value.shape[0] / value.shape[1]) ** 0.5)
         return loss
 

@@ -179,10 +179,11 @@ def stack(
     if share == 0 and gate is None:
         return learned
     overruled = share > OVERRULED
-    if overruled:
-        learned, hull, share = hull, learned, 1 - share
-    own = {each.name: getattr(learned, each.name) for each in fields(learned)}
-    return StackedField(**own, other=hull, share=share, overruled=overruled, gate=gate, views=views)
+    shown, other = (hull, learned) if overruled else (learned, hull)
+    share = 1 - share if overruled else share
+    own = {each.name: getattr(shown, each.name) for each in fields(shown)}
+    own["symmetry"] = learned.symmetry  # that of the object, which the hull does not know
+    return StackedField(**own, other=other, share=share, overruled=overruled, gate=gate, views=views)
 
 
 @torch.no_grad()

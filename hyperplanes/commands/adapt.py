@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
-from hyperplanes.commands.options import Free, ObjectArguments
+from hyperplanes.commands.options import Free, ObjectArguments, check_fine_tune
 from hyperplanes.commands.scene import read_object, refuse_sources
 from hyperplanes.commands.writing import refuse_checkpoint, writes_to
 from hyperplanes.utilities.shell import command_line
@@ -40,6 +40,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.data.devices import choose_device
 
+    check_fine_tune(arguments.fine_tune, arguments.steps)
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "adapt")
     refuse_checkpoint(arguments.out, arguments.checkpoint)

@@ -34,14 +34,14 @@ class Arguments(ObjectArguments):
     """What to bake.
 
     Attributes:
-        voxels: Along each side of the grid; two for every pixel that the object is wide lose little.
+        voxels: Along each side of the grid; 1.4 for every pixel of the images, and at most 256, when not given.
         fit: Gradient steps that fit the voxels to the shown views; 0 keeps what the field shows.
         orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
         size: Pixels along the longer side of the turntable; as the images when not given.
         turntable: The format of the turntable; mp4 and webm need `pip install 'hyperplanes[video]'`.
     """
 
-    voxels: int = 256
+    voxels: OptionalInt = None
     fit: Annotated[int, range(10_000)] = 100
     orbit: Annotated[int | None, optional("FRAMES")] = None
     size: OptionalInt = None
@@ -68,7 +68,7 @@ def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.data.devices import choose_device
-    from hyperplanes.export.baking import BakedScene, coarsening
+    from hyperplanes.export.baking import BakedScene, coarsening, default_side
     from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, to_pixels
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.utilities.errors import prefix_errors
@@ -83,8 +83,11 @@ def run(arguments: Arguments) -> int:
     check_orbit(arguments.orbit, arguments.size)
     if arguments.orbit is not None:
         require_encoder(arguments.turntable)
-    with prefix_errors("--voxels"):
-        coarsening(arguments.voxels)
+    elif arguments.turntable != "webp":
+        raise ValueError(f"--turntable: expected --orbit, whose animation it is of, got {arguments.turntable} alone")
+    if arguments.voxels is not None:
+        with prefix_errors("--voxels"):
+            coarsening(arguments.voxels)
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "bake")
     model = load_adaptable(arguments.checkpoint, device, reflections=not arguments.no_reflections)
@@ -93,7 +96,8 @@ def run(arguments: Arguments) -> int:
     shown, query = task.support.to(device), task.query
     field, _ = adapt_to(model, shown, task.name, console, steps=arguments.steps)
     assert isinstance(field, AdaptedField)
-    baked = bake_field(field, shown, arguments.voxels, fit=arguments.fit, console=console)
+    side = arguments.voxels or default_side(shown.size)
+    baked = bake_field(field, shown, side, fit=arguments.fit, console=console)
     baked.save(arguments.out)
     console.say(f"{arguments.out}: {arguments.out.stat().st_size / 2**20:.1f} MiB")
     scene = BakedScene(baked)

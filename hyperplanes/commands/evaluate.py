@@ -224,15 +224,15 @@ def _supports(data: Tasks, names: Sequence[str]) -> Iterator[Views]:
             yield data.task(name).support
 
 
-def _up(arguments: Arguments, data: Dataset, console: Console) -> str:
-    """The direction that is up in the world of the data."""
+def _up(arguments: Arguments, data: Dataset, console: Console) -> str | None:
+    """The direction that is up in the world of the data; None where each object's files say it, or it is y."""
     from hyperplanes.commands.scene import say_up
     from hyperplanes.data.upright import y_up_from
 
     if arguments.up == "auto":
         names = data.names() if data.layout == "posed" else []
         if len(names) != 1:
-            return "y"
+            return None
         scene = data.posed(names[0])
         return say_up([scene.support, scene.query], console)
     y_up_from(arguments.up)  # a wrong one is found before anything is evaluated

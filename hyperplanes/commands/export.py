@@ -47,7 +47,7 @@ class Arguments(ObjectArguments):
             with the rendered ones, and what no shown camera sees into is filled.
         page_voxels: Along each side of the grid that the page shows and splats are made of; 1.4 a pixel of the images,
             and at most 256, when not given.
-        fit: Gradient steps that fit these voxels to the shown views, and twice as many for splats; 0 keeps what the
+        fit: Gradient steps that fit these voxels to the shown views, and 1.6 times as many for splats; 0 keeps what the
             field shows.
         points: Of the cloud, at most.
         splat_format: ply, which viewers of Gaussian splats read, or the smaller splat without colour by direction.

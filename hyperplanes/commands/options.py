@@ -19,6 +19,7 @@ __all__ = [
     "Protocol",
     "Steps",
     "ViewsUp",
+    "check_fine_tune",
     "check_orbit",
     "optional",
 ]
@@ -84,6 +85,20 @@ class ObjectArguments:
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
     device: str = "auto"
+
+
+def check_fine_tune(chosen: str, steps: int | str) -> None:
+    """Refuse a choice of what fine-tuning optimises where there is none.
+
+    Args:
+        chosen: of `--fine-tune`.
+        steps: of fine-tuning.
+
+    Raises:
+        ValueError: a choice, and no step.
+    """
+    if chosen != "weights" and steps == 0:
+        raise ValueError(f"--fine-tune: expected --steps, which optimise so, got {chosen} alone; add a number of steps")
 
 
 def check_orbit(orbit: int | None, size: int | None, *others: str, orbits: tuple[str, ...] = ("--orbit",)) -> None:

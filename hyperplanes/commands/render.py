@@ -29,6 +29,7 @@ from hyperplanes.commands.options import (
     OptionalFile,
     OptionalInt,
     Protocol,
+    check_fine_tune,
     check_orbit,
     optional,
 )
@@ -126,6 +127,7 @@ def run(arguments: Arguments) -> int:
         "--representation": arguments.representation == "field",
     }
     refuse_of_baked(source, given)
+    check_fine_tune(arguments.fine_tune, arguments.steps)
     task, up = read_object(arguments, source, console)
     refuse_sources(arguments.out, arguments.views, task.query.names)
     shown, known = task.support.to(device), task.query.to(device)

@@ -103,16 +103,18 @@ def read_scene(
     from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.formats.recognise import read_posed, read_posed_task
     from hyperplanes.data.upright import upright_task
+    from hyperplanes.utilities.files import malformed
     from hyperplanes.views import Task
 
     path = locate_scene(path)
-    if all_views:
-        scene = read_posed(path, downscale)
-        views, notes = scene.views(), scene.notes
-        task = Task(views, views, path.resolve().name)
-    else:
-        posed = read_posed_task(path, downscale)
-        task, notes = posed.task(), posed.notes
+    with malformed(path, "posed images of one scene"):
+        if all_views:
+            scene = read_posed(path, downscale)
+            views, notes = scene.views(), scene.notes
+            task = Task(views, views, path.resolve().name)
+        else:
+            posed = read_posed_task(path, downscale)
+            task, notes = posed.task(), posed.notes
     for note in notes:
         console.warn(f"{path}: {note}")
     if up == "auto":
@@ -143,7 +145,8 @@ def read_path(
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.utilities.files import read_json
 
-    listed = locate_scene(scene) / "transforms.json"
+    listed = locate_scene(scene)
+    listed = listed if listed.is_file() else listed / "transforms.json"
     document = read_json(listed) if listed.is_file() else None
     found = read_camera_path(path, transforms, document)
     cameras = upright_cameras(found.cameras, up)

@@ -94,7 +94,9 @@ def run(arguments: Arguments) -> int:
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     if not arguments.compare:
-        refuse_of_baked(source, {"--no-reflections": arguments.no_reflections})
+        given = {"--no-reflections": arguments.no_reflections, "--fit": arguments.fit != Arguments.fit}
+        refuse_of_baked(source, given)
+    refuse_of_baked(source, {"--steps": arguments.steps != 0})
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
     shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, TypeAlias
 
-from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = ["CELLS", "FINE_VIEWS", "FRESH", "MANY_VIEWS", "RATES", "FineTuning", "Steps"]
@@ -87,9 +86,6 @@ class FineTuning:
     cells: Annotated[int, range(257)] | None = None
 
     def __post_init__(self) -> None:
-        choices = {"trainable": RATES, "optimiser": (None, "adam", "muon", "sgd"), "decay": ("cosine", "exponential")}
-        choices |= {"draw": (None, "uniform", "contrast")}
-        check_choices(self, choices)
         for name, least in (("rays", 1), ("max_steps", 1), ("holdout", 2)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")

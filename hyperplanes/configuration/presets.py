@@ -288,32 +288,14 @@ TRAINABLE = ("hyperplanes", *reversed(TARGETS), "autoencoder", *LEARNED)
 of weights for all objects."""
 
 
-def configure(
-    name: str,
-    method: str = "hyperplanes",
-    *,
-    steps: int | None = None,
-    seed: int = 0,
-    protocol: str = "default",
-    target: str | None = None,
-) -> Preset:
+def configure(name: str, method: str = "hyperplanes") -> Preset:
     """The configuration of a method at the scale of a preset.
 
     Args:
         name: of the preset.
         method: one of TRAINABLE, or a field of another installed package.
-        steps: other than the preset's.
-        seed: of the training.
-        protocol: a name in PROTOCOLS: how rays are sampled.
-        target: one of TARGETS; where absent that of the preset, or of an initialisation "nerf" (Tancik et al. 2021).
 
     Returns:
-        Model and training.
-
-    Raises:
-        ValueError: an unknown preset, method, protocol or target, no step, or a target beside a method that is another.
+        Model and training; an unknown preset or method is a ValueError.
     """
-    if steps is not None and steps < 1:
-        raise ValueError(f"steps: expected at least 1, got {steps}")
-    chosen = preset(name).by_protocol(protocol).by_method(method, target)
-    return replace(chosen, training=replace(chosen.training, steps=steps or chosen.training.steps, seed=seed))
+    return preset(name).by_method(method)

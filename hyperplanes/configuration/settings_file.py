@@ -125,13 +125,13 @@ def _change_kind(model: dict[str, Any], wanted: Any) -> None:
     if not isinstance(wanted, Mapping):
         return
     known = find_targets()
-    if (target := wanted.get("target")) in known:
+    if isinstance(target := wanted.get("target"), str) and target in known:
         shared = {each.name for each in fields(known[target].config_type)}
         model["network"] = {name: value for name, value in model["network"].items() if name in shared}
     hypernetwork = wanted.get("hypernetwork")
-    kind = KINDS.get(hypernetwork.get("kind", "")) if isinstance(hypernetwork, Mapping) else None
-    if kind is not None and model["hypernetwork"] is not None:
-        shared = {each.name for each in fields(kind)}
+    kind = hypernetwork.get("kind") if isinstance(hypernetwork, Mapping) else None
+    if isinstance(kind, str) and kind in KINDS and model["hypernetwork"] is not None:
+        shared = {each.name for each in fields(KINDS[kind])}
         entries = {name: value for name, value in model["hypernetwork"].items() if name in shared}
         model["hypernetwork"] = entries
 

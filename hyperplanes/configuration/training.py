@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
-from hyperplanes.hypernetwork.choices import check_choices
 from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = ["TrainingConfig"]
@@ -78,11 +77,11 @@ class TrainingConfig:
     random_background: bool = False
     empty_points: Annotated[int, range(2**24)] = 0
     volume_loss: float = 0.0
-    optimiser: str = "adam"
+    optimiser: Literal["adam", "muon"] = "adam"
     learning_rate: float = 1e-4
     muon_learning_rate: float = 0.02
     hypernetwork_learning_rate: float = 1e-4
-    precision: str = "automatic"
+    precision: Literal["automatic", "single", "bfloat16"] = "automatic"
     warmup: Annotated[int, range(10**10)] = 0
     final_rate_factor: float = 1.0
     clip: float = 0.0
@@ -96,7 +95,6 @@ class TrainingConfig:
     seed: Annotated[int, range(2**40)] = 0
 
     def __post_init__(self) -> None:
-        check_choices(self, {"precision": ("automatic", "single", "bfloat16")})
         for name in (
             *("learning_rate", "muon_learning_rate", "hypernetwork_learning_rate"),
             *("final_rate_factor", "volume_loss", "clip"),

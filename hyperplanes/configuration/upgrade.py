@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
-from hyperplanes.hypernetwork.configuration import HeadConfig
 from hyperplanes.utilities.settings import SettingsError
 
 __all__ = ["TARGETS", "upgrade_model", "upgrade_training"]
@@ -21,7 +19,10 @@ TARGETS = {"any_order": "image_based"}
 
 OF_IMAGE_BASED = ("blended", "grid")
 OF_IMAGES = ("encoder", "views", "choice", "resolution", "normalisation", "join", "see_directions")
-OF_HEADS = tuple(each.name for each in fields(HeadConfig))
+OF_HEADS = (
+    *("code", "code_normalisation", "depth", "width", "activation", "layers", "update", "rank"),
+    *("see_weights", "weights_seen", "centre"),
+)
 """What every network, and every hypernetwork, was once written with, whether it read it or not."""
 
 REMOVED: dict[str, object] = {"gain": 1.0, "code_activation": "none"}

@@ -36,13 +36,13 @@ class TasksOnDevice(TaskWrapper):
 
     Attributes:
         device: where they go.
-        up: the axis that points up in the data's world.
+        up: the axis that points up in the data's world; where None, as the files of each object say, or y.
     """
 
     device: torch.device
-    up: str = "y"
+    up: str | None = None
 
     def change(self, task: Task) -> Task:
         """The task on the device."""
-        task = upright_task(task, self.up)
+        task = upright_task(task, self.up or task.support.up or "y")
         return Task(task.support.to(self.device), task.query.to(self.device), task.name)

@@ -22,7 +22,6 @@ class Scale:
 
     Attributes:
         name: of the scale.
-        about: one line.
         presets: of the configuration, by the paper's pixels a side.
         protocol: how rays are sampled, a name in `presets.PROTOCOLS`.
         resolution: pixels a side of generated images; None where data must be given.
@@ -46,7 +45,6 @@ class Scale:
     """
 
     name: str
-    about: str
     presets: Mapping[int, str]
     protocol: str = "default"
     resolution: int | None = None
@@ -133,7 +131,6 @@ SCALES: dict[str, Scale] = {
     for each in (
         Scale(
             name="smoke",
-            about="seconds: that everything runs; nothing is learnt",
             presets={128: "quick", 200: "quick"},
             resolution=16,
             objects=4,
@@ -166,7 +163,6 @@ SCALES: dict[str, Scale] = {
         ),
         Scale(
             name="small",
-            about="all ten in some hours on one core: 32x32, procedural objects",
             presets={128: "quick", 200: "quick"},
             resolution=32,
             objects=50,
@@ -195,7 +191,6 @@ SCALES: dict[str, Scale] = {
         ),
         Scale(
             name="gpu",
-            about="all ten in about a day on one card: data sets as published, samples in the visual hull alone",
             presets={128: "paper-128", 200: "paper-200"},
             protocol="ray_marching",
             steps=5000,
@@ -215,7 +210,6 @@ SCALES: dict[str, Scale] = {
         ),
         Scale(
             name="paper",
-            about="the paper's setting on data sets as they were published, on a GPU",
             presets={128: "paper-128", 200: "paper-200"},
             protocol="paper",
             learned=LEARNIT,

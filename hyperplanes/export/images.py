@@ -87,7 +87,8 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
     if not 0 < seconds < math.inf:
         raise ValueError(f"seconds: expected a time above 0, got {seconds}")
     if kind in CODECS:
-        return _video(frames, kind, max(1.0, len(frames) / seconds))
+        repeats = math.ceil(seconds / len(frames))  # players expect a frame a second or more
+        return _video(frames.repeat(repeats, axis=0), kind, repeats * len(frames) / seconds)
     first, *others = [Image.fromarray(frame) for frame in frames]
     how = {"quality": 90, "method": 4} if kind == "webp" else {}
     buffer = io.BytesIO()

@@ -132,11 +132,12 @@ def farthest_first(directions: Float[Tensor, "direction 3"], first: int, count: 
         count: how many, at most all.
 
     Returns:
-        Indices: the first, and after it always the one of the largest angle to the nearest of those before.
+        Indices: the first, and after it always the one of the largest angle to the nearest of those before, none twice.
     """
     chosen = [first]
     nearest = directions @ directions[first]
     while len(chosen) < count:
+        nearest[chosen[-1]] = math.inf  # a direction that another one repeats is as near to that as to itself
         chosen.append(int(nearest.argmin()))
         nearest = torch.maximum(nearest, directions @ directions[chosen[-1]])
     return chosen[:count]

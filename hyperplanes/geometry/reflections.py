@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -13,13 +14,15 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.arguments import checked, checked_fields
 
 __all__ = ["Plane", "Symmetry", "reflected_cameras", "rotation_about"]
 
+MOST_PLANES = 64  # of a symmetry
 UNIT = 1e-4  # by which the length of a normal may differ from 1
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Plane:
     """The points x of the world with normal · x = offset.
@@ -67,6 +70,7 @@ class Plane:
         return Plane(_triple(normal), self.offset + float(normal @ motion[:3, 3]))
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Symmetry:
     """The planes about which an object is its own mirror image: one, or several through a vertical axis.
@@ -76,20 +80,18 @@ class Symmetry:
 
     Attributes:
         plane: one of the planes.
-        order: how many there are.
+        order: how many there are, at most MOST_PLANES.
         axis: a point of their axis; y is up.
 
     Raises:
-        ValueError: no plane, or several through a plane that is not vertical or that the axis does not lie in.
+        ValueError: no plane or too many, or several through one that is not vertical or that the axis does not lie in.
     """
 
     plane: Plane
-    order: int = 1
+    order: Annotated[int, range(1, MOST_PLANES + 1)] = 1
     axis: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if self.order < 1:
-            raise ValueError(f"order: expected at least 1, got {self.order}")
         apart = sum(a * b for a, b in zip(self.plane.normal, self.axis, strict=True)) - self.plane.offset
         through = abs(self.plane.normal[1]) < UNIT and abs(apart) < UNIT * (1 + math.hypot(*self.axis))
         if self.order > 1 and not through:

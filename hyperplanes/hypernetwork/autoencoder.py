@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import silu
 
 from hyperplanes.hypernetwork.base import HyperNetwork, Observed
-from hyperplanes.hypernetwork.choices import check_choices
-from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS, encode_objects
+from hyperplanes.hypernetwork.encoders import ENCODERS, Choice, Encoder, Normalisation, encode_objects
 from hyperplanes.hypernetwork.weights import random_matrix
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
@@ -36,14 +35,11 @@ class AutoencoderConfig:
     """
 
     views: Annotated[int, range(1, 1025)] = 5
-    choice: str = "farthest"
-    encoder: str = "convnet"
-    normalisation: str = "group"
+    choice: Choice = "farthest"
+    encoder: Encoder = "convnet"
+    normalisation: Normalisation = "group"
     code: Annotated[int, range(1, 8193)] = 128
     latent: Annotated[int, range(1, 8193)] = 128
-
-    def __post_init__(self) -> None:
-        check_choices(self, {"choice": CHOICES, "encoder": ENCODERS, "normalisation": NORMALISATIONS})
 
 
 class Autoencoder(HyperNetwork):

@@ -4,34 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 from torch import Tensor
 from torch.nn.functional import relu, silu
 
-from hyperplanes.hypernetwork.choices import check_choices
-from hyperplanes.hypernetwork.encoders import CHOICES, ENCODERS, NORMALISATIONS
-from hyperplanes.hypernetwork.updates import UPDATES
+from hyperplanes.hypernetwork.encoders import Choice, Encoder, Normalisation
 from hyperplanes.utilities.arguments import checked_fields
 
 __all__ = [
     "ACTIVATIONS",
     "KINDS",
-    "HeadConfig",
     "HyperNetworkConfig",
     "ImageHyperNetworkConfig",
     "VolumeHyperNetworkConfig",
 ]
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": relu, "silu": silu}
-CODE_NORMALISATIONS = ("none", "running")
-JOINS = ("concatenate", "mean")
-WEIGHTS_SEEN = ("updated", "all")
 
 
+@checked_fields
 @dataclass(frozen=True)
-class HeadConfig:
-    """What hypernetworks that read images end with: from the code of an object to an update.
+class ImageHyperNetworkConfig:
+    """A hypernetwork that reads images, as in the paper (`ImageHyperNetwork`).
 
     Attributes:
         code: length of the code of one image.
@@ -49,31 +44,6 @@ class HeadConfig:
             the update follow the weights it is added to.
         centre: what the output layers read is standardised by running statistics over objects, and they have no bias:
             the update has mean zero over objects, so that what is the same for every object can only go into theta.
-    """
-
-    code: Annotated[int, range(1, 8193)] = 128
-    code_normalisation: str = "running"
-    depth: Annotated[int, range(1, 257)] = 3
-    width: Annotated[int, range(1, 8193)] = 256
-    activation: str = "relu"
-    layers: tuple[str, ...] = ("colour", "density")
-    update: str = "full"
-    rank: Annotated[int, range(1, 1025)] = 4
-    see_weights: bool = True
-    weights_seen: str = "updated"
-    centre: bool = True
-
-    def __post_init__(self) -> None:
-        known = {"activation": ACTIVATIONS, "update": UPDATES, "weights_seen": WEIGHTS_SEEN}
-        check_choices(self, {"code_normalisation": CODE_NORMALISATIONS, **known})
-
-
-@checked_fields
-@dataclass(frozen=True)
-class ImageHyperNetworkConfig(HeadConfig):
-    """A hypernetwork that reads images, as in the paper (`ImageHyperNetwork`).
-
-    Attributes:
         views: k, the number of HyperPlanes it reads; the most it reads with a field that takes any number of views.
         choice: which k of the n planes they are: the "farthest" apart, or the "first".
         resolution: pixels a side that HyperPlanes are resized to before they are encoded, so that pictures of every
@@ -86,18 +56,24 @@ class ImageHyperNetworkConfig(HeadConfig):
         see_directions: the viewing directions are an input.
     """
 
+    code: Annotated[int, range(1, 8193)] = 128
+    code_normalisation: Literal["none", "running"] = "running"
+    depth: Annotated[int, range(1, 257)] = 3
+    width: Annotated[int, range(1, 8193)] = 256
+    activation: Literal["relu", "silu"] = "relu"
+    layers: tuple[str, ...] = ("colour", "density")
+    update: Literal["full", "low_rank"] = "full"
+    rank: Annotated[int, range(1, 1025)] = 4
+    see_weights: bool = True
+    weights_seen: Literal["updated", "all"] = "updated"
+    centre: bool = True
     views: Annotated[int, range(1, 1025)] = 5
-    choice: str = "farthest"
+    choice: Choice = "farthest"
     resolution: Annotated[int, range(8193)] = 0
-    encoder: str = "convnet"
-    normalisation: str = "batch"
-    join: str = "concatenate"
+    encoder: Encoder = "convnet"
+    normalisation: Normalisation = "batch"
+    join: Literal["concatenate", "mean"] = "concatenate"
     see_directions: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        known = {"choice": CHOICES, "encoder": ENCODERS, "normalisation": NORMALISATIONS, "join": JOINS}
-        check_choices(self, known)
 
 
 @checked_fields

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal, TypeAlias
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -9,38 +11,39 @@ from torch.nn.functional import relu
 
 from hyperplanes.hypernetwork.synchronisation import BatchNorm2d
 
-__all__ = ["CHOICES", "ENCODERS", "NORMALISATIONS", "ConvNet", "ResNet101", "encode_objects"]
+__all__ = ["ENCODERS", "Choice", "ConvNet", "Encoder", "Normalisation", "ResNet101", "encode_objects"]
 
-CHOICES = ("farthest", "first")
+Choice: TypeAlias = Literal["farthest", "first"]
 """Which k of n planes an encoder reads."""
 
-NORMALISATIONS = ("batch", "batch_statistics", "group")
+Encoder: TypeAlias = Literal["convnet", "resnet101"]
+
+Normalisation: TypeAlias = Literal["batch", "batch_statistics", "group"]
+
+CHANNELS = (32, 64, 128, 128)  # of the convolutions of `ConvNet`
 
 
-def _normalisation(name: str, channels: int) -> nn.Module:
+def _normalisation(name: Normalisation, channels: int) -> nn.Module:
     if name == "batch":
         return BatchNorm2d(channels)
     if name == "batch_statistics":
         return BatchNorm2d(channels, track_running_stats=False)
-    if name == "group":
-        return nn.GroupNorm(8, channels)
-    expected = ", ".join(map(repr, NORMALISATIONS))
-    raise ValueError(f"normalisation: expected one of {expected}, got {name!r}")
+    return nn.GroupNorm(8, channels)
 
 
 class ConvNet(nn.Module):
     """3x3 convolutions, each followed by normalisation and ReLU, halving the image (HyperPlanes, Appendix B)."""
 
-    def __init__(self, code: int, normalisation: str = "batch", channels: tuple[int, ...] = (32, 64, 128, 128)) -> None:
+    def __init__(self, code: int, normalisation: Normalisation = "batch") -> None:
         super().__init__()
-        sizes = (3, *channels)
+        sizes = (3, *CHANNELS)
         self.convolutions = nn.ModuleList(
             nn.Conv2d(before, after, 3, stride=2, padding=1, bias=False)
-            for before, after in zip(sizes, channels, strict=False)
+            for before, after in zip(sizes, CHANNELS, strict=False)
         )
-        self.normalisations = nn.ModuleList(_normalisation(normalisation, after) for after in channels)
+        self.normalisations = nn.ModuleList(_normalisation(normalisation, after) for after in CHANNELS)
         self.pool = nn.AdaptiveAvgPool2d(4)
-        self.code = nn.Linear(channels[-1] * 16, code)
+        self.code = nn.Linear(CHANNELS[-1] * 16, code)
 
     def forward(self, images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view code"]:
         """One code an image; images in [0, 1] of any size."""
@@ -56,7 +59,7 @@ class _Bottleneck(nn.Module):
     The stride is that of the 3x3 convolution, as in torchvision (ResNet v1.5); the publication strides the first 1x1.
     """
 
-    def __init__(self, before: int, narrow: int, stride: int, normalisation: str) -> None:
+    def __init__(self, before: int, narrow: int, stride: int, normalisation: Normalisation) -> None:
         super().__init__()
         after = 4 * narrow
         self.path = nn.Sequential(
@@ -82,7 +85,9 @@ class _Bottleneck(nn.Module):
 class ResNet101(nn.Module):
     """ResNet-101 with an output of chosen size (He et al. 2016; HyperPlanes, Appendix B)."""
 
-    def __init__(self, code: int, normalisation: str = "batch", blocks: tuple[int, ...] = (3, 4, 23, 3)) -> None:
+    def __init__(
+        self, code: int, normalisation: Normalisation = "batch", blocks: tuple[int, ...] = (3, 4, 23, 3)
+    ) -> None:
         super().__init__()
         self.stem = nn.Sequential(
             nn.Conv2d(3, 64, 7, 2, 3, bias=False), _normalisation(normalisation, 64), nn.ReLU(), nn.MaxPool2d(3, 2, 1)

@@ -2,41 +2,76 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import silu
+from torch.nn.functional import relu, silu
 
-from hyperplanes.hypernetwork.base import Observed
-from hyperplanes.hypernetwork.configuration import ImageHyperNetworkConfig
+from hyperplanes.hypernetwork.base import HyperNetwork, Observed
+from hyperplanes.hypernetwork.configuration import ACTIVATIONS, ImageHyperNetworkConfig
 from hyperplanes.hypernetwork.encoders import ENCODERS, encode_objects
 from hyperplanes.hypernetwork.standardisation import RunningStandardisation
-from hyperplanes.hypernetwork.update_head import UpdateHead
+from hyperplanes.hypernetwork.updates import UPDATES
+from hyperplanes.hypernetwork.weights import LowRankReader
 from hyperplanes.parameters import Parameters
 
 __all__ = ["ImageHyperNetwork"]
 
 
-class ImageHyperNetwork(UpdateHead):
+class ImageHyperNetwork(HyperNetwork):
     """H(I_1..I_k, d_1..d_k, theta; delta) = one tensor for each named parameter of the chosen layers.
 
     The outputs start at zero: an untrained hypernetwork changes nothing.
+
+    Args:
+        config: the shape.
+        shapes: of the parameters of the target by name.
+
+    Raises:
+        ValueError: layers that the target does not have.
     """
 
     def __init__(self, config: ImageHyperNetworkConfig, shapes: Mapping[str, torch.Size]) -> None:
-        super().__init__(config, shapes)
+        super().__init__()
         self.config = config
         self.views, self.choice, self.resolution = config.views, config.choice, config.resolution
+        # the layers that are updated
+        known = {name.split(".")[-2] for name in shapes}
+        chosen = known if config.layers == ("all",) else set(config.layers)
+        if not chosen or chosen - known:
+            expected = f"('all',) or some of {sorted(known)}"
+            raise ValueError(f"layers: expected {expected}, got {sorted(chosen - known) or 'none'}")
+        self.shapes = {name: shape for name, shape in shapes.items() if name.split(".")[-2] in chosen}
+        # a code of every image, and of the object
         self.encoder = ENCODERS[config.encoder](config.code, config.normalisation)
         concatenated = config.join == "concatenate"
-        self.code_normalisation = self.make_normalisation(
-            (config.views, config.code) if concatenated else (config.code,)
-        )
+        shape = (config.views, config.code) if concatenated else (config.code,)
+        running = config.code_normalisation == "running"
+        self.code_normalisation = RunningStandardisation(shape) if running else nn.Identity()
         if not concatenated:
             self.place = nn.Linear(config.code + 3, config.code)
-        self.make_head(config.views * (config.code + 3) if concatenated else config.code, shapes)
+        # a code of theta
+        if config.weights_seen == "all":
+            self.weights_code = LowRankReader(shapes, config.code)
+        else:
+            self.weights_code = nn.Linear(sum(shape.numel() for shape in self.shapes.values()), config.code)
+        # the head, from both codes to the outputs
+        read = config.views * (config.code + 3) if concatenated else config.code
+        sizes = [read + config.code] + [config.width] * config.depth
+        self.head = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
+        updates = [UPDATES[config.update](shape, config.rank) for shape in self.shapes.values()]
+        self.updates = nn.ModuleList(updates)
+        self.standardise = RunningStandardisation((config.width,)) if config.centre else nn.Identity()
+        self.outputs = nn.ModuleList(nn.Linear(config.width, update.size, bias=not config.centre) for update in updates)
+        for parameter in self.outputs.parameters():
+            nn.init.zeros_(parameter)
+
+    @property
+    def activated(self) -> Sequence[nn.Module]:
+        """The layers of the head."""
+        return list(self.head)
 
     def forward(self, observed: Observed, theta: Mapping[str, Tensor]) -> list[Parameters]:
         """The update of theta for the objects that these HyperPlanes show.
@@ -64,7 +99,7 @@ class ImageHyperNetwork(UpdateHead):
             )
         # codes of the images, joined with the directions; the head makes updates of them
         codes = self.encode(images, directions, observed.present)
-        return self.updates_of(self._joined(codes, directions), theta)
+        return self._updates_of(self._joined(codes, directions), theta)
 
     def standardised_codes(self, observed: Observed) -> Tensor | None:
         """The codes of the images in deviations of those of the training; None where they are not standardised so."""
@@ -100,3 +135,31 @@ class ImageHyperNetwork(UpdateHead):
             seen = directions if self.config.see_directions else torch.zeros_like(directions)
             parts.append(seen.flatten(1))
         return torch.cat(parts, 1)
+
+    def _updates_of(self, read: Float[Tensor, "object read"], theta: Mapping[str, Tensor]) -> list[Parameters]:
+        """The updates of several objects, of what the head reads of each and of the target's parameters."""
+        config = self.config
+        activation = ACTIVATIONS[config.activation]
+        # the code of the object beside that of theta, through the fully connected layers
+        hidden = torch.cat([read, self._weights_read(theta).expand(len(read), -1)], 1)
+        for layer in self.head:
+            hidden = activation(layer(hidden))
+        if config.centre:  # of unit length on average, as what Adam moves an output by grows with it
+            hidden = self.standardise(hidden) / config.width**0.5
+        # each parameter has an output layer of its own, and a form in which its update is written
+        outputs = [output(hidden) for output in self.outputs]
+        return [
+            Parameters(
+                (name, update(output[index], theta[name]))
+                for name, update, output in zip(self.shapes, self.updates, outputs, strict=True)
+            )
+            for index in range(len(read))
+        ]
+
+    def _weights_read(self, theta: Mapping[str, Tensor]) -> Float[Tensor, " code"]:
+        """The code of theta."""
+        if not self.config.see_weights:
+            theta = {name: torch.zeros_like(value) for name, value in theta.items()}
+        if isinstance(self.weights_code, LowRankReader):
+            return relu(self.weights_code(theta))
+        return relu(self.weights_code(torch.cat([theta[name].flatten() for name in self.shapes])))

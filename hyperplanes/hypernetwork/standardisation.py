@@ -10,6 +10,8 @@ from hyperplanes.hypernetwork.synchronisation import gather_objects
 
 __all__ = ["RunningStandardisation"]
 
+EPSILON = 1e-5  # added to the variance
+
 
 class RunningStandardisation(nn.Module):
     """Batch renormalisation (Ioffe 2017) over objects, without an affine part.
@@ -24,17 +26,15 @@ class RunningStandardisation(nn.Module):
     Args:
         shape: of the codes of one object.
         momentum: weight of the newest step in the statistics; the first 1 / momentum steps are averaged evenly.
-        epsilon: added to the variance.
     """
 
     mean: Tensor
     variance: Tensor
     steps: Tensor
 
-    def __init__(self, shape: tuple[int, ...], momentum: float = 0.05, epsilon: float = 1e-5) -> None:
+    def __init__(self, shape: tuple[int, ...], momentum: float = 0.05) -> None:
         super().__init__()
         self.momentum = momentum
-        self.epsilon = epsilon
         self.register_buffer("mean", torch.zeros(shape))
         self.register_buffer("variance", torch.ones(shape))
         self.register_buffer("steps", torch.zeros(()))
@@ -50,15 +50,15 @@ class RunningStandardisation(nn.Module):
         self._update(codes.detach())
         if len(codes) == 1:
             return self._standardised(codes)
-        deviation = (codes.var(0, unbiased=False) + self.epsilon).sqrt()
+        deviation = (codes.var(0, unbiased=False) + EPSILON).sqrt()
         normalised = (codes - codes.mean(0)) / deviation
-        running = (self.variance + self.epsilon).sqrt()
+        running = (self.variance + EPSILON).sqrt()
         scale = (deviation / running).detach()
         shift = ((codes.mean(0) - self.mean) / running).detach()
         return normalised * scale + shift
 
     def _standardised(self, codes: Tensor) -> Tensor:
-        return (codes - self.mean) * torch.rsqrt(self.variance + self.epsilon)
+        return (codes - self.mean) * torch.rsqrt(self.variance + EPSILON)
 
     @torch.no_grad()
     def _update(self, codes: Tensor) -> None:

@@ -12,6 +12,7 @@ from hyperplanes.utilities.transforms import are_plain
 __all__ = ["VolumeNetwork"]
 
 FOLD = 2  # cells an axis that become channels before the first convolution
+WIDTHS = (32, 64, 128)  # channels at half, a quarter and an eighth of the side
 GROUPS = 8  # of the normalisation
 
 
@@ -97,17 +98,16 @@ class VolumeNetwork(nn.Module):
         channels: numbers that are read of a cell.
         side: cells an axis, a multiple of eight.
         features: of every cell.
-        widths: channels at half, a quarter and an eighth of the side.
 
     Raises:
         ValueError: another side.
     """
 
-    def __init__(self, channels: int, side: int, features: int, widths: tuple[int, int, int] = (32, 64, 128)) -> None:
+    def __init__(self, channels: int, side: int, features: int) -> None:
         super().__init__()
         if side % (4 * FOLD):
             raise ValueError(f"side: expected a multiple of {4 * FOLD}, got {side}")
-        fine, middle, coarse = widths
+        fine, middle, coarse = WIDTHS
         self.features = features
         folded = channels * FOLD**3
         self.first = _Pointwise(folded, fine)

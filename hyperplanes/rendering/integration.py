@@ -158,7 +158,8 @@ def _by_importance(
         mean = torch.where(share > 0, sums / share.clamp_min(1e-12), scene.background)
     colours = mean[samples.ray].index_put((chosen,), colour)
     weights = packed_weights(density * samples.step, samples.ray, count)
-    return composite_packed(colours, weights, samples.distances, samples.ray, count, scene.background)
+    result = composite_packed(colours, weights, samples.distances, samples.ray, count, scene.background)
+    return replace(result, samples=len(samples) + len(chosen))  # those with a gradient are evaluated twice
 
 
 def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: float) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ from hyperplanes.adaptation.gating import GatingNetwork, readings
 from hyperplanes.adaptation.held_out import hold_out
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.stacking import hull_field, hull_share
+from hyperplanes.utilities.seeding import seeded
 from hyperplanes.views import Task, moved
 
 __all__ = ["GatingExample", "example_of", "fit_gate", "turned"]
@@ -94,8 +95,7 @@ def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS, seed: int
     examples = [each for each in examples if len(each.read)]
     if not examples:
         raise ValueError("examples: expected one of which a picture shows anything, got none")
-    with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(seed)  # `torch.manual_seed` would seed GPUs, too
+    with seeded(seed):
         gate = GatingNetwork().requires_grad_()
     descent = torch.optim.Adam(gate.parameters(), RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(descent, steps)

@@ -79,7 +79,7 @@ class Validator:
                 prepared = [each.prepared for each in episodes]
                 # stacked pictures are no measure of what an update alone loses
                 stacked = model.config.stacked or model.config.hull_share or model.config.gated
-                _, gap = swap_gap(model, prepared, queries, None if stacked else quality)
+                gap = swap_gap(model, prepared, queries, None if stacked else quality)
                 diagnostics = replace(diagnose(model, prepared), swap_gap=gap)
         return Validation(quality, samples.ssim, samples, diagnostics)
 

@@ -8,16 +8,17 @@ __all__ = ["format_duration", "format_rate"]
 def format_duration(seconds: float) -> str:
     """A length of time with its unit.
 
-    >>> format_duration(0.034), format_duration(8.25), format_duration(75), format_duration(7322)
-    ('34 ms', '8.2 s', '1 min 15 s', '2 h 02 min')
+    >>> [format_duration(seconds) for seconds in (0.034, 0.9996, 8.25, 59.96, 75, 7322)]
+    ['34 ms', '1.0 s', '8.2 s', '1 min 00 s', '1 min 15 s', '2 h 02 min']
     """
-    if seconds < 1:
+    if round(1000 * seconds) < 1000:
         return f"{1000 * seconds:.0f} ms"
-    if seconds < 60:
+    if round(10 * seconds) < 600:
         return f"{seconds:.1f} s"
-    if seconds < 3600:
-        return f"{int(seconds) // 60} min {int(seconds) % 60:02d} s"
-    return f"{int(seconds) // 3600} h {int(seconds) % 3600 // 60:02d} min"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
 def format_rate(value: float) -> str:

@@ -11,7 +11,7 @@ import reprlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, is_dataclass
 from types import NoneType
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from cattrs import Converter, IterableValidationError
 from cattrs.errors import ClassValidationError, ForbiddenExtraKeysError
@@ -115,7 +115,8 @@ def _first(error: BaseException, kind: Any, path: tuple[str, ...]) -> SettingsEr
             return _first(cause, note.type, (*path, note.name))
         return _first(others[0], kind, path)
     if isinstance(error, IterableValidationError):
-        return _first(error.group_exceptions()[0][0][0], kind, path)
+        noted, others = error.group_exceptions()
+        return _first(noted[0][0] if noted else others[0], kind, path)
     where = ".".join(path)
     if isinstance(error, ForbiddenExtraKeysError):
         name = str(sorted(error.extra_fields, key=str)[0])
@@ -146,6 +147,13 @@ def _number(value: Any, _: Any) -> float:
 def _in_range(allowed: range) -> Callable[[Any, Any], Any]:
     name = f"a whole number from {allowed[0]} to {allowed[-1]}"
     return _exact(lambda value: _is_whole(value) and value in allowed, name)
+
+
+def _one_of(value: Any, kind: Any) -> Any:
+    known = get_args(kind)
+    if not any(type(value) is type(each) and value == each for each in known):
+        raise ValueError(f"expected one of {', '.join(map(repr, known))}, got {reprlib.repr(value)}")
+    return value
 
 
 def _names(value: Any, _: Any) -> tuple[str, ...]:
@@ -183,3 +191,4 @@ _CONVERTER.register_structure_hook(bool, _exact(lambda value: isinstance(value, 
 _CONVERTER.register_structure_hook(str, _exact(lambda value: isinstance(value, str), "a name"))
 _CONVERTER.register_structure_hook(float, _number)
 _CONVERTER.register_structure_hook_func(lambda kind: kind == tuple[str, ...], _names)
+_CONVERTER.register_structure_hook_func(lambda kind: get_origin(kind) is Literal, _one_of)

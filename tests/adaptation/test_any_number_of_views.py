@@ -14,6 +14,7 @@ from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FRESH, MANY_VIEWS, FineTuning
 from hyperplanes.fields import ImageBasedConfig, TargetConfig
 from hyperplanes.geometry.cameras import centres
+from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering import RayMarching
 from hyperplanes.rendering.compositing import Rendered
@@ -108,6 +109,15 @@ def test_the_hypernetwork_reads_the_views_that_stand_farthest_apart():
     standing = torch.nn.functional.normalize(centres(chosen.cameras), dim=1)
     assert len(chosen) == 3
     assert (standing @ standing.T).fill_diagonal_(-1).max() < 0.2  # three of eight, more than 78 degrees apart
+
+
+def test_directions_that_repeat_others_are_chosen_once_each():
+    directions = torch.nn.functional.normalize(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    repeated = torch.cat([directions, directions[:2]])
+    for first in range(8):
+        order = farthest_first(repeated, first, 8)
+        assert sorted(order) == list(range(8))
+        assert {each % 6 for each in order[:6]} == set(range(6))
 
 
 @pytest.mark.parametrize("reader", READERS)

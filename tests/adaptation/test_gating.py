@@ -8,6 +8,7 @@ import torch
 
 from hyperplanes.adaptation import HullBlend, HyperPlanes
 from hyperplanes.adaptation.descent import Descent
+from hyperplanes.adaptation.fine_tuning import fine_tune_to
 from hyperplanes.adaptation.gating import GatingNetwork, readings
 from hyperplanes.adaptation.held_out import FEWEST
 from hyperplanes.adaptation.stacking import StackedField, stack
@@ -89,7 +90,7 @@ def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
     torch.testing.assert_close(again.render(cameras).images, tuned.render(cameras).images, atol=1e-6, rtol=0)
     few = adapter.prepare(ball_views(ring(MANY_VIEWS - 1, (24, 24))), symmetry=Symmetry(Plane((1.0, 0.0, 0.0))))
     assert len(few.views) > MANY_VIEWS
-    assert not isinstance(adapter.fine_tune_to(few, 1, settings), StackedField)  # reflections do not count
+    assert not isinstance(fine_tune_to(adapter, few, 1, settings), StackedField)  # reflections do not count
     alone, hull = replace(tuned, gate=None), HullBlend().adapt_to(adapter.prepare(support).planes)
     one, other, mixed = (each.render(cameras).images for each in (alone, hull, tuned))
     torch.testing.assert_close(mixed, torch.lerp(one, other, 0.3))

@@ -323,7 +323,7 @@ def test_a_packaged_model_is_found_by_its_name(model, tmp_path, monkeypatch):
     assert all(torch.equal(value, found.state_dict()[name]) for name, value in model.state_dict().items())
     with pytest.raises(CheckpointError, match=r"boats-8: expected .* packaged model \(cars-8\), found neither; "):
         HyperPlanes.from_pretrained("boats-8")
-    with pytest.raises(CheckpointError, match="model.json: expected a checkpoint's JSON file, found none"):
+    with pytest.raises(CheckpointError, match="runs/boats-8: expected a checkpoint's folder, found no such folder"):
         HyperPlanes.from_pretrained("runs/boats-8")  # a path is a path
 
 

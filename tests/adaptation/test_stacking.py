@@ -31,6 +31,7 @@ from hyperplanes.geometry.cameras import centres
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Sphere, cast
+from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.rendering import RayMarching, render
 from hyperplanes.training import TrainingConfig
@@ -263,11 +264,14 @@ def test_a_field_that_knows_views_by_their_places_is_not_stacked():
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.8, 1.0])
 def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share, gated):
     adapter, support, cameras = model(), ball_views(ring(7, (24, 24))), ring(2, (10, 13), shift=1)
-    context = adapter.prepare(support)
+    symmetry = Symmetry(Plane((1.0, 0.0, 0.0)))  # its reflections are views, too
+    context = adapter.prepare(support, symmetry=symmetry)
     learned = adapter.rendering_field(context, adapter.adapted_weights(context))
-    stacked = stack(learned, HullBlend().adapt_to(context.planes), share, GatingNetwork() if gated else None, 7)
+    gate = GatingNetwork() if gated else None
+    stacked = stack(learned, HullBlend().adapt_to(context.planes), share, gate, len(context.views))
     keep_field(adapter, stacked, tmp_path / "adapted" / "kept")
     expected = stacked.render(cameras).images
+    assert stacked.symmetry == symmetry
     for again in (
         adapter.with_weights_of(stacked).adapt(support),
         recall_field(tmp_path / "adapted" / "kept", support),

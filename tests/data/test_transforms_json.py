@@ -10,7 +10,7 @@ import torch
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.scene import read_path, read_scene
-from hyperplanes.data import read_task, read_views
+from hyperplanes.data import open_dataset, read_task, read_views
 from hyperplanes.data.formats.recognise import read_posed_task
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.formats.transforms_json import _lens, read_transforms
@@ -184,3 +184,32 @@ def test_the_chair_of_blenders_format():
     assert task.query.images.shape == (25, 3, 200, 200)
     assert abs(float(camera.intrinsics(task.support.cameras)[0, 0, 0]) - 277.7777) < 1e-3
     assert 1.0 < task.support.bounds.radius < 1.5
+
+
+def test_a_file_of_another_name_is_all_there_is_of_a_scene(scene, tmp_path):
+    """Beside transforms.json with all frames lies a file with some of them."""
+    scene.write(tmp_path)
+    document = scene.document()
+    document["frames"] = document["frames"][:6:2]
+    (tmp_path / "subset.json").write_text(json.dumps(document))
+    task = read_task(tmp_path / "subset.json")
+    assert task.support.names + task.query.names == (scene.names[0], scene.names[4], scene.names[2])
+    assert open_dataset(tmp_path / "subset.json").names() == [tmp_path.name]
+    assert len(read_task(tmp_path / "transforms.json").support) == 4
+
+
+def test_a_camera_path_is_in_the_world_of_the_file_whether_it_or_its_folder_is_named(scene, tmp_path):
+    """nerfstudio's world is that of the file times dataparser_transforms.json, without `applied_transform`."""
+    applied = np.eye(4)[[1, 2, 0]]
+    scene.write(tmp_path / "app", scene.document(applied_transform=applied.tolist()))
+    frames = [{"camera_to_world": scene.opengl(index), "fov": 60.0} for index in range(3)]
+    path, transforms = tmp_path / "path.json", tmp_path / "dataparser_transforms.json"
+    path.write_text(json.dumps({"render_width": 8, "render_height": 8, "camera_path": frames}))
+    transforms.write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 1.0}))
+    task, up = read_scene(tmp_path / "app", Console(silent=True), all_views=True)
+    found = [
+        read_path(path, transforms, None, task.support, up, named, Console(silent=True))[0].extrinsics
+        for named in (tmp_path / "app", tmp_path / "app" / "transforms.json")
+    ]
+    assert torch.equal(*found)
+    assert not torch.allclose(found[0], task.support.cameras.extrinsics[:3], atol=0.1)

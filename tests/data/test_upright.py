@@ -6,7 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
-from hyperplanes.data import read_task, read_views
+from hyperplanes.data import open_dataset, read_task, read_views
+from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.data.upright import _direction, guess_up, upright, upright_task, y_up_from
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
@@ -106,3 +107,14 @@ def test_scenes_are_read_upright_when_asked_for(tmp_path):
         assert torch.equal(camera.camera_from_world(task.query.cameras), expected[1::2])
     with pytest.raises(ValueError, match="up: expected one of y, z, .* got 'w'"):
         read_task(tmp_path, up="w")
+
+
+def test_each_scene_of_a_folder_is_turned_as_its_file_says(scene, tmp_path):
+    for name, up in (("a", "z"), ("b", "y")):
+        scene.write(tmp_path / name, scene.document(up=up))
+    data = open_dataset(tmp_path)
+    on_device = TasksOnDevice(data, torch.device("cpu"))
+    for name, up in (("a", "z"), ("b", "y")):
+        expected = upright_task(data.task(name), up).support.cameras
+        found = on_device.task(name).support.cameras
+        assert torch.equal(camera.camera_from_world(found), camera.camera_from_world(expected))

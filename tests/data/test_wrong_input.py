@@ -174,6 +174,23 @@ def test_archives(tmp_path):
     refused(read_npz, path, match="expected arrays images and cam_poses, found images")
 
 
+def test_archives_of_one_name_are_refused_and_those_of_no_split_are_named(tmp_path):
+    """The authors take the first 80 % of the sorted names to train on and the last 20 % to test."""
+    home = tmp_path / "cars" / "sampled"
+    home.mkdir(parents=True)
+    for name in "abcdefg":
+        np.savez(home / f"8_{name}.npz", images=np.zeros((8, 8, 8, 3)), cam_poses=np.stack([np.eye(4)] * 8), focal=8.0)
+    data = open_dataset(tmp_path)
+    assert (data.names("train"), data.names("test")) == (list("abcde"), ["g"])
+    assert "skipped f, neither of the first 80 % nor of the last 20 %" in data.skipped[0]
+    other = tmp_path / "chairs" / "sampled"
+    other.mkdir(parents=True)
+    (home / "8_a.npz").rename(other / "8_b.npz")
+    refused(open_dataset, tmp_path, match="8_b.npz: expected a name that no other object has")
+    with pytest.raises(DataError, match="expected a downscale from 1 to 8, found 0"):
+        read_views(other / "8_b.npz", downscale=0)
+
+
 def test_channels_that_were_not_generated(tmp_path):
     refused(read_channel, tmp_path, "depth", match=r"depth\.npz: expected the depth of the object, found nothing")
     np.savez(tmp_path / "depth.npz", depth=np.zeros((2, 3)))

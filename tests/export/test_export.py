@@ -263,6 +263,16 @@ def test_a_video_has_the_frames(kind, tmp_path):
     gc.collect()
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_slow_video_lasts_as_long_as_it_was_asked_to(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed; the extra video")
+    path = tmp_path / "slow.mp4"
+    path.write_bytes(encode_animation(np.zeros((2, 32, 32, 3), np.uint8), "mp4", seconds=5.0))
+    assert ffmpeg.count_frames_and_secs(str(path))[1] == pytest.approx(5.0, abs=0.1)
+    gc.collect()
+
+
 @pytest.mark.parametrize("kind", ["webp", "gif"])
 def test_an_animation_lasts_as_long_as_it_was_asked_to(kind):
     frames = np.random.default_rng(0).integers(0, 255, (48, 2, 2, 3), np.uint8)

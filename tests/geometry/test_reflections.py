@@ -82,7 +82,7 @@ def test_by_a_quarter_turn_the_z_axis_is_mapped_onto_the_x_axis():
 @pytest.mark.parametrize(
     ("plane", "order", "message"),
     [
-        (Plane((1.0, 0.0, 0.0)), 0, "order: expected at least 1"),
+        (Plane((1.0, 0.0, 0.0)), 0, "order: expected a whole number from 1 to 64"),
         (Plane((0.0, 1.0, 0.0)), 2, "symmetry: expected a vertical plane through the axis"),
         (Plane((1.0, 0.0, 0.0), 0.1), 2, "symmetry: expected a vertical plane through the axis"),
     ],

@@ -86,8 +86,3 @@ def test_white_is_silence():
     # a convolution without bias sees nothing in a white image, border included: codes are those of the head alone
     network = ConvNet(5, "batch").eval()
     torch.testing.assert_close(network(torch.ones(1, 3, 32, 32))[0], network.code.bias)
-
-
-def test_an_unknown_normalisation_is_refused():
-    with pytest.raises(ValueError, match="normalisation: expected one of 'batch', .*, 'group', got 'layer'"):
-        ConvNet(4, "layer")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from hyperplanes.hypernetwork.standardisation import RunningStandardisation
+from hyperplanes.hypernetwork.standardisation import EPSILON, RunningStandardisation
 
 
 def test_the_statistics_become_those_of_what_it_is_shown():
@@ -68,8 +68,8 @@ def test_the_gradient_is_that_of_batch_normalisation_scaled_to_the_running_devia
     codes, weight = torch.randn(4, 2, requires_grad=True), torch.randn(4, 2)
     (layer(codes) * weight).sum().backward()
     other = codes.detach().clone().requires_grad_()
-    normalised = torch.nn.functional.batch_norm(other, None, None, training=True, eps=layer.epsilon)
-    ratio = ((codes.var(0, unbiased=False) + layer.epsilon) / (layer.variance + layer.epsilon)).sqrt().detach()
+    normalised = torch.nn.functional.batch_norm(other, None, None, training=True, eps=EPSILON)
+    ratio = ((codes.var(0, unbiased=False) + EPSILON) / (layer.variance + EPSILON)).sqrt().detach()
     (normalised * ratio * weight).sum().backward()
     torch.testing.assert_close(codes.grad, other.grad)
     assert codes.grad.sum(0).abs().max() < 1e-5

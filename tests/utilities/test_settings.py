@@ -106,7 +106,8 @@ def test_one_number_is_a_list_of_one_where_a_list_is_expected():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_configuration_written_is_the_one_read(name, tmp_path):
-    chosen = configure(name, "multiplane", seed=4)
+    chosen = configure(name, "multiplane")
+    chosen = replace(chosen, training=replace(chosen.training, seed=4))
     write_experiment(tmp_path / "config.yaml", "multiplane", chosen)
     found = read_experiment(tmp_path / "config.yaml")
     assert found["method"] == "multiplane"
@@ -165,6 +166,11 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
             ["--model.hypernetwork.encoder", "vgg"],
             "encoder: expected one of 'convnet', 'resnet101', got 'vgg'",
         ),
+        (["--model.target", "[1]"], "--model.target: [1] instead of a name"),
+        (["--model.hypernetwork.kind", "[1]"], "--model.hypernetwork: kind: expected one of images, volume, got [1]"),
+        (["--model.symmetry.plane.normal", "[1, 0]"], "--model.symmetry.plane.normal: "),
+        (["--model.symmetry", "{plane: {normal: [1, 0, 0]}, order: 1000}"], "--model.symmetry.order: 1000 instead of"),
+        (["--training.optimiser", "sgd"], "--training.optimiser: expected one of 'adam', 'muon', got 'sgd'"),
         (["--model.network", "3"], "--model.network: 3 instead of its entries"),
         (["--training.rays", "["], "--training.rays: expected a plain value"),
         (["--method", "magic"], "method: expected one of hyperplanes, "),

@@ -148,9 +148,14 @@ def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -
 def _authors(
     folder: Path, archives: list[Path], manifest: dict[str, Any], bounds: Sphere | None, legacy: bool
 ) -> Catalogue:
-    paths = {path.stem.rpartition("_")[2]: path for path in archives}
+    paths: dict[str, Path] = {}
+    for path in archives:
+        other = paths.setdefault(path.stem.rpartition("_")[2], path)
+        if other != path:
+            raise DataError(path, "a name that no other object has", f"that of {other}", "rename one of them")
     if isinstance(manifest.get("objects"), dict):  # whose names have underscores
         manifest = {**manifest, "objects": {k.replace("_", "-"): v for k, v in manifest["objects"].items()}}
+    skipped: list[str] = []
     splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
     if isinstance(manifest.get("splits"), dict):
         for split in SPLITS:
@@ -162,12 +167,14 @@ def _authors(
             first, last = max(1, int(len(names) * 0.8)), max(1, int(len(names) * 0.2))
             splits["train"] += tuple(names[:first])
             splits["test"] += tuple(names[first:][-last:])
+            if left := names[first:][:-last]:
+                skipped.append(f"{home}: skipped {', '.join(left)}, neither of the first 80 % nor of the last 20 %")
     split = PosedTask.alternating if manifest else PosedTask.halves
 
     def read(name: str) -> PosedTask:
         return split(read_npz(paths[name], legacy=legacy, bounds=bounds, root=folder), name)
 
-    return Catalogue("hyperplanes-200", splits, read, manifest)
+    return Catalogue("hyperplanes-200", splits, read, manifest, tuple(skipped))
 
 
 def _learnit(

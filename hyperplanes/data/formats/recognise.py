@@ -94,7 +94,7 @@ def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
     """
     path = Path(path)
     if path.is_file() and path.suffix in (".json", ".npz"):
-        return _one_scene(path, path.stem if path.suffix == ".npz" else path.resolve().parent.name)
+        return _one_scene(path, path.stem if path.suffix == ".npz" else path.resolve().parent.name, legacy)
     if not path.is_dir():
         refuse_unposed(path)
         raise DataError(path, "the folder of a data set", "nothing", "check the path, or run hyperplanes generate")
@@ -102,12 +102,12 @@ def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
     if manifest.get("format") == FORMAT and manifest.get("layout", "native") == "native":
         return native(path, manifest)
     if nsvf.is_nsvf(path):
-        return _one_scene(path, path.resolve().name)
+        return _one_scene(path, path.resolve().name, legacy)
     found = srn.catalogue(path, manifest) or npz.catalogue(path, manifest, legacy=legacy)
     if found is not None:
         return found
     if _find_format(path) is not None:
-        return _one_scene(path, path.resolve().name)
+        return _one_scene(path, path.resolve().name, legacy)
     for published in (nmr.catalogue, co3d.catalogue, objaverse.objaverse, objaverse.omniobject):
         if (found := published(path)) is not None:
             return found
@@ -138,26 +138,32 @@ def read_posed(path: str | Path, downscale: int | None = None) -> Posed:
     return _format(path).read(path, downscale, path)
 
 
-def read_posed_task(path: str | Path, downscale: int | None = None) -> PosedTask:
+def read_posed_task(path: str | Path, downscale: int | None = None, *, legacy: bool = False) -> PosedTask:
     """Support and query of one scene: as its files split it, or views in turn.
 
     Args:
-        path: as in `read_posed`; of a transforms file, those beside it belong to the scene.
+        path: as in `read_posed`; to transforms_train.json, _val or _test belong those beside it.
         downscale: as in `frames.assemble`.
+        legacy: of an .npz, as in `npz.read_npz`.
 
     Returns:
         The task, named after the folder or the .npz file. Anything wrong with a file is a DataError.
     """
     path = Path(path)
     if path.is_file() and path.suffix == ".npz":
-        return PosedTask.alternating(npz.read_npz(path), path.stem).downscaled(downscale)
-    folder = path.parent if path.is_file() and path.suffix == ".json" else path
+        return PosedTask.alternating(npz.read_npz(path, legacy=legacy), path.stem).downscaled(downscale)
+    folder = path
+    if path.is_file() and path.suffix == ".json":
+        folder = path.parent
+        if path not in find_transforms(folder):
+            return read_transforms_task(path, path.stem, downscale=downscale)
     return _format(folder).task(folder, folder.resolve().name, downscale, folder)
 
 
-def _one_scene(path: Path, name: str) -> Catalogue:
+def _one_scene(path: Path, name: str, legacy: bool) -> Catalogue:
     """One posed scene as a data set of one test object."""
-    return Catalogue("posed", {"train": (), "val": (), "test": (name,)}, lambda _: read_posed_task(path))
+    splits = {"train": (), "val": (), "test": (name,)}
+    return Catalogue("posed", splits, lambda _: read_posed_task(path, legacy=legacy))
 
 
 def _read_child(root: Path, name: str) -> PosedTask:

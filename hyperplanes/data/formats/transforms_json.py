@@ -75,7 +75,7 @@ def read_transforms(
 
 
 def read_transforms_task(
-    folder: str | Path,
+    path: str | Path,
     name: str,
     *,
     legacy: bool = False,
@@ -91,7 +91,7 @@ def read_transforms_task(
     transforms.json, `train_filenames` and `test_filenames` decide; else views alternate, the first one support.
 
     Args:
-        folder: what holds the files.
+        path: the folder that holds the files, or one file that is all there is.
         name: of the object.
         legacy: as in `calibration`.
         bounds: as in `read_transforms`; an estimate uses the views of the support alone.
@@ -106,16 +106,16 @@ def read_transforms_task(
     Raises:
         DataError: no transforms file, no view in one half, or anything wrong with a file.
     """
-    files = find_transforms(folder)
+    files = [path] if (path := Path(path)).is_file() else find_transforms(path)
     if not files:
-        raise DataError(folder, "transforms.json or transforms_train.json", "neither", "check the path")
+        raise DataError(path, "transforms.json or transforms_train.json", "neither", "check the path")
     paths = files if len(files) == 1 else [files[0], files[-1]]
     document, frames, counts = _listed_frames(paths, legacy, flat, root)
     query = range(counts[0], len(frames))
     if len(paths) == 1:
         frames, query = _split_by_names(document, frames, files[0])
     bounds = bounds or stated_bounds(document, files[0])
-    source = files[0] if len(paths) == 1 else folder
+    source = files[0] if len(paths) == 1 else path
     scene, kept = assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)
     scene = replace(scene, up=stated_up(document, files[0]))
     if query is None:

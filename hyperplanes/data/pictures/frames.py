@@ -14,6 +14,7 @@ import torch
 from hyperplanes.data.pictures.images import (
     Header,
     Pixels,
+    check_downscale,
     image_header,
     image_size,
     opacity_of,
@@ -225,9 +226,7 @@ def _factor(size: tuple[int, int], downscale: int | None, complete: bool, source
         while not complete and (size[0] // factor) * (size[1] // factor) > MEGAPIXEL:
             factor += 1
         return factor
-    if downscale < 1 or downscale > min(size):
-        found = f"{downscale} for pictures of {size[1]} x {size[0]} pixels"
-        raise DataError(source, f"a downscale from 1 to {min(size)}", found, "give another --downscale")
+    check_downscale(downscale, size, source)
     return downscale
 
 

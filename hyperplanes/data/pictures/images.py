@@ -106,6 +106,13 @@ def resized(picture: Pixels, size: tuple[int, int]) -> Pixels:
     return np.array(scaled.convert("RGBA"))
 
 
+def check_downscale(factor: int, size: tuple[int, int], source: str | Path) -> None:
+    """Refuse a factor by which pictures of a (height, width) cannot be scaled down."""
+    if not 1 <= factor <= min(size):
+        found = f"{factor} for pictures of {size[1]} x {size[0]} pixels"
+        raise DataError(source, f"a downscale from 1 to {min(size)}", found, "give another --downscale")
+
+
 def reduced(picture: Pixels, factor: int) -> Pixels:
     """A picture (height, width, 4) of straight alpha, the mean of every factor x factor pixels one pixel.
 

@@ -15,7 +15,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.data.pictures.bounds import estimate_bounds
-from hyperplanes.data.pictures.images import composite_over_white, reduced
+from hyperplanes.data.pictures.images import check_downscale, composite_over_white, reduced
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError
@@ -83,14 +83,8 @@ class Posed:
         """The pictures with the mean of every factor x factor pixels as one pixel; None leaves them as they are."""
         if factor is None or factor == 1:
             return self
+        check_downscale(factor, (self.rgba.shape[2], self.rgba.shape[3]), self.names[0])
         height, width = self.rgba.shape[2] // factor, self.rgba.shape[3] // factor
-        if not height or not width:
-            raise DataError(
-                self.names[0],
-                f"pictures of {factor} pixels or more to scale down by {factor}",
-                f"{self.rgba.shape[3]} x {self.rgba.shape[2]}",
-                "give a smaller --downscale",
-            )
         pictures = [reduced(picture, factor) for picture in self.rgba.permute(0, 2, 3, 1).numpy()]
         whole = camera.cropped(self.cameras, height * factor, width * factor)
         return replace(

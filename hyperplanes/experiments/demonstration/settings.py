@@ -152,7 +152,6 @@ class DemoSettings:
         unseen = {"objects": self.unseen_objects, "held_out": self.unseen_objects}
         return Scale(
             name="demonstration",
-            about="the class that is trained on, and another one",
             presets={self.resolution: self.preset},
             resolution=self.resolution,
             objects=self.objects,
@@ -169,7 +168,6 @@ class DemoSettings:
         drawn = {"rig": "random", "seed": self.seed, "views": self.views}
         return Scale(
             name="demonstration",
-            about="what the packaged model is shown",
             presets={self.resolution: self.preset},
             resolution=self.first_resolution,
             objects=1,

@@ -1,6 +1,6 @@
 """The fused lookup for CUDA devices, in Triton: one program a block of points, all planes in a loop.
 
-The same three operators as on the CPU, registered for CUDA. Points, matrices and images stay in their own layouts;
+The fused lookup of the CPU and its gradient, for CUDA. Points, matrices and images stay in their own layouts;
 results are planar, (view, channel, point), so that a warp writes whole lines. Gradients with respect to images and
 matrices are summed by atomics, so their last digits may differ from run to run.
 """

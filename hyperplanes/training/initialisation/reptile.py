@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 
 from hyperplanes.adaptation.descent import ray_loss
+from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.data.support import SingleView
 from hyperplanes.training.episodes import Batch
 from hyperplanes.training.initialisation.base import InitialisationObjective, draw_rays, draw_seed
@@ -39,7 +40,7 @@ class Reptile(InitialisationObjective):
             episode, generator = draw.episode, draw.generator
             # gradient steps from theta on rays of its support views
             settings = replace(self.initialisation.descent(self.config.rays), seed=draw_seed(generator))
-            descent, variables = self.model.descent(episode.prepared, settings, start=theta)
+            descent, variables = make_descent(self.model, episode.prepared, settings, start=theta)
             for _ in descent.run(self.initialisation.inner_steps):
                 pass
             weights = variables.weights().detach()
