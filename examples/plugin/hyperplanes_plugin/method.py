@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from hyperplanes.adaptation import Adapter, FieldFromScratch
-from hyperplanes.configuration.presets import configure
 from hyperplanes.methods import Method, Request
 
 __all__ = ["SYMMETRIC_SCRATCH"]
@@ -11,8 +10,7 @@ __all__ = ["SYMMETRIC_SCRATCH"]
 
 def make(request: Request) -> Adapter:
     """An adapter: its `adapt` turns the support views of an object into a field."""
-    config = configure(request.preset, "symmetric", protocol=request.protocol).model
-    return FieldFromScratch(config, request.needed_steps, request.settings, request.device)
+    return FieldFromScratch(request.configured("symmetric"), request.needed_steps, request.settings, request.device)
 
 
 SYMMETRIC_SCRATCH = Method("a symmetric NeRF of one object from random weights", make, steps="required")
