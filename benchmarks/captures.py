@@ -74,7 +74,7 @@ class PoseErrors:
 
     Attributes:
         degrees: between the rotations, for each camera.
-        percent: between the centres, of the true distance from the middle of what they look at.
+        percent: between the centres, of the true distance from the origin, which they look at.
     """
 
     degrees: Float[np.ndarray, " camera"]
@@ -85,15 +85,12 @@ class PoseErrors:
         return float(((self.degrees <= degrees) & (self.percent <= percent)).mean())
 
 
-def compare_poses(
-    found: Float[np.ndarray, "camera 4 4"], true: Float[np.ndarray, "camera 4 4"], middle: tuple[float, ...] = (0, 0, 0)
-) -> PoseErrors:
+def compare_poses(found: Float[np.ndarray, "camera 4 4"], true: Float[np.ndarray, "camera 4 4"]) -> PoseErrors:
     """Errors after the similarity that brings the found centres nearest to the true ones (Umeyama, 1991).
 
     Args:
         found: world_from_camera.
         true: likewise, in the true world.
-        middle: what distances count from, in the true world.
     """
     source, target = found[:, :3, 3], true[:, :3, 3]
     shifted, wanted = source - source.mean(0), target - target.mean(0)
@@ -104,7 +101,7 @@ def compare_poses(
     centres = scale * shifted @ turn.T + target.mean(0)
     rotations = turn @ found[:, :3, :3]
     cosine = (np.einsum("cij,cij->c", rotations, true[:, :3, :3]) - 1) / 2
-    distance = np.linalg.norm(target - np.array(middle), axis=-1)
+    distance = np.linalg.norm(target, axis=-1)
     return PoseErrors(
         np.rad2deg(np.arccos(cosine.clip(-1, 1))), 100 * np.linalg.norm(centres - target, axis=-1) / distance
     )

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -186,7 +186,6 @@ class _PooledWithFeatures(_Pooled, _WithFeatures):
 class _Reader:
     """What of the hypernetwork is changed or left out."""
 
-    changes: dict[str, Any] = field(default_factory=dict)
     images: bool = False
     grid: bool = True
     completed: bool = True
@@ -279,7 +278,7 @@ def configured(name: str, steps: int, seed: int) -> Preset:
     assert isinstance(network, ImageBasedConfig)
     network = replace(network, depth=3, width=96, grid=network.grid if wanted and wanted.grid else 0)
     volume = made.model.hypernetwork
-    reader = None if wanted is None or volume is None else replace(volume, **wanted.changes)
+    reader = None if wanted is None else volume
     if wanted is not None and wanted.images:
         reader = replace(ALL_LAYERS, join="mean", views=6, resolution=64)
     model = replace(made.model, target=name, network=network, hypernetwork=reader, hull_resolution=64)

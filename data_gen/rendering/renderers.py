@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 
 __all__ = [
@@ -68,14 +67,12 @@ class ProbeResult:
     Attributes:
         name: one of RENDERERS.
         works: whether it drew the test picture right.
-        seconds: how long the trial took, start of the subprocess included.
         message: what draws, or what went wrong, one line.
         remedy: the command that should fix it; empty when it works.
     """
 
     name: str
     works: bool
-    seconds: float
     message: str
     remedy: str
 
@@ -167,7 +164,6 @@ def _advice(failure: ProbeResult) -> str:
 
 def _run_probe(name: str) -> ProbeResult:
     command = [sys.executable, "-m", "data_gen.rendering.probe_process", name]
-    start = time.monotonic()
     try:
         # The package may be imported from a folder that a fresh interpreter does not look in.
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
@@ -176,14 +172,13 @@ def _run_probe(name: str) -> ProbeResult:
         )
     except subprocess.TimeoutExpired:
         message = f"no picture within {_PROBE_SECONDS:g} s"
-        return ProbeResult(name, False, time.monotonic() - start, message, REMEDIES[name])
-    seconds = time.monotonic() - start
+        return ProbeResult(name, False, message, REMEDIES[name])
     lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
     if done.returncode == 0 and lines:
-        return ProbeResult(name, True, seconds, lines[-1], "")
+        return ProbeResult(name, True, lines[-1], "")
     errors = [line.strip() for line in done.stderr.splitlines() if line.strip()]
     if done.returncode < 0:
         message = f"crashed with signal {-done.returncode}"
     else:
         message = errors[-1] if errors else f"exit code {done.returncode}"
-    return ProbeResult(name, False, seconds, message, REMEDIES[name])
+    return ProbeResult(name, False, message, REMEDIES[name])

@@ -21,7 +21,7 @@ from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "made_anyway", "make_descent", "one_step"]
+__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "made_anyway", "make_descent", "one_step", "trained_on"]
 
 Made = TypeVar("Made")
 

@@ -78,7 +78,7 @@ class Photograph:
 
 
 def find_photographs(folder: Path) -> list[Path]:
-    """The photographs of a folder, or of its folder images/, input/, rgb/ or photos/, in the order of their names.
+    """The photographs of a folder, or of the one in it that holds them, such as images/, in the order of their names.
 
     Numbers in names count as numbers, so that IMG_9 comes before IMG_10.
 

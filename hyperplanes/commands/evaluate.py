@@ -11,7 +11,7 @@ over them. A seed is that of gradient steps on the support views and of random w
 in its name, it is that of the training, too. Methods are compared in pairs over the objects, by a paired t-test.
 
 Objects that cannot be read or adapted to are named and left out, for all methods, and the exit code is 1. What has been
-measured stands in FILE.partial.json until the FILE of --json is whole.
+measured stands in NAME.partial.json until the NAME.json of --json is whole.
 
 Example:
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method nearest_view hyperplanes hyperplanes_swapped

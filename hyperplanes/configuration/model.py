@@ -22,10 +22,10 @@ __all__ = ["ORDERS", "ModelConfig"]
 
 ORDERS = ("matched", "file")
 
-PROTOCOLS = {"hierarchical": Hierarchical, "ray_marching": RayMarching}
+SAMPLERS = {"hierarchical": Hierarchical, "ray_marching": RayMarching}
 """Samplers by the entry `protocol`."""
 
-choose_by_tag(Hierarchical | RayMarching, "protocol", PROTOCOLS)
+choose_by_tag(Hierarchical | RayMarching, "protocol", SAMPLERS)
 choose_by_tag(HyperNetworkConfig | None, "kind", KINDS)
 
 
@@ -118,7 +118,7 @@ class ModelConfig:
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""
-        sampling = tagged(self.sampling, "protocol", PROTOCOLS) or {}
+        sampling = tagged(self.sampling, "protocol", SAMPLERS) or {}
         protocol = sampling.pop("protocol")
         hypernetwork = tagged(self.hypernetwork, "kind", KINDS)
         return {**asdict(self), "hypernetwork": hypernetwork, "sampling": sampling, "protocol": protocol}

@@ -1,4 +1,4 @@
-"""Files to views: transforms.json, SRN, npz and COLMAP in, posed images and few-shot tasks out."""
+"""Files to views: data sets and posed images of many layouts in, few-shot tasks out."""
 
 from __future__ import annotations
 

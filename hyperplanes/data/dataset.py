@@ -29,7 +29,7 @@ class Dataset:
     """The objects of a folder, read when asked for and kept as 8-bit pictures while there is room.
 
     Args:
-        folder: a data set in the native layout, SRN's, learnit's or the HyperPlanes authors', or one posed scene.
+        folder: a data set, a folder of posed scenes, or one of them, in a layout that `find_catalogue` knows.
         budget: bytes of decoded pictures to keep in memory; the least recently used go first.
         legacy: principal points of learnit's and the authors' layouts at W / 2 at integer pixel centres, as the code
             that was published with these data has them, instead of at the middle of the pictures.

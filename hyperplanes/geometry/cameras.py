@@ -32,6 +32,7 @@ __all__ = [
     "intrinsics",
     "least_depth",
     "look_at",
+    "moved",
     "opencv_from_opengl",
     "opengl_from_opencv",
     "orbit",

@@ -15,7 +15,15 @@ from torch import Tensor
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.axes import flip_camera_axes
 
-__all__ = ["farthest_first", "fibonacci_sphere", "look_at", "opencv_from_opengl", "opengl_from_opencv", "orbit"]
+__all__ = [
+    "farthest_first",
+    "fibonacci_sphere",
+    "look_at",
+    "opencv_from_opengl",
+    "opengl_from_opencv",
+    "orbit",
+    "outermost_first",
+]
 
 Count: TypeAlias = Annotated[int, range(1, 2**24)]
 """Of cameras."""

@@ -14,10 +14,10 @@ from hyperplanes.commands import checks as doctor
 from hyperplanes.commands.checks import Check, examine, healthy
 
 WORKING = [
-    ProbeResult("pyrender-egl", False, 1.0, "no libEGL", "apt-get install -y libegl1 libgl1"),
-    ProbeResult("embree", True, 1.0, "Embree ray casting", ""),
+    ProbeResult("pyrender-egl", False, "no libEGL", "apt-get install -y libegl1 libgl1"),
+    ProbeResult("embree", True, "Embree ray casting", ""),
 ]
-NONE = [ProbeResult("embree", False, 1.0, "no module named embreex", "pip install embreex")]
+NONE = [ProbeResult("embree", False, "no module named embreex", "pip install embreex")]
 
 
 def test_optional_parts_may_be_missing(monkeypatch, capsys):

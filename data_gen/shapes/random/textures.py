@@ -20,12 +20,12 @@ __all__ = ["TEXTURES", "octaves", "random_material"]
 SIZE = patterns.SIZE
 
 
-def octaves(rng: np.random.Generator, coarsest: int, count: int, size: int = SIZE) -> np.ndarray:
-    """Noise (size, size) of several octaves, each of half the cells and half the strength, stretched to [0, 1]."""
-    total, strength = np.zeros((size, size)), 1.0
+def octaves(rng: np.random.Generator, coarsest: int, count: int) -> np.ndarray:
+    """Noise (SIZE, SIZE) of several octaves, each of half the cells and half the strength, stretched to [0, 1]."""
+    total, strength = np.zeros((SIZE, SIZE)), 1.0
     for octave in range(count):
-        cells = min(coarsest << octave, size // 2)
-        total += strength * patterns.noise(rng, (cells, cells), size)
+        cells = min(coarsest << octave, SIZE // 2)
+        total += strength * patterns.noise(rng, (cells, cells), SIZE)
         strength *= 0.55
     total -= total.min()
     return total / max(total.max(), 1e-9)

@@ -49,7 +49,6 @@ class ViewReport:
         direction: (azimuth, elevation) in degrees in which it stands; azimuth 0 is z, 90 is x.
         neighbour: degrees to the view that stands nearest.
         agreement: of its mask with the silhouette of all masks' hull (intersection over union), or None.
-        sharpness: of its picture, in that of the nearest views (median).
         error: reprojection error in pixels, or None.
         cut: whether the border of the picture cuts the object off.
         faults: what is wrong with it, in words.
@@ -59,7 +58,6 @@ class ViewReport:
     direction: tuple[float, float]
     neighbour: float
     agreement: float | None
-    sharpness: float
     error: float | None
     cut: bool
     faults: tuple[str, ...] = ()
@@ -193,9 +191,7 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
         if nearest > max(NEAR, LONELY * float(nearests.median())):
             faults.append(f"no other within {nearest:.0f} degrees")
         direction = float(azimuth[index]), float(elevation[index])
-        reports.append(
-            ViewReport(name, direction, nearest, fit, float(sharp[index]), error, bool(cut[index]), tuple(faults))
-        )
+        reports.append(ViewReport(name, direction, nearest, fit, error, bool(cut[index]), tuple(faults)))
     # how much of all directions, from above and from below, some view covers
     every = torch.linalg.inv(fibonacci_sphere(DIRECTIONS, 1.0).double())[:, :3, 3]
     near = angles_to(axes, every) < NEAR

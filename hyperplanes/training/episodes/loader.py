@@ -31,7 +31,7 @@ from hyperplanes.utilities.encoding import sha256
 from hyperplanes.utilities.lru_cache import LRUCache
 from hyperplanes.views import Task, Tasks, class_of
 
-__all__ = ["Batch", "Draw", "EpisodeLoader"]
+__all__ = ["Batch", "Draw", "EpisodeLoader", "reads_hull", "reference_objects", "training_names"]
 
 
 @dataclass(frozen=True)

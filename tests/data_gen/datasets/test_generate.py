@@ -37,7 +37,7 @@ SPLITS = ("test", "train", "val")
 SCRIPT = """
 from data_gen.datasets.generate import *
 from data_gen.rendering import renderers
-renderers.probe = lambda name: renderers.ProbeResult(name, True, 0.0, "tried by the tests", "")
+renderers.probe = lambda name: renderers.ProbeResult(name, True, "tried by the tests", "")
 config = GenerationConfig(views=4, resolution=16, workers=1, held_out=2)
 print(generate(Procedural("car", 5, seed=3), {out!r}, config,
     progress=lambda *state: print(*state, flush=True)))

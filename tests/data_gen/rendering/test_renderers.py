@@ -28,7 +28,7 @@ def pretend(fresh):
             tried.append(name)
             works = name in working
             return ProbeResult(
-                name, works, 0.1, "fine" if works else "no library", "" if works else renderers.REMEDIES[name]
+                name, works, "fine" if works else "no library", "" if works else renderers.REMEDIES[name]
             )
 
         fresh.setattr(renderers, "_run_probe", attempt)
