@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.geometry.chosen_views import BEYOND, CUT, MARGIN, WHOLE, Penalties
@@ -22,13 +22,11 @@ class Against:
     """What counts against the views of planes.
 
     Attributes:
-        masked: those that see nothing.
         handicaps: added to the penalty of each wherever it shows a point.
         margins: as `margins` returns them.
         penalties: how much counts.
     """
 
-    masked: Bool[Tensor, " view"]
     handicaps: Float[Tensor, " view"]
     margins: Float[Tensor, "view 4"]
     penalties: Penalties

@@ -83,7 +83,6 @@ class VisibilityPlanes:
         self._surface: Float[Tensor, "view height width 2"] | None = None
         self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
         self._against = Against(
-            torch.zeros(len(images), dtype=torch.bool, device=images.device),
             images.new_zeros(len(images)),
             images.new_zeros(len(images), 4) if masks is None else margins(masks).to(images),
             Penalties(),
@@ -113,9 +112,8 @@ class VisibilityPlanes:
         Args:
             views: their indices, or whether each of all views is masked.
         """
-        colours = self.colours.mask_views(views)
-        result = self._with(masked=colours.masked)
-        result.colours = colours
+        result = copy.copy(self)
+        result.colours = self.colours.mask_views(views)
         return result
 
     def with_penalties(self, penalties: Penalties) -> VisibilityPlanes:
@@ -199,8 +197,8 @@ class VisibilityPlanes:
 
     def shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, 0 where hidden, its handicap and margins."""
-        against = self._against
-        shown = (~against.masked).to(self._cameras)
+        against, masked = self._against, self.colours.masked
+        shown = self._cameras.new_ones(len(self)) if masked is None else (~masked).to(self._cameras)
         return torch.cat([self._cameras, torch.stack([shown, against.handicaps]), against.margins.T])
 
     def _choose_compiled(
@@ -230,7 +228,7 @@ class VisibilityPlanes:
             points: in the world.
             directions: along which they are seen, where there are any.
         """
-        if type(self) is not VisibilityPlanes or not self._takes_kernels(points) or self.colours.background != 1.0:
+        if type(self) is not VisibilityPlanes or not self._takes_kernels(points):
             return False
         given = [points, self.colours.cameras.intrinsics, self.colours.cameras.extrinsics]
         if not wants_values_alone(*given, *([] if directions is None else [directions])):
@@ -302,7 +300,7 @@ def choose_torch(
     rays, distances = found.directions, found.distances
     assert rays is not None
     assert distances is not None
-    valid = found.valid & ~planes._against.masked
+    valid = found.valid if planes.colours.masked is None else found.valid & ~planes.colours.masked
     depth, coverage = found.colours.unbind(-1)
     coverage = torch.where(valid, coverage, 1.0)
     # how far behind the surface, in radii, and what that and a broken mask cost
