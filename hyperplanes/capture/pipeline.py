@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from PIL import Image
 
 from hyperplanes.capture.masks.choice import check_mask, choose_masker
 from hyperplanes.capture.masks.consistency import agree
@@ -32,7 +31,7 @@ from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import Pixels, read_image
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.arguments import checked_fields
-from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.encoding import encode_jpeg, encode_png
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.writing import write_whole
 
@@ -181,7 +180,7 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
                 done["opaque"].append(True)
                 continue
             alpha = alpha and work.settings.mask in ("auto", "given")
-            write_whole(folder / f"{index:05d}.jpg", _jpeg(picture[..., :3]), durable=False)
+            write_whole(folder / f"{index:05d}.jpg", encode_jpeg(picture[..., :3], QUALITY), durable=False)
             if alpha:
                 write_whole(folder / f"{index:05d}.mask.png", encode_png(picture[..., 3]), durable=False)
             done["sizes"].append(list(picture.shape[:2]))
@@ -348,7 +347,7 @@ def _written(
     files = {}
     for row, (one, picture) in enumerate(zip(photographs, straight, strict=True)):
         work.progress("writing", row, len(straight), one.name)
-        files[f"images/{one.name}.jpg"] = _jpeg(picture[..., :3])
+        files[f"images/{one.name}.jpg"] = encode_jpeg(picture[..., :3], QUALITY)
         if masks is not None:
             files[f"masks/{one.name}.png"] = encode_png((masks[row] * 255).round().astype(np.uint8))
     captured = write_scene(
@@ -356,11 +355,3 @@ def _written(
     )
     work.progress("writing", len(straight), len(straight), "scene")
     return replace(captured, mask=how, up_from=placement.up_from, notes=tuple(work.notes))
-
-
-def _jpeg(picture: Pixels) -> bytes:
-    import io
-
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(picture)).save(buffer, "JPEG", quality=QUALITY, subsampling=0)
-    return buffer.getvalue()

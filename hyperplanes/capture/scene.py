@@ -14,6 +14,7 @@ from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.pictures.images import Pixels
 from hyperplanes.data.pictures.undistort import undistort
+from hyperplanes.utilities.encoding import encode_ply
 from hyperplanes.utilities.files import DataError, read_json
 from hyperplanes.utilities.writing import write_json, write_whole
 
@@ -115,13 +116,4 @@ def _listed(document: Path) -> set[str]:
 
 def encode_points(model: SparseModel) -> bytes:
     """The points with their colours as binary PLY."""
-    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    rows = np.zeros(len(model.points), kinds)
-    for axis, name in enumerate("xyz"):
-        rows[name] = model.points[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        rows[name] = model.colours[:, channel]
-    kind = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property {kind[code]} {name}" for name, code in kinds] + ["end_header", ""]
-    return "\n".join(header).encode() + rows.tobytes()
+    return encode_ply(model.points, model.colours)

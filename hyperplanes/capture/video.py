@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hyperplanes.capture.packages import require
+from hyperplanes.utilities.encoding import encode_jpeg
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.writing import write_whole
 
@@ -18,6 +18,7 @@ __all__ = ["VIDEO_SUFFIXES", "sharpness", "take_frames"]
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 LOOKED_AT = 5  # frames of each stretch, of which the sharpest is taken
+QUALITY = 95  # of JPEG
 SMALL = 320  # pixels along the longer side, on which sharpness is judged
 BLURRED = 0.25  # of the median sharpness: frames below are left out
 
@@ -57,7 +58,7 @@ def take_frames(path: Path, folder: Path, count: int, progress: Callable[[str, i
         progress("frames", min(index, total), total, path.name)
         slot, value = int(index / stretch), sharpness(picture)
         if slot not in best or value > best[slot][0]:
-            best[slot] = value, _jpeg(picture)
+            best[slot] = value, encode_jpeg(picture, QUALITY)
     if not best:
         raise DataError(path, "a video with frames that can be read", "none", "export it again")
     least = BLURRED * float(np.median([value for value, _ in best.values()]))
@@ -82,9 +83,3 @@ def sharpness(picture: np.ndarray) -> float:
 def _pictures(frames: Iterator[bytes], size: tuple[int, int]) -> Iterator[np.ndarray]:
     for data in frames:
         yield np.frombuffer(data, np.uint8).reshape(size[1], size[0], 3)
-
-
-def _jpeg(picture: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "JPEG", quality=95, subsampling=0)
-    return buffer.getvalue()

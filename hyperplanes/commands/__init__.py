@@ -6,13 +6,13 @@ imports nothing heavy; so does data_gen with `generate` and `inspect`.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 from hyperplanes.utilities.entry_points import find_entries
+from hyperplanes.utilities.errors import nearest
 
 __all__ = ["EXAMPLES", "VERBS", "Verb", "find_verb", "find_verbs", "split_settings"]
 
@@ -80,9 +80,7 @@ def find_verb(name: str) -> Verb:
         return Verb(f"{__name__}.{name}", VERBS[name])
     verbs = find_verbs()
     if name not in verbs:
-        near = difflib.get_close_matches(name, verbs, 1)
-        known = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(verbs)}"
-        raise ValueError(f"no verb {name!r}; {known}")
+        raise ValueError(f"no verb {name!r}; {nearest(name, list(verbs))}")
     return verbs[name]
 
 

@@ -22,8 +22,9 @@ from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.configuration.upgrade import upgrade_model, upgrade_training
 from hyperplanes.fields import find_targets
 from hyperplanes.hypernetwork import KINDS
+from hyperplanes.utilities.errors import nearest
 from hyperplanes.utilities.files import DataError, read_bytes
-from hyperplanes.utilities.settings import SettingsError, nearest, structure
+from hyperplanes.utilities.settings import SettingsError, structure
 from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["changed", "document", "parse_options", "read_experiment", "write_experiment"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from kornia.geometry.camera import PinholeCamera
@@ -16,6 +15,7 @@ from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering.depth import seen_surface
 from hyperplanes.rendering.images import Pictures
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.encoding import encode_ply
 from hyperplanes.utilities.files import format_of
 from hyperplanes.utilities.writing import write_whole
 
@@ -133,16 +133,6 @@ def save_points(cloud: PointCloud, path: str | Path) -> Path:
     """
     path = Path(path)
     format_of(path, ("ply",))
-    floats = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    colours = [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.zeros(len(cloud), np.dtype([*floats, *colours]))
-    numbers = torch.cat([cloud.points, cloud.normals], 1).cpu().numpy()
     pixels = (cloud.colours.clamp(0, 1) * 255).round().byte().cpu().numpy()
-    for values, names in ((numbers, floats), (pixels, colours)):
-        for column, (name, _) in enumerate(names):
-            rows[name] = values[:, column]
-    kinds = {"<f4": "float", "u1": "uchar"}
-    lines = "".join(f"property {kinds[kind]} {name}\n" for name, kind in (*floats, *colours))
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n{lines}end_header\n"
-    write_whole(path, header.encode() + rows.tobytes())
+    write_whole(path, encode_ply(cloud.points.cpu().numpy(), pixels, cloud.normals.cpu().numpy()))
     return path

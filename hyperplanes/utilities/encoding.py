@@ -1,4 +1,4 @@
-"""Values as the bytes of files: JSON, PNG, NPZ, each the same for the same value, and their checksum."""
+"""Values as the bytes of files: JSON, PNG, JPEG, PLY, NPZ, each the same for the same value, and their checksum."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["encode_json", "encode_npz", "encode_png", "sha256"]
+__all__ = ["encode_jpeg", "encode_json", "encode_npz", "encode_ply", "encode_png", "sha256"]
 
 _COLOUR_TYPES = {1: 0, 3: 2, 4: 6}  # PNG's numbers, by channels
 
@@ -25,6 +25,42 @@ def encode_json(value: Any) -> bytes:
     b'{\n  "a": [\n    1.5\n  ],\n  "b": 1\n}\n'
     """
     return (json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n").encode()
+
+
+def encode_jpeg(pixels: npt.NDArray[np.uint8], quality: int) -> bytes:
+    """JPEG bytes of (height, width, 3) pixels, of whose colours none are left out.
+
+    Args:
+        pixels: the image.
+        quality: as Pillow counts it, to 100.
+    """
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "JPEG", quality=quality, subsampling=0)
+    return buffer.getvalue()
+
+
+def encode_ply(
+    points: npt.NDArray[np.floating], colours: npt.NDArray[np.uint8], normals: npt.NDArray[np.floating] | None = None
+) -> bytes:
+    """Binary PLY of points with their colours.
+
+    Args:
+        points: (point, 3).
+        colours: (point, 3), RGB.
+        normals: (point, 3), where there are any.
+    """
+    numbers = points if normals is None else np.concatenate([points, normals], 1)
+    names = ("x", "y", "z", "nx", "ny", "nz")[: numbers.shape[1]]
+    kinds = [*((name, "<f4") for name in names), *((name, "u1") for name in ("red", "green", "blue"))]
+    rows = np.zeros(len(points), kinds)
+    for (name, _), column in zip(kinds, [*numbers.T, *colours.T], strict=True):
+        rows[name] = column
+    words = {"<f4": "float", "u1": "uchar"}
+    lines = "".join(f"property {words[kind]} {name}\n" for name, kind in kinds)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{lines}end_header\n"
+    return header.encode() + rows.tobytes()
 
 
 def encode_png(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], *, small: bool = False) -> bytes:

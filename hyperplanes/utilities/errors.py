@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 
-__all__ = ["MissingPackageError", "did_you_mean", "prefix_errors"]
+__all__ = ["MissingPackageError", "did_you_mean", "nearest", "prefix_errors"]
 
 
 class MissingPackageError(RuntimeError):
@@ -25,6 +25,19 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     """
     close = difflib.get_close_matches(str(name), list(known), 1)
     return f"; did you mean {close[0]}?" if close else ""
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """What to say after an unknown name: the nearest one that there is, or all of them.
+
+    >>> nearest("stpes", ["rays", "steps"])
+    'did you mean steps?'
+
+    Args:
+        name: what was given.
+        known: what there is.
+    """
+    return did_you_mean(name, known).removeprefix("; ") or f"expected one of {', '.join(known)}"
 
 
 @contextmanager

@@ -5,7 +5,6 @@ A whole number's range is declared where the field is: `depth: Annotated[int, ra
 
 from __future__ import annotations
 
-import difflib
 import math
 import reprlib
 from collections.abc import Callable, Mapping
@@ -17,7 +16,9 @@ from cattrs import Converter, IterableValidationError
 from cattrs.errors import ClassValidationError, ForbiddenExtraKeysError
 from cattrs.gen import make_dict_structure_fn, override
 
-__all__ = ["SettingsError", "choose_by_tag", "nearest", "structure", "tagged"]
+from hyperplanes.utilities.errors import nearest
+
+__all__ = ["SettingsError", "choose_by_tag", "structure", "tagged"]
 
 Made = TypeVar("Made")
 
@@ -94,16 +95,6 @@ def tagged(value: Any, tag: str, kinds: Mapping[str, type]) -> dict[str, Any] | 
     if value is None:
         return None
     return {tag: next(name for name, kind in kinds.items() if type(value) is kind), **asdict(value)}
-
-
-def nearest(name: str, known: list[str]) -> str:
-    """What to say after an unknown name: the nearest one, or all of them.
-
-    >>> nearest("stpes", ["rays", "steps"])
-    'did you mean steps?'
-    """
-    close = difflib.get_close_matches(name, known, 1)
-    return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
 
 
 def _first(error: BaseException, kind: Any, path: tuple[str, ...]) -> SettingsError | None:
