@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from hyperplanes.data.devices import choose_device
+from hyperplanes.utilities.timing import clock
 
 __all__ = [
     "Times",
@@ -70,9 +71,8 @@ def interleaved(
             begun, computed = time.perf_counter(), time.process_time()
             for _ in range(row):
                 ways[name]()
-            wait()
+            times[name].wall.append((clock() - begun) / row)
             times[name].processor.append((time.process_time() - computed) / row)
-            times[name].wall.append((time.perf_counter() - begun) / row)
     return times
 
 
@@ -95,17 +95,9 @@ def add_device_option(parser: argparse.ArgumentParser, default: str) -> None:
 
 def timed(run: Callable[[], Any]) -> tuple[float, Any]:
     """Seconds of a call, all that it left to a GPU included, and what it returned."""
-    wait()
-    begun = time.perf_counter()
+    begun = clock()
     result = run()
-    wait()
-    return time.perf_counter() - begun, result
-
-
-def wait() -> None:
-    """Until a GPU, where there is one, has done what it was asked for."""
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
+    return clock() - begun, result
 
 
 def ratio(reference: list[float], ours: list[float]) -> dict[str, float]:

@@ -48,6 +48,7 @@ from hyperplanes.adaptation.symmetry import ReflectedHullBlend
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Inputs, Shown
+from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
@@ -238,24 +239,13 @@ def _above(score: Score, reference: Score) -> Row:
 
 
 @dataclass(frozen=True)
-class _Rotated:
-    """Tasks whose scenes are rotated about their vertical axes.
+class _Rotated(TaskWrapper):
+    """Tasks whose scenes are rotated by so many degrees about their vertical axes."""
 
-    Attributes:
-        data: the tasks.
-        degrees: of the rotation.
-    """
-
-    data: Tasks
     degrees: float
 
-    def names(self, split: str) -> Sequence[str]:
-        """The objects of a split."""
-        return self.data.names(split)
-
-    def task(self, name: str) -> Task:
-        """One object."""
-        task, rotation = self.data.task(name), Rotation(math.radians(self.degrees))
+    def change(self, task: Task) -> Task:
+        rotation = Rotation(math.radians(self.degrees))
         return Task(rotation.views(task.support), rotation.views(task.query), task.name)
 
 
