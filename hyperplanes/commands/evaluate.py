@@ -78,7 +78,7 @@ class Arguments:
             compared although they were shown.
         preset: The shape of fields that need no checkpoint.
         up: The direction that points up in the data's world: an axis such as y or -z, three numbers such as 0,0.1,1, or
-            auto: of a single scene as its cameras are held, of a data set y as in training data.
+            auto: of a single scene as its cameras are held; of a data set as its files say, else y as in training data.
         protocol: How fields are sampled: as they were trained, 64 + 128 times a ray as in the paper, or by
             ray marching through what is not empty.
         legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.

@@ -156,7 +156,7 @@ def read_posed_task(path: str | Path, downscale: int | None = None, *, legacy: b
     if path.is_file() and path.suffix == ".json":
         folder = path.parent
         if path not in find_transforms(folder):
-            return read_transforms_task(path, path.stem, downscale=downscale)
+            return read_transforms_task(path, folder.resolve().name, downscale=downscale)
     return _format(folder).task(folder, folder.resolve().name, downscale, folder)
 
 
