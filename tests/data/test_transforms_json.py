@@ -10,7 +10,7 @@ import torch
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.scene import read_path, read_scene
-from hyperplanes.data import open_dataset, read_task, read_views
+from hyperplanes.data import DataError, open_dataset, read_task, read_views
 from hyperplanes.data.formats.recognise import read_posed_task
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.formats.transforms_json import _lens, read_transforms
@@ -213,3 +213,12 @@ def test_a_camera_path_is_in_the_world_of_the_file_whether_it_or_its_folder_is_n
     ]
     assert torch.equal(*found)
     assert not torch.allclose(found[0], task.support.cameras.extrinsics[:3], atol=0.1)
+
+
+def test_what_a_reader_stumbles_over_is_one_line(tmp_path, monkeypatch):
+    def stumble(*_):
+        raise KeyError("viewpoint")
+
+    monkeypatch.setattr("hyperplanes.data.formats.recognise.read_posed_task", stumble)
+    with pytest.raises(DataError, match="expected posed images of one scene, found"):
+        read_scene(tmp_path, Console(silent=True))
