@@ -1,5 +1,8 @@
 """Sources of truth: torch.optim's own steps, singular values of orthogonalised matrices, the minimum of a quadratic."""
 
+from concurrent.futures import ThreadPoolExecutor
+from threading import get_ident
+
 import pytest
 import torch
 
@@ -34,6 +37,27 @@ def test_steps_are_those_of_torch_but_for_its_precision():
             optimiser.step()
     moved = (ours - start).norm()
     assert (ours - theirs).norm() < 0.05 * moved
+
+
+@pytest.mark.parametrize(("device", "shared"), [("cpu", True), ("meta", False)])
+def test_what_is_not_on_a_cpu_stays_in_the_thread_that_steps(monkeypatch, device, shared):
+    # Other threads have streams of their own on a GPU, which do not wait for the gradients of this one.
+    seen = []
+    monkeypatch.setattr(
+        "hyperplanes.adaptation.optimisers.orthogonalise", lambda value: seen.append(get_ident()) or value
+    )
+    monkeypatch.setattr("hyperplanes.adaptation.optimisers.parallel_map", in_another_thread)
+    values = [torch.zeros(4, 4, device=device, requires_grad=True) for _ in range(2)]
+    for value in values:
+        value.grad = torch.zeros_like(value)
+    Muon(values, 0.1, 0.95).step()
+    assert len(seen) == 2
+    assert (get_ident() not in seen) == shared
+
+
+def in_another_thread(function, items):
+    with ThreadPoolExecutor(1) as thread:
+        return list(thread.map(function, items))
 
 
 def test_a_quadratic_is_minimised():

@@ -65,9 +65,13 @@ def test_the_mean_gradient_and_the_pixels_are_those_of_all_samples(level):
 
 def test_fewer_samples_are_differentiated_than_there_are():
     field, weights = ball(6.0)
-    differentiated = []
+    differentiated, evaluated = [], []
 
     class Counting(Ball):
+        def hidden(self, points):
+            evaluated.append(len(points))
+            return super().hidden(points)
+
         def __call__(self, points, directions):
             differentiated.append(len(points))
             return super().__call__(points, directions)
@@ -76,6 +80,7 @@ def test_fewer_samples_are_differentiated_than_there_are():
     seen = render(Counting(weights), rays, RayMarching(64), occupancy=grid, generator=torch.Generator().manual_seed(0))
     assert seen.colour.requires_grad
     assert differentiated[0] < 0.5 * len(march(rays, grid, 2 / 64))
+    assert seen.samples == sum(evaluated) - sum(differentiated)  # a call of the ball asks for `hidden` twice
 
 
 def test_without_random_samples_or_an_end_of_rays_all_are_differentiated():
