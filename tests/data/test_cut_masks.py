@@ -1,10 +1,12 @@
 """Source of truth: the masks of a ball, known exactly, that the borders of close-ups cut off."""
 
+import numpy as np
 import pytest
 import torch
 
 from hyperplanes.data.inspection.conventions import check_conventions
-from hyperplanes.data.pictures.bounds import estimate_bounds
+from hyperplanes.data.pictures.bounds import are_inverted, estimate_bounds
+from hyperplanes.data.pictures.posed import posed
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry import cast
 from hyperplanes.geometry.rays import pixel_grid
@@ -36,6 +38,29 @@ def test_the_sphere_holds_what_close_ups_cut_off(close_ups):
     reach = RADIUS + torch.tensor(sphere.centre).norm()
     assert reach < 1.05 * sphere.radius
     assert sphere.radius < 1.4 * RADIUS
+
+
+def test_masks_of_the_background_are_told_from_those_of_close_ups(close_ups):
+    masks, _ = close_ups
+    near = masks[masks.flatten(1).mean(1) > 0.8]  # which fill their pictures
+    assert len(near) >= 3
+    for found in (masks, near, torch.ones_like(masks), torch.zeros_like(masks), masks[:0]):
+        assert not are_inverted(found)
+        assert not are_inverted((255 * found).to(torch.uint8))
+    shown_whole = masks[masks.flatten(1).mean(1) < 0.5]
+    assert are_inverted(1 - shown_whole)
+    assert are_inverted((255 * (1 - shown_whole)).to(torch.uint8))
+
+
+@pytest.mark.parametrize("has_alpha", [True, False])
+def test_scenes_are_read_with_a_note_about_them(has_alpha):
+    picture = np.full((SIZE, SIZE, 4), 255, np.uint8)
+    picture[20:40, 20:40, 3] = 0
+    cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.9), camera.fibonacci_sphere(3, 3.5), SIZE, SIZE)
+    poses, calibrations = camera.camera_from_world(cameras).double(), camera.intrinsics(cameras).double()
+    options = {"has_alpha": has_alpha, "bounds": None, "names": ("a", "b", "c"), "source": "scene"}
+    found = posed([picture] * 3, poses.numpy(), calibrations.numpy(), **options)
+    assert any("invert them, white is the object" in note for note in found.notes) == has_alpha
 
 
 def test_right_poses_of_close_ups_are_not_called_wrong(close_ups):

@@ -53,6 +53,13 @@ def test_coverage_is_the_area_of_caps():
     assert "only from near where the views stand" in replace(report, masked=True).expectation()
 
 
+def test_masks_that_show_the_background_are_to_be_inverted():
+    views = ball()
+    assert describe_scene(views).expectation().startswith("good pictures")
+    found = describe_scene(replace(views, masks=1 - views.masks)).expectation()
+    assert found == "poor pictures: masks seem to show the background; invert them, white is the object"
+
+
 def test_the_widest_gap_lies_between_views_that_are_named():
     """A view that looks steeply down closes no gap."""
     report = describe_scene(standing(*((20 * index, 10) for index in range(11)), (280, 85)))

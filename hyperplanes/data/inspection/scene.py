@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate, normalize
 
 from hyperplanes.data.formats.sparse_points import SparsePoints
 from hyperplanes.data.inspection.silhouettes import masks_tell, silhouettes
-from hyperplanes.data.pictures.bounds import cut_off
+from hyperplanes.data.pictures.bounds import are_inverted, cut_off
 from hyperplanes.data.upright import guess_up, upright
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
@@ -77,6 +77,7 @@ class SceneReport:
         rarely_shown: share of that surface that fewer than three views show, or None.
         sparse: points of a reconstruction, or None.
         masked: whether the views have masks.
+        inverted: whether these seem to show the background.
     """
 
     views: tuple[ViewReport, ...]
@@ -88,6 +89,7 @@ class SceneReport:
     rarely_shown: float | None
     sparse: SparsePoints | None = None
     masked: bool = True
+    inverted: bool = False
 
     @property
     def worst(self) -> list[ViewReport]:
@@ -135,6 +137,8 @@ class SceneReport:
         """What pictures made of these views will be like, in words."""
         if not self.masked:
             return "poor pictures: there are no masks, which packaged models need; --learn-background makes rough ones"
+        if self.inverted:
+            return "poor pictures: masks seem to show the background; invert them, white is the object"
         unseen = [side for side, share in (("above", self.above), ("below", self.below)) if share < 0.25]
         if self.covered < 0.25:
             text = "good pictures only from near where the views stand; other sides are guessed"
@@ -207,6 +211,7 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
         None if shown is None else float((shown < 3).double().mean()),
         sparse,
         views.masks is not None,
+        views.masks is not None and are_inverted(views.masks),
     )
 
 

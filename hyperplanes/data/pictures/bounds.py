@@ -20,6 +20,7 @@ from hyperplanes.utilities.files import DataError
 __all__ = [
     "OFTEN_CUT",
     "ROOM",
+    "are_inverted",
     "are_shown",
     "cut_off",
     "estimate_bounds",
@@ -33,6 +34,7 @@ HULL_MARGIN = 1.05
 FEWEST_MASKS = 3
 MOST_MASKS = 24  # the hull of fewer views is only larger
 LARGEST_MASK = 256
+BORDER = 0.9  # of the pixels at the border of a picture, which an inverted mask covers
 OFTEN_CUT = 0.1  # of the masks reach the border of their picture
 ROOM = 3.0  # times the radius of the sphere from the cameras, where that is so
 WHOLE, SHOWN = 0.9, 0.25  # of the pictures that show the object whole, or of all where too few do
@@ -95,6 +97,21 @@ def cut_off(masks: Float[Tensor, "view 1 height width"]) -> Bool[Tensor, " view"
     opaque = masks[:, 0] > 0
     sides = [opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]]
     return torch.cat(sides, -1).any(-1)
+
+
+def are_inverted(masks: Float[Tensor, "view 1 height width"] | UInt8[Tensor, "view 1 height width"]) -> bool:
+    """Whether masks seem to show the background: most cover their picture's border, and what they leave is within it.
+
+    An object that fills its pictures reaches their borders, too, and leaves less within them.
+
+    Args:
+        masks: opacity in [0, 1] or of 8 bits.
+    """
+    if not len(masks):
+        return False
+    opaque = masks[:, 0] > (127 if masks.dtype == torch.uint8 else 0.5)
+    border = torch.cat([opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]], -1).float().mean(-1)
+    return float(border.median()) > BORDER and float(opaque.float().mean()) < float(border.mean())
 
 
 def are_shown(

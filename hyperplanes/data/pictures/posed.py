@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.data.pictures.bounds import estimate_bounds
+from hyperplanes.data.pictures.bounds import are_inverted, estimate_bounds
 from hyperplanes.data.pictures.images import check_downscale, composite_over_white, reduced
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
@@ -198,6 +198,8 @@ def posed(
             centre = bounds.centre
             bounds = Sphere((centre[0] - x, centre[1] - y, centre[2] - z), bounds.radius)
         notes = (*notes, f"the world is shifted: ({x:.10g}, {y:.10g}, {z:.10g}) is its new origin, for float32's sake")
+    if has_alpha and are_inverted(rgba[:, 3:]):
+        notes = (*notes, "masks cover the pictures' borders and leave their middle out: invert them, white is the object")
     try:
         cameras = camera.pinhole(
             torch.from_numpy(intrinsics).float(), torch.from_numpy(camera_from_world).float(), height, width
