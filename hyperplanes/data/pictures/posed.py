@@ -199,7 +199,7 @@ def posed(
             bounds = Sphere((centre[0] - x, centre[1] - y, centre[2] - z), bounds.radius)
         notes = (*notes, f"the world is shifted: ({x:.10g}, {y:.10g}, {z:.10g}) is its new origin, for float32's sake")
     if has_alpha and are_inverted(rgba[:, 3:]):
-        notes = (*notes, "masks cover the borders and leave out the middle of pictures: invert them, white is the object")
+        notes = (*notes, "masks cover the pictures' borders and not their middle: invert them, white is the object")
     try:
         cameras = camera.pinhole(
             torch.from_numpy(intrinsics).float(), torch.from_numpy(camera_from_world).float(), height, width
