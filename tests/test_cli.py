@@ -211,6 +211,10 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ([*RENDER, "--turntable", "gif"], ["--turntable: expected --orbit or --camera-path"]),
         ([*BAKE, "OUT/b.safetensors", "--turntable", "gif"], ["--turntable: expected --orbit, whose animation it is"]),
         (
+            ["evaluate", "--data", "DATA", "--method", "nearest_view", "--fine-tune", "hypernetwork"],
+            ["--fine-tune: expected --steps, which optimise so, got hypernetwork alone"],
+        ),
+        (
             ["adapt", *RENDER[1:], "--fine-tune", "hypernetwork"],
             ["--fine-tune: expected --steps, which optimise so, got hyper"],
         ),

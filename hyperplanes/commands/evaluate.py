@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from hyperplanes.commands.console import Console
-from hyperplanes.commands.options import Free, OptionalInt, Protocol, ViewsUp, optional
+from hyperplanes.commands.options import Free, OptionalInt, Protocol, ViewsUp, check_fine_tune, optional
 from hyperplanes.commands.writing import check_output
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ def with_seed(folders: Sequence[Path], seed: int) -> list[Path]:
 def run(arguments: Arguments) -> int:
     """Evaluate all methods, print the table and write what was asked for."""
     from hyperplanes.adaptation.checkpoints import find_checkpoints
+    from hyperplanes.adaptation.fine_tuned import FineTuned
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data import open_dataset
@@ -176,6 +177,7 @@ def run(arguments: Arguments) -> int:
 
     chosen = list(dict.fromkeys(each for name in arguments.method for each in at_steps(name, arguments.steps)))
     first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to
+    check_fine_tune(arguments.fine_tune, sum(isinstance(made.adapter, FineTuned) for made in first.values()))
     pictures, failures, kept = PictureGrid(), {}, PartialResults(arguments.json)
 
     def failed(method: str, seed: int, name: str, error: Exception) -> None:
