@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Protocol, Self, runtime_checkable
+from functools import cached_property, partial
+from typing import Protocol, Self, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -24,7 +24,7 @@ from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.rendering.images import Pictures
 from hyperplanes.rendering.refinement import RefinedOccupancy, refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
-from hyperplanes.rendering.scene import SplitField
+from hyperplanes.rendering.scene import mapped
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views
@@ -183,37 +183,9 @@ class AdaptedField:
     def _for_pictures(self, field: FieldFunction, mixed_precision: bool) -> FieldFunction:
         """A field as a function of single-precision points; in mixed precision, if it is a network of single one."""
         if self.dtype != torch.float32:
-            return _SplitCast(field, self.dtype) if isinstance(field, SplitField) else _Cast(field, self.dtype)
+            cast = partial(torch.Tensor.to, dtype=self.dtype)
+            return mapped(field, cast, cast, torch.Tensor.float)
         return field.in_mixed_precision if mixed_precision and isinstance(field, Field) else field
-
-
-@dataclass(frozen=True)
-class _Cast:
-    """A field of some precision as a function of single-precision points."""
-
-    field: Any
-    dtype: torch.dtype
-
-    @property
-    def thread_safe(self) -> bool:
-        return getattr(self.field, "thread_safe", False)
-
-    def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        colour, density = self.field(points.to(self.dtype), directions.to(self.dtype))
-        return colour.float(), density.float()
-
-
-class _SplitCast(_Cast):
-    """Likewise, of one whose colours can be asked for later than its densities."""
-
-    def hidden(self, points: Tensor) -> Any:
-        return self.field.hidden(points.to(self.dtype))
-
-    def density_of(self, hidden: Any) -> Tensor:
-        return self.field.density_of(hidden).float()
-
-    def colour_of(self, hidden: Any, directions: Tensor) -> Tensor:
-        return self.field.colour_of(hidden, directions.to(self.dtype)).float()
 
 
 def hull(support: Views, side: int, within: Occupancy | None = None) -> Occupancy:

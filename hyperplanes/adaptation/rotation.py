@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -16,8 +16,8 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.geometry.reflections import Symmetry, rotation_about
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.rendering.renderer import FieldFunction, Sampler
-from hyperplanes.rendering.scene import SplitField
+from hyperplanes.rendering.renderer import Sampler
+from hyperplanes.rendering.scene import mapped
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views, moved
@@ -57,9 +57,10 @@ class Rotation:
         """The field of the rotated object, which renders as the other one does by cameras that are rotated back."""
         if not self.angle:
             return field
-        bounds, split = field.occupancy.bounds, isinstance(field.field, SplitField)
+        bounds = field.occupancy.bounds
+        back = partial(_moved, motion=self.inverse.about(bounds))
         return RotatedField(
-            (_SplitMoved if split else _Moved)(field.field, self.inverse.about(bounds)),
+            mapped(field.field, back, partial(back, translated=0.0)),
             self._occupancy(field.occupancy),
             field.sampling,
             symmetry=self.symmetry(field.symmetry, bounds),
@@ -121,45 +122,6 @@ class RotatedField(AdaptedField):
         """As `AdaptedField.render`."""
         cameras = camera.moved(cameras, self._back)
         return self.unrotated.render(cameras, sampling, antialias, mixed_precision=mixed_precision)
-
-
-@dataclass(frozen=True)
-class _Moved:
-    """A field at points that are moved.
-
-    Attributes:
-        field: at the points it is asked for.
-        motion: of the points, in float64.
-    """
-
-    field: FieldFunction
-    motion: Tensor
-
-    @property
-    def dtype(self) -> torch.dtype:
-        return getattr(self.field, "dtype", torch.float32)
-
-    @property
-    def thread_safe(self) -> bool:
-        return getattr(self.field, "thread_safe", False)
-
-    def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        return self.field(_moved(points, self.motion), _moved(directions, self.motion, 0.0))
-
-
-class _SplitMoved(_Moved):
-    """Likewise, of one whose colours can be asked for later than its densities."""
-
-    field: Any
-
-    def hidden(self, points: Tensor) -> Any:
-        return self.field.hidden(_moved(points, self.motion))
-
-    def density_of(self, hidden: Any) -> Tensor:
-        return self.field.density_of(hidden)
-
-    def colour_of(self, hidden: Any, directions: Tensor) -> Tensor:
-        return self.field.colour_of(hidden, _moved(directions, self.motion, 0.0))
 
 
 def _moved(points: Float[Tensor, "*point 3"], motion: Float[Tensor, "4 4"], translated: float = 1.0) -> Tensor:

@@ -12,7 +12,16 @@ from torch import Tensor
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.utilities.arguments import kind_of
 
-__all__ = ["FieldFunction", "Scene", "SplitField", "can_be_joined", "evaluate", "join_hidden", "points_per_batch"]
+__all__ = [
+    "FieldFunction",
+    "Scene",
+    "SplitField",
+    "can_be_joined",
+    "evaluate",
+    "join_hidden",
+    "mapped",
+    "points_per_batch",
+]
 
 FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Points (n, 3) and unit directions (n, 3) -> colours (n, 3) in [0, 1] and densities (n,) per world unit.
@@ -47,6 +56,62 @@ class SplitField(Protocol):
     def colour_of(self, hidden: Any, directions: Tensor) -> Tensor:
         """Colours (n, 3) in [0, 1] seen along unit directions (n, 3)."""
         ...
+
+
+def mapped(
+    field: FieldFunction,
+    points: Callable[[Tensor], Tensor],
+    directions: Callable[[Tensor], Tensor],
+    values: Callable[[Tensor], Tensor] | None = None,
+) -> FieldFunction:
+    """A field of other points: its colours can be asked for later where those of the given one can.
+
+    Args:
+        field: any callable.
+        points: those that it is asked for -> those of the given field.
+        directions: likewise.
+        values: of colours and densities; None leaves them as they are.
+    """
+    kind = _SplitMapped if isinstance(field, SplitField) else _Mapped
+    return kind(field, points, directions, values)
+
+
+@dataclass(frozen=True)
+class _Mapped:
+    """As `mapped`."""
+
+    field: Any
+    points: Callable[[Tensor], Tensor]
+    directions: Callable[[Tensor], Tensor]
+    values: Callable[[Tensor], Tensor] | None
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return getattr(self.field, "dtype", torch.float32)
+
+    @property
+    def thread_safe(self) -> bool:
+        return getattr(self.field, "thread_safe", False)
+
+    def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        colour, density = self.field(self.points(points), self.directions(directions))
+        return self._value(colour), self._value(density)
+
+    def _value(self, found: Tensor) -> Tensor:
+        return found if self.values is None else self.values(found)
+
+
+class _SplitMapped(_Mapped):
+    """Likewise, of one whose colours can be asked for later than its densities."""
+
+    def hidden(self, points: Tensor) -> Any:
+        return self.field.hidden(self.points(points))
+
+    def density_of(self, hidden: Any) -> Tensor:
+        return self._value(self.field.density_of(hidden))
+
+    def colour_of(self, hidden: Any, directions: Tensor) -> Tensor:
+        return self._value(self.field.colour_of(hidden, self.directions(directions)))
 
 
 @dataclass(frozen=True)
