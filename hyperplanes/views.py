@@ -38,6 +38,8 @@ def check_values(name: str, values: object) -> None:
     """
     if not isinstance(values, Tensor) or not values.is_floating_point():
         found, hint = kind_of(values), "; torch.from_numpy(x).float() / 255 makes them of 8-bit pixels"
+        if isinstance(values, Tensor) and values.dtype == torch.bool:
+            hint = "; x.float() makes them of booleans"
         raise ValueError(f"{name}: expected a tensor of floating-point numbers in [0, 1], got {found}{hint}")
     if not values.numel() or values.is_meta:
         return
@@ -244,7 +246,7 @@ class Views:
         height, width = self.size
         view, pixel = pixels // (height * width), pixels % (height * width)
         row, column = pixel // width, pixel % width
-        places = torch.stack([column, row], -1).to(self.images)
+        places = torch.stack([column, row], -1).to(self.cameras.extrinsics)  # images may be too coarse for them
         places = torch.cat([places + places.new_tensor(each) for each in subpixels])
         rays = cast(self.cameras, view.repeat(len(subpixels)), places, self.bounds, near_far=near_far)
         colours = self.images[view, :, row, column]

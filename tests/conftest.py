@@ -9,6 +9,8 @@ import sys
 import tempfile
 from itertools import pairwise
 
+import pytest
+
 SLOWEST_FIRST = (
     "test_cli",
     "test_engine",
@@ -50,6 +52,14 @@ if not STARTS_OTHERS:  # the process that starts others (`make test`) runs no te
     second_device.register()  # before the first gradient, when autograd makes a queue for each device that it knows
     torch.set_num_threads(1)  # small tensors: more threads only wait for each other; tests of threads set their own
     typechecker.install("hyperplanes")
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Without the type checks of the tests, as users run it."""
+    import jaxtyping
+
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 def pytest_collection_modifyitems(items):

@@ -125,6 +125,15 @@ def test_swapped_objects_have_the_update_of_the_next_one_and_everything_else_of_
             assert not torch.equal(swapped.adapt(own).render(cameras).images, model.adapt(own).render(cameras).images)
 
 
+def test_an_object_in_another_precision_has_the_update_of_another_one_too():
+    data, model = Balls(test=2), awaken(small_model()).eval()
+    supports = [data.task(name).support for name in data.names("test")]
+    swapped, precise = Swapped(model, supports), supports[0].to(dtype=torch.float64)
+    cameras = supports[0].cameras
+    expected = swapped.adapt(supports[0]).render(cameras).images
+    torch.testing.assert_close(swapped.adapt(precise).render(cameras).images, expected, atol=1e-3, rtol=0)
+
+
 def test_swapping_takes_two_objects_and_a_hypernetwork():
     support = Balls().task("test0").support
     with pytest.raises(ValueError, match="swapped: expected at least 2 objects to swap updates of, got 1"):

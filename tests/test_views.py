@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -10,7 +9,7 @@ import torch
 from hyperplanes.geometry.cameras import centres, cropped, image_size, pinhole, resized, select
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, Views
-from tests.reference_rendering import ring
+from tests.reference_rendering import ring, small_model
 
 NAMES = ("a", "b", "c", "d")
 
@@ -144,6 +143,22 @@ def test_halves_keep_the_size_of_the_pictures(dtype):
     assert image_size(pinhole(torch.eye(3), torch.eye(4, dtype=dtype)[None], 6, 2049)) == (6, 2049)
 
 
+def test_rays_go_through_the_pixels_whose_colours_they_have_in_any_precision():
+    single = views((6, 2049))
+    coarse = replace(single, images=single.images.bfloat16(), masks=None)
+    rays, _ = coarse.sample_rays(50, generator=torch.Generator().manual_seed(0))
+    expected, _ = single.sample_rays(50, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(rays.directions, expected.directions)
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.uint8, torch.bool])
+def test_there_are_no_views_of_whole_numbers(dtype, tmp_path):
+    for call in (views().to, lambda dtype: small_model().save(tmp_path, dtype)):
+        with pytest.raises(ValueError, match=f"dtype: expected one of floating-point numbers, got {dtype}"):
+            call(dtype=dtype)
+    assert not list(tmp_path.iterdir())
+
+
 def test_pictures_have_a_pixel_at_least():
     for no_size in (0, -5):
         with pytest.raises(ValueError, match=f"longest: expected at least 1 pixel, got {no_size}"):
@@ -171,14 +186,6 @@ def test_rays_through_pixels_are_those_of_their_view():
         torch.testing.assert_close(rays.directions[place : place + 1], expected.directions)
         assert torch.equal(truth[place], whole.images[view, :, row, column])
         assert torch.equal(opacity[place], whole.masks[view, :, row, column])
-
-
-@pytest.fixture
-def unchecked():
-    """Without the type checks of the tests, as users run it."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -232,6 +239,7 @@ def test_a_task_names_its_object():
         ),
         (lambda images: (images * 255).to(torch.uint8), "got a tensor of uint8, shape .*/ 255 makes them of 8-bit"),
         (lambda images: images * float("nan"), "expected finite numbers in .0, 1., got nan"),
+        (lambda images: images > 0.5, r"got a tensor of bool, shape .*; x.float\(\) makes them of booleans"),
         (lambda images: images.numpy(), "got a numpy.ndarray; torch.from_numpy"),
         (lambda images: None, "got None"),
     ],

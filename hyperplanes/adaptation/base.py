@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Protocol, Self, runtime_checkable
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.inputs import as_points
 from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.occupancy import Occupancy, carve, full
@@ -26,6 +27,7 @@ from hyperplanes.rendering.refinement import RefinedOccupancy, refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
 from hyperplanes.rendering.scene import mapped
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.kept import kept
 from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views
 
@@ -108,16 +110,23 @@ class AdaptedField:
         """Whether several threads may evaluate the field at once; as it says itself."""
         return getattr(self.field, "thread_safe", False)
 
-    @cached_property
+    @property
     def refined_occupancy(self) -> RefinedOccupancy:
-        """The voxels of `occupancy` in which the field has density; computed when they are asked for first."""
+        """The voxels of `occupancy` in which the field has density; computed when they are asked for first.
+
+        They are computed again where weights of a network, or the voxels, have changed in place.
+        """
         if self.refined is not None:
             return self.refined
+        weights = self.field.parameters.values() if isinstance(self.field, Field) else ()
+        return kept(self, "refined", [self.occupancy.occupied, *weights], self._refined)
+
+    def _refined(self) -> RefinedOccupancy:
         return refine(self.occupancy, self.density, opacity_loss=OPACITY_LOSS, margin_loss=MARGIN_LOSS)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without colour where the field can do that."""
-        points = points.to(self.dtype)
+        points = as_points(points).to(self.dtype)
         if self.thread_safe and points.device.type == "cpu" and not torch.is_grad_enabled():
             return torch.cat(list(parallel_map(self._density, points.split(POINTS))))
         return self._density(points)
@@ -133,14 +142,17 @@ class AdaptedField:
         """Colour and density of the field."""
         return self.field(points, directions)
 
+    @without_autocast
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
         """The pixels of rays by the field's own sampler: the forward pass of training.
 
         Args:
-            rays: through the scene.
+            rays: through the scene, in any precision.
             generator: of the places of samples; on the CPU.
             differentiable: with gradients; else in chunks, each ray up to where it is opaque.
         """
+        if isinstance(self.field, Field):
+            rays = rays.to(self.field.dtype)
         return render(
             self.field, rays, self.sampling, occupancy=self.occupancy, proposal=self.proposal, generator=generator,
             differentiable=differentiable,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -12,13 +12,14 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.geometry.chosen_views import Penalties, Reading
 from hyperplanes.geometry.hull_hits import hull_hits
-from hyperplanes.geometry.occupancy import Occupancy
+from hyperplanes.geometry.occupancy import LARGEST_SIDE, Occupancy
+from hyperplanes.geometry.poses import Count
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.rendering.samplers import PackedSamples
-from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.arguments import checked, checked_fields
 from hyperplanes.views import Views
 
 __all__ = ["HullBlend", "blend_views"]
@@ -30,6 +31,7 @@ POINTS = 1 << 14  # in one call of the density
 ROUNDING = 1e-4  # of an opacity, by which kernels differ: without it 5 of 424,000 samples in the hull were holes
 
 
+@checked_fields
 @dataclass(frozen=True)
 class HullBlend:
     """The visual hull of the support masks is the surface, and its colour that of the support views that see it.
@@ -45,9 +47,9 @@ class HullBlend:
         steps: samples along a diameter of the scene.
     """
 
-    nearest: int = 3
-    side: int = 96
-    steps: int = 256
+    nearest: Count = 3
+    side: Annotated[int, range(1, LARGEST_SIDE + 1)] = 96
+    steps: Count = 256
 
     @checked
     @torch.no_grad()

@@ -20,6 +20,7 @@ from hyperplanes.adaptation.rotation import RotatedField
 from hyperplanes.adaptation.stacking import learned_part, stacked_field
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.geometry.inputs import check_precision
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.precision import without_autocast
@@ -111,7 +112,12 @@ class HyperPlanes(HyperPlanesNetwork):
             negative number, "auto" with fewer than 3 views, or a single view of a field that takes any number of them,
             unless `settings.mask_views` is off. So are steps that lower nothing (`NoProgressError`, which holds the
             field that they ended at).
+
+        Raises:
+            RuntimeError: within `torch.inference_mode`.
         """
+        if torch.is_inference_mode_enabled():
+            raise RuntimeError("fine_tune: expected gradients, got torch.inference_mode; call it outside of that")
         return fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
 
     def with_weights_of(self, adapted: AdaptedField) -> HyperPlanes:
@@ -152,6 +158,7 @@ class HyperPlanes(HyperPlanesNetwork):
             dtype: of the weights in the file, such as float16, which halves it; their own where absent. Statistics stay
                 as they are, and `from_pretrained` makes single precision of all.
         """
+        check_precision(dtype)
         weights = self.state_dict()
         if dtype is not None:
             weights |= {name: value.to(dtype) for name, value in self.named_parameters()}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from threading import Lock
+from threading import RLock
 
 import torch
 from jaxtyping import Bool, Float
@@ -37,7 +37,7 @@ FAINT, SOLID = 0.01, 1 / 3  # opacity of a pixel from which on it is corrected, 
 PAIRS = 1 << 18  # of a pixel and a support view, at once
 VIEWS = 8  # support views that are rendered together
 
-_rendering = Lock()  # support views: two threads that need the same ones render them once
+_rendering = RLock()  # support views: two threads that need the same ones render them once
 
 
 class ResidualField:

@@ -124,6 +124,7 @@ class RotatedField(AdaptedField):
         return self.unrotated.render(cameras, sampling, antialias, mixed_precision=mixed_precision)
 
 
+@without_autocast
 def _moved(points: Float[Tensor, "*point 3"], motion: Float[Tensor, "4 4"], translated: float = 1.0) -> Tensor:
     """Points after a rigid motion; directions, which it does not translate, with 0."""
     motion = motion.to(points)

@@ -76,6 +76,7 @@ class StackedField(AdaptedField):
             return replace(self, other=self.other.with_sampling(sampling))
         return super().with_sampling(sampling)
 
+    @without_autocast
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
         """The mean of the pixels of both, as `AdaptedField.trace`."""
         own = super().trace(rays, generator, differentiable=differentiable)

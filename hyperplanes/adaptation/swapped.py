@@ -37,7 +37,7 @@ class Swapped:
         with torch.no_grad(), in_use(model):
             for support in objects:
                 placed = to_canonical_frame(model, support)
-                self._updates[_digest(support)] = model.update(placed.context(model, carved=False))
+                self._updates[_digest(model, support)] = model.update(placed.context(model, carved=False))
         if len(self._updates) < 2:
             raise ValueError(f"swapped: expected at least 2 objects to swap updates of, got {len(self._updates)}")
 
@@ -47,10 +47,11 @@ class Swapped:
         placed = to_canonical_frame(self.model, support)
         prepared = placed.context(self.model)
         known = list(self._updates)
-        own = _digest(support)
+        own = _digest(self.model, support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]
         return placed.in_scene(stacked_field(self.model, prepared, self.model.theta + self._updates[other]))
 
 
-def _digest(support: Views) -> str:
-    return hashlib.sha256(support.images.detach().cpu().contiguous().numpy().tobytes()).hexdigest()
+def _digest(model: HyperPlanes, support: Views) -> str:
+    """Of the images as the model takes them: the same object in another precision has the same."""
+    return hashlib.sha256(model.to_own(support).images.detach().cpu().contiguous().numpy().tobytes()).hexdigest()

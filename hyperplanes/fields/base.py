@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from jaxtyping import Float, Int
@@ -20,12 +20,11 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.kept import kept
 from hyperplanes.utilities.transforms import wants_values_alone
 from hyperplanes.views import Views
 
 __all__ = ["Field", "MLPField", "Target", "TargetConfig"]
-
-Made = TypeVar("Made")
 
 
 @checked_fields
@@ -265,21 +264,12 @@ class Field:
     def _packed(self, layers: Sequence[Layer]) -> PackedLayers | None:
         """The layers for the kernel: packed once, and anew where weights have changed in place."""
         values = [value for layer in layers for value in layer]
-        return self._kept(
-            "packed", values, lambda: PackedLayers.of(layers, self.target.skip, mixed_precision=self.mixed_precision)
+        return kept(
+            self,
+            "packed",
+            values,
+            lambda: PackedLayers.of(layers, self.target.skip, mixed_precision=self.mixed_precision),
         )
-
-    def _kept(self, name: str, values: Sequence[Tensor], make: Callable[[], Made]) -> Made:
-        """What is made of some tensors: made once, and anew where they have changed in place.
-
-        Inference tensors do not count their changes, and are taken to have none.
-        """
-        state = [(value.data_ptr(), 0 if value.is_inference() else value._version) for value in values]
-        kept = self.__dict__.get(f"_kept_{name}")
-        if kept is None or kept[0] != state:
-            kept = state, make()
-            self.__dict__[f"_kept_{name}"] = kept  # threads that come at once make the same
-        return kept[1]
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is computed from the rest: for copies and pickles."""

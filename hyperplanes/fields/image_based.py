@@ -27,6 +27,7 @@ from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, resampled_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.kept import kept
 from hyperplanes.utilities.transforms import wants_values_alone
 from hyperplanes.views import Views
 
@@ -279,7 +280,7 @@ class ImageBasedField(Field):
         grid = self.parameters.get("grid.weight")
         if grid is None:
             return None
-        return self._kept("cells", [grid], lambda: grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2))
+        return kept(self, "cells", [grid], lambda: grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2))
 
     def _features(self, points: Tensor) -> list[Float[Tensor, "point number"]]:
         """Those of the grid, the first through a sigmoid."""

@@ -17,10 +17,11 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry.distortion import DistortedCamera
-from hyperplanes.geometry.inputs import Selection, as_selection
+from hyperplanes.geometry.inputs import Selection, as_selection, check_precision
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.poses import fibonacci_sphere, look_at, opencv_from_opengl, opengl_from_opencv, orbit
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.precision import without_autocast
 
 __all__ = [
     "camera_from_world",
@@ -51,6 +52,7 @@ ROTATION_TOLERANCE = 1e-3
 
 
 @checked
+@without_autocast
 def pinhole(
     intrinsics: Float[Tensor, "*view 3 3"],
     camera_from_world: Float[Tensor, "view 4 4"],
@@ -177,11 +179,13 @@ def image_size(cameras: PinholeCamera) -> tuple[int, int]:
     return sizes.pop()
 
 
+@without_autocast
 def projection_matrices(cameras: PinholeCamera) -> Float[Tensor, "view 3 4"]:
     """K [R | t]: homogeneous pixels from world."""
     return intrinsics(cameras) @ camera_from_world(cameras)[:, :3]
 
 
+@without_autocast
 def centres(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
     """Optical centres in the world: -R^T t."""
     pose = camera_from_world(cameras)
@@ -273,7 +277,11 @@ def concatenate(batches: list[PinholeCamera]) -> PinholeCamera:
 def to(
     cameras: PinholeCamera, device: torch.device | str | None = None, dtype: torch.dtype | None = None
 ) -> PinholeCamera:
-    """The cameras on another device or in another precision; sizes of pictures are in single precision at least."""
+    """The cameras on another device or in another precision; sizes of pictures are in single precision at least.
+
+    A type of whole numbers, which would round rotations to 0 and 1, raises ValueError.
+    """
+    check_precision(dtype)
     of_size = None if dtype is None else _size_dtype(dtype)
     return _rebuilt(
         cameras,
@@ -290,6 +298,7 @@ def with_poses(cameras: PinholeCamera, camera_from_world: Float[Tensor, "view 4 
 
 
 @checked
+@without_autocast
 def moved(cameras: PinholeCamera, motion: Float[Tensor, "4 4"]) -> PinholeCamera:
     """The cameras after a rigid motion of the world, in float64, which they take part in."""
     pose = camera_from_world(cameras)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
@@ -28,6 +28,8 @@ from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.packed_images import PackedImages, pack
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.kept import kept
+from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["MIN_Z", "ImagePlanes", "Lookup"]
@@ -79,7 +81,6 @@ class ImagePlanes:
         self.exact = exact
         self.nearest = camera.least_depth(cameras)
         self.masked: Bool[Tensor, " view"] | None = None
-        self._packed: tuple[int, PackedImages | None] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -105,22 +106,24 @@ class ImagePlanes:
         result.masked[chosen] = True
         return result
 
-    def with_images(self, images: Float[Tensor, "view channel height width"]) -> ImagePlanes:
+    def with_images(self, images: ArrayLike) -> ImagePlanes:
         """Other images of the same cameras, which are looked up exactly; no view of them is masked.
 
         Args:
-            images: of the same number and size, with any number of channels.
+            images: of the same number and size, with any number of channels, as the class takes them.
 
         Raises:
             ValueError: images of another number or size.
         """
-        if images.ndim != 4 or (len(images), *images.shape[2:]) != (len(self), *self.images.shape[2:]):
+        images = as_images(images)
+        if (len(images), *images.shape[2:]) != (len(self), *self.images.shape[2:]):
             expected = f"({len(self)}, channel, {self.images.shape[2]}, {self.images.shape[3]})"
             raise ValueError(f"images: expected shape {expected}, got {tuple(images.shape)}")
         result = copy.copy(self)
-        result.images, result.exact, result.masked, result._packed = images.contiguous(), True, None, None
+        result.images, result.exact, result.masked = images.contiguous(), True, None
         return result
 
+    @without_autocast
     def lookup(
         self,
         points: ArrayLike,
@@ -164,7 +167,8 @@ class ImagePlanes:
         centres = camera.centres(self.cameras).to(points)
         offsets = points[:, None] - (centres if views is None else centres[views])
         distances = offsets.norm(dim=-1)
-        directions = offsets / distances.clamp_min(torch.finfo(points.dtype).tiny)[..., None]
+        # at a centre both are 0, and a gradient of 1 / 0 would be infinite
+        directions = offsets / torch.where(distances > 0, distances, 1.0)[..., None]
         return replace(found, directions=directions, distances=distances)
 
     def _lookup_distorted(self, points: Tensor, matrices: Tensor, views: Tensor | None) -> Lookup:
@@ -187,9 +191,7 @@ class ImagePlanes:
             return None
         if not are_plain(points, self.images) or (self.backend or choose(points, self.images)) != "cpu":
             return None
-        if self._packed is None or self._packed[0] != self.images._version:
-            self._packed = self.images._version, pack(self.images)
-        return self._packed[1]
+        return kept(self, "packed", [self.images], lambda: pack(self.images))
 
 
 def _counting(images: Tensor, given: ArrayLike) -> Tensor:

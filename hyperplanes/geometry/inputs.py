@@ -23,6 +23,7 @@ __all__ = [
     "as_tensor",
     "check_channels_first",
     "check_indices",
+    "check_precision",
 ]
 
 MOST_COLOURS = 4
@@ -51,6 +52,19 @@ def as_tensor(name: str, value: ArrayLike) -> Tensor:
     if value.is_complex():
         raise ValueError(f"{name}: expected real numbers, got {value.dtype}")
     return value
+
+
+def check_precision(dtype: torch.dtype | None) -> None:
+    """Refuse a type of whole numbers, or of booleans, for what lies between them.
+
+    Args:
+        dtype: asked for; None where it stays.
+
+    Raises:
+        ValueError: such a type.
+    """
+    if dtype is not None and not dtype.is_floating_point:
+        raise ValueError(f"dtype: expected one of floating-point numbers, got {dtype}")
 
 
 def _floating(value: Tensor) -> Tensor:

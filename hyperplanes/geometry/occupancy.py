@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from importlib.util import find_spec
 
 import numpy as np
@@ -20,7 +19,9 @@ from hyperplanes.geometry.inputs import ArrayLike, as_images
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.arguments import checked, kind_of
+from hyperplanes.utilities.kept import kept
+from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["Occupancy", "ball_extent", "carve", "dilate", "full", "ranges"]
@@ -33,12 +34,20 @@ class Occupancy:
     """A grid of voxels in the cube around a sphere: true where the scene may not be empty.
 
     Attributes:
-        occupied: indexed [x, y, z]; voxel 0 starts at centre - radius on each axis.
+        occupied: booleans of one cube, indexed [x, y, z]; voxel 0 starts at centre - radius on each axis.
         bounds: the sphere inside the cube.
+
+    Raises:
+        ValueError: no booleans, or no cube.
     """
 
-    occupied: Bool[Tensor, "x y z"]
+    occupied: Bool[Tensor, "side side side"]
     bounds: Sphere
+
+    def __post_init__(self) -> None:
+        shape = self.occupied.shape
+        if self.occupied.dtype != torch.bool or len(shape) != 3 or not 0 < shape[0] == shape[1] == shape[2]:
+            raise ValueError(f"occupied: expected booleans (side, side, side), got {kind_of(self.occupied)}")
 
     @property
     def voxel(self) -> float:
@@ -65,12 +74,15 @@ class Occupancy:
         unit = (cells.float() + 0.5) * (2 / self.occupied.shape[0]) - 1
         return unit * self.bounds.radius + unit.new_tensor(self.bounds.centre)
 
-    @cached_property
+    @property
     def box(self) -> tuple[float, ...]:
         """Lower and upper corner, in the world, of the box around all occupied voxels and half a voxel more.
 
         What rounding moves across a face is in it. Without any voxels it has no size.
         """
+        return kept(self, "box", [self.occupied], self._box)
+
+    def _box(self) -> tuple[float, ...]:
         corners = []
         for (first, last), middle in zip(ranges(self.occupied), self.bounds.centre, strict=True):
             ends = (first - 0.5, last + 0.5) if last else (0.0, 0.0)
@@ -86,10 +98,10 @@ class Occupancy:
                 inner &= padded.narrow(axis, start, len(inner))[_middle(axis)]
         return Occupancy(self.occupied & ~inner, self.bounds)
 
-    @cached_property
+    @property
     def surface_centres(self) -> Float[Tensor, "voxel 3"]:
         """World positions of the centres of the voxels of `surface`, computed once."""
-        return self.surface().centres()
+        return kept(self, "surface_centres", [self.occupied], lambda: self.surface().centres())
 
     def with_even_side(self) -> Occupancy:
         """The same voxels in a grid that blocks of 2 x 2 x 2 fill: of an odd side it is one empty voxel longer."""
@@ -145,6 +157,7 @@ def full(bounds: Sphere, side: int = 64, device: torch.device | str | None = Non
 
 
 @checked
+@without_autocast
 @torch.no_grad()
 def carve(
     masks: ArrayLike,

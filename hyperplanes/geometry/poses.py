@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.axes import flip_camera_axes
+from hyperplanes.utilities.precision import without_autocast
 
 __all__ = [
     "farthest_first",
@@ -43,6 +44,7 @@ def opengl_from_opencv(camera_from_world: Float[Tensor, "view 4 4"]) -> Float[Te
 
 
 @checked
+@without_autocast
 def look_at(
     eyes: Float[Tensor, "view 3"],
     target: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -118,6 +120,7 @@ def fibonacci_sphere(views: Count, distance: float, lowest: float = -1.0, highes
     return look_at(distance * torch.stack([flat * azimuth.sin(), height, flat * azimuth.cos()], -1))
 
 
+@without_autocast
 def outermost_first(directions: Float[Tensor, "direction 3"], count: int) -> list[int]:
     """As `farthest_first`, from the direction on that is farthest from their mean.
 
@@ -128,6 +131,7 @@ def outermost_first(directions: Float[Tensor, "direction 3"], count: int) -> lis
     return farthest_first(directions, int((directions @ directions.mean(0)).argmin()), count)
 
 
+@without_autocast
 def farthest_first(directions: Float[Tensor, "direction 3"], first: int, count: int) -> list[int]:
     """Directions as far apart as they can be, one after the other (Gonzalez 1985).
 

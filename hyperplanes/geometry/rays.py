@@ -74,6 +74,10 @@ class Rays:
     def __getitem__(self, index: slice | Tensor) -> Rays:
         return Rays(self.origins[index], self.directions[index], self.near[index], self.far[index])
 
+    def to(self, dtype: torch.dtype) -> Rays:
+        """The rays in another precision."""
+        return Rays(*(part.to(dtype) for part in (self.origins, self.directions, self.near, self.far)))
+
     def at(self, t: Float[Tensor, "ray ..."]) -> Float[Tensor, "ray ... 3"]:
         """The points at distances t."""
         shape = (len(self),) + (1,) * (t.ndim - 1) + (3,)

@@ -38,6 +38,7 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.kept import kept
 from hyperplanes.utilities.transforms import (
     are_plain,
     is_transformed,
@@ -79,9 +80,7 @@ class VisibilityPlanes:
         self._maps = _Maps(
             torch.ones_like(images[:, 0]) if masks is None else masks[:, 0].to(images), cameras, occupancy
         )
-        matrices, centres = camera.projection_matrices(cameras).flatten(1), camera.centres(cameras)
         self._surface: Float[Tensor, "view height width 2"] | None = None
-        self._cameras: Float[Tensor, "number view"] = torch.cat([centres, matrices], 1).T.to(images)
         self._against = Against(
             images.new_zeros(len(images)),
             images.new_zeros(len(images), 4) if masks is None else margins(masks).to(images),
@@ -197,9 +196,16 @@ class VisibilityPlanes:
 
     def shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, 0 where hidden, its handicap and margins."""
-        against, masked = self._against, self.colours.masked
-        shown = self._cameras.new_ones(len(self)) if masked is None else (~masked).to(self._cameras)
-        return torch.cat([self._cameras, torch.stack([shown, against.handicaps]), against.margins.T])
+        against, masked, cameras = self._against, self.colours.masked, self.colours.cameras
+        poses = kept(self, "poses", [cameras.extrinsics, cameras.intrinsics], self._poses)
+        shown = poses.new_ones(len(self)) if masked is None else (~masked).to(poses)
+        return torch.cat([poses, torch.stack([shown, against.handicaps]), against.margins.T])
+
+    def _poses(self) -> Float[Tensor, "number view"]:
+        """Centres and projection matrices."""
+        cameras = self.colours.cameras
+        found = torch.cat([camera.centres(cameras), camera.projection_matrices(cameras).flatten(1)], 1)
+        return found.T.to(self.maps)
 
     def _choose_compiled(
         self, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor

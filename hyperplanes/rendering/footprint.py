@@ -18,6 +18,7 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy, ball_extent
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["footprint", "pixels_across"]
@@ -31,6 +32,7 @@ def pixels_across(cameras: PinholeCamera, bounds: Sphere) -> float:
     return float((2 * bounds.radius * focal / distance.clamp_min(bounds.radius)).max())
 
 
+@without_autocast
 @torch.no_grad()
 def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "view height width"]:
     """The pixels whose rays may cross an occupied voxel; every other pixel is background.

@@ -112,7 +112,7 @@ def render_images(
 
     def rendered(view: Tensor, where: Tensor) -> Rendered:
         rays = cast(cameras, view, where, bounds, near_far=near_far)
-        return render_rays(Rays(rays.origins.float(), rays.directions.float(), rays.near.float(), rays.far.float()))
+        return render_rays(rays.to(torch.float32))
 
     for first, last in pairwise(_groups(live.sum(1).tolist())):
         view, chosen = live[first:last].nonzero().unbind(1)

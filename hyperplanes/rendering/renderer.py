@@ -13,6 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.poses import Count
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import pixels_across
@@ -64,7 +65,7 @@ def render(
     generator: torch.Generator | None = None,
     background: float = 1.0,
     differentiable: bool | None = None,
-    chunk: int | None = None,
+    chunk: Count | None = None,
     antialias: bool | None = None,
 ) -> Pictures | Rendered:
     """The pictures that cameras take of a field, or the pixels of single rays.
@@ -83,7 +84,9 @@ def render(
             absent.
         proposal: the field of the coarse pass of `Hierarchical`; `field` where absent. `RayMarching` evaluates it only
             for gradients, so that it learns.
-        generator: jitters the samples; on the CPU. Without one they are the same each time.
+        generator: jitters the samples; on the CPU. Without one they are the same each time. With gradients
+            `RayMarching` draws by it which samples have one, unless its `stop` is 0: gradients are then estimates that
+            are right in the mean, and second derivatives are not.
         background: grey value behind everything.
         differentiable: keep gradients to whatever the field and the rays depend on; by default for rays, not for
             cameras. Without gradients rays are rendered in chunks, so that memory does not grow with their number, and

@@ -14,7 +14,7 @@ from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering import Hierarchical, RayMarching, composite
 from hyperplanes.views import Views
-from tests.reference_rendering import ball_views, camera_at, composite_ray, ring
+from tests.reference_rendering import awaken, ball_views, camera_at, composite_ray, ring, small_model
 
 SOLID = Sphere(radius=0.5)
 
@@ -224,3 +224,31 @@ def test_rays_without_gradients_show_the_same(sampling):
     assert ended.samples <= whole.samples
     assert (ended.samples < whole.samples) == (sampling.stop > 0)
     torch.testing.assert_close(ended.colour, whole.colour, atol=max(1e-6, sampling.stop), rtol=0)
+
+
+@torch.no_grad()
+def test_pictures_follow_weights_and_voxels_that_change_in_place():
+    views = ball_views(ring(4))
+    field, cameras = awaken(small_model()).eval().adapt(views), ring(1, shift=1)
+    before, bias = field.render(cameras).opacity, field.field.parameters["density.bias"]
+    trained = bias.clone()
+    bias -= 50
+    assert field.render(cameras).opacity.max() < 1e-3
+    bias.copy_(trained)
+    assert torch.equal(field.render(cameras).opacity, before)
+    assert before.max() > 0.01
+    field.occupancy.occupied.zero_()
+    assert field.render(cameras).opacity.max() == 0
+
+
+@pytest.mark.usefixtures("unchecked")
+@torch.no_grad()
+def test_rays_of_any_precision_are_traced_and_points_of_another_shape_are_refused():
+    views = ball_views(ring(4))
+    field = awaken(small_model()).eval().adapt(views)
+    expected = field.trace(views.rays(0), differentiable=False).colour
+    found = field.trace(views.to(dtype=torch.float64).rays(0), differentiable=False).colour
+    assert found.dtype == expected.dtype
+    torch.testing.assert_close(found, expected, atol=1e-3, rtol=0)
+    with pytest.raises(ValueError, match=r"points: .*write points\[None\] for a single point"):
+        field.density(torch.zeros(3))

@@ -283,10 +283,11 @@ def test_wrong_settings_are_refused(model, support):
 
 
 def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, support):
-    taken = []
+    taken, tried = [], []
     ruinous = replace(WEIGHTS, learning_rate=1e30, muon_learning_rate=1e30, max_steps=12)  # NaN after the first step
-    field = model.fine_tune(support, "auto", ruinous, on_step=taken.append)
+    field = model.fine_tune(support, "auto", ruinous, on_step=taken.append, on_trial=tried.append)
     assert taken == [0]
+    assert tried == [0, 1, 2, 3]  # three checks
     cameras = ring(1, shift=1)
     assert torch.equal(field.render(cameras).images, model.adapt(support).render(cameras).images)
 

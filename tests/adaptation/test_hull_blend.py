@@ -147,7 +147,7 @@ def test_rays_begin_at_the_box_of_the_hull_and_lose_nothing(monkeypatch):
     assert max(field.refined_occupancy.box) < 0.9
     found = field.render(cameras)
     for scale, same in ((2.0, True), (0.3, False)):
-        monkeypatch.setitem(vars(field.refined_occupancy), "box", (-scale,) * 3 + (scale,) * 3)
+        monkeypatch.setattr(Occupancy, "box", (-scale,) * 3 + (scale,) * 3)
         rendered = field.render(cameras)
         assert torch.equal(found.depth, rendered.depth) == same
         assert (found.samples == rendered.samples) == same

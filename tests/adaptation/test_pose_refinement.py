@@ -75,6 +75,13 @@ def test_disturbed_poses_come_back(views):
     assert found.turned.shape == (len(views),)
 
 
+def test_a_motion_that_all_cameras_have_in_common_is_none(views):
+    moving = pose_refinement._MovedCameras(views.cameras, views.bounds)
+    with torch.no_grad():
+        moving.twist[:] = torch.tensor([0.3, -0.2, 0.1, 0.2, 0.4, -0.1])
+    torch.testing.assert_close(moving().extrinsics, views.cameras.extrinsics, atol=1e-5, rtol=0)
+
+
 def test_what_cannot_be_refined_is_refused(views):
     with pytest.raises(ValueError, match="views: expected at least 5 without lens distortion to refine poses, got 4"):
         refine_poses(views[:4])

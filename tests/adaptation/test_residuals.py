@@ -3,6 +3,7 @@
 import copy
 import math
 from itertools import pairwise
+from threading import Thread
 
 import pytest
 import torch
@@ -227,3 +228,13 @@ def test_a_method_is_corrected_object_by_object(support, query):
         found.render(query.cameras).images,
         ResidualField(ball((0.5, 0.5, 0.5)), support).render(query.cameras).images,
     )
+
+
+def test_a_corrected_field_can_be_corrected_again(support, query):
+    """By a thread of its own, which would wait for itself."""
+    found = []
+    again = ResidualField(ResidualField(ball((0.5, 0.5, 0.5)), support), support)
+    thread = Thread(target=lambda: found.append(again.render(query.cameras)), daemon=True)
+    thread.start()
+    thread.join(30)
+    assert len(found) == 1

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from hyperplanes.geometry import ImagePlanes, cameras
+from hyperplanes.geometry.distortion import distorted
 from hyperplanes.geometry.lookup import _INSTALLED, backends, choose, lookup
 from hyperplanes.geometry.packed_images import pack, unpack
 from tests import reference
@@ -323,11 +324,12 @@ def test_what_does_not_count_its_changes_is_copied():
 
 
 def test_a_single_camera_sees_what_is_before_it_wherever_the_origin_is():
-    for far in (0.0, 1e3, 1e5, 1e7):
-        pose = cameras.look_at(torch.tensor([[far, 0.0, 3.0]]), target=(far, 0.0, 0.0)).double()
+    for far, size in ((0.0, 1.0), (1e3, 1.0), (1e5, 1.0), (1e7, 1.0), (1e-4, 1e-5)):
+        eye = torch.tensor([[far, 0.0, 3.0 * size]], dtype=torch.double)
+        pose = cameras.look_at(eye, target=(far, 0.0, 0.0)).double()
         one = cameras.pinhole(cameras.symmetric_intrinsics(9, 13, 0.7), pose, 9, 13)
         planes = ImagePlanes(torch.rand(1, 3, 9, 13, dtype=torch.double), one)
-        ahead, behind = [far, 0.0, 0.0], [far, 0.0, 6.0]
+        ahead, behind = [far, 0.0, 0.0], [far, 0.0, 6.0 * size]
         assert planes.lookup(torch.tensor([ahead, behind], dtype=torch.double)).valid[:, 0].tolist() == [True, False]
 
 
@@ -353,3 +355,34 @@ def test_images_may_be_under_a_transform():
     torch.testing.assert_close(
         torch.func.vmap(summed)(stack), torch.stack([summed(each) for each in stack]), rtol=1e-3, atol=0
     )
+
+
+def test_other_images_are_read_as_the_first_ones_are():
+    points, ours = scene()[0], cameras.pinhole(cameras.symmetric_intrinsics(9, 13, 0.7), cameras.orbit(5, 3.0), 9, 13)
+    bytes_ = torch.randint(256, (5, 2, 9, 13), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    lens = distorted(ours, torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0]))
+    for shown in (ours, lens):
+        expected = ImagePlanes(bytes_, shown, exact=True).lookup(points).colours
+        first = ImagePlanes(torch.zeros(5, 3, 9, 13), shown)
+        for images in (bytes_, bytes_.numpy()):
+            assert torch.equal(first.with_images(images).lookup(points).colours, expected)
+
+
+def test_images_that_take_the_place_of_others_are_looked_up():
+    points, ours, images = scene()
+    planes = ImagePlanes(images, ours)
+    before = planes.lookup(points).colours
+    planes.images = 1 - images
+    after = planes.lookup(points).colours
+    assert torch.equal(after, ImagePlanes(1 - images, ours).lookup(points).colours)
+    assert not torch.equal(after, before)
+
+
+def test_at_a_camera_there_is_no_direction_and_its_gradient_is_finite():
+    _, ours, images = scene()
+    points = cameras.centres(ours).clone().requires_grad_()
+    found = ImagePlanes(images, ours).lookup(points, return_directions=True)
+    own = found.directions.diagonal().T
+    assert torch.equal(own, torch.zeros_like(own))
+    (gradient,) = torch.autograd.grad(found.directions.sum(), points)
+    assert gradient.abs().max() < 10

@@ -186,3 +186,22 @@ def test_an_odd_grid_gets_one_more_voxel_and_keeps_the_places_of_the_others(side
     even = grid.with_even_side()
     assert len(even.occupied) == 2 * math.ceil(side / 2)
     torch.testing.assert_close(even.centres(), grid.centres())
+
+
+def test_what_is_known_of_voxels_follows_their_changes():
+    grid = Occupancy(torch.zeros(32, 32, 32, dtype=torch.bool), Sphere())
+    for reach in (4, 12):
+        grid.occupied[16 - reach : 16 + reach, 10:20, 10:20] = True
+        fresh = Occupancy(grid.occupied.clone(), grid.bounds)
+        assert grid.box == fresh.box
+        assert torch.equal(grid.surface_centres, fresh.surface_centres)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    "voxels", [torch.ones(4, 4, 4), torch.ones(4, 2, 2).bool(), torch.ones(0, 0, 0).bool(), torch.ones(4, 4).bool()]
+)
+def test_a_grid_is_a_cube_of_booleans(voxels):
+    """The kernels read it as one."""
+    with pytest.raises(ValueError, match=r"occupied: expected booleans \(side, side, side\), got"):
+        Occupancy(voxels, Sphere())

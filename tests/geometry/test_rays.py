@@ -27,3 +27,12 @@ def test_rays_of_distant_cameras_meet_the_sphere_where_they_do_in_double_precisi
 def test_a_sphere_is_moved_to_the_unit_sphere(centre):
     sphere, directions = Sphere(centre, 4.0), torch.nn.functional.normalize(torch.eye(3) + 0.5, dim=1)
     torch.testing.assert_close(sphere.normalise(torch.tensor(centre) + 4 * directions), directions)
+
+
+@pytest.mark.parametrize("near_far", ["sphere", "constant"])
+def test_a_camera_in_the_scene_sees_nothing_behind_itself(near_far):
+    poses = camera.look_at(torch.tensor([[0.0, 0.0, 0.25]]))
+    cameras = camera.pinhole(camera.symmetric_intrinsics(3, 3, 0.7), poses, 3, 3)
+    rays = cast(cameras, torch.zeros(9, dtype=torch.long), pixel_grid(3, 3), near_far=near_far)
+    assert torch.equal(rays.near, torch.zeros(9))
+    assert float(rays.far[4]) == pytest.approx(1.25)

@@ -352,3 +352,16 @@ def test_a_hull_is_carved_and_its_depth_found_under_transforms():
 
     _, (count, _) = torch.func.grad(both, has_aux=True)(torch.tensor(2.0))
     assert int(count) == int(carve(views.masks, views.cameras, Sphere(), 16).occupied.sum())
+
+
+def test_cameras_that_move_in_place_see_from_where_they_stand():
+    """The kernels and plain PyTorch, which reads them at each call, choose the same views."""
+    shown, (points, directions) = planes(ring(4, SIZE)), queries(200)
+    before = shown.choose(points, directions, best=2, nearest=2).best.views
+    poses = shown.colours.cameras.extrinsics
+    poses.copy_(poses.roll(1, 0))
+    found = shown.choose(points, directions, best=2, nearest=2)
+    expected = module.choose_torch(shown, points, directions, 2, 3, shown.depth_opacity)
+    assert (found.best.views == expected.best.views).float().mean() > 0.99  # ties
+    assert (found.nearest.views == expected.nearest.views).float().mean() > 0.99
+    assert not torch.equal(found.best.views, before)

@@ -93,3 +93,13 @@ def test_without_random_samples_or_an_end_of_rays_all_are_differentiated():
     expected = gradient_of(_all_at_once(Scene(field, grid), rays, jittered), weights)
     found = render(field, rays, RayMarching(64, 0.0), occupancy=grid, generator=drawn[1])
     torch.testing.assert_close(gradient_of(found, weights), expected)
+
+
+def test_a_ray_none_of_whose_samples_has_a_gradient_has_the_colour_of_the_background():
+    field, _ = ball(-3.0)  # haze, of which a sample is drawn in some rays
+    rays, grid = some_rays(40), full(Sphere(), 4)
+    samples = march(rays, grid, 2 / 64)
+    seen = _by_importance(Scene(field, grid, background=0.7), rays, samples, 1e-3, torch.Generator().manual_seed(0))
+    undrawn = (seen.colour - 0.7).abs().amax(1) < 1e-9
+    assert 10 < undrawn.sum() < 40
+    assert seen.opacity[undrawn].max() > 0.01

@@ -6,12 +6,26 @@ import torch
 from torch.nn.functional import linear
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.fields import base
-from hyperplanes.geometry.cameras import resized, select
+from hyperplanes.geometry.cameras import (
+    centres,
+    look_at,
+    pinhole,
+    projection_matrices,
+    resized,
+    select,
+    symmetric_intrinsics,
+)
+from hyperplanes.geometry.image_planes import ImagePlanes
+from hyperplanes.geometry.occupancy import carve, full
+from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.renderer import allow_tf32
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
-from tests.reference_rendering import ring
+from tests.reference_rendering import ball_views, ring
 
 
 def test_tf32_is_allowed_on_a_gpu_alone_and_while_the_context_lasts():
@@ -53,6 +67,34 @@ def test_tf32_products_leave_pictures_as_they_are(monkeypatch):
     assert exact.std() > 0.02
     assert not torch.equal(short, exact)
     assert psnr(short, exact).min() > 60
+
+
+def test_places_are_those_of_full_precision_under_autocast():
+    """In bfloat16 they would be pixels away from where points are, and rotations would not be any."""
+    views, grid = ball_views(ring(5, (200, 200))), full(Sphere(), 24)
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    eyes = 3 * torch.nn.functional.normalize(points[:9], dim=1)
+
+    def found():
+        cameras = pinhole(symmetric_intrinsics(200, 200, 0.7), look_at(eyes), 200, 200)
+        seen = ImagePlanes(views.images, views.cameras).lookup(points, return_directions=True)
+        hull = carve(views.masks, views.cameras, views.bounds, 24).occupied
+        chosen = torch.tensor(farthest_first(eyes, 0, 6))
+        where = [centres(cameras), projection_matrices(cameras), footprint(grid, cameras), chosen]
+        return [*where, seen.colours, seen.directions, seen.coordinates, hull]
+
+    expected = found()
+    with torch.autocast("cpu", torch.bfloat16):
+        assert all(torch.equal(*each) for each in zip(found(), expected, strict=True))
+
+
+def test_rays_are_traced_as_without_autocast():
+    views = ball_views(ring(6, (16, 16)))
+    field = HyperPlanes.from_pretrained("small").adapt(views)
+    for each in (field, Rotation(0.3).field(field)):
+        expected = each.trace(views.rays(0), differentiable=False).colour
+        with torch.autocast("cpu", torch.bfloat16):
+            assert torch.equal(each.trace(views.rays(0), differentiable=False).colour, expected)
 
 
 def test_fields_are_adapted_and_rendered_as_without_autocast():

@@ -12,7 +12,7 @@ from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data.support import SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.parameters import Parameters
-from hyperplanes.rendering import Hierarchical
+from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.training import Trainer, TrainingConfig, start_training
 from hyperplanes.training.episodes.drawing import object_generator
 from hyperplanes.training.initialisation import initialisation_trainer
@@ -75,7 +75,9 @@ def test_one_inner_step_of_reptile_is_a_gradient_step_on_support_rays():
 
 @pytest.mark.parametrize("coarse", [False, True])
 def test_inner_steps_of_rate_zero_lead_nowhere(coarse):
-    changes = {"coarse_network": True, "sampling": Hierarchical(6, 6)} if coarse else {}
+    changes = {"sampling": RayMarching(12, stop=0.0)}  # no gradient is an estimate, as in maml alone
+    if coarse:
+        changes = {"coarse_network": True, "sampling": Hierarchical(6, 6)}
 
     def found(method):
         model = small_model(
@@ -286,3 +288,16 @@ def test_a_validation_whose_steps_lower_nothing_does_not_end_the_training():
         model.networks["fine"].density.bias.fill_(-60.0)  # empty, and without a gradient
     trainer = initialisation_trainer(model, Balls(), replace(FAST, steps=1), None)
     assert [row.psnr for row in trainer.run()][-1] is not None
+
+
+def test_maml_takes_no_estimate_of_gradients_and_its_first_order_form_does():
+    """Second derivatives of an estimate are wrong even in the mean; `stop` chooses the samples with a gradient."""
+
+    def found(method, stop):
+        model = model_of(method)
+        model.config = replace(model.config, sampling=RayMarching(24, stop))
+        return gradients_of(initialisation_trainer(model, Balls(), FAST, None))
+
+    for method, exact in (("maml", True), ("maml_first_order", False)):
+        estimated, whole = (found(method, stop) for stop in (5e-3, 0.0))
+        assert all(torch.equal(estimated[name], whole[name]) for name in whole) == exact

@@ -1,13 +1,12 @@
 """Source of truth: wrong calls of people who come from NumPy and other libraries; each is a line with the name."""
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation import HullBlend, HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.export.images import orbit_cameras, save_images
@@ -20,14 +19,6 @@ from tests.reference_rendering import ring
 
 PICTURES = torch.zeros(1, 3, 4, 4)
 VIEWS = Views(PICTURES, ring(1, (4, 4)))
-
-
-@pytest.fixture
-def unchecked():
-    """Without the type checks of the tests, as users run it."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def field(points, directions):
@@ -65,6 +56,9 @@ def field(points, directions):
         (lambda: cameras.orbit(3, 10**30), "distance: expected float, got 1000"),
         (lambda: VIEWS.to("../a"), "device: expected a device such as 'cpu' or 'cuda:0', got '../a'"),
         (lambda: render(field, None), "target: expected PinholeCamera or Rays, got None"),
+        (lambda: render(field, ring(1, (4, 4)), chunk=0), "chunk: expected a whole number from 1 to .* or None, got 0"),
+        (lambda: HullBlend(nearest=0), "nearest: expected a whole number from 1 to .*, got 0"),
+        (lambda: HullBlend(side=1.5), "side: expected a whole number from 1 to 1024, got 1.5"),
         (lambda: render(field, ring(1, (4, 4)), background="white"), "background: expected float, got 'white'"),
     ],
 )

@@ -2,7 +2,6 @@
 
 import math
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -86,14 +85,6 @@ def test_the_foreground_psnr_counts_pixels_of_the_mask_alone():
     expected = [psnr(predicted[i : i + 1, :, a, b], truth[i : i + 1, :, a, b]).item() for i, a, b in parts]
     assert found[[0, 2]].tolist() == pytest.approx(expected, abs=1e-4)
     assert found[1].isnan()
-
-
-@pytest.fixture
-def unchecked():
-    """Runs without the type checks, as a user's program does."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.mark.usefixtures("unchecked")

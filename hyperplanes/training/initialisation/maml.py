@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters
+from hyperplanes.rendering.renderer import RayMarching, Sampler
 from hyperplanes.training.episodes import Batch, Episode
 from hyperplanes.training.initialisation.base import InitialisationObjective, draw_rays, draw_seed
 from hyperplanes.training.meta_gradients import maml_gradient
@@ -44,7 +46,9 @@ class MAML(InitialisationObjective):
         """MAML's gradient, averaged over the objects."""
         total, mean, count = 0.0, Parameters(), len(batch.rendered)
         initialisation, theta = self.initialisation, self.model.theta.detach()
-        first_order = initialisation.method == "maml_first_order"
+        first_order, sampling = initialisation.method == "maml_first_order", self.model.config.sampling
+        if not first_order and isinstance(sampling, RayMarching):
+            sampling = replace(sampling, stop=0.0)  # no estimate of gradients: its second derivatives are wrong
         for draw in batch.rendered:
             episode, generator, rays = draw.episode, draw.generator, self.config.rays
             field = self.model.field(episode.prepared, theta)
@@ -53,7 +57,7 @@ class MAML(InitialisationObjective):
                 draw_rays(episode, field, rays, generator, of_support=True) for _ in range(initialisation.inner_steps)
             ]
             drawn.append(draw_rays(episode, field, rays, generator))
-            *inner, outer = [self._loss(episode, *each, draw_seed(generator)) for each in drawn]
+            *inner, outer = [self._loss(episode, sampling, *each, draw_seed(generator)) for each in drawn]
             # the gradient of the outer loss through the inner steps
             gradient, loss = maml_gradient(theta, inner, outer, initialisation.inner_rate, first_order=first_order)
             total += float(loss)
@@ -62,9 +66,11 @@ class MAML(InitialisationObjective):
         self.set_gradients(mean)
         return total / count
 
-    def _loss(self, episode: Episode, rays: Rays, truth: Tensor, seed: int) -> Callable[[Parameters], Tensor]:
+    def _loss(
+        self, episode: Episode, sampling: Sampler, rays: Rays, truth: Tensor, seed: int
+    ) -> Callable[[Parameters], Tensor]:
         def loss(parameters: Parameters) -> Tensor:
-            generator = torch.Generator().manual_seed(seed)
-            return ray_loss(self.model.field(episode.prepared, parameters).trace(rays, generator), truth)
+            field = self.model.field(episode.prepared, parameters).with_sampling(sampling)
+            return ray_loss(field.trace(rays, torch.Generator().manual_seed(seed)), truth)
 
         return loss

@@ -1,0 +1,33 @@
+"""What is kept of tensors is what would be made of them now."""
+
+import gc
+import weakref
+from types import SimpleNamespace
+
+import torch
+
+from hyperplanes.utilities.kept import kept
+
+
+def test_it_is_made_once_and_again_after_a_change_in_place_or_of_another_tensor():
+    owner, made = SimpleNamespace(), []
+
+    def asked(*tensors):
+        return kept(owner, "sum", tensors, lambda: made.append(0) or float(sum(each.sum() for each in tensors)))
+
+    one, other = torch.ones(3), torch.zeros(2)
+    assert asked(one, other) == asked(one, other) == 3.0
+    assert len(made) == 1
+    other += 1
+    assert asked(one, other) == asked(one, other) == 5.0
+    assert asked(one.clone(), other) == 5.0
+    assert len(made) == 3
+
+
+def test_the_memory_of_what_it_was_made_of_is_not_given_to_another_tensor():
+    owner, value = SimpleNamespace(), torch.ones(1000)
+    kept(owner, "sum", [value], lambda: 0)
+    alive = weakref.ref(value)
+    del value
+    gc.collect()
+    assert alive() is not None
