@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from torch.nn.functional import linear
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.fields import base
+from hyperplanes.geometry import occupancy
 from hyperplanes.geometry.cameras import (
     centres,
     look_at,
@@ -21,6 +23,7 @@ from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import carve, full
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering import footprint as footprints
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.renderer import allow_tf32
 from hyperplanes.utilities.metrics import psnr
@@ -69,17 +72,22 @@ def test_tf32_products_leave_pictures_as_they_are(monkeypatch):
     assert psnr(short, exact).min() > 60
 
 
-def test_places_are_those_of_full_precision_under_autocast():
+@pytest.mark.parametrize("compiled", [True, False])
+def test_places_are_those_of_full_precision_under_autocast(monkeypatch, compiled):
     """In bfloat16 they would be pixels away from where points are, and rotations would not be any."""
+    if not compiled:
+        for module in (occupancy, footprints):
+            monkeypatch.setattr(module, "find_spec", lambda name: None)
     views, grid = ball_views(ring(5, (200, 200))), full(Sphere(), 24)
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) - 0.5
-    eyes = 3 * torch.nn.functional.normalize(points[:9], dim=1)
+    eyes = torch.nn.functional.normalize(points, dim=1)
 
     def found():
-        cameras = pinhole(symmetric_intrinsics(200, 200, 0.7), look_at(eyes), 200, 200)
-        seen = ImagePlanes(views.images, views.cameras).lookup(points, return_directions=True)
+        cameras = pinhole(symmetric_intrinsics(200, 200, 0.7), look_at(3 * eyes[:9]), 200, 200)
+        planes = ImagePlanes(views.images, views.cameras, backend=None if compiled else "torch")
+        seen = planes.lookup(points, return_directions=True)
         hull = carve(views.masks, views.cameras, views.bounds, 24).occupied
-        chosen = torch.tensor(farthest_first(eyes, 0, 6))
+        chosen = torch.tensor(farthest_first(eyes, 0, 100))
         where = [centres(cameras), projection_matrices(cameras), footprint(grid, cameras), chosen]
         return [*where, seen.colours, seen.directions, seen.coordinates, hull]
 
