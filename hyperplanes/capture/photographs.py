@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
 from hyperplanes.capture.video import VIDEO_SUFFIXES
@@ -21,11 +22,9 @@ from hyperplanes.data.formats.unposed import photographs_folder
 from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import (
     PICTURE_SUFFIXES,
-    Pixels,
     image_header,
     opacity_of,
     read_image,
-    resized,
     turned,
 )
 from hyperplanes.data.pictures.masks import match_masks
@@ -169,44 +168,48 @@ def without_copies(photographs: Sequence[Photograph]) -> tuple[list[Photograph],
     return kept, notes
 
 
-def read_upright(photograph: Photograph, max_size: int) -> tuple[Pixels, bool]:
-    """The pixels of a photograph as it is stored in a capture: upright or on its side, scaled, its mask as alpha.
+def read_upright(
+    photograph: Photograph, max_size: int
+) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
+    """The pixels of a photograph as it is stored in a capture: upright or on its side, scaled; and its mask.
 
     Args:
         photograph: which one.
         max_size: pixels along the longer side at most.
 
     Returns:
-        (height, width, 4), straight alpha, and whether alpha means anything.
+        The picture, which a mask does not change, and the opacity that the mask or, without one, alpha states; None
+        where there is neither.
 
     Raises:
         DataError: a photograph that is broken, or a mask of another shape.
     """
-    picture, alpha = read_image(photograph.path)
-    stored = picture.shape[:2]
-    picture = turned(picture, photograph.orientation)
+    rgba, alpha = read_image(photograph.path)
+    stored = rgba.shape[:2]
+    rgba = turned(rgba, photograph.orientation)
+    upright = rgba.shape[:2]
+    opacity = rgba[..., 3] if alpha else None
     if photograph.mask is not None:
         values, has_alpha = read_image(photograph.mask)
         opacity = opacity_of(values, has_alpha)
-        if _same_shape(opacity.shape, stored) and not _same_shape(opacity.shape, picture.shape[:2]):
+        if _same_shape(opacity.shape, stored) and not _same_shape(opacity.shape, upright):
             opacity = turned(opacity, photograph.orientation)  # drawn on the pixels as they are stored
-        elif stored == picture.shape[:2] and photograph.orientation != 1:
+        elif stored == upright and photograph.orientation != 1:
             opacity = turned(opacity, photograph.orientation)
-        if not _same_shape(opacity.shape, picture.shape[:2]):
+        if not _same_shape(opacity.shape, upright):
             raise DataError(
                 photograph.mask,
                 f"the shape of {photograph.path.name}, {stored[1]} x {stored[0]} pixels",
                 f"{values.shape[1]} x {values.shape[0]}",
                 "give each photograph a mask of its own shape",
             )
-        scaled = Image.fromarray(opacity).resize(picture.shape[1::-1], Image.Resampling.BILINEAR)
-        picture[..., 3] = np.array(scaled)
-        alpha = True
-    size = scaled_size(picture.shape[:2], max_size)
-    picture = resized(picture, size)
-    if photograph.turned:
-        picture = np.ascontiguousarray(np.rot90(picture))
-    return picture, alpha and bool((picture[..., 3] < 255).any())
+    height, width = scaled_size(upright, max_size)
+
+    def stored_as(layer: np.ndarray) -> np.ndarray:
+        scaled = np.array(Image.fromarray(layer).resize((width, height), Image.Resampling.BILINEAR))
+        return np.ascontiguousarray(np.rot90(scaled)) if photograph.turned else scaled
+
+    return stored_as(np.ascontiguousarray(rgba[..., :3])), None if opacity is None else stored_as(opacity)
 
 
 def scaled_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:

@@ -31,7 +31,7 @@ from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import Pixels, read_image
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.arguments import checked_fields
-from hyperplanes.utilities.encoding import encode_jpeg, encode_png
+from hyperplanes.utilities.encoding import encode_jpeg, encode_png, sha256
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.writing import write_whole
 
@@ -105,7 +105,7 @@ def capture(
     if not is_video:
         _refuse_inside(out, *(path for one in photographs for path in (one.path, one.mask) if path is not None))
     photographs, pictures, opacities = _pictures(photographs, work)
-    model = _poses(photographs, pictures, is_video, work)
+    model = _poses(pictures, is_video, work)
     kept = [photographs[index] for index in model.pictures]
     if len(kept) < len(photographs):
         rest = [one.name for index, one in enumerate(photographs) if index not in set(model.pictures.tolist())]
@@ -162,29 +162,30 @@ def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
 def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photograph], list[Picture], dict[int, Path]]:
     """The photographs upright and scaled, as files, and the masks that came with them by their number."""
     max_size = work.settings.max_size
-    masks = [None if one.mask is None else (str(one.mask), one.mask.stat().st_mtime) for one in photographs]
-    key = fingerprint(_stamps(photographs), masks, max_size, work.settings.mask in ("auto", "given"))
+    masked = work.settings.mask in ("auto", "given")
+    key = fingerprint([(_stamp(one.path), one.mask and _stamp(one.mask)) for one in photographs], max_size, masked)
     folder = work.stages.folder / "pictures"
     done = work.stages.begin("pictures", key)
     if done is None:
-        done = {"sizes": [], "opaque": [], "broken": {}}
+        done = {"sizes": [], "masked": [], "broken": {}}
+        with_alpha, transparent = list[int](), False
         for index, one in enumerate(photographs):
             work.progress("photographs", index, len(photographs), one.path.name)
             try:
-                picture, alpha = read_upright(one, max_size)
+                picture, opacity = read_upright(one, max_size)
             except DataError as error:
                 if one.mask is not None and str(one.mask) in str(error):
                     raise
                 done["broken"][str(index)] = f"left out: {error}"
                 done["sizes"].append(None)
-                done["opaque"].append(True)
                 continue
-            alpha = alpha and work.settings.mask in ("auto", "given")
-            write_whole(folder / f"{index:05d}.jpg", encode_jpeg(picture[..., :3], QUALITY), durable=False)
-            if alpha:
-                write_whole(folder / f"{index:05d}.mask.png", encode_png(picture[..., 3]), durable=False)
+            write_whole(folder / f"{index:05d}.jpg", encode_jpeg(picture, QUALITY), durable=False)
             done["sizes"].append(list(picture.shape[:2]))
-            done["opaque"].append(not alpha)
+            if masked and opacity is not None:
+                write_whole(folder / f"{index:05d}.mask.png", encode_png(opacity), durable=False)
+                (with_alpha if one.mask is None else done["masked"]).append(index)
+                transparent |= one.mask is None and bool((opacity < 255).any())
+        done["masked"] += with_alpha if transparent else []  # alpha that is opaque in all of them says nothing
         work.stages.finish("pictures", key, done)
         work.progress("photographs", len(photographs), len(photographs), "upright and scaled")
     work.notes += done["broken"].values()
@@ -196,24 +197,23 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
         camera = cameras.setdefault((one.camera, size), len(cameras))
         focal = None if one.focal is None else one.focal * max(size)
         pictures.append(Picture(f"{index:05d}.jpg", camera, size, focal))
-    opacities = {
-        row: folder / f"{index:05d}.mask.png" for row, index in enumerate(readable) if not done["opaque"][index]
-    }
+    opacities = {row: folder / f"{index:05d}.mask.png" for row, index in enumerate(readable) if index in done["masked"]}
     return [photographs[index] for index in readable], pictures, opacities
 
 
-def _stamps(photographs: Sequence[Photograph]) -> list[tuple[str, float, int]]:
-    """What tells the files from others."""
-    return [(str(one.path.resolve()), one.path.stat().st_mtime, one.path.stat().st_size) for one in photographs]
+def _stamp(path: Path) -> tuple[str, float, int]:
+    """What tells a file from others."""
+    return str(path.resolve()), path.stat().st_mtime, path.stat().st_size
 
 
-def _poses(photographs: Sequence[Photograph], pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
+def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
     """The largest model; other features are tried while it holds few of the pictures. Masks have no part in it."""
+    shown = work.stages.folder / "pictures"
     order = work.settings.order
     sequential = order == "sequence" or (order == "auto" and (is_video or len(pictures) > EXHAUSTIVE))
     how = [asdict(features) for features in ATTEMPTS]
-    shown = [asdict(picture) for picture in pictures]
-    key = fingerprint(shown, sequential, _stamps(photographs), work.settings.max_size, how)
+    what = [(asdict(picture), sha256((shown / picture.file).read_bytes())) for picture in pictures]
+    key = fingerprint(what, sequential, how)
     folder = work.stages.folder / "poses"
     done = work.stages.begin("poses", key)
     if done is not None:
@@ -227,7 +227,7 @@ def _poses(photographs: Sequence[Photograph], pictures: list[Picture], is_video:
             work.notes.append(f"{count} of {len(pictures)} photographs posed: tried again with {features.name}")
         found = find_poses(
             pictures,
-            work.stages.folder / "pictures",
+            shown,
             folder / f"{number}.db",
             features=features,
             sequential=sequential,

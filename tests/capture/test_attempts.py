@@ -24,6 +24,14 @@ class Model:
         path.touch()
 
 
+def drawn(folder, count, content=b""):
+    """Files of pictures, as the stage before leaves them."""
+    (folder / "pictures").mkdir(exist_ok=True)
+    for index in range(count):
+        (folder / "pictures" / f"{index}.jpg").write_bytes(content)
+    return [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(count)]
+
+
 @pytest.mark.parametrize(
     ("order", "is_video", "count", "sequential"),
     [
@@ -40,7 +48,7 @@ def test_all_pairs_are_matched_where_they_are_asked_for_or_few(
     asked = []
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **how: asked.append(how["sequential"]) or Model(count))
     work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(order=order), progress=print, notes=[])
-    pipeline._poses([], [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(count)], is_video, work)
+    pipeline._poses(drawn(tmp_path, count), is_video, work)
     assert asked == [sequential]
 
 
@@ -53,7 +61,7 @@ def test_nothing_of_colmap_stays_behind(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pipeline, "find_poses", find_poses)
     work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(), progress=print, notes=[])
-    pipeline._poses([], [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)], False, work)
+    pipeline._poses(drawn(tmp_path, 20), False, work)
     assert [path.name for path in sorted((tmp_path / "poses").iterdir())] == ["model.npz"]
 
 
@@ -65,19 +73,19 @@ def test_other_features_are_tried_while_too_few_pictures_are_registered(found, k
     models = iter([None if count is None else Model(count) for count in found])
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: next(models))
     work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(), progress=print, notes=[])
-    model = pipeline._poses([], [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)], False, work)
+    model = pipeline._poses(drawn(tmp_path, 20), False, work)
     assert (len(model), list(models)) == (kept, [])
     assert len(work.notes) == len(found) - 1 + advised
 
 
-def test_another_way_to_find_masks_keeps_the_poses(tmp_path, monkeypatch):
+def test_poses_are_those_of_the_pictures_whatever_else_is_asked_for(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: asked.append(1) or Model(20))
     monkeypatch.setattr(pipeline.SparseModel, "load", lambda path: Model(20))
-    pictures = [Picture(f"{index}.jpg", 0, (3, 4)) for index in range(20)]
-    for mask in ("auto", "given", "network", "none"):
-        stages = Stages(tmp_path)
-        stages.begin("pictures", mask)
-        work = types.SimpleNamespace(stages=stages, settings=Settings(mask=mask), progress=print, notes=[])
-        pipeline._poses([], pictures, False, work)
-    assert asked == [1]
+    for content, searches in ((b"same", 1), (b"other", 2)):
+        for mask in ("auto", "given", "network", "none"):
+            work = types.SimpleNamespace(
+                stages=Stages(tmp_path), settings=Settings(mask=mask), progress=print, notes=[]
+            )
+            pipeline._poses(drawn(tmp_path, 20, content), False, work)
+        assert len(asked) == searches

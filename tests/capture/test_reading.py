@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hyperplanes.capture import Settings, capture
+from hyperplanes.capture import Settings, capture, pipeline
 from hyperplanes.capture.packages import stated_threads
 from hyperplanes.capture.photographs import find_photographs, list_photographs, read_upright, without_copies
 from hyperplanes.capture.scene import write_scene
@@ -40,9 +40,9 @@ def test_photographs_are_read_upright(upright, tmp_path, orientation):
     for index in range(3):
         save(upright, tmp_path / f"{index}.png", orientation)
     (first, *_), notes = list_photographs(find_photographs(tmp_path))
-    picture, opaque = read_upright(first, 1000)
-    assert (first.size, first.turned, notes, opaque) == ((24, 40), False, [], False)
-    np.testing.assert_array_equal(picture[..., :3], upright)
+    picture, opacity = read_upright(first, 1000)
+    assert (first.size, first.turned, notes, opacity) == ((24, 40), False, [], None)
+    np.testing.assert_array_equal(picture, upright)
 
 
 def test_photographs_of_one_name_get_names_that_no_other_has(upright, tmp_path):
@@ -88,9 +88,45 @@ def test_masks_beside_turned_photographs_are_turned_with_them(upright, tmp_path,
         save(upright, tmp_path / f"{index}.png", 6)
         Image.fromarray(np.rot90(mask) if drawn == "as stored" else mask).save(tmp_path / "masks" / f"{index}_mask.png")
     (first, *_), _ = list_photographs(find_photographs(tmp_path), tmp_path / "masks")
-    picture, has_alpha = read_upright(first, 1000)
-    assert has_alpha
-    np.testing.assert_array_equal(picture[..., 3], mask)
+    _, opacity = read_upright(first, 1000)
+    np.testing.assert_array_equal(opacity, mask)
+
+
+@pytest.mark.parametrize("kind", ["masks/", "alpha"])
+def test_masks_do_not_change_the_pictures_that_poses_are_found_in(kind, tmp_path, monkeypatch):
+    shown = []
+
+    def find_poses(pictures, folder, *_, **__):
+        shown.append([(folder / picture.file).read_bytes() for picture in pictures])
+
+    monkeypatch.setattr(pipeline, "find_poses", find_poses)
+    rgba = np.random.default_rng(0).integers(0, 255, (3, 96, 160, 4), dtype=np.uint8)
+    rgba[..., 3] = 255 * (np.arange(160) < 50)
+    for given in (False, True):
+        home = tmp_path / str(given)
+        (home / "masks" if given and kind == "masks/" else home).mkdir(parents=True)
+        for index, picture in enumerate(rgba):
+            Image.fromarray(picture if given and kind == "alpha" else picture[..., :3]).save(home / f"{index}.png")
+            if (home / "masks").is_dir():
+                Image.fromarray(picture[..., 3]).save(home / "masks" / f"{index}.png")
+        with pytest.raises(DataError, match="none can"):
+            capture(home, home / "scene", Settings(max_size=80))
+        assert len(list((home / "scene/capture/pictures").glob("*.mask.png"))) == 3 * given
+    attempts = len(shown) // 2
+    assert shown[0] == shown[attempts]
+
+
+def test_alpha_that_is_opaque_throughout_is_no_mask_and_that_of_one_among_others_is(upright, tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: None)
+    rgba = np.dstack([upright, np.full((24, 40), 255, np.uint8)])
+    for transparent in (0, 1):
+        for index in range(3):
+            rgba[0, 0, 3] = 255 - transparent * (index > 0)
+            rgba[1, 0, 0] = index
+            Image.fromarray(rgba).save(tmp_path / f"{index}.png")
+        work = pipeline._Work(pipeline.Stages(tmp_path / "work"), Settings(), print)
+        _, _, opacities = pipeline._pictures(list_photographs(find_photographs(tmp_path))[0], work)
+        assert len(opacities) == 3 * transparent
 
 
 def test_too_few_photographs_are_refused(upright, tmp_path):
