@@ -45,12 +45,12 @@ from hyperplanes.capture.masks import consistency
 from hyperplanes.capture.masks.consistency import agree
 from hyperplanes.capture.pipeline import ROOM
 from hyperplanes.capture.placement import object_points, object_sphere
-from hyperplanes.capture.scene import straightened
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages, fingerprint
 from hyperplanes.data import read_task
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.pictures.images import Pixels, composite_over_white, read_image
+from hyperplanes.data.pictures.undistort import undistort
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.environment import find_commit
@@ -261,7 +261,7 @@ def _name(view: int) -> str:
 def _straight(staged: Staged, view: int, calibration: np.ndarray, lens: Sequence[float]) -> Pixels:
     """A photograph with its true mask as alpha, without its lens."""
     rgba = np.concatenate([staged.photographs[view], 255 * staged.masks[view][..., None].astype(np.uint8)], -1)
-    return straightened(rgba, calibration, np.array(lens), opaque=False)
+    return undistort(rgba, calibration, (*lens, *(0.0,) * 6))
 
 
 def _read_masks(scene: Path, names: Iterable[str]) -> list[np.ndarray]:

@@ -110,8 +110,8 @@ def capture(
     if len(kept) < len(photographs):
         rest = [one.name for index, one in enumerate(photographs) if index not in set(model.pictures.tolist())]
         work.notes.append(f"{len(rest)} photographs could not be posed and are left out: {listed(rest)}")
-    straight = _straight(model, pictures, opacities, work)
-    masks, how = _masks(model, straight, [one.name for one in kept], work)
+    straight, given = _straight(model, pictures, opacities, work)
+    masks, how = _masks(model, straight, given, [one.name for one in kept], work)
     placement, masks = _placed(model, kept, straight, masks, work, trusted=how == "given")
     return _written(out, model, kept, straight, masks, how, placement, work)
 
@@ -253,51 +253,59 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
     return best
 
 
-def _straight(model: SparseModel, pictures: Sequence[Picture], opacities: dict[int, Path], work: _Work) -> list[Pixels]:
-    """The pictures that were posed, without their lens."""
-    result = []
+def _straight(
+    model: SparseModel, pictures: Sequence[Picture], opacities: dict[int, Path], work: _Work
+) -> tuple[list[Pixels], list[Pixels | None]]:
+    """The pictures (height, width, 3) that were posed, without their lens, and the masks that came with them."""
+    straight, given = list[Pixels](), list[Pixels | None]()
     for row, index in enumerate(model.pictures.tolist()):
         path = work.stages.folder / "pictures" / pictures[index].file
-        picture, _ = read_image(path)
-        given = opacities.get(index)
-        if given is not None:
-            picture[..., 3] = read_image(given)[0][..., 0]
         work.progress("lens", row, len(model), path.name)
-        result.append(straightened(picture, model.calibrations[row], model.lenses[row], opaque=given is None))
+        picture, opacity = straightened(
+            read_image(path)[0][..., :3],
+            read_image(opacities[index])[0][..., 0] if index in opacities else None,
+            model.calibrations[row],
+            model.lenses[row],
+        )
+        straight.append(picture)
+        given.append(opacity)
     work.progress("lens", len(model), len(model), "distortion removed")
-    return result
+    return straight, given
 
 
 def _masks(
-    model: SparseModel, straight: list[Pixels], names: Sequence[str], work: _Work
+    model: SparseModel,
+    straight: list[Pixels],
+    given: Sequence[Pixels | None],
+    names: Sequence[str],
+    work: _Work,
 ) -> tuple[list[np.ndarray] | None, str]:
     """A mask a camera, opacity in [0, 1], and how they were found."""
     if work.settings.mask == "none":
         return None, "none"
-    given = [index for index, picture in enumerate(straight) if (picture[..., 3] < 255).any()]
-    if work.settings.mask == "given" and not given:
+    bare = [name for name, opacity in zip(names, given, strict=True) if opacity is None]
+    if work.settings.mask == "given" and len(bare) == len(given):
         raise DataError(
             "--mask given", "photographs with alpha, or a folder masks/ beside them", "neither", "leave --mask out"
         )
-    if len(given) == len(straight):
-        return [picture[..., 3] / 255.0 for picture in straight], "given"
-    masker, how = choose_masker(work.settings.mask, model, [picture[..., :3] for picture in straight])
-    if given:
-        bare = listed([names[index] for index in range(len(straight)) if index not in set(given)])
-        work.notes.append(f"{len(straight) - len(given)} photographs came without a mask and get one by {how}: {bare}")
+    if not bare:
+        return [opacity / 255.0 for opacity in given if opacity is not None], "given"
+    masker, how = choose_masker(work.settings.mask, model, straight)
+    if len(bare) < len(given):
+        work.notes.append(f"{len(bare)} photographs came without a mask and get one by {how}: {listed(bare)}")
     key = fingerprint(work.stages.key("poses"), how)
     work.stages.begin("masks", key)
     folder = work.stages.folder / "masks"
     masks = []
-    for row, picture in enumerate(straight):
+    for row, (picture, opacity) in enumerate(zip(straight, given, strict=True)):
         path = folder / f"{row:05d}.png"
-        if row in given:
-            masks.append(picture[..., 3] / 255.0)
+        if opacity is not None:
+            masks.append(opacity / 255.0)
             continue
         if not path.is_file():
             work.progress("masks", row, len(straight), how)
-            opacity = masker(picture[..., :3], row)
-            write_whole(path, encode_png((opacity * 255).round().astype(np.uint8)), durable=False)
+            found = masker(picture, row)
+            write_whole(path, encode_png((found * 255).round().astype(np.uint8)), durable=False)
         masks.append(read_image(path)[0][..., 0] / 255.0)
     work.progress("masks", len(straight), len(straight), how)
     if not any(mask.any() for mask in masks):
@@ -321,7 +329,7 @@ def _placed(
     sphere = object_sphere(model, chosen)
     if masks is not None:
         work.progress("agreement", 0, 1, "of the masks with each other")
-        pictures = None if trusted or not is_installed("cv2") else [picture[..., :3] for picture in straight]
+        pictures = None if trusted or not is_installed("cv2") else straight
         found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius), pictures)
         if found.wrong:
             names = listed([photographs[row].name for row in found.wrong])
@@ -347,7 +355,7 @@ def _written(
     files = {}
     for row, (one, picture) in enumerate(zip(photographs, straight, strict=True)):
         work.progress("writing", row, len(straight), one.name)
-        files[f"images/{one.name}.jpg"] = encode_jpeg(picture[..., :3], QUALITY)
+        files[f"images/{one.name}.jpg"] = encode_jpeg(picture, QUALITY)
         if masks is not None:
             files[f"masks/{one.name}.png"] = encode_png((masks[row] * 255).round().astype(np.uint8))
     captured = write_scene(

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.data.formats.transforms_document import transforms_document
-from hyperplanes.data.pictures.images import Pixels
 from hyperplanes.data.pictures.undistort import undistort
 from hyperplanes.utilities.encoding import encode_ply
 from hyperplanes.utilities.files import DataError, read_json
@@ -48,22 +47,33 @@ class Captured:
 
 
 def straightened(
-    picture: Pixels, calibration: Float[np.ndarray, "3 3"], lens: Float[np.ndarray, " 2"], *, opaque: bool
-) -> Pixels:
-    """A picture as a pinhole with the same calibration would have taken it.
+    picture: UInt8[np.ndarray, "height width 3"],
+    opacity: UInt8[np.ndarray, "height width"] | None,
+    calibration: Float[np.ndarray, "3 3"],
+    lens: Float[np.ndarray, " 2"],
+) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
+    """A picture and its mask as a pinhole with the same calibration would have taken them, each by itself.
 
     Args:
-        picture: (height, width, 4).
+        picture: with all that it shows.
+        opacity: of the object, None where nothing is known of it.
         calibration: of its camera.
         lens: k1 and k2.
-        opaque: its alpha means nothing.
+
+    Returns:
+        Where the lens did not see, the picture goes on as it ends, and the mask is 0.
     """
     height, width = picture.shape[:2]
     corner = np.array([width, height]) / 2 / calibration[[0, 1], [0, 1]]
     square = float(corner @ corner)
     if abs(lens[0] * square + lens[1] * square**2) * np.hypot(width, height) / 2 < STRAIGHT:
-        return picture
-    return undistort(picture, calibration, (float(lens[0]), float(lens[1]), *(0.0,) * 6), opaque=opaque)
+        return picture, opacity
+    coefficients = (float(lens[0]), float(lens[1]), *(0.0,) * 6)
+    opaque = np.dstack([picture, np.full((height, width), 255, np.uint8)])
+    straight = undistort(opaque, calibration, coefficients, opaque=True)[..., :3]
+    if opacity is None:
+        return straight, None
+    return straight, undistort(np.dstack([picture, opacity]), calibration, coefficients)[..., 3]
 
 
 def write_scene(

@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -9,6 +10,7 @@ from PIL import Image
 from benchmarks.captures import compare_poses
 from benchmarks.staged_photographs import stage, walk_around
 from hyperplanes.capture.packages import is_installed
+from hyperplanes.capture.scene import straightened
 
 needs_pycolmap = pytest.mark.skipif(not is_installed("pycolmap"), reason="needs pycolmap, of the extra photos")
 VIEWS = 9
@@ -61,6 +63,35 @@ def test_the_scene_reads_as_any_other(staged, scene):
     assert views.bounds.radius == 1.0
     assert views.masks is not None
     assert float(views.masks.mean()) == pytest.approx(np.mean(staged.masks), rel=0.1)
+
+
+@needs_pycolmap
+def test_masks_do_not_change_the_pictures_of_the_scene(staged, scene):
+    """The photographs without their lens by OpenCV, around the object as well, and masks that are black beyond them."""
+    captured, _ = scene
+    lens = np.array([*staged.lens, 0.0, 0.0])
+    for index, (photograph, mask) in enumerate(zip(staged.photographs, staged.masks, strict=True)):
+        with Image.open(captured.folder / f"images/photo_{index:03d}.jpg") as image:
+            written = np.asarray(image).astype(float)
+        true = cv2.undistort(photograph, staged.calibration, lens)
+        around = cv2.undistort(np.where(mask, 0, 255).astype(np.uint8), staged.calibration, lens) == 255
+        assert np.abs(written - true)[around].mean() < 8
+        assert np.abs(true[around]).mean() > 80
+
+
+def test_a_mask_goes_through_the_lens_by_itself():
+    """OpenCV's mask, and the picture that is the same without one; beyond what the lens saw it is black."""
+    rows, columns = np.mgrid[:60, :80]
+    opacity = (128 + 127 * np.sin(columns / 9) * np.cos(rows / 7)).astype(np.uint8)
+    picture = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    matrix, lens = np.array([[70.0, 0, 39.5], [0, 72.0, 29.5], [0, 0, 1]]), np.array([0.12, 0.05])
+    bare, _ = straightened(picture, None, matrix, lens)
+    straight, mask = straightened(picture, opacity, matrix, lens)
+    np.testing.assert_array_equal(straight, bare)
+    assert mask is not None
+    theirs = cv2.undistort(opacity, matrix, np.array([*lens, 0.0, 0.0])).astype(int)
+    assert np.abs(mask - theirs).max() <= 4, "OpenCV interpolates in steps of 1/32 of a pixel"
+    assert mask[0, 0] == 0 < bare[0, 0].max()
 
 
 @needs_pycolmap
