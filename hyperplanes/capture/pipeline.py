@@ -112,7 +112,7 @@ def capture(
         work.notes.append(f"{len(rest)} photographs could not be posed and are left out: {listed(rest)}")
     straight, given = _straight(model, pictures, opacities, work)
     masks, how = _masks(model, straight, given, [one.name for one in kept], work)
-    placement, masks = _placed(model, kept, straight, masks, work, trusted=how == "given")
+    placement, masks = _placed(model, kept, straight, masks, given, work)
     return _written(out, model, kept, straight, masks, how, placement, work)
 
 
@@ -320,23 +320,23 @@ def _placed(
     photographs: Sequence[Photograph],
     straight: Sequence[Pixels],
     masks: list[np.ndarray] | None,
+    given: Sequence[Pixels | None],
     work: _Work,
-    *,
-    trusted: bool,
 ) -> tuple[Placement, list[np.ndarray] | None]:
-    """Where the object is, and the masks after they were compared with each other; trusted ones stay as they are."""
+    """Where the object is, and the masks after they were compared with each other; given ones stay as they are."""
     chosen = object_points(model, masks)
     sphere = object_sphere(model, chosen)
     if masks is not None:
         work.progress("agreement", 0, 1, "of the masks with each other")
-        pictures = None if trusted or not is_installed("cv2") else straight
+        own = [opacity is not None for opacity in given]
+        pictures = None if all(own) or not is_installed("cv2") else straight
         found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius), pictures)
-        if found.wrong:
-            names = listed([photographs[row].name for row in found.wrong])
-            done = "look at them" if trusted else "they were mended by what these show together"
-            work.notes.append(f"{len(found.wrong)} masks contradict the others, {done}: {names}")
+        for kept, done in ((True, "look at them"), (False, "they were mended by what these show together")):
+            if names := [photographs[row].name for row in found.wrong if own[row] == kept]:
+                work.notes.append(f"{len(names)} masks contradict the others, {done}: {listed(names)}")
         work.progress("agreement", 1, 1, f"{1 - float(found.disagreement.mean()):.1%} of their area")
-        masks, sphere = masks if trusted else found.masks, found.sphere or sphere
+        masks = [mask if kept else other for mask, other, kept in zip(masks, found.masks, own, strict=True)]
+        sphere = found.sphere or sphere
     up, source = find_up(model, np.array([one.up_in_camera for one in photographs]), sphere, chosen)
     return Placement(sphere, up, source), masks
 

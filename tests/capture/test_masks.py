@@ -4,11 +4,14 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from hyperplanes.capture import Settings, pipeline
 from hyperplanes.capture.masks.colour import PlainBackground, is_plain
 from hyperplanes.capture.masks.command import Command
 from hyperplanes.capture.masks.network import SalientObject, weights
 from hyperplanes.capture.masks.regions import cleaned
+from hyperplanes.data.pictures.images import read_image
 
 
 def overlap(found, true):
@@ -136,6 +139,28 @@ def test_masks_damaged_on_purpose_are_named_and_mended(ball_seen):
     ]
     assert volume[1] < 0.6 * volume[0]  # what single masks carve away
     assert abs(volume[2] / volume[0] - 1) < 0.05
+
+
+def test_masks_that_came_with_photographs_stay_as_they_are_beside_others(ball_seen, tmp_path, monkeypatch):
+    model, _, masks = ball_seen
+    damaged = [mask.copy() for mask in masks]
+    for row in (2, 9):
+        damaged[row][:, :48] = 0
+    (tmp_path / "photos/masks").mkdir(parents=True)
+    for row, mask in enumerate(damaged):
+        Image.fromarray(np.full((96, 96, 3), row, np.uint8)).save(tmp_path / f"photos/{row}.png")
+        if row < 8:
+            Image.fromarray((255 * mask).astype(np.uint8)).save(tmp_path / f"photos/masks/{row}.png")
+    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: model)
+    monkeypatch.setattr(pipeline, "choose_masker", lambda *_: (lambda picture, row: damaged[row], "damage"))
+    captured = pipeline.capture(tmp_path / "photos", tmp_path / "scene", Settings(mask="given"))
+    found = [read_image(tmp_path / f"scene/masks/{row}.png")[0][..., 0] / 255 for row in range(len(masks))]
+    for row in range(8):
+        np.testing.assert_array_equal(found[row], damaged[row])
+    assert overlap(found[9], masks[9] > 0.5) > 0.9
+    mended = "they were mended by what these show together"
+    said = [f"1 masks contradict the others, {done}" for done in ("look at them: 2", f"{mended}: 9")]
+    assert [note for note in captured.notes if "contradict" in note] == said
 
 
 def test_a_piece_that_a_mask_lacks_is_found_by_its_colour():

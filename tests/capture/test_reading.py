@@ -116,8 +116,17 @@ def test_masks_do_not_change_the_pictures_that_poses_are_found_in(kind, tmp_path
     assert shown[0] == shown[attempts]
 
 
-def test_alpha_that_is_opaque_throughout_is_no_mask_and_that_of_one_among_others_is(upright, tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: None)
+def test_masks_of_close_ups_may_be_white_all_over(upright, tmp_path):
+    (tmp_path / "masks").mkdir()
+    for index in range(3):
+        save(upright, tmp_path / f"{index}.png")
+        Image.fromarray(np.full((24, 40), 255, np.uint8)).save(tmp_path / f"masks/{index}.png")
+    photographs, _ = list_photographs(find_photographs(tmp_path), tmp_path / "masks")
+    _, _, opacities = pipeline._pictures(photographs, pipeline._Work(pipeline.Stages(tmp_path), Settings(), print))
+    assert len(opacities) == 3
+
+
+def test_alpha_that_is_opaque_throughout_is_no_mask_and_that_of_one_among_others_is(upright, tmp_path):
     rgba = np.dstack([upright, np.full((24, 40), 255, np.uint8)])
     for transparent in (0, 1):
         for index in range(3):
