@@ -188,6 +188,10 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
         done["masked"] += with_alpha if transparent else []  # alpha that is opaque in all of them says nothing
         work.stages.finish("pictures", key, done)
         work.progress("photographs", len(photographs), len(photographs), "upright and scaled")
+    if work.settings.mask == "given" and not done["masked"]:
+        raise DataError(
+            "--mask given", "photographs with alpha, or a folder masks/ beside them", "neither", "leave --mask out"
+        )
     work.notes += done["broken"].values()
     readable = [index for index in range(len(photographs)) if str(index) not in done["broken"]]
     cameras: dict[tuple[str, tuple[int, ...]], int] = {}
@@ -284,10 +288,6 @@ def _masks(
     if work.settings.mask == "none":
         return None, "none"
     bare = [name for name, opacity in zip(names, given, strict=True) if opacity is None]
-    if work.settings.mask == "given" and len(bare) == len(given):
-        raise DataError(
-            "--mask given", "photographs with alpha, or a folder masks/ beside them", "neither", "leave --mask out"
-        )
     if not bare:
         return [opacity / 255.0 for opacity in given if opacity is not None], "given"
     masker, how = choose_masker(work.settings.mask, model, straight)

@@ -1,12 +1,14 @@
 """Source of truth: pictures whose pixels are known before they were turned, scaled and saved."""
 
 import re
+import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from hyperplanes.capture import Settings, capture, pipeline
+from hyperplanes.capture.masks import network
 from hyperplanes.capture.packages import stated_threads
 from hyperplanes.capture.photographs import find_photographs, list_photographs, read_upright, without_copies
 from hyperplanes.capture.scene import write_scene
@@ -173,11 +175,41 @@ def test_copies_of_a_file_are_left_out(upright, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("mask", "said"), [("netwrok", "expected one of auto, given"), ("cut {image}", "{mask} in it")]
+    ("mask", "said"),
+    [
+        ("netwrok", "expected one of auto, given"),
+        ("cut {image}", "{mask} in it"),
+        ("no_such_program {image} {mask}", "a program that is installed, found none called 'no_such_program'"),
+        ("network", "onnx"),
+        ("grabcut", "package cv2"),
+    ],
 )
-def test_masks_that_nothing_finds_are_refused_before_poses_are_searched_for(tmp_path, mask, said):
+def test_masks_that_nothing_finds_are_refused_before_poses_are_searched_for(mask, said, tmp_path, monkeypatch):
+    monkeypatch.setattr(network, "weights", lambda: None)
+    monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(ValueError, match=said):
         capture(tmp_path / "nothing", tmp_path / "scene", Settings(mask=mask))
+
+
+@pytest.mark.parametrize(
+    ("mask", "name", "said"),
+    [
+        ("given", None, "expected photographs with alpha, or a folder masks/ beside them, found neither"),
+        ("given", "object_0.png", "masks: expected masks named as the pictures, found none of them for 0.png"),
+        ("auto", "object_0.png", "masks: expected masks named as the pictures, found none of them for 0.png"),
+    ],
+)
+def test_masks_that_are_missing_are_asked_for_before_poses_are_searched_for(
+    mask, name, said, upright, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: pytest.fail("poses are searched for"))
+    for index in range(3):
+        save(np.roll(upright, index, 0), tmp_path / f"{index}.png")
+    if name is not None:
+        (tmp_path / "masks").mkdir()
+        Image.fromarray(upright[..., 0]).save(tmp_path / "masks" / name)
+    with pytest.raises(DataError, match=said):
+        capture(tmp_path, tmp_path / "scene", Settings(mask=mask))
 
 
 @pytest.mark.parametrize(("given", "out"), [("scene", "scene"), ("scene/images", "scene"), ("capture/pictures", ".")])

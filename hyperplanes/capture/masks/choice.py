@@ -10,7 +10,7 @@ from hyperplanes.capture.masks.colour import PlainBackground, is_plain
 from hyperplanes.capture.masks.command import Command
 from hyperplanes.capture.masks.grabcut import GrabCut
 from hyperplanes.capture.masks.network import SalientObject, weights
-from hyperplanes.capture.packages import is_installed, stated_threads
+from hyperplanes.capture.packages import is_installed, require, stated_threads
 from hyperplanes.capture.sparse_model import SparseModel
 
 __all__ = ["MASKS", "Masker", "check_mask", "choose_masker"]
@@ -25,19 +25,23 @@ LOOKED_AT = 12  # pictures by which a background is called plain
 
 
 def check_mask(name: str) -> None:
-    """Refuse a name that stands for nothing, before anything else is done.
+    """Refuse a way that cannot be gone, before anything else is done.
 
     Args:
         name: one of MASKS, or a command.
 
     Raises:
-        ValueError: another name, or a command without {image} and {mask}.
+        ValueError: another name, a package that is missing, or a command without {image} and {mask} or whose program
+            is not installed.
     """
-    if name in MASKS:
-        return
-    if " " not in name and "{" not in name:
-        raise ValueError(f"--mask: expected one of {', '.join(MASKS)}, or a command, got {name!r}")
-    Command(name)
+    if name == "network":
+        SalientObject()
+    elif name == "grabcut":
+        require("cv2", "cuts masks out of pictures")
+    elif name not in MASKS:
+        if " " not in name and "{" not in name:
+            raise ValueError(f"--mask: expected one of {', '.join(MASKS)}, or a command, got {name!r}")
+        Command(name)
 
 
 def choose_masker(name: str, model: SparseModel, pictures: Sequence[np.ndarray]) -> tuple[Masker, str]:
@@ -47,14 +51,13 @@ def choose_masker(name: str, model: SparseModel, pictures: Sequence[np.ndarray])
     GrabCut else.
 
     Args:
-        name: one of MASKS but none, or a command.
+        name: one of MASKS but none, or a command, which `check_mask` lets pass.
         model: of structure from motion.
         pictures: one a camera.
 
     Raises:
-        ValueError: a name that stands for nothing, or a package that is missing.
+        ValueError: nothing that `auto` could take is installed.
     """
-    check_mask(name)
     if name in ("auto", "given"):
         step = max(1, len(pictures) // LOOKED_AT)
         if is_plain(pictures[::step]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import subprocess
 import tempfile
 from dataclasses import dataclass
@@ -36,6 +37,9 @@ class Command:
                 f"--mask: expected a command with {{image}} and {{mask}} in it, got {self.line!r}; "
                 'such as --mask "rembg i {image} {mask}"'
             )
+        program = shlex.split(self.line)[0]
+        if shutil.which(program) is None:
+            raise ValueError(f"--mask: expected a program that is installed, found none called {program!r}")
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
         """Opacity in [0, 1]."""

