@@ -7,7 +7,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from hyperplanes.utilities.interrupts import keep_handlers
+from hyperplanes.utilities.interrupts import interrupt_behind, keep_handlers
 
 __all__ = ["is_installed", "require", "stated_threads"]
 
@@ -36,6 +36,9 @@ def require(name: str, purpose: str) -> Any:
     try:
         with keep_handlers():
             return import_module(name)
-    except ImportError as error:
-        missing = f"expected the package {name}, which {purpose}, found {error}"
+    except Exception as error:  # pycolmap raises a RuntimeError in answer to an ImportError, or to an interrupt
+        if (interrupt := interrupt_behind(error)) is not None:
+            raise interrupt from None
+        found = " ".join(str(error.__cause__ or error).split())
+        missing = f"expected the package {name}, which {purpose}, found {found}"
         raise ValueError(f"{missing}; pip install 'hyperplanes[photos]'") from error

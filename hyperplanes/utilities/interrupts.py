@@ -9,7 +9,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["SIGNALS", "HungUp", "Terminated", "interruptible", "keep_handlers", "listened_to"]
+__all__ = ["SIGNALS", "HungUp", "Terminated", "interrupt_behind", "interruptible", "keep_handlers", "listened_to"]
 
 AGAIN_SECONDS = 0.2
 """After which an interrupt that was swallowed is raised again."""
@@ -98,11 +98,23 @@ def keep_handlers() -> Generator[None]:
                     signal.signal(number, handler)
 
 
+def interrupt_behind(error: BaseException | None) -> BaseException | None:
+    """The interrupt, or the closing of a generator, that an exception is or was raised in answer to; None for others.
+
+    >>> try:
+    ...     try:
+    ...         raise KeyboardInterrupt
+    ...     except KeyboardInterrupt:
+    ...         raise ValueError
+    ... except ValueError as error:
+    ...     interrupt_behind(error)
+    KeyboardInterrupt()
+    """
+    while error is not None and not isinstance(error, KeyboardInterrupt | GeneratorExit):
+        error = error.__context__
+    return error
+
+
 def _is_passed_on() -> bool:
     """Whether the main thread is in a `finally` or `except` of an interrupt, or in that of a generator being closed."""
-    error = sys.exception()
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt | GeneratorExit):
-            return True
-        error = error.__context__
-    return False
+    return interrupt_behind(sys.exception()) is not None

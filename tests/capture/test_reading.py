@@ -9,7 +9,6 @@ from PIL import Image
 
 from hyperplanes.capture import Settings, capture, pipeline
 from hyperplanes.capture.masks import network
-from hyperplanes.capture.packages import stated_threads
 from hyperplanes.capture.photographs import find_photographs, list_photographs, read_upright, without_copies
 from hyperplanes.capture.scene import write_scene
 from hyperplanes.utilities.files import DataError
@@ -242,9 +241,3 @@ def test_what_lies_beside_the_pictures_of_a_former_scene_stays(tmp_path):
 def test_settings_that_cannot_be_are_refused(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected"):
         Settings(**wrong)
-
-
-@pytest.mark.parametrize(("stated", "threads"), [("4", 4), ("4,2", 4), ("", 0), ("many", 0)])
-def test_threads_are_those_of_the_environment(stated, threads, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", stated)
-    assert stated_threads() == threads
