@@ -253,10 +253,22 @@ def test_a_mask_is_that_of_a_picture_whose_alpha_says_nothing(transparent, tmp_p
     assert float(shown.masks.mean()) == pytest.approx((64 * 255 - 1) / 64 / 255 if transparent else 1 / 8)
 
 
-def test_floating_point_pictures_up_to_one_are_as_bright_as_they_say(tmp_path):
-    Image.fromarray(np.linspace(0, 1, 64, dtype=np.float32).reshape(8, 8)).save(tmp_path / "mask.tiff")
+@pytest.mark.parametrize("white", [1.0, 255.0, 65535.0])
+def test_floating_point_pictures_are_as_bright_as_they_say(white, tmp_path):
+    Image.fromarray(np.linspace(0, white, 64, dtype=np.float32).reshape(8, 8)).save(tmp_path / "mask.tiff")
     pixels, _ = read_image(tmp_path / "mask.tiff")
     np.testing.assert_allclose(pixels[..., 0].flatten(), np.linspace(0, 255, 64), atol=0.51)
+
+
+@pytest.mark.parametrize("how", [Image.Resampling.BICUBIC, Image.Resampling.LANCZOS])
+def test_a_mask_that_overshoots_where_it_was_scaled_is_as_if_it_had_been_clipped(how, tmp_path):
+    mask = np.zeros((12, 12), np.float32)
+    mask[3:9, 3:9] = 1.0
+    scaled = Image.fromarray(mask).resize((30, 30), how)
+    assert np.asarray(scaled).max() > 1.05
+    scaled.save(tmp_path / "mask.tiff")
+    pixels, _ = read_image(tmp_path / "mask.tiff")
+    np.testing.assert_allclose(pixels[..., 0], 255 * np.asarray(scaled).clip(0, 1), atol=0.51)
 
 
 @pytest.mark.parametrize(

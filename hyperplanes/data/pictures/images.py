@@ -44,6 +44,7 @@ PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", 
 
 Pixels = npt.NDArray[np.uint8]
 
+_OVERSHOOT = 1.5  # times white, up to which floating-point numbers reach: Lanczos' scaling of a mask reaches 1.49
 _REMEDY = "render, export or download it again"
 _ORIENTATION = 0x0112  # of EXIF: 1 is upright, 2 to 8 are the other turns and mirrorings
 _TURNS = {
@@ -129,7 +130,8 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     """The pixels of an image.
 
     Args:
-        path: one of FORMATS; more than 8 bits a channel are scaled down to 8, floating-point numbers up to 1 up to 255.
+        path: one of FORMATS; more than 8 bits a channel are scaled down to 8. Of floating-point numbers, white is the
+            first of 1, 255 and 65535 that none exceeds by more than half, as masks do that were scaled smoothly.
         size: the (height, width) that it must have, checked before decoding.
 
     Returns:
@@ -150,8 +152,8 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
             alpha = "A" in image.getbands() or "transparency" in image.info
             if image.mode.startswith("I") or image.mode == "F":
                 wide = np.nan_to_num(np.asarray(image, dtype=np.float64)).clip(0)
-                white = 1.0 if image.mode == "F" and wide.max() <= 1 else max(65535.0, float(wide.max()))
-                image = Image.fromarray((wide / white * 255).round().astype(np.uint8))
+                white = _white(image.mode, float(wide.max()))
+                image = Image.fromarray((wide / white * 255).round().clip(0, 255).astype(np.uint8))
             return np.array(image.convert("RGBA")), alpha
         except (OSError, SyntaxError, ValueError, EOFError, IndexError) as error:
             raise DataError(path, "a whole image", f"a broken one ({error})", _REMEDY) from error
@@ -187,6 +189,13 @@ def composite_over_white(
     colour *= alpha
     colour += 1
     return torch.from_numpy(colour), torch.from_numpy(alpha)
+
+
+def _white(mode: str, largest: float) -> float:
+    """The number that stands for white in a picture of one of Pillow's modes for wide numbers."""
+    if mode != "F":
+        return max(65535.0, largest)
+    return next((white for white in (1.0, 255.0, 65535.0) if largest <= _OVERSHOOT * white), largest)
 
 
 def _open(path: Path) -> Image.Image:
