@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from hyperplanes.capture.video import VIDEO_SUFFIXES
-from hyperplanes.data.formats.unposed import photographs_folder
+from hyperplanes.data.formats.unposed import find_video, photographs_folder
 from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import (
+    HEIF_SUFFIXES,
     PICTURE_SUFFIXES,
     image_header,
     opacity_of,
@@ -36,7 +36,6 @@ FEWEST = 3
 """Photographs from which poses can be found at all."""
 
 _LOOKED_AT = 1000  # entries of a folder
-_HEIF = frozenset({".heic", ".heif"})
 _MAKE, _MODEL, _EXIF = 0x010F, 0x0110, 0x8769
 _FOCAL, _FOCAL_35, _PIXELS_X = 0x920A, 0xA405, 0xA002
 _PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
@@ -87,9 +86,9 @@ def find_photographs(folder: Path) -> list[Path]:
     Raises:
         DataError: fewer than three, or HEIC photographs where nothing can read them.
     """
-    home = photographs_folder(folder, PICTURE_SUFFIXES | _HEIF)
+    home = photographs_folder(folder)
     files = [] if home is None else [p for p in home.iterdir() if p.is_file() and not p.name.startswith(".")]
-    heif = [path for path in files if path.suffix.lower() in _HEIF]
+    heif = [path for path in files if path.suffix.lower() in HEIF_SUFFIXES]
     found = sorted((path for path in files if path.suffix.lower() in PICTURE_SUFFIXES), key=_natural)
     if heif and not _reads_heif():
         raise DataError(
@@ -106,10 +105,10 @@ def _elsewhere(folder: Path) -> str:
     """What to do about a folder with too few photographs: a folder or a video in it may be what was meant."""
     children = sorted(child for _, child in zip(range(_LOOKED_AT), folder.iterdir(), strict=False))
     for child in children:
-        if child.name != "masks" and child.is_dir() and (home := photographs_folder(child, PICTURE_SUFFIXES | _HEIF)):
+        if child.name != "masks" and child.is_dir() and (home := photographs_folder(child)):
             return f"there are some in {home}: give that folder"
-        if child.is_file() and child.suffix.lower() in VIDEO_SUFFIXES:
-            return f"there is a video in it: give {child}"
+    if (video := find_video(folder)) is not None:
+        return f"there is a video in it: give {video}"
     return "40 to 75 from all around are a good number"
 
 

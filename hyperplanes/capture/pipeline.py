@@ -26,9 +26,9 @@ from hyperplanes.capture.scene import Captured, straightened, write_scene
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages, fingerprint
 from hyperplanes.capture.structure_from_motion import ATTEMPTS, EXHAUSTIVE, Picture, Progress, find_poses
-from hyperplanes.capture.video import VIDEO_SUFFIXES, take_frames
+from hyperplanes.capture.video import take_frames
 from hyperplanes.data.pictures.frames import listed
-from hyperplanes.data.pictures.images import Pixels, read_image
+from hyperplanes.data.pictures.images import VIDEO_SUFFIXES, Pixels, read_image
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.utilities.encoding import encode_jpeg, encode_png, sha256

@@ -14,9 +14,8 @@ from hyperplanes.utilities.encoding import encode_jpeg
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.writing import write_whole
 
-__all__ = ["VIDEO_SUFFIXES", "sharpness", "take_frames"]
+__all__ = ["sharpness", "take_frames"]
 
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 LOOKED_AT = 5  # frames of each stretch, of which the sharpest is taken
 QUALITY = 95  # of JPEG
 SMALL = 320  # pixels along the longer side, on which sharpness is judged

@@ -203,6 +203,21 @@ def test_photographs_without_poses_are_told_how_to_get_them(scene, tmp_path, pla
             action(tmp_path)
 
 
+@pytest.mark.parametrize("given", ["walk.webm", "."])
+def test_a_video_without_poses_is_told_how_to_get_them(given, tmp_path):
+    (tmp_path / "walk.webm").touch()
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(DataError, match=rf"found a video; find .*: hyperplanes capture {tmp_path}/walk.webm "):
+        read_views(tmp_path / given)
+
+
+def test_photographs_of_a_phone_count(tmp_path):
+    for index in range(3):
+        (tmp_path / f"{index}.HEIC").touch()
+    with pytest.raises(DataError, match=r"found 3 photographs and no poses; find them: hyperplanes capture "):
+        read_views(tmp_path)
+
+
 def test_a_linked_folder_of_pictures_inside_the_tree_is_followed(scene, tmp_path):
     """The tree given holds scenes; the pictures of one lie beside it. Given alone, the scene's link leads out of it."""
     from hyperplanes.data import open_dataset

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
+from hyperplanes.data.pictures.images import HEIF_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.shell import command_line
 
-__all__ = ["photographs_folder", "refuse_unposed"]
+__all__ = ["find_video", "photographs_folder", "refuse_unposed"]
 
 _HOMES = (".", "images", "input", "rgb", "photos", "image", "rgbd", "keyframes/images")
 _COUNTED = 10_000  # entries of a folder that are looked at
-_VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv"})
+_PHOTOGRAPHS = PICTURE_SUFFIXES | HEIF_SUFFIXES
 _PACKED = frozenset({".zip", ".r3d"})  # Record3D's .r3d is a ZIP archive
 
 
@@ -29,10 +29,6 @@ def refuse_unposed(path: Path) -> None:
     if packed is not None:
         remedy = f"unpack it ({command_line('unzip', packed, '-d', 'capture')}), then give that folder"
         raise DataError(path, "the folder of an export", f"{packed.name}, which is packed", remedy)
-    if path.is_file() and path.suffix.lower() in _VIDEOS:
-        command = command_line("hyperplanes", "capture", path, "--out", "scene")
-        remedy = f"find the poses of its frames: {command}, then give scene"
-        raise DataError(path, "posed images", "a video", remedy)
     home, count = _photographs(path)
     if count:
         raise DataError(
@@ -41,6 +37,10 @@ def refuse_unposed(path: Path) -> None:
             f"{count} photograph{'s' if count > 1 else ''} and no poses",
             f"find them: {command_line('hyperplanes', 'capture', home, '--out', 'NEW')}, then give NEW",
         )
+    if (video := find_video(path)) is not None:
+        command = command_line("hyperplanes", "capture", video, "--out", "scene")
+        remedy = f"find the poses of its frames: {command}, then give scene"
+        raise DataError(path, "posed images", "a video", remedy)
 
 
 def _packed(path: Path) -> Path | None:
@@ -51,25 +51,26 @@ def _packed(path: Path) -> Path | None:
     return _packed(children[0]) if len(children) == 1 and children[0].is_file() else None
 
 
-def photographs_folder(path: Path, suffixes: frozenset[str] = PICTURE_SUFFIXES) -> Path | None:
-    """The folder that holds photographs: the one given, or images/ or the like in it; None where none does.
-
-    Args:
-        path: a folder.
-        suffixes: endings of photographs, in small letters.
-    """
+def photographs_folder(path: Path) -> Path | None:
+    """The folder that holds photographs: the one given, or images/ or the like in it; None where none does."""
     homes = (path / name for name in _HOMES)
-    return next((home for home in homes if home.is_dir() and _count(home, suffixes)), None)
+    return next((home for home in homes if home.is_dir() and _count(home)), None)
+
+
+def find_video(path: Path) -> Path | None:
+    """The video at a path: the file itself, or the first one in the folder; None where there is none."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES and file.is_file()), None)
 
 
 def _photographs(path: Path) -> tuple[Path, int]:
     """The folder of photographs, and how many there are."""
     if path.is_file():
-        return path.parent, int(path.suffix.lower() in PICTURE_SUFFIXES)
+        return path.parent, int(path.suffix.lower() in _PHOTOGRAPHS)
     home = photographs_folder(path)
-    return (path, 0) if home is None else (home, _count(home, PICTURE_SUFFIXES))
+    return (path, 0) if home is None else (home, _count(home))
 
 
-def _count(home: Path, suffixes: frozenset[str]) -> int:
+def _count(home: Path) -> int:
     children = zip(range(_COUNTED), home.iterdir(), strict=False)
-    return sum(child.suffix.lower() in suffixes for _, child in children)
+    return sum(child.suffix.lower() in _PHOTOGRAPHS for _, child in children)

@@ -18,8 +18,10 @@ from hyperplanes.utilities.files import DataError, check_regular
 
 __all__ = [
     "FORMATS",
+    "HEIF_SUFFIXES",
     "LARGEST_IMAGE",
     "PICTURE_SUFFIXES",
+    "VIDEO_SUFFIXES",
     "Header",
     "Pixels",
     "composite_over_white",
@@ -41,6 +43,12 @@ HEIF once pillow-heif has registered it."""
 
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """Endings, in small letters, of the files that are taken for pictures."""
+
+HEIF_SUFFIXES = frozenset({".heic", ".heif"})
+"""Those of photographs that Pillow reads once pillow-heif has registered their format."""
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
+"""Those of the files that are taken for videos."""
 
 Pixels = npt.NDArray[np.uint8]
 
