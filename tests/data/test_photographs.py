@@ -262,9 +262,9 @@ def test_a_mask_is_that_of_a_picture_whose_alpha_says_nothing(transparent, tmp_p
     Image.fromarray(picture).save(tmp_path / "images/0.png")
     masks_of_widths([tmp_path / "masks/0.png"])
     pose = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 3.0], [0, 0, 0, 1.0]]
-    frames = [{"file_path": "images/0.png", "transform_matrix": pose}] * 2
+    frames = [{"file_path": "images/0.png", "transform_matrix": pose}]
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
-    shown = read_task(tmp_path).support
+    shown = read_views(tmp_path)
     assert float(shown.masks.mean()) == pytest.approx((64 * 255 - 1) / 64 / 255 if transparent else 1 / 8)
 
 

@@ -148,6 +148,32 @@ def test_train_and_test_files_are_support_and_query(scene, tmp_path):
     assert read_task(tmp_path / "transforms_train.json").name == tmp_path.name
 
 
+def test_no_picture_is_both_shown_and_asked_for(scene, tmp_path):
+    """Property: support and query are disjoint, however the files name a picture that is in both."""
+    document, names = scene.document(), scene.names
+    lists = {"train_filenames": names[:5], "test_filenames": [f"./{name}" for name in names[4:]]}
+    scene.write(tmp_path / "lists", document | lists)
+    twice = [frame for frame in document["frames"] for _ in range(2)]
+    scene.write(tmp_path / "twice", document | {"frames": twice})
+    scene.write(tmp_path / "files")
+    (tmp_path / "files/images/link.png").symlink_to("000.png")
+    linked = [document["frames"][0] | {"file_path": "images/link.png"}, *document["frames"][6:]]
+    for half, frames in (("train", document["frames"][:6]), ("test", linked)):
+        (tmp_path / f"files/transforms_{half}.json").write_text(json.dumps(document | {"frames": frames}))
+    (tmp_path / "files/transforms.json").unlink()
+    for folder, support, query, note in (
+        ("lists", names[:5], names[5:], f"1 frames left out, whose pictures are listed before: {names[4]}"),
+        ("twice", names[::2], names[1::2], f"8 frames left out, whose pictures are listed before: {', '.join(names)}"),
+        ("files", names[:6], names[6:], "1 frames left out, whose pictures are listed before: images/link.png"),
+    ):
+        task = read_posed_task(tmp_path / folder)
+        assert (task.support.names, task.query.names) == (tuple(support), tuple(query))
+        assert task.notes == (note,)
+    (tmp_path / "files/transforms_test.json").write_text((tmp_path / "files/transforms_train.json").read_text())
+    with pytest.raises(DataError, match="found 6 to train and 0 to test on; .* each in one split alone"):
+        read_task(tmp_path / "files")
+
+
 def test_views_alternate_without_a_split(scene, tmp_path):
     task = read_task(scene.write(tmp_path))
     assert task.support.names == tuple(scene.names[::2])

@@ -123,7 +123,8 @@ def read_transforms_task(
     halves = [[at for at, index in enumerate(kept) if (index in query) == asked] for asked in (False, True)]
     if not all(halves):
         found = f"{len(halves[0])} to train and {len(halves[1])} to test on"
-        raise DataError(source, "pictures of both splits", found, "copy the pictures to where the files name them")
+        remedy = "copy the pictures to where the files name them, each in one split alone"
+        raise DataError(source, "pictures of both splits", found, remedy)
     return PosedTask.split(scene, halves[0], halves[1], name)
 
 
@@ -136,10 +137,8 @@ def _split_by_names(document: dict[str, Any], frames: list[Frame], path: Path) -
     if not (isinstance(support, list) and support and isinstance(query, list) and query):
         return frames, None
     names = [*support, *query]
-    if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
-        raise DataError(
-            path, "train_filenames and test_filenames without common or repeated files", "some", "correct the file"
-        )
+    if not all(isinstance(name, str) for name in names):
+        raise DataError(path, "names of files in train_filenames and test_filenames", "others", "correct the file")
     return _chosen(frames, names, path), range(len(support), len(names))
 
 

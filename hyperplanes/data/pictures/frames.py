@@ -92,9 +92,10 @@ def assemble(
 ) -> tuple[Posed, list[int]]:
     """Read the pictures of frames and bring them to one size.
 
-    Where at least two thirds of the pictures are there, the others are left out and named. Pictures of several sizes
-    are scaled to the commonest one, and their calibrations with them; those of another aspect ratio, as portraits among
-    landscapes, by another factor for each axis, so that their pixels are no longer square. EXIF's orientation is
+    Where at least two thirds of the pictures are there, the others are left out and named. So are frames whose picture
+    is listed before, links followed: no method is judged by what it was shown. Pictures of several sizes are scaled to
+    the commonest one, and their calibrations with them; those of another aspect ratio, as portraits among landscapes,
+    by another factor for each axis, so that their pixels are no longer square. EXIF's orientation is
     applied where the size that the file states asks for it. Distorted pictures are undistorted with the same
     calibration.
 
@@ -161,22 +162,29 @@ def listed(names: Sequence[str], most: int = 20) -> str:
 
 
 def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tuple[list[int], list[str]]:
-    """Which frames have a picture, and what to say of the others."""
-    kept = [index for index, frame in enumerate(frames) if frame.path.exists()]
+    """Which frames have a picture that no frame before them has, and what to say of the others."""
+    there = [index for index, frame in enumerate(frames) if frame.path.exists()]
     missing = [frame for frame in frames if not frame.path.exists()]
-    if not missing:
-        return kept, []
-    if complete:
+    notes = []
+    if missing and complete:
         raise DataError(missing[0].path, "an image", "nothing", "generate or copy the data set again")
-    if len(kept) < ENOUGH * len(frames):
+    if missing and len(there) < ENOUGH * len(frames):
         raise DataError(
             source,
             f"the pictures of its {len(frames)} frames, or of two thirds of them",
-            f"{len(kept)} ({missing[0].path} and {len(missing) - 1} others are missing)",
+            f"{len(there)} ({missing[0].path} and {len(missing) - 1} others are missing)",
             "copy the pictures to where the file names them",
         )
-    names = listed([frame.name for frame in missing])
-    return kept, [f"{len(kept)} of {len(frames)} frames have a picture, {len(missing)} are missing: {names}"]
+    if missing:
+        names = listed([frame.name for frame in missing])
+        notes.append(f"{len(there)} of {len(frames)} frames have a picture, {len(missing)} are missing: {names}")
+    first: dict[Path, int] = {}
+    for index in there:
+        first.setdefault(frames[index].path.resolve(), index)
+    kept = list(first.values())
+    if again := [frames[index].name for index in there if index not in kept]:
+        notes.append(f"{len(again)} frames left out, whose pictures are listed before: {listed(again)}")
+    return kept, notes
 
 
 def _examine(frame: Frame, source: str | Path) -> _Found:
