@@ -134,6 +134,22 @@ def test_models_and_pictures_in_their_usual_places(scene, tmp_path, model, pictu
     assert len(read_views(project / given)) == 8
 
 
+@pytest.mark.parametrize(
+    ("model", "own", "other", "side"),
+    [("dense/sparse", "dense/images", "images", 1), ("distorted/sparse/0", "input", "images", 2)],
+)
+def test_a_model_is_of_the_nearest_pictures_of_its_cameras_size(scene, tmp_path, model, own, other, side):
+    """COLMAP's image_undistorter leaves the originals above its model, 3DGS's convert.py its results beside them."""
+    project = write(scene, tmp_path)
+    (project / model).parent.mkdir(parents=True)
+    (project / "sparse/0").rename(project / model)
+    (project / "images").rename(project / own)
+    (project / other).mkdir()
+    for path in (project / own).iterdir():
+        Image.new("RGBA", (side * scene.size[1], side * scene.size[0])).save(project / other / path.name)
+    assert torch.allclose(read_views(project).images.flip(0), scene.over_white(), atol=1e-6)
+
+
 def test_the_largest_part_of_a_reconstruction_is_read(scene, tmp_path):
     project = write(scene, tmp_path / "project")
     small = project / "sparse/1"

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hyperplanes.data.pictures.frames import Frame, assemble, scaled_matrix
+from hyperplanes.data.pictures.images import image_size
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import Posed, check_pose
 from hyperplanes.utilities.files import DataError, check_link, inside, read_bytes, read_text
@@ -73,9 +74,9 @@ def read_colmap(folder: str | Path, *, downscale: int | None = None, root: Path 
     """The posed pictures of a COLMAP reconstruction.
 
     COLMAP's world and its OpenCV axes are kept; its principal point counts from the pictures' borders. Pictures lie in
-    images/ or input/ beside sparse/, above it, or beside the model. Cameras with distortion (SIMPLE_RADIAL, RADIAL,
-    OPENCV, FULL_OPENCV) keep their calibration, their pictures are resampled. Masks may lie in masks/ beside the
-    pictures' folder.
+    images/ or input/ beside the model or above it; those of its cameras' size are taken before others, then the
+    nearest. Cameras with distortion (SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV) keep their calibration, their pictures
+    are resampled. Masks may lie in masks/ beside the pictures' folder.
 
     Args:
         folder: the project, or the model itself.
@@ -100,7 +101,7 @@ def read_colmap(folder: str | Path, *, downscale: int | None = None, root: Path 
     absent = [image.name for image in images if image.camera not in cameras]
     if absent:
         raise DataError(paths[0], f"the camera of {absent[0]}", "none", _REMEDY)
-    home = _pictures_folder(folder, model, images, paths[1], root or folder)
+    home = _pictures_folder(folder, model, images, cameras, paths[1], root or folder)
     frames = []
     for image in images:
         seen = cameras[image.camera]
@@ -164,17 +165,24 @@ def _count(model: Path) -> int:
     return max((model / name).stat().st_size for name in ("images.bin", "images.txt") if (model / name).is_file())
 
 
-def _pictures_folder(folder: Path, model: Path, images: list[_Image], source: Path, root: Path) -> Path:
-    """The folder that holds most of the pictures: images or input, beside the model or up to four folders above."""
-    roots = [folder, model, *list(model.absolute().parents)[:4]]
+def _pictures_folder(
+    folder: Path, model: Path, images: list[_Image], cameras: dict[int, _Camera], source: Path, root: Path
+) -> Path:
+    """The folder that holds most of the pictures: images or input, beside the model or up to four folders above.
+
+    Of several, the one whose pictures have the size of their cameras, then the nearest: a model of undistorted pictures
+    lies beside these and below the originals.
+    """
+    roots = [model, *list(model.absolute().parents)[:4]]
     homes = [root / name for root in roots for name in ("images", "input")] + [folder, model]
-    homes = list(dict.fromkeys(home for home in homes if home.is_dir()))
-    chosen = [image.name for image in images[:: max(1, len(images) // 20)]]
+    chosen = images[:: max(1, len(images) // 20)]
 
-    def present(home: Path) -> int:
-        return sum(_picture(home, name, source, root).is_file() for name in chosen)
+    def fit(home: Path) -> tuple[int, int]:
+        paths = {_picture(home, image.name, source, root): cameras[image.camera].size for image in chosen}
+        there = [path for path in paths if path.is_file()]
+        return len(there), sum(image_size(path) == paths[path] for path in there)
 
-    return max(homes, key=present)
+    return max((home for home in homes if home.is_dir()), key=fit)
 
 
 def _camera(model: str, width: int, height: int, values: list[float], path: Path) -> _Camera:
