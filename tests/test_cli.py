@@ -249,6 +249,22 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ([*BAKE, "OUT/bk.safetensors", "--orbit", "0"], ["--orbit: expected at least 1 frame, got 0"]),
         (["export", *RENDER[1:], "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
         (["export", *RENDER[1:], "--what", "mesh", "--size", "64"], ["--size: expected --what turntable, whose"]),
+        *(
+            (["export", *RENDER[1:], *more.split()], [f"{more.split()[-2]}: expected {wanted}, whose option it is"])
+            for more, wanted in (
+                ("--what mesh --frames 7", "--what turntable"),
+                ("--what mesh --turntable gif", "--what turntable"),
+                ("--what page --mesh-format ply", "--what mesh"),
+                ("--what page --voxels 64", "--what mesh"),
+                ("--what page --level 5", "--what mesh"),
+                ("--what mesh --mesh-format ply --faces 500", "--what mesh --mesh-format glb"),
+                ("--what mesh --mesh-format obj --texture 64", "--what mesh --mesh-format glb"),
+                ("--what mesh --page-voxels 64", "--what page or --what splats"),
+                ("--what mesh --fit 3", "--what turntable or --what page or --what splats"),
+                ("--points 5", "--what points"),
+                ("--what page --splat-format splat", "--what splats"),
+            )
+        ),
         (["export", *RENDER[1:], "--what"], ["--what: expected at least one of images, turntable, mesh, page"]),
         (
             ["demo", "--quick-check", "--objects", "9", "--out", "OUT/demo"],
@@ -680,7 +696,7 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     assert "steps: expected 0 with a baked file" in complaint(capsys)
     for verb, *option in (
         *(["render", "--protocol", "paper"], ["render", "--fine-tune", "hypernetwork"], ["render", "--no-reflections"]),
-        *(["render", "--representation", "field"], ["export", "--page-voxels", "32"]),
+        *(["render", "--representation", "field"], ["export", "--page-voxels", "32", "--what", "page"]),
     ):
         assert main([verb, "--checkpoint", str(out), *scene, *option]) == 2
         assert f"{option[0]}: expected none with a baked file" in complaint(capsys)

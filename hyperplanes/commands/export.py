@@ -72,6 +72,17 @@ class Arguments(ObjectArguments):
     splat_format: Literal["ply", "splat"] = "ply"
 
 
+BELONGS = {
+    **dict.fromkeys(("frames", "size", "turntable"), ("--what turntable",)),
+    **dict.fromkeys(("mesh_format", "voxels", "level"), ("--what mesh",)),
+    **dict.fromkeys(("faces", "texture"), ("--what mesh --mesh-format glb",)),
+    "page_voxels": ("--what page", "--what splats"),
+    "fit": ("--what turntable", "--what page", "--what splats"),
+    "points": ("--what points",),
+    "splat_format": ("--what splats",),
+}
+"""What options say something of."""
+
 GOOD_OVERLAP = 0.9
 GOOD_DEPTH = 0.9
 
@@ -94,9 +105,9 @@ def run(arguments: Arguments) -> int:
 
     if not arguments.what:
         raise ValueError("--what: expected at least one of images, turntable, mesh, page, splats, points, got none")
-    turned = arguments.frames if "turntable" in arguments.what else None
-    check_orbit(turned, arguments.size, orbits=("--what turntable",))
-    if turned:
+    _refuse_unused(arguments)
+    if "turntable" in arguments.what:
+        check_orbit(arguments.frames, arguments.size)
         require_encoder(arguments.turntable)
     if arguments.level is not None and not arguments.level > 0:
         raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")
@@ -156,6 +167,17 @@ def run(arguments: Arguments) -> int:
         if "splats" in arguments.what:
             _write_splats(baked, shown, query, arguments, console)
     return 0
+
+
+def _refuse_unused(arguments: Arguments) -> None:
+    """Refuse options that say nothing of what is written."""
+    written = {f"--what {each}" for each in arguments.what}
+    if "mesh" in arguments.what:
+        written.add(f"--what mesh --mesh-format {arguments.mesh_format}")
+    for name, wanted in BELONGS.items():
+        given, option = getattr(arguments, name), name.replace("_", "-")
+        if given != getattr(Arguments, name) and written.isdisjoint(wanted):
+            raise ValueError(f"--{option}: expected {' or '.join(wanted)}, whose option it is, got {given} without it")
 
 
 def _judges(arguments: Arguments) -> str:

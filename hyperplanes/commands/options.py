@@ -101,14 +101,13 @@ def check_fine_tune(chosen: str, steps: int | str) -> None:
         raise ValueError(f"--fine-tune: expected --steps, which optimise so, got {chosen} alone; add a number of steps")
 
 
-def check_orbit(orbit: int | None, size: int | None, *others: str, orbits: tuple[str, ...] = ("--orbit",)) -> None:
+def check_orbit(orbit: int | None, size: int | None, *others: str) -> None:
     """Refuse frames and pixels of an orbit that cannot be rendered.
 
     Args:
         orbit: frames around the object, None for no orbit.
         size: pixels along the longer side of its pictures, None for that of the images.
-        others: options beside these whose pictures may have that size.
-        orbits: the options that ask for an orbit.
+        others: options beside --orbit whose pictures may have that size.
 
     Raises:
         ValueError: no frame, no pixel, or a size of no orbit.
@@ -116,7 +115,7 @@ def check_orbit(orbit: int | None, size: int | None, *others: str, orbits: tuple
     if orbit is not None and orbit < 1:
         raise ValueError(f"--orbit: expected at least 1 frame, got {orbit}")
     if size is not None and orbit is None:
-        those = " or ".join([*orbits, *others])
+        those = " or ".join(["--orbit", *others])
         raise ValueError(f"--size: expected {those}, whose pictures it is for, got {size} without; leave it out")
     if size is not None and size < 1:
         raise ValueError(f"--size: expected at least 1 pixel, got {size}")
