@@ -12,7 +12,7 @@ Example:
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -25,6 +25,8 @@ from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from hyperplanes.views import Task
 
 __all__ = ["Arguments", "run"]
 
@@ -54,10 +56,10 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
     return time.perf_counter() - started, result
 
 
-def _refuse_sources(arguments: Arguments, names: Sequence[str] = ()) -> None:
+def _refuse_sources(arguments: Arguments, task: Task | None = None) -> None:
     """As `refuse_sources`, where a turntable is written, which would be read as a picture of the scene."""
     if arguments.orbit is not None:
-        refuse_sources(arguments.out.parent, arguments.views, names)
+        refuse_sources(arguments.out.parent, arguments.views, task)
 
 
 @writes_to(
@@ -92,7 +94,7 @@ def run(arguments: Arguments) -> int:
     refuse_baked(arguments.checkpoint, "bake")
     model = load_adaptable(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     task, _ = read_object(arguments, model, console)
-    _refuse_sources(arguments, task.query.names)
+    _refuse_sources(arguments, task)
     shown, query = task.support.to(device), task.query
     field, _ = adapt_to(model, shown, task.name, console, steps=arguments.steps)
     assert isinstance(field, AdaptedField)

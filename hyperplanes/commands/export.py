@@ -122,7 +122,7 @@ def run(arguments: Arguments) -> int:
     given = {"--page-voxels": arguments.page_voxels is not None, "--no-reflections": arguments.no_reflections}
     refuse_of_baked(source, given)
     task, _ = read_object(arguments, source, console)
-    refuse_sources(out / "images", arguments.views, task.query.names)
+    refuse_sources(out / "images", arguments.views, task)
     shown, query = task.support.to(device), task.query.to(device)
     field, _ = adapt_to(source, shown, task.name, console, steps=arguments.steps)
     made: dict[int, BakedField] = {}

@@ -129,7 +129,7 @@ def run(arguments: Arguments) -> int:
     refuse_of_baked(source, given)
     check_fine_tune(arguments.fine_tune, arguments.steps)
     task, up = read_object(arguments, source, console)
-    refuse_sources(arguments.out, arguments.views, task.query.names)
+    refuse_sources(arguments.out, arguments.views, task)
     shown, known = task.support.to(device), task.query.to(device)
     asked = _asked(arguments, shown, known, up, console)
     settings = FineTuning(trainable=arguments.fine_tune)

@@ -224,13 +224,13 @@ INPUT = re.compile(r"images(_\d+)?|image|input|rgb|masks?|pose|sparse|dense|dist
 """Names of the folders of a scene that readers look into."""
 
 
-def refuse_sources(folder: Path, path: Path, names: Sequence[str] = ()) -> None:
+def refuse_sources(folder: Path, path: Path, task: Task | None = None) -> None:
     """One line where pictures would be written over those that are read, or to where they are read next time.
 
     Args:
         folder: to write into.
         path: of the posed images that are read, or of a data set.
-        names: of their pictures, relative to it.
+        task: what was read of it, where it was.
 
     Raises:
         ValueError: a folder that holds one of them, or one of a scene that readers look into.
@@ -241,6 +241,7 @@ def refuse_sources(folder: Path, path: Path, names: Sequence[str] = ()) -> None:
     path = locate_scene(path)
     root = (path if path.is_dir() else path.parent).resolve()
     target = folder.resolve()
+    names = () if task is None else (*task.support.names, *task.query.names)
     sources = {(root / name).parent.resolve() for name in names}
     inner = target.relative_to(root).parts if target.is_relative_to(root) else ()
     scenes = [root] if len(inner) < 2 or not is_scene(root / inner[0]) else [root, root / inner[0]]

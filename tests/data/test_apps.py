@@ -7,6 +7,7 @@ models"), "RealityCapture XMP Camera Math".
 """
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_formats import FOCAL, HEIGHT, VIEWS, WIDTH, expected, eyes_and_axes, found, pictures
 
+from hyperplanes.commands.scene import refuse_sources
 from hyperplanes.data import DataError, open_dataset, read_task, read_views
 from hyperplanes.data.formats.apps.calibration import brown_lens
 from hyperplanes.data.formats.apps.realitycapture import world_from_angles
@@ -93,7 +95,7 @@ def test_polycam(tmp_path):
     polycam(tmp_path)
     views = read_views(tmp_path)
     np.testing.assert_allclose(found(views), expected(CENTRE), atol=1e-3)
-    assert (views.up, views.names[1], len(read_task(tmp_path).support)) == ("y", "1001.jpg", 3)
+    assert (views.up, len(read_task(tmp_path).support)) == ("y", 3)
     for path in (tmp_path / "keyframes/cameras").iterdir():
         path.write_text(path.read_text().replace('"t_03": ', '"t_03": 1'))
     polycam(tmp_path, "corrected_")
@@ -186,6 +188,36 @@ def test_metashape(tmp_path, component):
         (tmp_path / "scan.xml").write_text(whole.replace(old, new))
         with pytest.raises(DataError, match=rf"scan\.xml.* {match}"):
             read_views(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("write", "home"),
+    [
+        (polycam, "keyframes/images"),
+        (record3d, "rgbd"),
+        (realitycapture, "photos"),
+        (realitycapture, "."),
+        (metashape, "photos"),
+    ],
+)
+def test_names_lead_to_the_photographs_which_nothing_is_written_beside(tmp_path, write, home):
+    if write in (realitycapture, metashape):
+        pictures(tmp_path / home, NAMES)
+    write(tmp_path)
+    task = read_task(tmp_path)
+    assert all((tmp_path / name).samefile(tmp_path / home / Path(name).name) for name in task.support.names)
+    with pytest.raises(ValueError, match=f"--out: expected a folder that no pictures .* got {tmp_path / home}, "):
+        refuse_sources(tmp_path / home, tmp_path, task)
+    refuse_sources(tmp_path / "made", tmp_path, task)
+
+
+def test_a_label_without_ending_is_that_of_one_photograph(tmp_path):
+    pictures(tmp_path / "photos", NAMES)
+    metashape(tmp_path, component=False)
+    assert read_views(tmp_path).names[1] == "photos/IMG_1.JPG"
+    pictures(tmp_path / "photos", ["IMG_1.png"])
+    with pytest.raises(DataError, match=r"scan\.xml: expected one photograph IMG_1, found several, with different end"):
+        read_views(tmp_path)
 
 
 LENS = {"k1": -0.35, "k2": 0.3, "k3": -0.2, "k4": 0.15, "p1": 0.02, "p2": -0.03}

@@ -83,7 +83,7 @@ def test_co3d(tmp_path, kind):
     views = read_views(tmp_path / "car/110_1_2")
     np.testing.assert_allclose(found(views), expected((14.0, 9.0)), atol=1e-3)
     assert views.masks is not None
-    assert views.names[1] == "frame000001.jpg"
+    assert views.names[1] == "images/frame000001.jpg"
     (tmp_path / "car/frame_annotations.jgz").rename(tmp_path / "elsewhere.jgz")
     (tmp_path / "car/frame_annotations.jgz").symlink_to(tmp_path / "elsewhere.jgz")
     with pytest.raises(DataError, match=r"frame_annotations.jgz: expected a file inside .*a symbolic link to"):
@@ -133,6 +133,7 @@ def test_omniobject3d(tmp_path):
         assert data.names("train") == ["apple_004", "apple_005"]
         assert data.class_of("apple_001") == "apple"
     views = read_views(tmp_path / "blender_renders/apple/apple_001")
+    assert views.names[1] == "render/images/r_1"
     np.testing.assert_allclose(found(views), expected(), atol=1e-3)
     assert views.masks is not None
     assert views.masks.sum((1, 2, 3)).tolist() == [40.0] * VIEWS

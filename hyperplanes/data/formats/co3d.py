@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import zlib
 from collections import defaultdict
 from functools import partial
@@ -154,13 +155,14 @@ def _read(folder: Path, listed: list[dict[str, Any]], downscale: int | None, roo
         pose[:3, 3] = _FLIP @ np.array(view["T"], dtype=np.float64)
         mask = (frame.get("mask") or {}).get("path")
         found = inside(base, mask, source) if mask else None
-        for path in (inside(base, name, source), found):
+        picture = inside(base, name, source)
+        for path in (picture, found):
             if path is not None:
                 check_link(path, root)
         frames.append(
             Frame(
-                inside(base, name, source),
-                Path(name).name,
+                picture,
+                Path(os.path.relpath(picture, folder)).as_posix(),
                 check_pose(pose, source, name),
                 partial(_calibration, view, source),
                 (height, width),

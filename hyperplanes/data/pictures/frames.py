@@ -43,7 +43,7 @@ class Frame:
 
     Attributes:
         path: of the picture.
-        name: as the file writes it.
+        name: of the picture, relative to the folder that is read, or as the file writes it.
         camera_from_world: (4, 4), OpenCV axes, already checked.
         calibrate: the (3, 3) calibration, integer pixel centres, for a picture of (height, width).
         size: (height, width) of the pictures that the calibration was made for, or None where the file does not say.

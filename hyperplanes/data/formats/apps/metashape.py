@@ -98,7 +98,8 @@ def read_metashape(folder: str | Path, *, downscale: int | None = None, root: Pa
         sensor = sensors[camera.get("sensor_id", "")]
         assert sensor is not None
         calibrate = calibrated(sensor.focal, sensor.centre, sensor.size, path)
-        frames.append(Frame(picture, picture.name, pose, calibrate, sensor.size, sensor.lens, mask))
+        written = picture.relative_to(folder).as_posix()
+        frames.append(Frame(picture, written, pose, calibrate, sensor.size, sensor.lens, mask))
     scene = assemble(frames, path, downscale=downscale)[0]
     left_out = [each.get("label", "") for each in cameras if each not in kept]
     if not left_out:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
@@ -32,7 +33,8 @@ def find_photographs(
         A path a name, of a file that need not be there, and a mask or None each.
 
     Raises:
-        DataError: a name that no file can have, two names of one photograph, or none of the photographs.
+        DataError: a name that no file can have, two names of one photograph, two photographs of one name without
+            ending, or none of the photographs.
     """
     plain = [PurePosixPath(name.replace("\\", "/")).name for name in names]
     listed = {home: list_files(folder / home, PICTURE_SUFFIXES, root) for home in _HOMES if (folder / home).is_dir()}
@@ -41,6 +43,10 @@ def find_photographs(
         for home, files in listed.items()
     }
     home = max(known, key=lambda each: sum(name.lower() in known[each] for name in plain))
+    stems = Counter(path.stem.lower() for path in listed[home])
+    if several := [name for name in plain if stems[name.lower()] > 1]:
+        remedy = "move those away that the cameras are not of"
+        raise DataError(source, f"one photograph {several[0]}", "several, with different endings", remedy)
     paths = [known[home].get(name.lower()) or inside(folder / home, name, source) for name in plain]
     if not any(path.is_file() for path in paths):
         places = ", ".join(f"{name}/" for name in _HOMES[:-1])

@@ -69,7 +69,7 @@ def read_polycam(folder: str | Path, *, downscale: int | None = None, root: Path
         camera_from_world = opencv_from_opengl(check_pose(pose, path, path.stem)[None])[0]
         picture = next((each for each in _named(pictures, path.stem) if each.is_file()), pictures / f"{path.stem}.jpg")
         check_link(picture, root)
-        frames.append(Frame(picture, picture.name, camera_from_world, calibrate, size))
+        frames.append(Frame(picture, picture.relative_to(folder).as_posix(), camera_from_world, calibrate, size))
     homes = [cameras.parent / "masks", folder / "masks"]
     masks = find_masks(homes, [frame.path for frame in frames], root)
     frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]

@@ -80,7 +80,8 @@ def read_realitycapture(folder: str | Path, *, downscale: int | None = None, roo
             )
             lens = brown_lens(radial, tangential, math.sqrt(0.5) / focal, where)
         opencv = opencv_from_opengl(check_pose(pose, path, name)[None])[0]
-        frames.append(Frame(picture, picture.name, opencv, partial(_calibration, focal, centre), None, lens, mask))
+        written = picture.relative_to(folder).as_posix()
+        frames.append(Frame(picture, written, opencv, partial(_calibration, focal, centre), None, lens, mask))
     return assemble(frames, path, downscale=downscale)[0]
 
 

@@ -72,7 +72,7 @@ def read_record3d(folder: str | Path, *, downscale: int | None = None, root: Pat
     masks = find_masks([folder / "masks"], pictures, root)
     opengl = [_pose(row, path, index) for index, row in enumerate(poses)]
     frames = [
-        Frame(picture, picture.name, pose, calibrate, size, mask=mask)
+        Frame(picture, picture.relative_to(folder).as_posix(), pose, calibrate, size, mask=mask)
         for picture, pose, calibrate, mask in zip(
             pictures, opencv_from_opengl(np.stack(opengl)), calibrations, masks, strict=True
         )
