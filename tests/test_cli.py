@@ -1,6 +1,8 @@
 """Source of truth: what the command line promises its users: exit codes, one line a mistake, files that are there."""
 
+import csv
 import errno
+import io
 import json
 import math
 import os
@@ -401,6 +403,21 @@ def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
     for name in methods:
         assert written[name]["psnr"] == pytest.approx(before[name]["psnr"], abs=1e-3)
         assert f"{written[name]['psnr']:.2f} dB" in shown
+
+
+def test_views_that_were_shown_and_are_asked_for_are_counted(tmp_path, capsys):
+    """By hand: of so many support views, those that are more than there are come from the query views."""
+    task, files = read_task(locate_scene("example-car")), [tmp_path / "a.json", tmp_path / "a.md", tmp_path / "a.csv"]
+    options = [each for pair in zip(("--json", "--markdown", "--csv"), files, strict=True) for each in pair]
+    for shown in (0, 2):
+        command = ["evaluate", "--data", "example-car", "--method", "nearest_view", "--support"]
+        assert main([*map(str, (*command, len(task.support) + shown, *options))]) == 0
+        row = json.loads(files[0].read_text())["nearest_view"]
+        assert [each.get("query_views_shown", 0) for each in (row, *row["objects"].values())] == [shown] * 2
+        assert next(csv.DictReader(io.StringIO(files[2].read_text())))["query_views_shown"] == str(shown or "")
+        said = "1 of 1 objects are judged by query views that the methods were shown, up to 2 of them"
+        streams = capsys.readouterr()
+        assert [said in text for text in (streams.out + streams.err, files[1].read_text())] == [shown > 0] * 2
 
 
 def test_two_checkpoints_of_one_method_are_refused_wherever_they_are_and_a_folder_given_twice_is_one(tmp_path):

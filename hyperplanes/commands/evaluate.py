@@ -75,7 +75,7 @@ class Arguments:
         split: Which objects.
         objects: Only the first so many.
         support: Support views an object; more than the data set has are taken from its query views, and those are
-            compared although they were shown.
+            compared although they were shown, which a warning says.
         preset: The shape of fields that need no checkpoint.
         up: The direction that points up in the data's world: an axis such as y or -z, three numbers such as 0,0.1,1, or
             auto: of a single scene as its cameras are held; of a data set as its files say, else y as in training data.
@@ -201,6 +201,8 @@ def run(arguments: Arguments) -> int:
     if count > 1 and pairs:
         console.table(PAIR_HEADINGS, compared_rows(pairs[:LARGEST_TABLE]))
     console.say(f"{count} objects of {arguments.data}{_of_seeds(arguments)}")
+    if line := _of_shown(scores):
+        console.warn(line)
     _write(arguments, scores, pairs)
     if arguments.grid is not None:
         pictures.save(arguments.grid)
@@ -251,6 +253,17 @@ def _of_seeds(arguments: Arguments) -> str:
     return f"; ± is the standard deviation over {arguments.seeds} seeds {what}"
 
 
+def _of_shown(scores: Sequence[Score]) -> str:
+    """A sentence where methods are judged by views that they were shown, else nothing."""
+    shown = [int(each.query_views_shown) for each in scores[0].objects if each.query_views_shown]
+    if not shown:
+        return ""
+    return (
+        f"{len(shown)} of {len(scores[0].objects)} objects are judged by query views that the methods were shown, up "
+        f"to {max(shown)} of them, which --support takes: this is not the quality of new views"
+    )
+
+
 def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Comparison]) -> None:
     """Every file but the grid of pictures."""
     from hyperplanes.evaluation import figures, tables
@@ -263,6 +276,8 @@ def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Compar
         write_whole(arguments.csv, tables.as_csv(scores).encode())
     if arguments.markdown is not None:
         about = f"{len(scores[0].objects)} objects of {arguments.data}{_of_seeds(arguments)}."
+        if line := _of_shown(scores):
+            about += f" Caution: {line}."
         write_whole(arguments.markdown, tables.as_markdown(scores, pairs, about).encode())
     if arguments.curve is not None:
         # a method that takes no steps is a level

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import Adapter, Pictures, Renderable
+from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.errors import prefix_errors
 from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
@@ -21,7 +22,10 @@ from hyperplanes.views import Task, Tasks
 
 __all__ = ["QUANTITIES", "ObjectScore", "Perceptual", "Score", "evaluate", "evaluate_all", "merge_seeds"]
 
-QUANTITIES = ("psnr", "psnr_pooled", "psnr_foreground", "ssim", "lpips", "adapt_seconds", "render_seconds")
+QUANTITIES = (
+    *("psnr", "psnr_pooled", "psnr_foreground", "ssim", "lpips", "adapt_seconds", "render_seconds"),
+    "query_views_shown",
+)
 """The numbers of an `ObjectScore`, in the order of the tables."""
 
 Perceptual = Callable[[Float[Tensor, "view 3 h w"], Float[Tensor, "view 3 h w"]], Float[Tensor, " view"]]
@@ -41,6 +45,7 @@ class ObjectScore:
         psnr_pooled: dB, of the squared error of all its query views together.
         psnr_foreground: dB, inside the true masks, mean over its query views; None where no mask has a pixel.
         lpips: mean over its query views; None where its weights were not given.
+        query_views_shown: how many of its query views, by their poses, are among the support views; None for none.
     """
 
     name: str
@@ -51,6 +56,7 @@ class ObjectScore:
     psnr_pooled: float | None = None
     psnr_foreground: float | None = None
     lpips: float | None = None
+    query_views_shown: float | None = None
 
     def as_json(self) -> dict[str, float]:
         """The numbers that there are."""
@@ -205,6 +211,8 @@ def _evaluate_one(
     adapted_at = clock()
     pictures = adapted.render(task.query.cameras)
     rendered_at = clock()
+    support, query = (camera.camera_from_world(views.cameras) for views in (task.support, task.query))
+    known = (query[:, None] == support).all((-2, -1)).any(1)
     images, truth, masks = pictures.images.to(task.query.images).clamp(0, 1), task.query.images, task.query.masks
     score = ObjectScore(
         name,
@@ -215,6 +223,7 @@ def _evaluate_one(
         float(pooled_psnr(images, truth)),
         None if masks is None else _number(float(foreground_psnr(images, truth, masks).nanmean())),
         None if lpips is None else float(lpips(images, truth).mean()),
+        int(known.sum()) or None,
     )
     return score, task, pictures, adapted
 
