@@ -135,13 +135,14 @@ def one_writer(folder: str | Path) -> Generator[None]:
 def _delete_unfinished(folder: Path) -> None:
     """Delete what killed processes have left half written in a folder, and in those in it that nobody has locked."""
     for place in (folder, *(child for child in folder.iterdir() if child.is_dir() and not child.is_symlink())):
-        if place != folder and (place / ".lock").exists():
-            continue
-        for path in place.glob(".*.part"):
-            owner = UNFINISHED.fullmatch(path.name)
-            if owner is not None and not _is_running(int(owner[1])):
-                with suppress(OSError):
-                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+        with suppress(PermissionError):  # a folder that is not ours, such as lost+found
+            if place != folder and (place / ".lock").exists():
+                continue
+            for path in place.glob(".*.part"):
+                owner = UNFINISHED.fullmatch(path.name)
+                if owner is not None and not _is_running(int(owner[1])):
+                    with suppress(OSError):
+                        shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _is_running(process: int) -> bool:

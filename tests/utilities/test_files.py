@@ -122,6 +122,19 @@ def test_a_lock_ends_with_its_process(tmp_path):
         pass
 
 
+def test_a_folder_in_it_that_may_not_be_read_does_not_keep_anybody_from_writing(tmp_path):
+    """As lost+found of a disk; relative paths, as a user who is not root may not pass the folders above."""
+    (tmp_path / "lost+found").mkdir(mode=0o700)
+    tmp_path.chmod(0o777)
+    code = (
+        "import fcntl, os, sys; from hyperplanes.utilities import writing\nos.chdir(sys.argv[1])\n"
+        "os.setuid(65534) if os.getuid() == 0 else os.chmod('lost+found', 0)\n"
+        "with writing.one_writer('.'): writing.write_whole('a', b'whole')"
+    )
+    subprocess.run([sys.executable, "-c", code, tmp_path], cwd=ROOT, check=True)
+    assert (tmp_path / "a").read_bytes() == b"whole"
+
+
 def test_a_name_that_no_file_can_have_is_refused(tmp_path):
     assert inside(tmp_path, "a" * 255, "images.bin") == tmp_path / ("a" * 255)
     with pytest.raises(DataError, match="images.bin: expected file names of at most 255 bytes"):
