@@ -44,6 +44,7 @@ from hyperplanes.fields.baked import BakedField
 from hyperplanes.rendering.renderer import Hierarchical
 from hyperplanes.training import Trainer
 from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.writing import one_writer
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
@@ -692,7 +693,8 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     out = tmp_path / "voxels.safetensors"
     views = ["--views", str(first_object(demo_folder())), "--out", str(out)]
     command = ["bake", "--checkpoint", str(demo_folder()), *views, "--voxels", "32", "--fit", "2"]
-    assert main([*command, "--orbit", "2", "--size", "16", "--turntable", "gif"]) == 0
+    with one_writer(tmp_path):  # of another file
+        assert main([*command, "--orbit", "2", "--size", "16", "--turntable", "gif"]) == 0
     assert "dB, the field" in capsys.readouterr().out
     with Image.open(tmp_path / "voxels.gif") as animation:
         assert animation.n_frames == 2

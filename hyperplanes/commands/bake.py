@@ -20,7 +20,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import adapt_to, bake_field, load_adaptable, refuse_baked
 from hyperplanes.commands.options import ObjectArguments, OptionalInt, check_orbit, optional
 from hyperplanes.commands.scene import read_object, refuse_sources
-from hyperplanes.commands.writing import refuse_checkpoint, writes_to
+from hyperplanes.commands.writing import check_output, refuse_checkpoint
 from hyperplanes.utilities.formatting import format_duration
 
 if TYPE_CHECKING:
@@ -62,10 +62,6 @@ def _refuse_sources(arguments: Arguments, task: Task | None = None) -> None:
         refuse_sources(arguments.out.parent, arguments.views, task)
 
 
-@writes_to(
-    lambda arguments: arguments.out.parent,
-    check=_refuse_sources,
-)
 def run(arguments: Arguments) -> int:
     """Adapt, bake, write, and say what it cost and what it brought."""
     from hyperplanes.adaptation.base import AdaptedField
@@ -77,8 +73,8 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.utilities.metrics import psnr
     from hyperplanes.utilities.writing import write_whole
 
-    if arguments.out.is_dir():
-        raise ValueError(f"{arguments.out}: expected the name of a file to write, found a folder; name a file in it")
+    _refuse_sources(arguments)
+    check_output("out", arguments.out)
     if arguments.out.suffix != ".safetensors":
         raise ValueError(f"--out: expected a name that ends in .safetensors, got {arguments.out}; add the ending")
     refuse_checkpoint(arguments.out, arguments.checkpoint)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from contextlib import suppress
@@ -65,7 +66,8 @@ def check_output(option: str, path: Path | None) -> None:
         path: the file, or None.
 
     Raises:
-        ValueError: a folder, a file where its folder should be, or a file of a model, a training or a data set.
+        ValueError: a folder, a file where its folder should be, a folder that may not be written to, or a file of a
+            model, a training or a data set.
     """
     if path is None:
         return
@@ -74,6 +76,8 @@ def check_output(option: str, path: Path | None) -> None:
     above = next(each for each in path.absolute().parents if each.exists())
     if not above.is_dir():
         raise ValueError(f"--{option}: expected a file in a folder, got {path}, and {above} is a file; name another")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise ValueError(f"--{option}: expected a folder that may be written to, got {above}; name another")
     if path.exists() and READ.fullmatch(path.name):
         raise ValueError(
             f"--{option}: expected a file of its own, got {path}, which is read as a model, a training or a data set; "

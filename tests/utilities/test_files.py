@@ -103,9 +103,12 @@ def test_every_verb_that_writes_locks_its_folder_and_names_a_file_in_its_place(t
         for verb, options in verbs.items():
             assert main([verb, *options, "--out", str(out)]) == 2
             assert "found another hyperplanes at work there" in capsys.readouterr().err
-        bake = ["bake", *verbs["render"], "--out", str(out / "car.safetensors")]
-        assert main(bake) == 2
-        assert "found another hyperplanes at work there" in capsys.readouterr().err
+        # a file is written whole, so that others may write beside it
+        bake = ["bake", *verbs["render"], "--out"]
+        assert main([*bake, str(out / "car.safetensors")]) == 2
+        assert f"{tmp_path}: expected a checkpoint" in capsys.readouterr().err
+    assert main([*bake, str(tmp_path / "file/car.safetensors")]) == 2
+    assert "--out: expected a file in a folder, got" in capsys.readouterr().err
     for verb, options in verbs.items():
         assert main([verb, *options, "--out", str(tmp_path / "file")]) == 2
         assert "file: expected a folder to write into, found a file; name another one" in capsys.readouterr().err
