@@ -1,5 +1,7 @@
 """Source of truth: scenes whose poses are right by construction, and the same ones made wrong in a known way."""
 
+import json
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -9,6 +11,7 @@ import torch
 
 from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_splits
 from hyperplanes.data.inspection.conventions import check_conventions
+from hyperplanes.data.inspection.describe import describe
 from hyperplanes.data.inspection.matches import match_pictures, sampson
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
@@ -120,6 +123,17 @@ def test_one_picture_for_many_poses_is_found(scene):
     repeated = replace(views, images=views.images[[0, 1, 2, 0, 0, 5, 6, 7, 8, 9, 10, 0]], names=names)
     assert "4 of 12 poses have the picture of another pose (0.png and 3.png" in check_duplicates(repeated)
     assert check_duplicates(views[[0, 0, 1]]) is None  # the same view twice is no contradiction
+
+
+def test_one_picture_in_support_and_query_is_found(scene, tmp_path):
+    """A copy under another name is another pose's picture; a file listed twice is one view, which the notes say."""
+    document, home = scene.document(), scene.write(tmp_path)
+    shutil.copy(home / scene.names[0], home / scene.names[3])
+    document["frames"].append(document["frames"][5])
+    (home / "transforms.json").write_text(json.dumps(document))
+    found = describe(home).lines()
+    assert any("2 of 8 poses have the picture of another pose (images/000.png and images/003.png" in s for s in found)
+    assert f"{home.name}: 1 frames left out, whose pictures are listed before: images/005.png" in found
 
 
 def test_splits_in_different_worlds_are_found(scene):

@@ -15,7 +15,7 @@ from hyperplanes.data.inspection.conventions import Conventions, check_conventio
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.utilities.files import DataError
-from hyperplanes.views import Task
+from hyperplanes.views import Task, join_views
 
 __all__ = ["Description", "ObjectDescription", "describe"]
 
@@ -181,8 +181,9 @@ def _object(data: Dataset, name: str) -> ObjectDescription:
 
 def _checked(task: Task) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is wrong, and what was looked at besides."""
-    same = check_duplicates(task.support) or check_duplicates(task.query)
-    outcomes = [check_gaze(task.support), check_splits(task.support, task.query)]
-    problems = [same] if same else []
+    halves = task.support, task.query
+    parts = [join_views(*halves)] if task.support.size == task.query.size else halves
+    outcomes = [check_gaze(task.support), check_splits(*halves)]
+    problems = [same for part in parts if (same := check_duplicates(part))]
     problems += [line for fine, line in outcomes if not fine]
     return tuple(problems), tuple(line for fine, line in outcomes if fine)
