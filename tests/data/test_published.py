@@ -133,7 +133,7 @@ def test_omniobject3d(tmp_path):
         assert data.names("train") == ["apple_004", "apple_005"]
         assert data.class_of("apple_001") == "apple"
     views = read_views(tmp_path / "blender_renders/apple/apple_001")
-    assert views.names[1] == "render/images/r_1"
+    assert views.names[1] == "render/images/r_1.png"
     np.testing.assert_allclose(found(views), expected(), atol=1e-3)
     assert views.masks is not None
     assert views.masks.sum((1, 2, 3)).tolist() == [40.0] * VIEWS

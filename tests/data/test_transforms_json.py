@@ -148,6 +148,22 @@ def test_train_and_test_files_are_support_and_query(scene, tmp_path):
     assert read_task(tmp_path / "transforms_train.json").name == tmp_path.name
 
 
+def test_an_object_of_learnit_is_read_alone_and_in_its_data_set(scene, tmp_path):
+    """As published: cars/abc/transforms.json lists ./abc/000, and its loader takes the last part, beside the file."""
+    home = tmp_path / "cars/abc"
+    scene.write(home)
+    document = scene.document()
+    for name, frame in zip(scene.names, document["frames"], strict=True):
+        (home / name).rename(home / Path(name).name)
+        frame["file_path"] = f"./abc/{Path(name).stem}"
+    (home / "transforms.json").write_text(json.dumps(document))
+    (tmp_path / "cars_splits.json").write_text(json.dumps({"train": [], "test": ["abc"]}))
+    whole, alone = open_dataset(tmp_path).task("abc"), read_views(home)
+    assert torch.allclose(alone.images, scene.over_white(), atol=1e-6)
+    assert torch.equal(alone.images, torch.cat([whole.support.images, whole.query.images]))
+    assert alone.names == tuple(Path(name).name for name in scene.names)
+
+
 def test_no_picture_is_both_shown_and_asked_for(scene, tmp_path):
     """Property: support and query are disjoint, however the files name a picture that is in both."""
     document, names = scene.document(), scene.names

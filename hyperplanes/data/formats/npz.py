@@ -200,9 +200,9 @@ def _learnit(
 
     def read(name: str) -> PosedTask:
         if manifest:
-            return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, flat=True, complete=True)
+            return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, complete=True)
         file = homes[name] / "transforms.json"
-        return PosedTask.halves(read_transforms(file, legacy=legacy, bounds=bounds, flat=True, complete=True), name)
+        return PosedTask.halves(read_transforms(file, legacy=legacy, bounds=bounds, complete=True), name)
 
     return Catalogue("learnit-128", splits, read, manifest, tuple(skipped))
 

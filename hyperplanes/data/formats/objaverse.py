@@ -129,7 +129,7 @@ def read_omniobject(folder: str | Path, *, downscale: int | None = None, root: P
     """
     folder = Path(folder)
     found = read_transforms(folder / "render" / "transforms.json", downscale=downscale, root=root or folder)
-    found = replace(found, names=tuple(f"render/images/{Path(name).name}" for name in found.names))
+    found = replace(found, names=tuple(f"render/{name}" for name in found.names))
     border = torch.cat([found.rgba[:, :3, [0, -1]].flatten(1), found.rgba[:, :3, :, [0, -1]].flatten(1)], 1)
     if found.has_alpha or border.any():
         return found

@@ -44,7 +44,6 @@ def read_transforms(
     *,
     legacy: bool = False,
     bounds: Sphere | None = None,
-    flat: bool = False,
     downscale: int | None = None,
     complete: bool = False,
     root: Path | None = None,
@@ -58,7 +57,6 @@ def read_transforms(
         path: a transforms file, or several of one folder that are read as one scene.
         legacy: as in `calibration`.
         bounds: of the scene; "scene_sphere" of the file, else an estimate, when None.
-        flat: take only the last part of each `file_path`, beside the file, as learnit's data have it.
         downscale: as in `assemble`.
         complete: as in `assemble`.
         root: no picture may lie outside of it, symbolic links followed; the file's folder when None.
@@ -67,7 +65,7 @@ def read_transforms(
         The pictures of all frames in the order of the files. Anything wrong with a file is a DataError that names it.
     """
     paths = [Path(path)] if isinstance(path, (str, Path)) else list(path)
-    document, frames, _ = _listed_frames(paths, legacy, flat, root)
+    document, frames, _ = _listed_frames(paths, legacy, root)
     source = paths[0] if len(paths) == 1 else paths[0].parent
     bounds = bounds or stated_bounds(document, paths[0])
     scene, _ = assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)
@@ -80,7 +78,6 @@ def read_transforms_task(
     *,
     legacy: bool = False,
     bounds: Sphere | None = None,
-    flat: bool = False,
     downscale: int | None = None,
     complete: bool = False,
     root: Path | None = None,
@@ -95,7 +92,6 @@ def read_transforms_task(
         name: of the object.
         legacy: as in `calibration`.
         bounds: as in `read_transforms`; an estimate uses the views of the support alone.
-        flat: as in `read_transforms`.
         downscale: as in `assemble`.
         complete: as in `assemble`.
         root: as in `read_transforms`.
@@ -110,7 +106,7 @@ def read_transforms_task(
     if not files:
         raise DataError(path, "transforms.json or transforms_train.json", "neither", "check the path")
     paths = files if len(files) == 1 else [files[0], files[-1]]
-    document, frames, counts = _listed_frames(paths, legacy, flat, root)
+    document, frames, counts = _listed_frames(paths, legacy, root)
     query = range(counts[0], len(frames))
     if len(paths) == 1:
         frames, query = _split_by_names(document, frames, files[0])
@@ -139,47 +135,46 @@ def _split_by_names(document: dict[str, Any], frames: list[Frame], path: Path) -
     names = [*support, *query]
     if not all(isinstance(name, str) for name in names):
         raise DataError(path, "names of files in train_filenames and test_filenames", "others", "correct the file")
-    return _chosen(frames, names, path), range(len(support), len(names))
+    return _chosen(document, frames, names, path), range(len(support), len(names))
 
 
-def _listed_frames(
-    paths: list[Path], legacy: bool, flat: bool, root: Path | None
-) -> tuple[dict[str, Any], list[Frame], list[int]]:
+def _listed_frames(paths: list[Path], legacy: bool, root: Path | None) -> tuple[dict[str, Any], list[Frame], list[int]]:
     """The first document, the frames of all, and how many each has."""
     documents = [read_json(one, root or one.parent) for one in paths]
-    parts = [_frames(path, document, legacy, flat, root) for path, document in zip(paths, documents, strict=True)]
+    parts = [_frames(path, document, legacy, root) for path, document in zip(paths, documents, strict=True)]
     return documents[0], [frame for part in parts for frame in part], [len(part) for part in parts]
 
 
-def _frames(path: Path, document: dict[str, Any], legacy: bool, flat: bool, root: Path | None) -> list[Frame]:
+def _frames(path: Path, document: dict[str, Any], legacy: bool, root: Path | None) -> list[Frame]:
     listed = document.get("frames")
     if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
         found = f"{len(listed)} of them" if isinstance(listed, list) else repr(listed)[:40]
         raise DataError(path, "frames, a list of one or more objects", found, "export the file again")
     common = {key: value for key, value in document.items() if key != "frames"}
-    frames = [_frame(path, common | frame, legacy, flat, root or path.parent) for frame in listed]
+    frames = [_frame(path, common | frame, legacy, root or path.parent) for frame in listed]
     if any(frame.mask is not None for frame in frames):
         return frames
     masks = find_masks([path.parent / "masks"], [frame.path for frame in frames], root or path.parent)
     return [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
 
 
-def _frame(path: Path, fields: dict[str, Any], legacy: bool, flat: bool, root: Path) -> Frame:
+def _frame(path: Path, fields: dict[str, Any], legacy: bool, root: Path) -> Frame:
     written = fields.get("file_path")
     if not isinstance(written, str) or not written:
         raise DataError(path, "a file_path in every frame", repr(written), "export the file again")
-    name = PurePosixPath(written.replace("\\", "/")).name if flat else written
-    located = _located(path, name, root)
+    located, name = _located(path, written, root), written
     if not located.is_file():
-        with_suffix = [located.with_name(located.name + suffix) for suffix in _SUFFIXES]
-        with_suffix += [located.parent / "images" / each.name for each in (located, *with_suffix)]  # OmniObject3D
-        located = next((candidate for candidate in with_suffix if candidate.is_file()), located)
+        homes = located.parent, located.parent / "images", path.parent  # as written, OmniObject3D's, learnit's
+        candidates = [home / (located.name + suffix) for home in homes for suffix in ("", *_SUFFIXES)]
+        located = next((candidate for candidate in candidates if candidate.is_file()), located)
         check_link(located, root)
+        if located.parent != homes[0]:
+            name = located.relative_to(path.parent).as_posix()
     pose = check_pose(fields.get("transform_matrix"), path, written)
     mask = fields.get("mask_path")
     return Frame(
         located,
-        written,
+        name,
         opencv_from_opengl(pose[None])[0],
         lambda size: calibration(fields, size, path, legacy=legacy),
         stated_size(fields, path),
@@ -209,8 +204,9 @@ def _located(path: Path, name: object, root: Path) -> Path:
     return inside(root, str(path.parent.relative_to(root) / text) if text else "", path)
 
 
-def _chosen(frames: list[Frame], only: Sequence[str], path: Path) -> list[Frame]:
-    by_name = {str(PurePosixPath(frame.name)): frame for frame in frames}
+def _chosen(document: dict[str, Any], frames: list[Frame], only: Sequence[str], path: Path) -> list[Frame]:
+    listed = zip(document["frames"], frames, strict=True)
+    by_name = {str(PurePosixPath(each["file_path"])): frame for each, frame in listed}
     chosen = []
     for name in only:
         frame = by_name.get(str(PurePosixPath(name)))
