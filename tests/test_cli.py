@@ -273,6 +273,17 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
             ["demo", "--quick-check", "--objects", "9", "--out", "OUT/demo"],
             ["--objects: expected none with --quick-check, which has its own"],
         ),
+        *(
+            (
+                [*command, "--legacy"],
+                [f"expected the layout learnit-128 or hyperplanes-200 with legacy, found {layout}"],
+            )
+            for command, layout in (
+                (["train", "--data", "DATA", "--out", "OUT/run"], "the layout native"),
+                (["evaluate", "--data", "DATA", "--method", "nearest_view"], "the layout native"),
+                (["evaluate", "--data", "example-car", "--method", "nearest_view"], "the layout posed"),
+            )
+        ),
         (["inspect", "OUT/none"], ["OUT/none: expected a data set, posed images, a checkpoint", "found nothing"]),
     ],
 )

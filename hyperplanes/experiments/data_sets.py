@@ -29,7 +29,7 @@ class DataSets:
         generate: called with what decides a data set and the folder it is to lie in; goes on where it stopped.
         device: where views are kept.
         given: folders by class, instead of generated data sets.
-        legacy: as in `open_dataset`.
+        legacy: as in `open_dataset`, of those that are not generated.
     """
 
     def __init__(
@@ -49,7 +49,9 @@ class DataSets:
     def tasks(self, class_name: str) -> Tasks:
         """The data set of a class; ValueError where none was given and the scale generates none."""
         if class_name not in self._tasks:
-            data: Tasks = open_dataset(self.folder(class_name), legacy=self.legacy)
+            folder = self.folder(class_name)
+            generated = folder.resolve().is_relative_to(self.workspace.out.resolve())  # which workers are given, too
+            data: Tasks = open_dataset(folder, legacy=self.legacy and not generated)
             if self.scale.bounds is not None:
                 data = WithBounds(data, self.scale.bounds)
             self._tasks[class_name] = TasksOnDevice(data, self.device)

@@ -18,10 +18,13 @@ from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import MALFORMED, DataError, check_regular, read_json
 
-__all__ = ["AUTHORS_FOCAL", "catalogue", "read_arrays", "read_npz"]
+__all__ = ["AUTHORS_FOCAL", "LEGACY", "catalogue", "read_arrays", "read_npz"]
 
 AUTHORS_FOCAL = 277.77
 """Focal length in pixels of the authors' 200x200 pictures: Blender's 50 mm on 36 mm."""
+
+LEGACY = ("learnit-128", "hyperplanes-200")
+"""The layouts whose published code puts principal points at W / 2 at integer pixel centres."""
 
 LARGEST_ARRAY = 2 * 2**30
 
@@ -174,7 +177,7 @@ def _authors(
     def read(name: str) -> PosedTask:
         return split(read_npz(paths[name], legacy=legacy, bounds=bounds, root=folder), name)
 
-    return Catalogue("hyperplanes-200", splits, read, manifest, tuple(skipped))
+    return Catalogue(LEGACY[1], splits, read, manifest, tuple(skipped))
 
 
 def _learnit(
@@ -204,7 +207,7 @@ def _learnit(
         file = homes[name] / "transforms.json"
         return PosedTask.halves(read_transforms(file, legacy=legacy, bounds=bounds, complete=True), name)
 
-    return Catalogue("learnit-128", splits, read, manifest, tuple(skipped))
+    return Catalogue(LEGACY[0], splits, read, manifest, tuple(skipped))
 
 
 def _home(folder: Path, name: str, file: Path) -> Path | None:

@@ -90,9 +90,17 @@ def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
         The catalogue; no picture has been read yet.
 
     Raises:
-        DataError: nothing that is known lies there.
+        DataError: nothing that is known lies there, or another layout than these two with `legacy`.
     """
     path = Path(path)
+    found = _find_catalogue(path, legacy)
+    if legacy and path.suffix != ".npz" and found.layout not in npz.LEGACY:
+        wanted = f"the layout {' or '.join(npz.LEGACY)} with legacy"
+        raise DataError(path, wanted, f"the layout {found.layout}", "leave legacy out")
+    return found
+
+
+def _find_catalogue(path: Path, legacy: bool) -> Catalogue:
     if path.is_file() and path.suffix in (".json", ".npz"):
         return _one_scene(path, path.stem if path.suffix == ".npz" else path.resolve().parent.name, legacy)
     if not path.is_dir():
@@ -102,12 +110,12 @@ def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
     if manifest.get("format") == FORMAT and manifest.get("layout", "native") == "native":
         return native(path, manifest)
     if nsvf.is_nsvf(path):
-        return _one_scene(path, path.resolve().name, legacy)
+        return _one_scene(path, path.resolve().name)
     found = srn.catalogue(path, manifest) or npz.catalogue(path, manifest, legacy=legacy)
     if found is not None:
         return found
     if _find_format(path) is not None:
-        return _one_scene(path, path.resolve().name, legacy)
+        return _one_scene(path, path.resolve().name)
     for published in (nmr.catalogue, co3d.catalogue, objaverse.objaverse, objaverse.omniobject):
         if (found := published(path)) is not None:
             return found
@@ -160,7 +168,7 @@ def read_posed_task(path: str | Path, downscale: int | None = None, *, legacy: b
     return _format(folder).task(folder, folder.resolve().name, downscale, folder)
 
 
-def _one_scene(path: Path, name: str, legacy: bool) -> Catalogue:
+def _one_scene(path: Path, name: str, legacy: bool = False) -> Catalogue:
     """One posed scene as a data set of one test object."""
     splits = {"train": (), "val": (), "test": (name,)}
     return Catalogue("posed", splits, lambda _: read_posed_task(path, legacy=legacy))
