@@ -198,6 +198,7 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
     """
     from hyperplanes.configuration.presets import preset
     from hyperplanes.configuration.settings_file import changed, parse_options, read_experiment
+    from hyperplanes.utilities.errors import prefix_errors
     from hyperplanes.utilities.settings import SettingsError
 
     given = read_experiment(arguments.config) if arguments.config else {}
@@ -241,7 +242,8 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
     except SettingsError as error:
         raise ValueError(f"--{error.path.replace('_', '-')}: {error.problem}") from None
     if arguments.support is not None:
-        network = replace(chosen.model.network, planes=arguments.support)
+        with prefix_errors("--support"):
+            network = replace(chosen.model.network, planes=arguments.support)
         chosen = replace(chosen, model=replace(chosen.model, network=network))
     return chosen.model.method, chosen
 
