@@ -27,7 +27,7 @@ __all__ = ["EmbreeRenderer", "Geometry", "cast_geometry"]
 
 Floats = npt.NDArray[np.float64]
 
-_MAX_LAYERS = 8
+_MAX_LAYERS = 256  # far more than foliage has; nearly all rays end sooner, and those that ended cost nothing
 
 
 @dataclass(frozen=True)

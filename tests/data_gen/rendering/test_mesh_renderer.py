@@ -247,6 +247,25 @@ def test_transparent_texels_do_not_bleed(backend):
     assert (seen[:, 1] > seen[:, 1].max() - 12).all()
 
 
+@pytest.mark.parametrize("alpha_mode", ["MASK", "BLEND"])
+def test_what_is_behind_many_clear_sheets_is_seen(backend, alpha_mode):
+    # Cards of foliage: their clear texels add nothing, however many there are in front of the wall.
+    clear = sheet(0.9)
+    texels = np.zeros((4, 4, 4), np.uint8)
+    texels[0, 0] = 255
+    clear.visual.material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(texels), alphaMode=alpha_mode
+    )
+    place = trimesh.transformations.translation_matrix
+    sheets = [(clear, place([0, 0, 0.02 * number]), False) for number in range(30)]
+    rig, back = _front_rig(9), (sheet(0.9), place([0, 0, -0.5]), False)
+    with MeshRenderer(backend) as renderer:
+        alone = renderer.render([back], rig, channels=("rgba", "depth"))
+        behind = renderer.render([*sheets, back], rig, channels=("rgba", "depth"))
+    np.testing.assert_allclose(behind.rgba[0, 4, 4], alone.rgba[0, 4, 4], atol=1)
+    assert behind.depth[0, 4, 4] == alone.depth[0, 4, 4]
+
+
 def test_texture_is_the_right_way_up(backend):
     quarters = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
     square = sheet(0.9)
