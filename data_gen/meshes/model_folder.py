@@ -18,7 +18,7 @@ from trimesh.resolvers import Resolver
 
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PIXELS, MeshError, check_image, read_bytes
 
-__all__ = ["MAX_REFERENCES", "ModelFolder", "model_root"]
+__all__ = ["MAX_REFERENCES", "ModelFolder", "model_root", "without_comment"]
 
 MAX_REFERENCES = 2000
 """Different names of other files in a mesh at most. One that is not there takes about 1 ms to look for."""
@@ -29,6 +29,15 @@ _MTL_OPTION = re.compile(
     r"^\s*-(?:(?:blendu|blendv|cc|clamp|imfchan|type|texres|boost|bm)\s+\S+|(?:o|s|t)(?:\s+[-+.\deE]+){1,3}"
     r"|mm\s+\S+\s+\S+)\s+"
 )
+
+
+def without_comment(name: str) -> str:
+    """A name in a text file without what follows a # behind a space, which names may hold, too.
+
+    >>> without_comment("wood.png # the floor"), without_comment("C#4")
+    ('wood.png', 'C#4')
+    """
+    return re.split(r"\s#", name, maxsplit=1)[0].rstrip()
 
 
 def model_root(path: Path) -> Path:
@@ -51,7 +60,7 @@ class ModelFolder(Resolver):
     """Gives a mesh loader the other files of its model, from one folder and no other place.
 
     Names are accepted as files hold them: with backslashes, percent-encoded, in the wrong case, behind MTL options
-    (`-s 1 1 1 wood.png`), or as `model://NAME/rest`, for which a folder NAME is looked for, and the model's own stands
+    (`-s 1 1 1 wood.png`) or before comments, or as `model://NAME/rest`, for which a folder NAME is looked for, and the model's own stands
     in. What is not where its name says is looked for by the last part of it, as Blender does: beside the mesh, and in
     the folders that usually hold textures. That is noted.
 
@@ -291,9 +300,10 @@ def _candidates(name: str) -> Iterator[str]:
     unprefixed = plain
     while (option := _MTL_OPTION.match(unprefixed)) is not None:
         unprefixed = unprefixed[option.end() :]
-    if unprefixed != plain:
-        yield unprefixed.strip()
-    yield from _other_code_pages(unprefixed.strip())
+    for bare in dict.fromkeys((unprefixed.strip(), without_comment(unprefixed).strip())):
+        if bare != plain:
+            yield bare
+        yield from _other_code_pages(bare)
 
 
 def _other_code_pages(name: str) -> Iterator[str]:

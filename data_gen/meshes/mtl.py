@@ -24,10 +24,10 @@ import PIL.Image
 
 from data_gen.meshes.files import IMAGE_FORMATS, MAX_TEXT_BYTES, MeshError
 from data_gen.meshes.materials import LinearMaterial, convert_image, roughness_of_exponent
-from data_gen.meshes.model_folder import ModelFolder
+from data_gen.meshes.model_folder import ModelFolder, without_comment
 from hyperplanes.utilities.colour import linear_from_srgb
 
-__all__ = ["MAX_LIBRARIES", "MtlMaterial", "decode_text", "read_materials"]
+__all__ = ["MAX_LIBRARIES", "MtlMaterial", "decode_text", "find_material", "read_materials"]
 
 MAX_LIBRARIES = 1000
 """Different material libraries of an OBJ file at most."""
@@ -79,8 +79,9 @@ def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str
             f"{folder.path}: expected at most {MAX_LIBRARIES} material libraries, found {len(different)}; merge them"
         )
     for line in different:
-        whole = folder.locate(line) is not None or not line.lower().endswith(".mtl")
-        names = [line] if whole or len(line.split()) < 2 else line.split()
+        words = without_comment(line).split()
+        whole = len(words) < 2 or not words[-1].lower().endswith(".mtl") or folder.locate(line) is not None
+        names = [line] if whole else words
         for name in names:
             try:
                 text = decode_text(folder.read(name, limit=MAX_TEXT_BYTES))
@@ -89,6 +90,23 @@ def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str
             for values in _statements(text, name, warnings):
                 materials.setdefault(values["name"], _material(values, folder, warnings))
     return materials
+
+
+def find_material(name: str, materials: dict[str, MtlMaterial]) -> MtlMaterial | None:
+    """The material that an OBJ file names.
+
+    Args:
+        name: what stands after `usemtl`.
+        materials: by name; these names and that one may be followed by a comment, where there is none of the whole name.
+
+    Returns:
+        The material, or None if there is none, or several that differ in what may be a comment.
+    """
+    if name in materials:
+        return materials[name]
+    plain = without_comment(name)
+    alike = [material for other, material in materials.items() if without_comment(other) == plain]
+    return materials.get(plain, alike[0] if len(alike) == 1 else None)
 
 
 def _statements(text: str, library: str, warnings: list[str]) -> list[dict[str, Any]]:
@@ -197,7 +215,7 @@ def _floats(text: str | None, count: int, default: tuple[float, ...], what: str,
     if text is None:
         return np.array(default)
     try:
-        found = np.array([float(value) for value in text.split()[:count]])
+        found = np.array([float(value) for value in text.partition("#")[0].split()[:count]])
         if len(found) == 1 and count == 3:
             found = found.repeat(3)
         if len(found) == count and np.isfinite(found).all():

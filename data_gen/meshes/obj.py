@@ -22,11 +22,12 @@ from trimesh.visual.material import PBRMaterial
 from data_gen.meshes.files import MeshError
 from data_gen.meshes.materials import DEFAULT_COLOUR
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.mtl import MtlMaterial, decode_text, read_materials
+from data_gen.meshes.mtl import MtlMaterial, decode_text, find_material, read_materials
 from data_gen.meshes.triangulate import retriangulate
 
 __all__ = ["read_obj"]
 
+_NAMES = ("usemtl", "mtllib")
 _IGNORED = {"o", "g", "mg", "vp", "shadow_obj", "trace_obj", "bevel", "c_interp", "d_interp", "lod", "usemap", "maplib"}
 _DROPPED = {"l": "lines", "p": "points", "curv": "curves", "curv2": "curves", "surf": "free-form surfaces"}
 
@@ -91,7 +92,7 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     for number, line in _lines(text):
         keyword, _, rest = line.partition(" ")
         if keyword in rows:
-            rows[keyword].append(rest.partition("#")[0] if "#" in rest else rest)
+            rows[keyword].append(rest)
             numbers[keyword].append(number)
         elif keyword == "f":
             if group is None:
@@ -119,12 +120,12 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     _check_indices(groups, tables, elsewhere, folder, warnings)
     white = _white(tables["v"])
     materials = read_materials(libraries, folder, warnings)
-    wanted = {name for name, _ in groups if name is not None}
-    for name in sorted(wanted - set(materials)):
+    wanted = {name: find_material(name, materials) for name, _ in groups if name is not None}
+    for name in sorted(name for name, material in wanted.items() if material is None):
         warnings.append(f"material {name!r} is defined nowhere; drawn grey")
     scene = trimesh.Scene()
     for (name, _), group in groups.items():
-        mesh = _geometry(group, tables, white, materials.get(name or ""), name or "no material", warnings)
+        mesh = _geometry(group, tables, white, wanted.get(name), name or "no material", warnings)
         scene.add_geometry(mesh, geom_name=name or "no material")
     return scene, warnings
 
@@ -135,14 +136,16 @@ def _lines(text: str) -> Any:
         text = text.replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), 1):
         line = line.strip()
-        if line and not line.startswith("#"):
+        if "#" in line and not line.startswith(_NAMES):  # a name may hold one
+            line = line.partition("#")[0].rstrip()
+        if line:
             yield number, line.replace("\t", " ") if "\t" in line else line
 
 
 def _add_face(
     rest: str, group: _Group, rows: dict[str, list[str]], number: int, folder: ModelFolder, skipped: Counter[str]
 ) -> None:
-    corners = (rest.partition("#")[0] if "#" in rest else rest).split()
+    corners = rest.split()
     if len(corners) < 3:
         skipped["faces with fewer than 3 corners left out"] += 1
         return

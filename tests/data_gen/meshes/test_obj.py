@@ -113,6 +113,34 @@ def test_textures_are_found_whatever_code_page_named_them(tmp_path, page):
     assert mesh.lost_files == ()
 
 
+def test_comments_behind_statements_are_no_part_of_them(tmp_path):
+    body = OBJ_SOLID + "s off # flat\nusemtl paint # red\n" + OBJ_FACES.replace("\n", " # a face\n")
+    path = write_obj(tmp_path, body="mtllib mesh.mtl # materials\n" + body, texture=picture(colour=(5, 6, 7)))
+    (tmp_path / "mesh.mtl").write_text("newmtl paint # red\nKd 0.5 # grey\nmap_Kd wood.png # oak\n")
+    mesh = load_mesh(path)
+    assert mesh.warnings == ()
+    part = only_part(mesh)
+    assert part.visual.material.baseColorTexture.getpixel((0, 0)) == (5, 6, 7)
+    assert not part.metadata["smooth"]
+
+
+@pytest.mark.parametrize(
+    ("used", "defined", "red"),
+    [
+        ("paint # a", "paint", True),
+        ("paint", "paint # b", True),
+        ("paint # a", "paint # b", True),
+        ("Material #25", "Material #26\nnewmtl Material #25\nKd 1 0 0", True),
+        ("Material #27", "Material #26\nnewmtl Material #25\nKd 1 0 0", False),
+    ],
+)
+def test_a_name_may_hold_what_looks_like_a_comment(tmp_path, used, defined, red):
+    mtl = "newmtl " + defined + ("\nKd 1 0 0\n" if "Kd" not in defined else "\n")
+    mesh = load_mesh(write_obj(tmp_path, mtl=mtl, body=OBJ_SOLID + f"usemtl {used}\n" + OBJ_FACES))
+    assert (only_part(mesh).visual.material.baseColorFactor.tolist() == [255, 0, 0, 255]) == red
+    assert mesh.warnings == (() if red else (f"material {used!r} is defined nowhere; drawn grey",))
+
+
 def test_vertices_of_lines_are_not_a_sign_of_a_cut_file(tmp_path):
     body = OBJ_SOLID + "v 2 2 2\nv 3 3 3\n" + OBJ_FACES + "l 5 6\n"
     assert load_mesh(write_obj(tmp_path, body=body)).warnings == ("1 lines left out, only faces are drawn",)
