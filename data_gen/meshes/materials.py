@@ -181,6 +181,8 @@ def _textured(
     data = _pbr_values(material if is_gltf else pbr_of_mtl(material, images), images)
     if colours == "srgb" and is_gltf:
         data["baseColorFactor"][:3] = linear_from_srgb(data["baseColorFactor"][:3])
+        if data["emissiveFactor"] is not None:
+            data["emissiveFactor"] = linear_from_srgb(data["emissiveFactor"])
     coordinates = _coordinates(visual, len(mesh.vertices), label, warnings)
     if coordinates is None:
         _drop_textures(data, label, warnings)

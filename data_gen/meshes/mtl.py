@@ -7,9 +7,9 @@ A texture takes the place of `Kd`, as in Blender and so in the pictures of Shape
 Opacity is that of `d` times that of `map_d` (its alpha where it has one, else its brightness), never the alpha of
 `map_Kd`; `Tr` is 1 - d where there is no d, but a lone `Tr 1` is what many programs write for opaque.
 
-`Kd` is sRGB, as the colours on their authors' screens were: 3ds Max writes its grey of 150/255 as 0.588. A ball of it
-in the studio light is 165 of 255 where it is brightest; read as linear, as Blender's importer does, it is 209, and a
-dark 0.2 (51 of 255) comes out at up to 143 in place of 97.
+`Kd` and `Ke` are sRGB, as the colours on their authors' screens were: 3ds Max writes its grey of 150/255 as 0.588. A
+ball of it in the studio light is 165 of 255 where it is brightest; read as linear, as Blender's importer does, it is
+209, and a dark 0.2 (51 of 255) comes out at up to 143 in place of 97.
 """
 
 from __future__ import annotations
@@ -138,7 +138,8 @@ def _material(values: dict[str, Any], folder: ModelFolder, warnings: list[str]) 
     if image is not None and (values.get("map_kd") or values.get("map_ka")):
         colour[:3] = 1.0
     exponent = _floats(values.get("ns"), 1, (10.0,), f"{label}: Ns", warnings)[0]
-    glow = np.clip(_floats(values.get("ke"), 3, (0.0, 0.0, 0.0), f"{label}: Ke", warnings), 0.0, 1.0)
+    glow = _floats(values.get("ke"), 3, (0.0, 0.0, 0.0), f"{label}: Ke", warnings)
+    glow = linear_from_srgb(np.clip(glow, 0.0, 1.0))
     glow_map = _image(values.get("map_ke"), f"{label}: drawn without its glow and its map", folder, warnings)
     if values.get("map_ke"):
         glow = np.zeros(3) if glow_map is None else glow if glow.any() else np.ones(3)

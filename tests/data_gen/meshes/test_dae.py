@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from mesh_writers import TETRAHEDRON_FACES, dae_text
 
-from data_gen.meshes.mesh import MeshError, load_mesh
+from data_gen.meshes.materials import linear_factor
+from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts
 
 CONTROLLER = """<library_controllers><controller id="c"><skin source="#g"></skin></controller></library_controllers>
 <library_visual_scenes>"""
@@ -21,6 +22,15 @@ def test_what_a_controller_deforms_is_drawn_and_said(tmp_path):
     mesh = load_mesh(written(tmp_path, text.replace("</instance_geometry>", "</instance_controller>")))
     assert mesh.face_count == 4
     assert mesh.warnings == ("1 controllers: drawn in the pose of their meshes, not of their skeletons",)
+
+
+def test_what_glows_is_as_bright_as_what_is_lit(tmp_path):
+    # 0.5 in sRGB is 0.214 of linear light, whether a surface reflects or emits it
+    glow = "<emission><color>0.5 0 1 1</color></emission><diffuse>"
+    text = dae_text(diffuse="<color>0.5 0 1 1</color>").replace("<diffuse>", glow)
+    ((part, _, _),) = mesh_parts(load_mesh(written(tmp_path, text)))
+    np.testing.assert_allclose(part.visual.material.emissiveFactor, [0.21404, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(linear_factor(part.visual.material)[:3], [0.21404, 0, 1], atol=0.003)
 
 
 def test_what_pycollada_leaves_out_is_said(tmp_path):
