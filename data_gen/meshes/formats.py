@@ -96,8 +96,8 @@ def _fixed_bytes(header: str, counts: dict[str, int]) -> int:
 def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
     """The geometry of a PLY file, and warnings.
 
-    trimesh cuts every polygon into a fan and gives each triangle the colour of the polygon of its own number, and draws
-    coordinates without a texture dark.
+    trimesh cuts every polygon into a fan and gives each triangle the colour of the polygon of its own number, draws
+    coordinates without a texture dark, and takes the lower 8 bits of colours of 16.
 
     Raises:
         MeshError: if it was cut or holds no faces.
@@ -109,6 +109,11 @@ def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     elements = loaded["metadata"].pop("_ply_raw")
     if loaded.pop("entities", None) is not None:  # edges, whose points take the place of the vertices
         loaded["vertices"] = np.column_stack([elements["vertex"]["data"][axis] for axis in "xyz"])
+    for name, keyword in (("vertex", "vertex_colors"), ("face", "face_colors")):
+        if loaded.get(keyword) is not None:
+            columns = elements[name]["data"]
+            alpha = columns["alpha"] if "alpha" in elements[name]["properties"] else None
+            loaded[keyword] = _colours(np.column_stack([columns[each] for each in ("red", "green", "blue")]), alpha)
     if "vertices" in loaded:
         _cut_polygons(loaded, elements, folder)
     texture = re.search(rb"^comment\s+TextureFile\s+(.+)$", data[:65536], re.MULTILINE | re.IGNORECASE)
@@ -169,6 +174,7 @@ def _ply_polygons(data: Any) -> Any:
 
 def read_off(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
     """The geometry of an OFF file with the colours of its vertices (COFF) or faces; and warnings."""
+    warnings = [] if data.endswith((b"\n", b"\r")) else [_CUT]
     lines = [line.partition("#")[0].split() for line in decode_text(data).splitlines()]
     lines = [line for line in lines if line]
     if not lines or not re.fullmatch(r"(ST|C|N){0,3}OFF.*", lines[0][0]):
@@ -178,20 +184,23 @@ def read_off(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     kind = lines[0][0].partition("OFF")[0]
     first = [lines[0][0].partition("OFF")[2], *lines[0][1:]]
     rest = ([numbers] if (numbers := [word for word in first if word]) else []) + lines[1:]
-    table, triangles, colours = _off_body(rest, folder)
+    table, triangles, colours = _off_body(rest, folder, warnings)
     keywords: dict[str, Any] = {}
     skip = 6 if "N" in kind else 3
-    if "C" in kind and table.shape[1] >= skip + 3:
-        keywords["vertex_colors"] = _colours(table[:, skip : skip + 4])
+    more = table.shape[1] - skip - 2 * kind.count("ST")
+    if "C" in kind and more >= 3:
+        keywords["vertex_colors"] = _colours(table[:, skip : skip + 3], table[:, skip + 3 : skip + 4])
     elif colours is not None:
-        keywords["face_colors"] = _colours(colours)
+        keywords["face_colors"] = _colours(colours[:, :3], colours[:, 3:])
+    if "C" not in kind and more > 0:
+        warnings.append(f"{more} numbers behind each vertex left out: colours need COFF on the first line")
     if "N" in kind:
         keywords["vertex_normals"] = table[:, 3:6]
     mesh = trimesh.Trimesh(table[:, :3], triangles, process=False, **keywords)
-    return trimesh.Scene(mesh), [] if data.endswith((b"\n", b"\r")) else [_CUT]
+    return trimesh.Scene(mesh), warnings
 
 
-def _off_body(lines: list[list[str]], folder: ModelFolder) -> tuple[Any, Any, Any]:
+def _off_body(lines: list[list[str]], folder: ModelFolder, warnings: list[str]) -> tuple[Any, Any, Any]:
     """The table of vertices, the triangles and their colours or None."""
     try:
         vertex_count, face_count = int(lines[0][0]), int(lines[0][1])
@@ -199,14 +208,14 @@ def _off_body(lines: list[list[str]], folder: ModelFolder) -> tuple[Any, Any, An
         if min(vertex_count, face_count) < 0 or len(lines) < last:
             raise ValueError(f"{vertex_count} vertices and {face_count} faces declared in {len(lines) - 1} lines")
         table = np.array(lines[1 : vertex_count + 1], dtype=np.float64).reshape(vertex_count, -1)
-        return table, *_off_faces(lines[vertex_count + 1 : last], table[:, :3])
+        return table, *_off_faces(lines[vertex_count + 1 : last], table[:, :3], warnings)
     except (ValueError, IndexError) as error:
         raise MeshError(
             f"{folder.path}: expected whole OFF vertices and faces, found {error}; the file is damaged or was cut"
         ) from error
 
 
-def _off_faces(lines: list[list[str]], positions: npt.NDArray[np.float64]) -> tuple[Any, Any]:
+def _off_faces(lines: list[list[str]], positions: npt.NDArray[np.float64], warnings: list[str]) -> tuple[Any, Any]:
     vertex_count = len(positions)
     triangles: list[tuple[int, int, int]] = []
     polygons: list[tuple[int, list[int]]] = []
@@ -224,11 +233,32 @@ def _off_faces(lines: list[list[str]], positions: npt.NDArray[np.float64]) -> tu
             colours.append(colour)
     widths = {len(colour) for colour in colours}
     usable = widths in ({3}, {4})
+    if not usable and widths - {0}:
+        found = " and ".join(map(str, sorted(widths)))
+        warnings.append(f"colours of its faces left out: expected 3 or 4 numbers behind every one, found {found}")
     faces = np.array(triangles, dtype=np.int64).reshape(-1, 3)
     retriangulate(faces, polygons, positions)
     return faces, np.array(colours) if usable else None
 
 
-def _colours(values: Any) -> Any:
-    values = np.asarray(values, dtype=np.float64)
-    return np.clip(np.round(values * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
+def _colours(colours: npt.NDArray[Any], alpha: npt.NDArray[Any] | None) -> npt.NDArray[np.uint8]:
+    """RGBA of colours (item, 3) and their alpha (item,) or (item, 0 or 1)."""
+    rgba = np.full((len(colours), 4), 255, dtype=np.uint8)
+    rgba[:, :3] = _of_255(colours)
+    if alpha is not None and alpha.size:
+        rgba[:, 3] = _of_255(alpha.reshape(-1))
+    return rgba
+
+
+def _of_255(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Values of 255. Floating-point ones are of 1, or of 255 where any is above; integers of what their type can hold.
+
+    Integers that are all up to 255 are of 255: many a program writes them into wider types.
+    """
+    values = np.where(np.isfinite(values), values, 0)
+    largest = values.max(initial=0)
+    if values.dtype.kind == "f":
+        top = 255.0 if largest > 1 else 1.0
+    else:
+        top = float(np.iinfo(values.dtype).max) if largest > 255 else 255.0
+    return np.clip(np.round(values * (255.0 / top)), 0, 255)

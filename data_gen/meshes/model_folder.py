@@ -60,9 +60,9 @@ class ModelFolder(Resolver):
     """Gives a mesh loader the other files of its model, from one folder and no other place.
 
     Names are accepted as files hold them: with backslashes, percent-encoded, in the wrong case, behind MTL options
-    (`-s 1 1 1 wood.png`) or before comments, or as `model://NAME/rest`, for which a folder NAME is looked for, and the model's own stands
-    in. What is not where its name says is looked for by the last part of it, as Blender does: beside the mesh, and in
-    the folders that usually hold textures. That is noted.
+    (`-s 1 1 1 wood.png`), before comments, or as `model://NAME/rest`, for which a folder NAME is looked for, and the
+    model's own stands in. What is not where its name says is looked for by the last part of it, as Blender does: beside
+    the mesh, and in the folders that usually hold textures. That is noted.
 
     Args:
         path: the mesh file; its name is what messages begin with.

@@ -97,7 +97,7 @@ def find_material(name: str, materials: dict[str, MtlMaterial]) -> MtlMaterial |
 
     Args:
         name: what stands after `usemtl`.
-        materials: by name; these names and that one may be followed by a comment, where there is none of the whole name.
+        materials: by name. Comments may follow these names and that one, where there is none of the whole name.
 
     Returns:
         The material, or None if there is none, or several that differ in what may be a comment.

@@ -1,7 +1,8 @@
 """What both renderers draw: triangles in world coordinates, with a small material model.
 
-Colours. Textures, vertex colours, face colours, the Kd and Ke of an MTL file and the colours of a COLLADA file are sRGB;
-a glTF `baseColorFactor` and `emissiveFactor` are linear, as glTF specifies. Everything is linear in a ShadedSurface.
+Colours. Textures, vertex colours, face colours, the Kd and Ke of an MTL file and the colours of a COLLADA file are
+sRGB; a glTF `baseColorFactor` and `emissiveFactor` are linear, as glTF specifies. Everything is linear in a
+ShadedSurface.
 
 Material. Lambertian plus a soft GGX highlight. There is no environment to be mirrored, so metal would be black:
 metalness counts for at most MAX_METALLIC, and is 0 where a file states none. Roughness counts for at least

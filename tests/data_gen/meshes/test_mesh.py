@@ -236,6 +236,47 @@ def test_colours_of_ply_faces_are_kept(tmp_path):
     assert np.array_equal(part.visual.face_colors[:, :3], 10 * TETRAHEDRON_FACES)
 
 
+@pytest.mark.parametrize("element", ["vertex", "face"])
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "dtype", "half", "white"),
+    [("uchar", "<u1", 128, 255), ("ushort", "<u2", 32900, 65535), ("ushort", "<u2", 128, 255), ("int", "<i4", 128, 255)]
+    + [("float", "<f4", 0.502, 1.0), ("float", "<f4", 128.0, 255.0), ("double", "<f8", 128.0, 255.0)],
+)
+def test_colours_of_ply_files_have_the_range_of_their_type(tmp_path, element, binary, kind, dtype, half, white):
+    # 128 of 255 whether it is written as that, as 0.502 of 1 or as 32900 of 65535
+    dtypes = {"vertex": [("at", "<f4", 3)], "face": [("count", "u1"), ("corners", "<i4", 3)]}
+    dtypes[element] = [*dtypes[element], ("colour", dtype, 3)]
+    vertices, faces = (np.zeros(4, dtype=dtypes[name]) for name in ("vertex", "face"))
+    vertices["at"], faces["count"], faces["corners"] = TETRAHEDRON, 3, TETRAHEDRON_FACES
+    rows = {"vertex": vertices, "face": faces}
+    rows[element]["colour"] = [half, 0, white]
+    colours = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+    head = f"ply\nformat {'binary_little_endian' if binary else 'ascii'} 1.0\nelement vertex 4\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + colours * (element == "vertex")
+    head += "element face 4\nproperty list uchar int vertex_indices\n" + colours * (element == "face")
+    if binary:
+        body = vertices.tobytes() + faces.tobytes()
+    else:
+        numbers = [[each for part in row.tolist() for each in np.ravel(part).tolist()] for row in [*vertices, *faces]]
+        body = "".join(" ".join(map(str, row)) + "\n" for row in numbers).encode()
+    (tmp_path / "a.ply").write_bytes(head.encode() + b"end_header\n" + body)
+    mesh = load_mesh(tmp_path / "a.ply")
+    assert mesh.warnings == ()
+    visual = mesh_parts(mesh)[0][0].visual
+    assert np.array_equal(getattr(visual, f"{element}_colors"), [[128, 0, 255, 255]] * 4)
+
+
+def test_colours_of_off_files_that_are_left_out_are_named(tmp_path):
+    path = tmp_path / "a.off"
+    path.write_text(off_text(vertex_tail=" 255 0 0"))
+    assert load_mesh(path).warnings == ("3 numbers behind each vertex left out: colours need COFF on the first line",)
+    path.write_text(off_text(face_tails=(" 255 0 0", "", " 0 0 255", "")))
+    assert load_mesh(path).warnings == (
+        "colours of its faces left out: expected 3 or 4 numbers behind every one, found 0 and 3",
+    )
+
+
 def test_a_prepared_scene_survives_its_own_export(tmp_path):
     painted = np.array([[0.50196, 0.25, 1, 1]] * 4)
     mesh = load_mesh(
