@@ -14,7 +14,7 @@ import trimesh
 from scipy.spatial import KDTree
 from trimesh.visual import ColorVisuals, TextureVisuals
 
-from data_gen.meshes.materials import LINEAR_COLOUR, select_vertices, visual_of
+from data_gen.meshes.materials import select_vertices, visual_of
 
 __all__ = ["check_faces", "CREASE", "clean", "decimate", "is_smooth", "smooth_normals"]
 
@@ -161,9 +161,11 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
         points, faces = fast_simplification.simplify(
             np.asarray(merged.vertices, dtype=np.float64), np.asarray(merged.faces, dtype=np.int32), target_count=target
         )[:2]
-        visual = visual_of(part).copy()
-        if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
-            nearest = KDTree(np.asarray(part.vertices)).query(points)[1]
+        visual = visual_of(part)
+        nearest = KDTree(np.asarray(part.vertices)).query(points)[1]
+        if isinstance(visual, TextureVisuals):
+            visual = select_vertices(visual, nearest)
+        else:
             visual = ColorVisuals(vertex_colors=np.asarray(visual.vertex_colors)[nearest])
         small = trimesh.Trimesh(points, faces, visual=visual, process=False)
         small.metadata |= {"smooth": is_smooth(part), "one_sided": bool(part.metadata.get("one_sided"))}
@@ -175,8 +177,6 @@ def _is_simple(mesh: trimesh.Trimesh) -> bool:
     if visual_of(mesh).kind == "face":
         return False
     material = getattr(mesh.visual, "material", None)
-    if LINEAR_COLOUR in getattr(mesh.visual, "vertex_attributes", {}):
-        return False
     return not any(
         getattr(material, slot, None) is not None for slot in ("baseColorTexture", "emissiveTexture", "normalTexture")
     )

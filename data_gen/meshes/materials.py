@@ -17,7 +17,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import Material, MultiMaterial, PBRMaterial, SimpleMaterial
 
 from data_gen.meshes.files import IMAGE_FORMATS
-from hyperplanes.utilities.colour import convert_8bit, linear_from_srgb, srgb_from_linear
+from hyperplanes.utilities.colour import linear_from_srgb, srgb_from_linear
 
 __all__ = [
     "DEFAULT_COLOUR",
@@ -33,7 +33,6 @@ __all__ = [
     "convert_image",
     "linear_factor",
     "pbr_of_mtl",
-    "rgba_8bit",
     "roughness_of_exponent",
     "select_vertices",
     "texture_of",
@@ -41,7 +40,7 @@ __all__ = [
 ]
 
 ColourSpace = Literal["scene", "gltf", "srgb"]
-"""What plain colours are before: `scene` as they are after, `gltf` all linear, `srgb` all sRGB."""
+"""What plain colours are before: `scene` as they are after, `gltf` linear on top of materials, too, `srgb` all sRGB."""
 
 DEFAULT_COLOUR = (0.6, 0.6, 0.6, 1.0)
 """Linear RGBA of a surface without a colour: a light grey."""
@@ -154,17 +153,15 @@ def canonical_visual(
     if not visual.defined:
         return TextureVisuals(material=PBRMaterial(baseColorFactor=DEFAULT_COLOUR, metallicFactor=0.0)), [], True
     kind = str(visual.kind)
-    return _coloured(visual.vertex_colors if kind == "vertex" else visual.face_colors, kind, label, colours)
+    return _coloured(visual.vertex_colors if kind == "vertex" else visual.face_colors, kind, label)
 
 
-def _coloured(values: Any, kind: str, label: str, colours: ColourSpace) -> tuple[Any, list[str], bool]:
+def _coloured(values: Any, kind: str, label: str) -> tuple[Any, list[str], bool]:
     values = np.array(values, dtype=np.uint8)
     warnings = []
     if not values[:, 3].any():
         values[:, 3] = 255
         warnings.append(f"{label}: every colour has alpha 0; taken as opaque")
-    if colours == "gltf":
-        values = convert_8bit(values, srgb_from_linear)
     keyword = "vertex_colors" if kind == "vertex" else "face_colors"
     return ColorVisuals(**{keyword: values}), warnings, True
 
@@ -192,16 +189,16 @@ def _textured(
     if vertex_colours is not None and not multiplies:
         tint = np.append(srgb_from_linear(data["baseColorFactor"][:3]), data["baseColorFactor"][3])
         if data["alphaMode"] == "OPAQUE":
-            vertex_colours[:, 3], tint[3] = 255, 1.0
-        return _coloured((vertex_colours * tint).round(), "vertex", label, "scene")
+            vertex_colours[:, 3], tint[3] = 1.0, 1.0
+        return _coloured((255.0 * vertex_colours * tint).round(), "vertex", label)
     data = {key: value for key, value in data.items() if value is not None}
     if data["alphaMode"] == "OPAQUE":
         data["baseColorFactor"][3] = 1.0
         if "baseColorTexture" in data:
             data["baseColorTexture"] = _converted(data["baseColorTexture"], "RGB", images)
     result = TextureVisuals(uv=coordinates, material=LinearMaterial(**data).with_fields_of(material))
-    if vertex_colours is not None and (vertex_colours < 255).any():
-        linear = vertex_colours / 255.0
+    if vertex_colours is not None and (vertex_colours < 1.0).any():
+        linear = vertex_colours
         if colours != "gltf":
             linear[:, :3] = linear_from_srgb(linear[:, :3])
         if data["alphaMode"] == "OPAQUE":
@@ -232,23 +229,15 @@ def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> Non
         data.pop(slot, None)
 
 
-def _material_vertex_colours(visual: TextureVisuals, count: int) -> npt.NDArray[np.uint8] | None:
-    """RGBA of vertex colours that lie on top of a material, as they stand in the file."""
-    attribute = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
+def _material_vertex_colours(visual: TextureVisuals, count: int) -> npt.NDArray[np.float64] | None:
+    """RGBA in [0, 1] of vertex colours that lie on top of a material, as they stand in the file."""
+    attribute = visual.vertex_attributes.get(VERTEX_COLOUR) if hasattr(visual, "vertex_attributes") else None
     if attribute is None or len(attribute) != count:
         return None
-    return rgba_8bit(np.asarray(attribute))
-
-
-def rgba_8bit(colours: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-    """RGBA of colours (vertex, 3 or 4) of any type of number: up to 1 of floating-point ones, else up to their largest.
-
-    Args:
-        colours: as a file holds them.
-    """
+    colours = np.asarray(attribute)
     top = 1.0 if colours.dtype.kind == "f" else float(np.iinfo(colours.dtype).max)
-    rgba = np.full((len(colours), 4), 255, dtype=np.uint8)
-    rgba[:, : colours.shape[1]] = np.clip(np.round(colours * (255.0 / top)), 0, 255)
+    rgba = np.ones((count, 4))
+    rgba[:, : colours.shape[1]] = np.clip(np.nan_to_num(colours / top), 0.0, 1.0)
     return rgba
 
 

@@ -137,8 +137,8 @@ def prepare_scene(
         name: what to call the mesh.
         up: the axis that points up in the scene.
         max_faces: triangles at most.
-        colours: `scene`: vertex and face colours are sRGB, factors of materials linear; `gltf`: all are linear;
-            `srgb`: all are sRGB. Textures are always sRGB.
+        colours: `scene`: vertex and face colours are sRGB, factors of materials linear; `gltf`: vertex colours on top
+            of a material are linear, too; `srgb`: all are sRGB. Textures are always sRGB.
         warnings: what is already known to be lost.
         source: what messages begin with; the name by default.
         closed: whether all of it is known to be watertight solids wound outwards, so that back faces are not

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["convert_8bit", "linear_from_srgb", "srgb_from_linear"]
+__all__ = ["linear_from_srgb", "srgb_from_linear"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -30,18 +28,3 @@ def srgb_from_linear(light: npt.ArrayLike) -> Floats:
     """
     value = np.asarray(light, dtype=np.float64)
     return np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 0.0031308) ** (1 / 2.4) - 0.055)
-
-
-def convert_8bit(
-    colours: npt.NDArray[np.uint8], conversion: Callable[[npt.ArrayLike], Floats]
-) -> npt.NDArray[np.uint8]:
-    """8-bit colours (..., 3 or 4) under one of the conversions above; a fourth channel (alpha) stays.
-
-    >>> convert_8bit(np.array([0, 188, 255, 128], np.uint8), linear_from_srgb).tolist()
-    [0, 128, 255, 128]
-    >>> convert_8bit(np.array([0, 128, 255, 128], np.uint8), srgb_from_linear).tolist()
-    [0, 188, 255, 128]
-    """
-    result = np.array(colours, dtype=np.uint8)
-    result[..., :3] = np.round(conversion(result[..., :3] / 255.0) * 255.0)
-    return result

@@ -14,7 +14,7 @@ from data_gen.meshes.files import MeshError
 from data_gen.meshes.gltf.accessors import as_numbers, read_accessor, read_numbers
 from data_gen.meshes.gltf.container import Document, not_negative
 from data_gen.meshes.gltf.materials import GltfMaterial, TextureCoordinates
-from data_gen.meshes.materials import EMISSIVE_UV, VERTEX_COLOUR, rgba_8bit
+from data_gen.meshes.materials import EMISSIVE_UV, VERTEX_COLOUR, DrawnMaterial
 
 __all__ = ["Skinning", "read_primitive"]
 
@@ -66,16 +66,15 @@ def read_primitive(
     _morph(attributes, primitive, weights, keywords)
     if skinning is not None:
         _skin(attributes, skinning, keywords)
-    material = materials[not_negative(primitive["material"])] if "material" in primitive else None
     colours = attributes.raw("COLOR_0") if "COLOR_0" in attributes else None
     if colours is not None and (colours.ndim != 2 or len(colours) != len(positions)):
         document.warnings.append(f"{label}: {len(colours)} vertex colours for {len(positions)} vertices; left out")
         colours = None
+    material = materials[not_negative(primitive["material"])] if "material" in primitive else None
+    if material is None and colours is not None:
+        material = GltfMaterial(DrawnMaterial())
     if material is not None:
         keywords["visual"] = _visual(attributes, material, colours)
-    elif colours is not None:
-        keywords["vertex_colors"] = rgba_8bit(colours)
-        keywords["vertex_colors"][:, 3] = 255  # the default material is opaque
     mesh = trimesh.Trimesh(**keywords)
     mesh.metadata["one_sided"] = material is None or not material.material.doubleSided
     if "NORMAL" not in attributes:

@@ -31,6 +31,7 @@ from mesh_writers import (
 )
 
 from data_gen.meshes import files
+from data_gen.meshes.materials import LINEAR_COLOUR
 from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts, prepare_scene
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.rendering.mesh_renderer import MeshRenderer
@@ -497,6 +498,11 @@ def test_too_many_faces_are_decimated_where_the_looks_survive(tmp_path):
     ball.visual.vertex_colors = np.where(ball.vertices[:, 2:] > 0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
     part = only_part(prepare_scene(trimesh.Scene(ball), "ball", max_faces=2000))
     red = part.visual.vertex_colors[:, 0] == 255
+    assert (red == (part.vertices[:, 2] > 0))[np.abs(part.vertices[:, 2]) > 0.1].all()
+    linear = ball.visual.vertex_colors / 255.0
+    path = write_glb(tmp_path / "a.glb", positions=ball.vertices, faces=ball.faces, colours=linear)
+    part = only_part(load_mesh(path, max_faces=2000))
+    red = part.visual.vertex_attributes[LINEAR_COLOUR][:, 0] == 1
     assert (red == (part.vertices[:, 2] > 0))[np.abs(part.vertices[:, 2]) > 0.1].all()
 
 
