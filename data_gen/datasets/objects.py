@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +42,8 @@ def open_renderer(settings: dict[str, Any]) -> Generator[Callable[[dict[str, Any
 
 
 def _render(renderer: Any, item: Item, config: RenderConfig, meshes: Path | None) -> RenderedObject:
-    from data_gen.meshes.mesh import load_mesh, lost_in_export, mesh_parts, prepare_scene
+    from data_gen.meshes.gltf import write_glb
+    from data_gen.meshes.mesh import load_mesh, mesh_parts, prepare_scene
 
     if item.path is not None:
         mesh = load_mesh(item.path, up=item.up, name=item.name, within=meshes)
@@ -65,8 +65,7 @@ def _render(renderer: Any, item: Item, config: RenderConfig, meshes: Path | None
     extra = {channel: getattr(rendering, channel) for channel in channels if channel != "rgba"}
     model: Any = None
     if "mesh" in config.channels:
-        model = mesh.scene.export(file_type="glb")
-        mesh = replace(mesh, warnings=(*mesh.warnings, *lost_in_export(mesh)))
+        model = write_glb(mesh.scene)
     return RenderedObject(item, rig, rendering.rgba, extra, model, mesh)
 
 

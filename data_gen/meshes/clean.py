@@ -162,7 +162,7 @@ def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trime
             np.asarray(merged.vertices, dtype=np.float64), np.asarray(merged.faces, dtype=np.int32), target_count=target
         )[:2]
         visual = visual_of(part)
-        nearest = KDTree(np.asarray(part.vertices)).query(points)[1]
+        nearest = np.asarray(KDTree(np.asarray(part.vertices)).query(points)[1])
         if isinstance(visual, TextureVisuals):
             visual = select_vertices(visual, nearest)
         else:

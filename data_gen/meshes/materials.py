@@ -31,6 +31,7 @@ __all__ = [
     "Wrap",
     "canonical_visual",
     "convert_image",
+    "linear_colours",
     "linear_factor",
     "pbr_of_mtl",
     "roughness_of_exponent",
@@ -106,6 +107,16 @@ def linear_factor(material: PBRMaterial) -> npt.NDArray[np.float64] | None:
     if isinstance(material, LinearMaterial) and np.abs(material.exact - rounded).max() < 0.51 / 255.0:
         return material.exact.copy()
     return rounded  # of another class, or set anew since
+
+
+def linear_colours(colours: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Linear RGBA in [0, 1] of sRGB colours (item, 4) from 0 to 255.
+
+    >>> linear_colours([[0, 188, 255, 51]]).round(2).tolist()
+    [[0.0, 0.5, 1.0, 0.2]]
+    """
+    rgba = np.asarray(colours, dtype=np.float64) / 255.0
+    return np.concatenate((linear_from_srgb(rgba[:, :3]), rgba[:, 3:4]), axis=1)
 
 
 def visual_of(mesh: trimesh.Trimesh) -> Visual:
@@ -184,6 +195,8 @@ def _textured(
     if coordinates is None:
         _drop_textures(data, label, warnings)
     vertex_colours = _material_vertex_colours(visual, len(mesh.vertices))
+    if data["alphaMode"] == "BLEND" and _hides_all(data, vertex_colours):
+        data["alphaMode"] = "OPAQUE"
     own = material if isinstance(material, DrawnMaterial) else DrawnMaterial()
     multiplies = colours == "gltf" or data.get("baseColorTexture") is not None or own.unlit or _glows(data)
     if vertex_colours is not None and not multiplies:
@@ -208,6 +221,14 @@ def _textured(
     if "emissiveTexture" in data and uv.shape == (len(mesh.vertices), 2):
         result.vertex_attributes[EMISSIVE_UV] = np.where(np.isfinite(uv), uv, 0.0)
     return result, warnings, _visible(data)
+
+
+def _hides_all(data: dict[str, Any], vertex_colours: npt.NDArray[np.float64] | None) -> bool:
+    """Whether no point of a surface has alpha below 1."""
+    image = data.get("baseColorTexture")
+    clear = image is not None and image.mode == "RGBA" and image.getchannel("A").getextrema()[0] < 255
+    painted = vertex_colours is not None and (vertex_colours[:, 3] < 1.0).any()
+    return data["baseColorFactor"][3] >= 1.0 and not clear and not painted
 
 
 def _glows(data: dict[str, Any]) -> bool:

@@ -19,14 +19,7 @@ from data_gen.meshes.clean import check_faces, clean, decimate, is_smooth, smoot
 from data_gen.meshes.dae import declared_up
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PARTS, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, read_bytes
 from data_gen.meshes.find import safe_name
-from data_gen.meshes.materials import (
-    EMISSIVE_UV,
-    LINEAR_COLOUR,
-    ColourSpace,
-    DrawnMaterial,
-    canonical_visual,
-    texture_of,
-)
+from data_gen.meshes.materials import ColourSpace, canonical_visual
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.read import read_scene
 
@@ -35,7 +28,6 @@ __all__ = [
     "Mesh",
     "MeshError",
     "load_mesh",
-    "lost_in_export",
     "prepare_scene",
     "mesh_parts",
 ]
@@ -205,25 +197,6 @@ def mesh_parts(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float64
         geometry = mesh.scene.geometry[key]
         ready.append((geometry, np.asarray(pose), bool(geometry.metadata.get("smooth", True))))
     return ready
-
-
-def lost_in_export(mesh: Mesh) -> tuple[str, ...]:
-    """What is drawn of a mesh and is not in the GLB file that trimesh writes of its scene: warnings, one line each."""
-    lost: set[str] = set()
-    for geometry in mesh.scene.geometry.values():
-        texture = texture_of(geometry)
-        if texture is None:
-            continue
-        material = texture.material
-        drawn = material if isinstance(material, DrawnMaterial) else DrawnMaterial()
-        stated = {
-            "vertex colours on top of textures": LINEAR_COLOUR in texture.vertex_attributes,
-            "second texture coordinates": EMISSIVE_UV in texture.vertex_attributes,
-            "unlit materials": drawn.unlit,
-            "textures that do not repeat": {*drawn.wrap, *drawn.emissive_wrap} != {"repeat"},
-        }
-        lost |= {name for name, there in stated.items() if there}
-    return tuple(f"mesh.glb: written without {name}" for name in sorted(lost))
 
 
 def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:

@@ -125,7 +125,7 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
         warnings.append(f"material {name!r} is defined nowhere; drawn grey")
     scene = trimesh.Scene()
     for (name, _), group in groups.items():
-        mesh = _geometry(group, tables, white, wanted.get(name), name or "no material", warnings)
+        mesh = _geometry(group, tables, white, wanted.get(name or ""), name or "no material", warnings)
         scene.add_geometry(mesh, geom_name=name or "no material")
     return scene, warnings
 

@@ -28,12 +28,12 @@ from data_gen.meshes.materials import (
     LINEAR_COLOUR,
     DrawnMaterial,
     Wrap,
+    linear_colours,
     linear_factor,
     pbr_of_mtl,
     texture_of,
     visual_of,
 )
-from hyperplanes.utilities.colour import linear_from_srgb
 
 __all__ = [
     "COINCIDENT",
@@ -204,7 +204,7 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
     uv, emissive_uv = _texture_coordinates(mesh, material, where)
     colours = None
     if isinstance(visual, ColorVisuals) and kind == "vertex":
-        colours = _linear_colours(visual.vertex_colors)
+        colours = linear_colours(visual.vertex_colors)
     elif texture is not None and LINEAR_COLOUR in texture.vertex_attributes:
         colours = np.asarray(texture.vertex_attributes[LINEAR_COLOUR], dtype=np.float64)
     if smooth and kind != "face":
@@ -216,7 +216,7 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
         emissive_uv = None if emissive_uv is None else emissive_uv[corners]
         colours = None if colours is None else colours[corners]
         if isinstance(visual, ColorVisuals) and kind == "face":
-            colours = np.repeat(_linear_colours(visual.face_colors), 3, axis=0)
+            colours = np.repeat(linear_colours(visual.face_colors), 3, axis=0)
         faces = np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
         edges = positions[1::3] - positions[0::3], positions[2::3] - positions[0::3]
         normals = np.repeat(_unit(np.cross(*edges)), 3, axis=0)
@@ -245,11 +245,6 @@ def _unit(vectors: Floats) -> Floats:
     vectors = np.where(np.isfinite(vectors).all(axis=1, keepdims=True), vectors, 0.0)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 1e-12)
-
-
-def _linear_colours(colours: Any) -> Floats:
-    rgba = np.asarray(colours, dtype=np.float64) / 255.0
-    return np.concatenate((linear_from_srgb(rgba[:, :3]), rgba[:, 3:4]), axis=1)
 
 
 def _texture_coordinates(

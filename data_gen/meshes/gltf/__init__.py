@@ -1,5 +1,6 @@
-"""glTF 2 and GLB files: container and checks, accessors, materials, primitives, and the scene they make."""
+"""glTF 2 and GLB files: container and checks, accessors, materials, primitives, and the scene they make; and back."""
 
 from data_gen.meshes.gltf.read import read_gltf
+from data_gen.meshes.gltf.write import write_glb
 
-__all__ = ["read_gltf"]
+__all__ = ["read_gltf", "write_glb"]

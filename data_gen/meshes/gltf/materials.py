@@ -20,7 +20,7 @@ from data_gen.meshes.gltf.container import Document, not_negative, read_uri
 from data_gen.meshes.materials import DEFAULT_COLOUR, DrawnMaterial, LinearMaterial, Wrap, convert_image
 from hyperplanes.utilities.colour import linear_from_srgb
 
-__all__ = ["GltfMaterial", "TextureCoordinates", "read_materials"]
+__all__ = ["WRAPS", "GltfMaterial", "TextureCoordinates", "read_materials"]
 
 _SPECULAR_GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 _FACTORS = (
@@ -30,7 +30,9 @@ _FACTORS = (
 _SLOTS = ("baseColorTexture", "metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
 _GLOSSINESS_FACTORS = ("specularFactor", "glossinessFactor", "diffuseFactor")
 _GLOSSINESS_SLOTS = ("diffuseTexture", "specularGlossinessTexture")
-_WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+"""How textures go on, by the numbers that samplers have."""
+
 _CLEAREST = 0.1
 
 
@@ -134,7 +136,7 @@ class _Textures:
         if texture is None or "sampler" not in texture:
             return "repeat", "repeat"
         sampler = self._document.items("samplers")[not_negative(texture["sampler"])]
-        return _WRAPS.get(sampler.get("wrapS", 10497), "repeat"), _WRAPS.get(sampler.get("wrapT", 10497), "repeat")
+        return WRAPS.get(sampler.get("wrapS", 10497), "repeat"), WRAPS.get(sampler.get("wrapT", 10497), "repeat")
 
     def _texture(self, values: dict[str, Any], slot: str) -> dict[str, Any] | None:
         textures = self._document.items("textures")

@@ -35,8 +35,8 @@ def read_gltf(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSp
         folder: gives the other files of the model.
 
     Returns:
-        Its scene; what its plain colours are (trimesh writes factors as sRGB); and warnings that name what will not be
-        drawn as the file states.
+        Its scene; what its plain colours are (trimesh writes vertex colours as it holds them, sRGB); and warnings that
+        name what will not be drawn as the file states.
 
     Raises:
         MeshError: if the file was cut, is malformed, or needs what is not supported.
