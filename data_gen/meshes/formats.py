@@ -29,22 +29,27 @@ _PLY_BYTES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort"
 
 def read_stl(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
     """The geometry of an STL file, shaded flat, and warnings; a MeshError if it was cut or holds no triangles."""
-    warnings = _check_stl(data, folder)
+    data, warnings = _check_stl(data, folder)
     scene = trimesh.load_scene(io.BytesIO(data), file_type="stl", resolver=folder, process=False)
     for geometry in scene.geometry.values():
         geometry.metadata["smooth"] = False
     return scene, warnings
 
 
-def _check_stl(data: bytes, folder: ModelFolder) -> list[str]:
+def _check_stl(data: bytes, folder: ModelFolder) -> tuple[bytes, list[str]]:
+    """The file without what stands behind its last triangle, and warnings."""
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
-    if len(data) >= 84 and len(data) == 84 + 50 * count:
+    spare = len(data) - 84 - 50 * count
+    text = b"" if spare == 0 else data.lower()
+    is_text = text.lstrip().startswith(b"solid") and b"facet" in text
+    if spare == 0 or (spare > 0 and count and not is_text):
         if count == 0:
             raise MeshError(f"{folder.path}: expected triangles, found an STL with none; export the mesh again")
+        data = data[: len(data) - spare]
         colours = np.frombuffer(data[84:], dtype=np.dtype([("numbers", "<f4", 12), ("colour", "<u2")]))["colour"]
-        return ["colours of its triangles (an extension of STL) left out"] if (colours & 0x8000).any() else []
-    text = data.lower()
-    if not text.lstrip().startswith(b"solid") or b"facet" not in text:
+        warnings = ["colours of its triangles (an extension of STL) left out"] if (colours & 0x8000).any() else []
+        return data, [*warnings, *([f"{spare} bytes behind its last triangle left out"] if spare else [])]
+    if not is_text:
         raise MeshError(
             f"{folder.path}: expected {count} triangles in {84 + 50 * count} bytes, found {len(data)} bytes: the "
             "file was cut or is no STL; fetch it again"
@@ -52,7 +57,7 @@ def _check_stl(data: bytes, folder: ModelFolder) -> list[str]:
     opened, closed = len(re.findall(rb"\bfacet\s", text)), text.count(b"endfacet")
     if opened != closed or opened * 3 != len(re.findall(rb"\bvertex\s", text)) or b"endsolid" not in text:
         raise MeshError(f"{folder.path}: expected {opened} whole facets and endsolid, found {closed}; fetch it again")
-    return []
+    return data, []
 
 
 def _check_ply(data: bytes, folder: ModelFolder) -> tuple[int, int, list[str]]:

@@ -471,6 +471,15 @@ def test_an_stl_and_a_gltf_with_nothing_in_them_are_refused(tmp_path):
     refusal(tmp_path / "b.glb")
 
 
+@pytest.mark.parametrize("head", [b"\0", b"solid"])
+def test_bytes_behind_the_last_triangle_of_an_stl_are_said_to_be_left_out(tmp_path, head):
+    path = tmp_path / "a.stl"
+    path.write_bytes(head + stl_bytes()[len(head) :] + b"padding")
+    mesh = load_mesh(path)
+    assert mesh.face_count == 4
+    assert mesh.warnings == ("7 bytes behind its last triangle left out",)
+
+
 @pytest.mark.parametrize("face", ["f 1 2 9", "f 0 1 2", "f 1 2 -9", "f 1 2 x", "f 1/1/1/1 2 3"])
 def test_obj_faces_on_vertices_that_are_not_there_are_refused(tmp_path, face):
     assert "expected" in refusal(write_obj(tmp_path, body=OBJ_SOLID + face + "\n"))
