@@ -149,7 +149,7 @@ def prepare_scene(
     found = list(warnings)
     _refuse_too_many(scene, max_faces, source)
     with np.errstate(all="ignore"):
-        parts = _clean_parts(scene, colours, found, source)
+        parts, scale = _clean_parts(scene, colours, found, source)
     if not parts:
         raise MeshError(f"{source}: expected triangles to draw, found none; {'; '.join(found) or 'export it again'}")
     faces = sum(len(part.faces) for part in parts)
@@ -162,7 +162,7 @@ def prepare_scene(
             )
         parts, closed = smaller, False
         found.append(f"decimated from {faces} to {sum(len(part.faces) for part in parts)} triangles")
-    world_from_file = _normalising_transform(parts, up, source, found)
+    world_from_parts = _normalising_transform(parts, scale, up, source, found)
     ready = trimesh.Scene()
     for number, part in enumerate(parts):
         key = f"part_{number:04d}"
@@ -170,13 +170,13 @@ def prepare_scene(
         normals = smooth_normals(part) if smooth else None
         if normals is not None:
             part.vertex_normals = normals
-        moved = _transformed(part, world_from_file)
+        moved = _transformed(part, world_from_parts)
         moved.metadata = {"smooth": smooth, "closed": closed, "one_sided": bool(part.metadata.get("one_sided"))}
         ready.add_geometry(moved, geom_name=key, node_name=key)
     return Mesh(
         name=name,
         scene=ready,
-        world_from_file=world_from_file,
+        world_from_file=world_from_parts * (scale, scale, scale, 1.0),
         warnings=tuple(dict.fromkeys(found)),
         face_count=sum(len(part.faces) for part in parts),
     )
@@ -213,9 +213,17 @@ def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:
         )
 
 
-def _clean_parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], source: str) -> list[trimesh.Trimesh]:
-    """Clean meshes in the file's axes, one a node that can be seen."""
-    placed: list[tuple[str, trimesh.Trimesh]] = []
+def _clean_parts(
+    scene: trimesh.Scene, colours: ColourSpace, found: list[str], source: str
+) -> tuple[list[trimesh.Trimesh], float]:
+    """Clean meshes in the file's axes, one a node that can be seen; and what their coordinates are multiplied by.
+
+    trimesh's tolerances are absolute, so a mesh is cleaned at about unit size. A power of two rounds nothing.
+
+    Raises:
+        MeshError: if a face refers to a vertex that is not there.
+    """
+    placed: list[tuple[str, trimesh.Trimesh, npt.NDArray[np.float64], Any]] = []
     images: dict[Any, Any] = {}
     for node in scene.graph.nodes_geometry:
         transform, key = scene.graph[node]
@@ -234,20 +242,35 @@ def _clean_parts(scene: trimesh.Scene, colours: ColourSpace, found: list[str], s
         if not visible:
             found.append(f"{key}: fully transparent, left out")
             continue
-        placed.append((str(key), _transformed(geometry, transform, visual)))
+        placed.append((str(key), geometry, transform, visual))
     parts = []
-    meshes = [mesh for _, mesh in placed]
     try:
-        for label, mesh in placed:
-            check_faces(mesh, label)  # of all, since each is compared with the others
-        for label, mesh in placed:
+        for label, geometry, _, _ in placed:
+            check_faces(geometry, label)  # of all, since each is compared with the others
+        scale = _power_of_two([(geometry, transform) for _, geometry, transform, _ in placed])
+        factors = np.array([[scale], [scale], [scale], [1.0]])
+        meshes = [_transformed(geometry, factors * transform, visual) for _, geometry, transform, visual in placed]
+        for (label, *_), mesh in zip(placed, meshes, strict=True):
             part, lines = clean(mesh, label, meshes)
             found += lines
             if part is not None:
                 parts.append(part)
     except ValueError as error:
         raise MeshError(f"{source}: {error}; the file is damaged") from error
-    return parts
+    return parts, scale
+
+
+def _power_of_two(placed: list[tuple[trimesh.Trimesh, npt.NDArray[np.float64]]]) -> float:
+    """What brings the largest extent of all faces into [0.5, 1); 1 where there is none."""
+    corners = [np.zeros((0, 3))]
+    for mesh, transform in placed:
+        points = np.asarray(mesh.vertices, dtype=np.float64)[np.unique(mesh.faces)]
+        points = points @ transform[:3, :3].T + transform[:3, 3]
+        points = points[np.isfinite(points).all(axis=1)]
+        corners += [points.min(axis=0, keepdims=True), points.max(axis=0, keepdims=True)] if len(points) else []
+    extent = float(np.ptp(np.concatenate(corners), axis=0).max()) if len(corners) > 1 else 0.0
+    exponent = int(np.frexp(extent)[1]) if np.isfinite(extent) else 0
+    return 2.0 ** -min(max(exponent, -1000), 1000)
 
 
 def _transformed(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visual: Any = None) -> trimesh.Trimesh:
@@ -268,22 +291,24 @@ def _transformed(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visu
 
 
 def _normalising_transform(
-    parts: list[trimesh.Trimesh], up: str, source: str, found: list[str]
+    parts: list[trimesh.Trimesh], scale: float, up: str, source: str, found: list[str]
 ) -> npt.NDArray[np.float64]:
     turn = _Y_FROM_Z if up == "z" else np.eye(4)
     points = np.concatenate([part.vertices for part in parts]) @ turn[:3, :3].T
     largest = float(np.abs(points).max())
-    if largest > 1e30:
-        raise MeshError(f"{source}: expected coordinates below 1e30, found {largest:.3g}; export the mesh again")
+    if largest / scale > 1e30:
+        raise MeshError(
+            f"{source}: expected coordinates below 1e30, found {largest / scale:.3g}; export the mesh again"
+        )
     low, high = points.min(axis=0), points.max(axis=0)
     centre = (low + high) / 2
     radius = float(np.linalg.norm(points - centre, axis=1).max())
-    if not radius > 1e-12 * max(largest, 1e-12):
+    if not radius > 1e-12 * largest:
         raise MeshError(f"{source}: expected a mesh with an extent, found all vertices in one point; export it again")
     near = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     if near.max() > _OUTLIER * np.quantile(near, 0.9) > 0:
         found.append("a few vertices lie far from all others, so the object is small in its views")
-    world_from_file = turn / radius
-    world_from_file[:3, 3] = -centre / radius
-    world_from_file[3, 3] = 1.0
-    return world_from_file
+    world_from_parts = turn / radius
+    world_from_parts[:3, 3] = -centre / radius
+    world_from_parts[3, 3] = 1.0
+    return world_from_parts

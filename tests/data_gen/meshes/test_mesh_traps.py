@@ -415,6 +415,21 @@ def test_any_sane_scale_is_normalised(tmp_path):
         assert only_part(load_mesh(path)).extents.tolist() == pytest.approx([2 / np.sqrt(3)] * 3, rel=1e-5)
 
 
+@pytest.mark.parametrize("scale", [2.0**-24, 2.0**-40, 2.0**24])
+def test_the_size_of_a_mesh_changes_nothing_of_its_repair(scale):
+    ball, rod = trimesh.creation.icosphere(2), trimesh.creation.cylinder(0.01, 3.0)
+    ball.invert()
+    scene = trimesh.Scene([ball, rod])
+    whole, scaled = prepare_scene(scene, "it"), prepare_scene(scene.scaled(scale), "it")
+    assert scaled.warnings == whole.warnings == ("geometry_0: wound inside out, its faces are turned",)
+    for (one, _, smooth), (other, _, as_smooth) in zip(mesh_parts(whole), mesh_parts(scaled), strict=True):
+        assert as_smooth == smooth
+        assert np.array_equal(other.vertices, one.vertices)
+        assert np.array_equal(other.faces, one.faces)
+        assert np.array_equal(other.vertex_normals, one.vertex_normals)
+    assert np.array_equal(scaled.world_from_file[:3, :3] * scale, whole.world_from_file[:3, :3])
+
+
 def test_a_vertex_far_away_is_remarked(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=1)
     points = np.concatenate([ball.vertices, [[1e4, 0, 0]]])
