@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 MAX_FACES = 2_000_000
-"""Triangles of a mesh at most, unless said otherwise. More are decimated where the looks survive it, else refused."""
+"""A mesh of more triangles is decimated where the looks survive it, unless said otherwise; of 8 times more, refused."""
 
 _DECIMATED_FROM = 8
 _OUTLIER = 30.0
@@ -76,7 +76,7 @@ def load_mesh(
         path: a GLB, glTF, OBJ, PLY, STL, OFF or DAE file.
         up: the axis that points up in the file. By default y, but what a COLLADA file declares.
         name: what to call it; the file's name by default.
-        max_faces: triangles at most.
+        max_faces: more triangles are decimated to as many, or drawn as they are with a warning; 8 times more, refused.
         within: the folder that no file which the mesh refers to may leave; the model's own by default.
 
     Returns:
@@ -128,7 +128,7 @@ def prepare_scene(
         scene: geometries and node transforms.
         name: what to call the mesh.
         up: the axis that points up in the scene.
-        max_faces: triangles at most.
+        max_faces: more triangles are decimated to as many, or drawn as they are with a warning; 8 times more, refused.
         colours: `scene`: vertex and face colours are sRGB, factors of materials linear; `gltf`: vertex colours on top
             of a material are linear, too; `srgb`: all are sRGB. Textures are always sRGB.
         warnings: what is already known to be lost.
@@ -156,12 +156,10 @@ def prepare_scene(
     if faces > max_faces:
         smaller = decimate(parts, max_faces)
         if smaller is None:
-            raise MeshError(
-                f"{source}: expected at most {max_faces} triangles, found {faces}, whose texture or face colours would "
-                "not survive decimation; simplify the mesh or raise the limit"
-            )
-        parts, closed = smaller, False
-        found.append(f"decimated from {faces} to {sum(len(part.faces) for part in parts)} triangles")
+            found.append(f"{faces} triangles drawn as they are: textures or face colours would not survive decimation")
+        else:
+            parts, closed = smaller, False
+            found.append(f"decimated from {faces} to {sum(len(part.faces) for part in parts)} triangles")
     world_from_parts = _normalising_transform(parts, scale, up, source, found)
     ready = trimesh.Scene()
     for number, part in enumerate(parts):

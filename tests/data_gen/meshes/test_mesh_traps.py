@@ -530,11 +530,12 @@ def test_too_many_faces_are_decimated_where_the_looks_survive(tmp_path):
     assert (red == (part.vertices[:, 2] > 0))[np.abs(part.vertices[:, 2]) > 0.1].all()
 
 
-def test_too_many_faces_are_refused_where_it_would_not(tmp_path):
+def test_too_many_faces_are_drawn_where_it_would_not_and_far_too_many_refused():
     ball = trimesh.creation.icosphere(subdivisions=3)
     ball.visual.face_colors = np.random.default_rng(0).integers(0, 255, (len(ball.faces), 4), dtype=np.uint8)
-    with pytest.raises(MeshError, match=r"ball: expected at most 1000 triangles, found 1280, whose texture"):
-        prepare_scene(trimesh.Scene(ball), "ball", max_faces=1000)
+    mesh = prepare_scene(trimesh.Scene(ball), "ball", max_faces=1000)
+    assert warning(mesh) == "1280 triangles drawn as they are: textures or face colours would not survive decimation"
+    assert mesh.face_count == 1280
     with pytest.raises(MeshError, match="before decimation, found 1280"):
         prepare_scene(trimesh.Scene(ball), "ball", max_faces=100)
 
