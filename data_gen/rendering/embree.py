@@ -1,9 +1,9 @@
 """Drawing by ray casting with Embree: the fallback that needs no OpenGL, and the source of exact geometry.
 
 Colours follow `shading`, the formula of the OpenGL shader, at the same sample positions, so the two renderers differ by
-rounding and by how they choose a texture's level only. Geometry (depth, normals, coordinates, mask) is always cast,
-whatever draws the colours: at exact pixel centres and in double precision, where a depth buffer has 24 bits that are
-spread unevenly.
+rounding, by how they choose a texture's level, and in the order of translucent faces where OpenGL's, by their centres,
+is not that along the ray. Geometry (depth, normals, coordinates, mask) is always cast, whatever draws the colours: at
+exact pixel centres and in double precision, where a depth buffer has 24 bits that are spread unevenly.
 """
 
 from __future__ import annotations

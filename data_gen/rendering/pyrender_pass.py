@@ -162,6 +162,8 @@ class SurfaceRenderer(Renderer):
         GL.glDepthRange(0.0, 1.0)
         translucent = [drawable for drawable in drawables if not drawable.surface.opaque]
         if translucent:
+            # Surfaces from far to near by their centres, of each its inner sides and then its outer ones, face by face:
+            # right for a solid and for panes that face one way; where others overlap, a farther one may be in front.
             translucent.sort(key=lambda drawable: -float(np.linalg.norm(drawable.centre - camera)))
             GL.glEnable(GL.GL_BLEND)
             GL.glBlendFunc(GL.GL_ONE, GL.GL_ONE_MINUS_SRC_ALPHA)
@@ -228,9 +230,21 @@ class SurfaceRenderer(Renderer):
                 GL.glActiveTexture(int(GL.GL_TEXTURE0) + unit)
                 texture._bind()
         drawable.primitive._bind()
+        faces = drawable.surface.faces[:count]
+        if layer == TRANSLUCENT_TEXELS:
+            centres = drawable.surface.positions[faces].mean(axis=1)
+            _upload(faces[np.argsort(-np.linalg.norm(centres - view[1], axis=1), kind="stable")])
         GL.glDrawElements(GL.GL_TRIANGLES, 3 * count, GL.GL_UNSIGNED_INT, c_void_p(0))
+        if layer == TRANSLUCENT_TEXELS:
+            _upload(faces)
         drawable.primitive._unbind()
         return program
+
+
+def _upload(faces: npt.NDArray[np.int64]) -> None:
+    """Put faces in place of the first ones of the primitive that is bound."""
+    indices = np.ascontiguousarray(faces, dtype=np.uint32)
+    GL.glBufferSubData(GL.GL_ELEMENT_ARRAY_BUFFER, 0, indices.nbytes, indices)
 
 
 def _program_key(drawable: Drawable) -> tuple[Any, ...]:

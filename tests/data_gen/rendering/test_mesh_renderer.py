@@ -233,6 +233,22 @@ def test_glass_over_black_and_white_closed_form(backend):
     np.testing.assert_allclose(rgba[16, 5], [255, 0, 0, 102], atol=2)
 
 
+@pytest.mark.parametrize("first", [-0.3, 0.3])
+def test_of_the_translucent_faces_of_a_surface_the_nearer_is_in_front(backend, first):
+    # Red glass of alpha 1/2 on one side, blue on the other, in either order of the file: 2/3 of what is seen of them
+    # is the nearer one's.
+    panes = trimesh.util.concatenate([sheet(0.9, uv=False), sheet(0.9, uv=False)])
+    panes.vertices[:4, 2], panes.vertices[4:, 2] = first, -first
+    red, blue = [255, 0, 0, 128], [0, 0, 255, 128]
+    colours = [red, red, blue, blue] if first > 0 else [blue, blue, red, red]
+    panes.visual = trimesh.visual.ColorVisuals(panes, face_colors=colours)
+    flat, rig = Lighting((), sky=(0.7,) * 3, ground=(0.7,) * 3), rigs.orbit(2, 33, elevation=0.0)
+    with MeshRenderer(backend) as renderer:
+        front, back = renderer.render([(panes, EYE, False)], rig, lighting=flat).rgba[:, 16, 16].astype(int)
+    assert front[0] / (front[0] + front[2]) == pytest.approx(2 / 3, abs=0.02)
+    np.testing.assert_allclose(back, front[[2, 1, 0, 3]], atol=1)
+
+
 def test_transparent_texels_do_not_bleed(backend):
     # Green leaves on transparent black: wherever anything is seen, it is as green as the leaf.
     texels = np.zeros((64, 64, 4), np.uint8)
