@@ -23,7 +23,7 @@ from hyperplanes.utilities.files import DataError
 
 __all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
 
-PICTURES = 4
+PICTURES = 5
 """Raised whenever the same arguments come to give other bytes, so that no data set is made half of each."""
 
 MOST_OBJECTS = 1_000_000
