@@ -129,6 +129,8 @@ def summary(report: GenerationReport, out: Path) -> str:
     """One line about what was written."""
     splits = ", ".join(f"{count} {split}" for split, count in report.splits.items() if count)
     reused = f", {report.reused} of them from before" if report.reused else ""
+    if report.changed:
+        reused += f", {len(report.changed)} made again, for their files have changed ({_some(report.changed)})"
     speed = (
         f" in {format_duration(report.seconds)}, {report.images_per_second:.0f} images/s"
         if report.images_per_second
@@ -146,11 +148,16 @@ def remarks(report: GenerationReport, out: Path) -> list[str]:
         ("drawn with other warnings", "with_warnings"): others,
     }
     return [
-        f"{what}: {len(names)} of {report.written} objects ({', '.join(names[:3])}{', ...' * (len(names) > 3)}), "
+        f"{what}: {len(names)} of {report.written} objects ({_some(names)}), "
         f"listed in {out / 'manifest.json'} under {key}"
         for (what, key), names in found.items()
         if names
     ]
+
+
+def _some(names: list[str]) -> str:
+    """The first of some names."""
+    return ", ".join(names[:3]) + ", ..." * (len(names) > 3)
 
 
 def run(arguments: Arguments) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 from data_gen.datasets.config import GenerationConfig, RenderConfig
 from data_gen.datasets.layouts import LAYOUTS, check_names
-from data_gen.datasets.manifest import GenerationState, build_manifest
+from data_gen.datasets.manifest import Entry, GenerationState, build_manifest
 from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
 from data_gen.meshes.files import MESH_SUFFIXES
@@ -46,6 +46,7 @@ class GenerationReport:
         unlisted: objects that the split file does not name, and that are trained on.
         incomplete: objects that are drawn without a texture or another file that they name.
         warned: objects with warnings, of which those with lost files are some.
+        changed: objects that an earlier call had written from other files.
     """
 
     written: int
@@ -57,6 +58,7 @@ class GenerationReport:
     unlisted: list[str] = field(default_factory=list)
     incomplete: list[str] = field(default_factory=list)
     warned: list[str] = field(default_factory=list)
+    changed: list[str] = field(default_factory=list)
 
 
 def generate(
@@ -68,13 +70,14 @@ def generate(
 ) -> GenerationReport:
     """Render objects into a data set.
 
-    The same arguments give the same bytes, however often the work was interrupted, on any number of workers. An
-    object that cannot be drawn, takes too long, or whose worker crashes twice, is skipped and listed, as are meshes of
-    formats that are not read; the rest goes on.
+    The same arguments give the same bytes, however often the work was interrupted, on any number of workers. What an
+    earlier call has written is kept, but for meshes whose files have changed, come or gone since. An object that cannot
+    be drawn, takes too long, or whose worker crashes twice, is skipped and listed, as are meshes of formats that are
+    not read; the rest goes on.
 
     Args:
         source: procedural objects or mesh files.
-        out: the folder; new, empty, or one in which the same generation was interrupted.
+        out: the folder; new, empty, or one in which the same generation was interrupted or ended.
         config: how they are rendered; the defaults of `GenerationConfig` when None.
         progress: called with (objects done, objects in all, name) after each object.
 
@@ -95,11 +98,14 @@ def generate(
     for class_name in classes:
         render.check_class(class_name)
     check_names(render.layout, [item.name for item in items])
-    with GenerationState(out, _configuration(source, items, render, config.held_out)) as state:
+    configuration = _configuration(source, items, render, config.held_out)
+    meshes = str(source.path) if isinstance(source, MeshFolder) else None
+    with GenerationState(out, configuration, _former(configuration, items)) as state:
         done = state.done()
-        reused = sum(item.name in done for item in items)
+        listed = [item for item in items if item.name in done]
+        changed = {item.name: done.pop(item.name) for item in listed if _has_changed(item, done[item.name], meshes)}
+        reused = len(listed) - len(changed)
         pending = (asdict(item) for item in items if item.name not in done)
-        meshes = str(source.path) if isinstance(source, MeshFolder) else None
         settings = {"out": str(out.resolve()), "render": render.as_json(), "meshes": meshes}
         count, skipped, images = reused, [], 0
         try:
@@ -109,6 +115,8 @@ def generate(
                     name = outcome.item["name"]
                     if outcome.result is None:
                         skipped.append((name, _without_path(str(outcome.reason), source)))
+                        if name in changed:
+                            state.remove(changed[name])
                     else:
                         done[name] = outcome.result
                         images += outcome.result["record"]["views"]
@@ -126,7 +134,9 @@ def generate(
     seconds = time.monotonic() - begun
     splits = {split: len(names) for split, names in manifest["splits"].items()}
     named = (manifest[key]["names"] for key in ("not_in_split_file", "with_lost_files", "with_warnings"))
-    return GenerationReport(len(kept), sorted(skipped), seconds, images / seconds, reused, splits, *named)
+    return GenerationReport(
+        len(kept), sorted(skipped), seconds, images / seconds, reused, splits, *named, changed=list(changed)
+    )
 
 
 def _configuration(
@@ -136,19 +146,38 @@ def _configuration(
     if isinstance(source, Procedural):
         described = asdict(source)
     else:
-        # a file that has changed since is another data set; its size tells most changes, without reading it
-        sizes = [Path(item.path).stat().st_size if item.path else 0 for item in items]
-        names = [[item.name, item.split, item.up, size] for item, size in zip(items, sizes, strict=True)]
         described = {
             "folder": Path(source.path).resolve().name,
             "meshes": len(items),
             "up": source.up,
             "up_of": list(source.up_of),
             "class_name": source.class_name,
-            "names": sha256(repr(names).encode()),
+            "splits": {item.name: item.split for item in items},
         }
     generator = f"hyperplanes {version('hyperplanes')}, pictures {PICTURES}"
     return render.as_json() | {"generator": generator, "source": described, "held_out": held_out}
+
+
+def _former(configuration: dict[str, Any], items: list[Item]) -> dict[str, Any] | None:
+    """What a version wrote that knew a mesh by the size of its file."""
+    if not any(item.path for item in items):
+        return None
+    names = [[item.name, item.split, item.up, Path(item.path or "").stat().st_size] for item in items]
+    source = {key: value for key, value in configuration["source"].items() if key != "splits"}
+    return configuration | {"source": source | {"names": sha256(repr(names).encode())}}
+
+
+def _has_changed(item: Item, entry: Entry, meshes: str | None) -> bool:
+    """Whether the files of a mesh are others than those that it was drawn from, or stand elsewhere."""
+    if item.path is None or meshes is None:
+        return False
+    from data_gen.meshes.model_folder import model_checksums
+
+    was = entry["record"].get("made_of", {})
+    now = model_checksums(Path(item.path), was, Path(meshes))
+    if not was:  # of a version that compared the sizes
+        entry["record"]["made_of"] = now
+    return bool(was) and was != now
 
 
 def _unread(source: Source) -> list[tuple[str, str]]:

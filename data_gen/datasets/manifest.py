@@ -26,6 +26,9 @@ FORMAT = "hyperplanes-dataset"
 VERSION = 1
 PROGRESS_FOLDER = ".progress"
 
+_DIFFERENCES = 5
+"""Differences between two configurations that a message names."""
+
 Entry = dict[str, Any]
 """{"name", "record", "files": {relative path: sha256}} of a finished object."""
 
@@ -133,16 +136,18 @@ class GenerationState:
     Args:
         out: the folder of the data set.
         configuration: what decides the bytes of the data set.
+        former: how an earlier version wrote the same configuration, if it did otherwise.
 
     Raises:
         DataError: a folder with other content, made with another configuration, or in use by another process.
     """
 
-    def __init__(self, out: Path, configuration: dict[str, Any]) -> None:
+    def __init__(self, out: Path, configuration: dict[str, Any], former: dict[str, Any] | None = None) -> None:
         self.out = out
         self.folder = out / PROGRESS_FOLDER
         self.scratch = self.folder / "unfinished"
         self.configuration = configuration
+        self.former = former
 
     def __enter__(self) -> GenerationState:
         """Lock the folder and check it."""
@@ -166,14 +171,15 @@ class GenerationState:
         if existing is None and others:
             found = ", ".join(sorted(others)[:3])
             raise DataError(self.out, "an empty folder or an unfinished data set", found, "name another one")
-        if existing is not None and existing != self.configuration:
-            changed = sorted(
-                key for key in existing | self.configuration if existing.get(key) != self.configuration.get(key)
+        if existing is not None and existing not in (self.configuration, self.former):
+            was, now = _flat(existing), _flat(self.configuration)
+            changed = sorted(key for key in was | now if was.get(key) != now.get(key))
+            held, wanted = (
+                ", ".join(f"{key} {source.get(key)}" for key in changed[:_DIFFERENCES]) for source in (was, now)
             )
-            was, now = (
-                ", ".join(f"{key} {source.get(key)}" for key in changed) for source in (existing, self.configuration)
-            )
-            raise DataError(self.out, f"the data set it holds ({was})", f"a request for {now}", "name another folder")
+            more = f" and {len(changed) - _DIFFERENCES} more" if len(changed) > _DIFFERENCES else ""
+            remedy = "name another folder"
+            raise DataError(self.out, f"the data set it holds ({held}{more})", f"a request for {wanted}{more}", remedy)
 
     def done(self) -> dict[str, Entry]:
         """The finished objects, by name, of which all files are as they were written, by their checksums.
@@ -207,6 +213,15 @@ class GenerationState:
                 entries[path.stem] = read_json(path)
         return {name: entry for name, entry in entries.items() if isinstance(entry.get("files"), dict)}
 
+    def remove(self, entry: Entry) -> None:
+        """Delete the files of an object that is no longer in the data set."""
+        for name in entry["files"]:
+            path = inside(self.out, name, self.out / MANIFEST)
+            path.unlink(missing_ok=True)
+            with suppress(OSError):  # until one holds something else
+                for folder in path.relative_to(self.out).parents[:-1]:
+                    (self.out / folder).rmdir()
+
     def finish(self, manifest: dict[str, Any], others: dict[str, bytes]) -> None:
         """Write what describes the whole, and remove the state of the work.
 
@@ -229,3 +244,11 @@ class GenerationState:
         if (self.out / MANIFEST).is_file():
             return read_json(self.out / MANIFEST).get("configuration", {})
         return None
+
+
+def _flat(configuration: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of a nested dictionary by their keys joined with dots."""
+    flat: dict[str, Any] = {}
+    for key, value in configuration.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat

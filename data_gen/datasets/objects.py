@@ -90,6 +90,8 @@ def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict
         record["seed"] = item.seed
     if mesh.warnings:
         record["warnings"] = list(mesh.warnings)
+    if mesh.made_of:
+        record["made_of"] = mesh.made_of
     if mesh.lost_files:
         record["lost_files"] = list(mesh.lost_files)
     checksums = {path: sha256(data) for path, data in files.items()}

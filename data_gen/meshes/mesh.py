@@ -7,7 +7,7 @@ is lost silently: what cannot be drawn as the file states is named in `Mesh.warn
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from data_gen.meshes.find import safe_name
 from data_gen.meshes.materials import ColourSpace, canonical_visual
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.read import read_scene
+from hyperplanes.utilities.encoding import sha256
 
 __all__ = [
     "MAX_FACES",
@@ -52,6 +53,7 @@ class Mesh:
         warnings: what was lost or repaired, one line each.
         face_count: triangles.
         lost_files: textures and material libraries that it names and is drawn without.
+        made_of: checksums of its files, as `model_folder.model_checksums` gives them.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Mesh:
     warnings: tuple[str, ...]
     face_count: int
     lost_files: tuple[str, ...] = ()
+    made_of: dict[str, str | None] = field(default_factory=dict)
 
 
 def load_mesh(
@@ -108,7 +111,8 @@ def load_mesh(
         warnings=(*lost, *lines, *folder.notes),
         source=str(path),
     )
-    return replace(mesh, lost_files=tuple(folder.lost))
+    made_of = {path.name: sha256(data), **folder.checksums()}
+    return replace(mesh, lost_files=tuple(folder.lost), made_of=made_of)
 
 
 def prepare_scene(

@@ -10,15 +10,16 @@ import os
 import re
 import unicodedata
 import urllib.parse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 from trimesh.resolvers import Resolver
 
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PIXELS, MeshError, check_image, read_bytes
+from hyperplanes.utilities.encoding import sha256
 
-__all__ = ["MAX_REFERENCES", "ModelFolder", "model_root", "without_comment"]
+__all__ = ["MAX_REFERENCES", "ModelFolder", "model_checksums", "model_root", "without_comment"]
 
 MAX_REFERENCES = 2000
 """Different names of other files in a mesh at most. One that is not there takes about 1 ms to look for."""
@@ -54,6 +55,25 @@ def model_root(path: Path) -> Path:
     of_shapenet = (folder.name, path.name) == ("models", "model_normalized.obj")
     of_gazebo = folder.name.lower() == "meshes" and (folder.parent / "materials").is_dir()
     return folder.parent if of_shapenet or of_gazebo else folder
+
+
+def model_checksums(path: Path, names: Iterable[str], within: Path | None = None) -> dict[str, str | None]:
+    """What a model is made of, without reading what its files say.
+
+    Args:
+        path: the mesh file.
+        names: of other files, as the mesh refers to them; that of the mesh file itself may be among them.
+        within: as in `ModelFolder`.
+
+    Returns:
+        The checksum of the mesh by the file's name, and of the file that each name refers to, None where there is none.
+        Nothing of a model that would be refused.
+    """
+    try:
+        others = ModelFolder(path, within).checksums(name for name in names if name != path.name)
+        return {path.name: sha256(path.read_bytes()), **others}
+    except (MeshError, OSError):
+        return {}
 
 
 class ModelFolder(Resolver):
@@ -199,6 +219,18 @@ class ModelFolder(Resolver):
                 )
             self._places[name] = self._locate(name)
         return self._places[name]
+
+    def checksums(self, names: Iterable[str] | None = None) -> dict[str, str | None]:
+        """The checksum of the file that each name refers to, None where there is none.
+
+        Args:
+            names: how the mesh refers to files; those that were asked for until now when None.
+        """
+        places = {name: self.locate(name) for name in (list(self._places) if names is None else names)}
+        return {
+            name: None if place is None else sha256(self._bytes.get(place) or place.read_bytes())
+            for name, place in places.items()
+        }
 
     def _locate(self, name: str) -> Path | None:
         plain = name.strip().strip('"')

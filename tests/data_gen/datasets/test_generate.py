@@ -195,19 +195,6 @@ def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path)
     assert line.startswith("drawn without a texture or another file that they name: 1 of 3 objects (grey), listed in")
 
 
-@pytest.mark.usefixtures("here")
-def test_a_mesh_that_has_changed_since_makes_another_data_set(tmp_path):
-    meshes = tmp_path / "meshes"
-    meshes.mkdir()
-    trimesh.creation.box().export(meshes / "a.ply")
-    config = GenerationConfig(held_out=0, **SMALL)
-    generate(MeshFolder(meshes), tmp_path / "out", config)
-    assert generate(MeshFolder(meshes), tmp_path / "out", config).reused == 1
-    trimesh.creation.icosphere(subdivisions=1).export(meshes / "a.ply")
-    with pytest.raises(DataError, match="out: expected the data set it holds"):
-        generate(MeshFolder(meshes), tmp_path / "out", config)
-
-
 def test_the_axis_is_that_of_the_format_unless_a_file_or_folder_is_named(tmp_path):
     for name in ("a.obj", "b.glb", "c.dae", "scans/d.glb", "scans/e.ply", "scans/old/f.stl"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,121 @@
+"""Source of truth: a data set made of the files as they are now, byte for byte."""
+
+import json
+from pathlib import Path
+
+import pytest
+import trimesh
+from PIL import Image
+from rendered_here import rendered_here
+
+from data_gen.commands.generate import summary
+from data_gen.datasets.generate import GenerationConfig, MeshFolder, generate
+from data_gen.datasets.manifest import verify
+from hyperplanes.data import DataError
+from hyperplanes.utilities.encoding import sha256
+
+CONFIG = GenerationConfig(views=2, resolution=16, workers=1, held_out=1)
+QUAD = "mtllib b.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 1\nv 0 1 1\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl paint\nf 1/1 2/2 3/3 4/1\n"
+PAINT = "newmtl paint\nKd 1 1 1\nmap_Kd wood.png\n"
+
+
+@pytest.fixture(autouse=True)
+def here():
+    with rendered_here():
+        yield
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    trimesh.creation.box().export(folder / "a.ply")
+    (folder / "b.obj").write_text(QUAD)
+    (folder / "c.glb").write_bytes(b"glTF but cut")
+    return folder
+
+
+def run(meshes, out="out"):
+    return generate(MeshFolder(meshes), meshes.parent / out, CONFIG)
+
+
+def tree(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def anew(meshes):
+    run(meshes, "anew")
+    return tree(meshes.parent / "anew")
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        pytest.param([("b.mtl", PAINT), ("wood.png", "brown"), ("wood.png", "blue")], id="files come and change"),
+        pytest.param([("b.obj", QUAD.replace("v 0 1 1", "v 0 2 1"))], id="a mesh changes and keeps its size"),
+    ],
+)
+def test_an_object_is_made_again_when_a_file_of_it_changes_and_the_others_are_kept(meshes, steps):
+    assert (run(meshes).written, run(meshes).reused) == (2, 2)
+    for name, content in steps:
+        if name.endswith(".png"):
+            Image.new("RGB", (8, 8), content).save(meshes / name)
+        else:
+            (meshes / name).write_text(content)
+        report = run(meshes)
+        assert (report.written, report.reused, report.changed) == (2, 1, ["b"])
+        assert "1 made again, for their files have changed (b)" in summary(report, Path("out"))
+    assert tree(meshes.parent / "out") == anew(meshes)
+    assert (run(meshes).reused, run(meshes).changed) == (2, [])
+
+
+def test_a_mesh_that_was_skipped_is_drawn_once_it_is_repaired(meshes):
+    assert [name for name, _ in run(meshes).skipped] == ["c"]
+    trimesh.creation.icosphere(subdivisions=1).export(meshes / "c.glb")
+    report = run(meshes)
+    assert (report.written, report.reused, report.changed, report.skipped) == (3, 2, [], [])
+    assert tree(meshes.parent / "out") == anew(meshes)
+
+
+def test_nothing_is_left_of_an_object_whose_mesh_can_no_longer_be_drawn(meshes):
+    run(meshes)
+    (meshes / "b.obj").write_text("v 0 0 0\n")
+    report = run(meshes)
+    assert (report.written, [name for name, _ in report.skipped]) == (1, ["b", "c"])
+    assert tree(meshes.parent / "out") == anew(meshes)
+    assert not (meshes.parent / "out/b").exists()
+
+
+def test_a_mesh_more_is_another_data_set_and_named(meshes):
+    run(meshes)
+    trimesh.creation.box().export(meshes / "d.ply")
+    with pytest.raises(DataError, match=r"source\.splits\.c test, .*splits\.d None.*found.* train, .*splits\.d test;"):
+        run(meshes)
+
+
+def test_a_data_set_of_a_version_that_compared_sizes_goes_on_while_they_are_the_same(meshes):
+    run(meshes)
+    path = meshes.parent / "out/manifest.json"
+    manifest, names = json.loads(path.read_text()), []
+    for name, split, up in (("a.ply", "train", "y"), ("b.obj", "train", "y"), ("c.glb", "test", None)):
+        names.append([Path(name).stem, split, up, (meshes / name).stat().st_size])
+    source = manifest["configuration"]["source"]
+    del source["splits"]
+    source["names"] = sha256(repr(names).encode())
+    for record in manifest["objects"].values():
+        del record["made_of"]
+    path.write_text(json.dumps(manifest))
+    assert (run(meshes).reused, verify(meshes.parent / "out").intact) == (2, True)
+    trimesh.creation.box().export(meshes / "a.ply", encoding="ascii")
+    assert run(meshes).changed == ["a"]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(DataError, match=r"source\.names"):
+        run(meshes)
+
+
+def test_what_a_model_is_made_of_is_in_the_manifest(meshes):
+    (meshes / "b.mtl").write_text(PAINT)
+    run(meshes)
+    made_of = json.loads((meshes.parent / "out/manifest.json").read_text())["objects"]["b"]["made_of"]
+    checksums = {name: sha256((meshes / name).read_bytes()) for name in ("b.obj", "b.mtl")}
+    assert made_of == {**checksums, "wood.png": None}
