@@ -149,7 +149,7 @@ def _scenes(options: argparse.Namespace) -> list[_Scene]:
     if options.meshes is None:
         paths = {f"ellipsoid_{index}": None for index in range(options.count)}
     for given in options.meshes or ():
-        found = [given] if given.is_file() else [item.path for item in find_meshes(given)]
+        found = [given] if given.is_file() else [item.path for item in find_meshes(given).meshes]
         for path in found[:: max(1, len(found) // options.count)][: options.count]:
             if path.stem in paths:
                 raise DataError(path, "meshes of different names", "two of one name", "rename one")

@@ -42,7 +42,7 @@ def obvious_loop(objects: int, out: Path) -> dict[str, float]:
     ends: list[float] = []
     opengl = flip_camera_axes(rig.world_from_camera)
     focal = rig.intrinsics[0, 0, 0]
-    for item in list_items(Procedural("car", objects), 0):
+    for item in list_items(Procedural("car", objects), 0).items:
         mesh = prepare_scene(make("car", int(item.seed or 0)), item.name)
         scene = pyrender.Scene.from_trimesh_scene(mesh.scene, bg_color=[0.0, 0.0, 0.0, 0.0], ambient_light=[0.3] * 3)
         camera = scene.add(pyrender.IntrinsicsCamera(focal, focal, RESOLUTION / 2, RESOLUTION / 2))
@@ -89,7 +89,7 @@ def stages(objects: int, out: Path) -> dict[str, float]:
     spent = dict.fromkeys(("mesh", "one sample a pixel drawn", "nine samples a pixel drawn", "png", "written"), 0.0)
     with MeshRenderer(find_renderer().name) as renderer:
         sparse = MeshRenderer(renderer.name, 1)
-        for index, item in enumerate(list_items(Procedural("car", objects + 1), 0)):
+        for index, item in enumerate(list_items(Procedural("car", objects + 1), 0).items):
             if index == 1:
                 started = time.process_time()
                 spent = dict.fromkeys(spent, 0.0)

@@ -140,19 +140,25 @@ def summary(report: GenerationReport, out: Path) -> str:
 
 
 def remarks(report: GenerationReport, out: Path) -> list[str]:
-    """One line about each set of objects that a user should look at, and where they are listed."""
+    """One line about each set of objects or files that a user should look at, and where they are listed."""
     others = [name for name in report.warned if name not in set(report.incomplete)]
     found = {
         ("not in the split file, so trained on", "not_in_split_file"): report.unlisted,
         ("drawn without a texture or another file that they name", "with_lost_files"): report.incomplete,
         ("drawn with other warnings", "with_warnings"): others,
     }
-    return [
+    lines = [
         f"{what}: {len(names)} of {report.written} objects ({_some(names)}), "
         f"listed in {out / 'manifest.json'} under {key}"
         for (what, key), names in found.items()
         if names
     ]
+    if report.duplicates:
+        lines.append(
+            f"left out, for they hold objects that are taken in another format: {len(report.duplicates)} of the files "
+            f"({_some(report.duplicates)}), listed in {out / 'manifest.json'} under skipped"
+        )
+    return lines
 
 
 def _some(names: list[str]) -> str:

@@ -15,7 +15,6 @@ from data_gen.datasets.layouts import LAYOUTS, check_names
 from data_gen.datasets.manifest import Entry, GenerationState, build_manifest
 from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
-from data_gen.meshes.files import MESH_SUFFIXES
 from data_gen.rigs import OBJECT_RADIUS
 from hyperplanes.utilities.encoding import sha256
 from hyperplanes.utilities.environment import usable_cores
@@ -47,6 +46,7 @@ class GenerationReport:
         incomplete: objects that are drawn without a texture or another file that they name.
         warned: objects with warnings, of which those with lost files are some.
         changed: objects that an earlier call had written from other files.
+        duplicates: mesh files that hold one of the objects in another format, which are not among `skipped`.
     """
 
     written: int
@@ -59,6 +59,7 @@ class GenerationReport:
     incomplete: list[str] = field(default_factory=list)
     warned: list[str] = field(default_factory=list)
     changed: list[str] = field(default_factory=list)
+    duplicates: list[str] = field(default_factory=list)
 
 
 def generate(
@@ -93,7 +94,8 @@ def generate(
     if isinstance(source, Procedural) and source.count > MOST_OBJECTS:
         raise ValueError(f"count: expected at most {MOST_OBJECTS} objects, got {source.count}; make several data sets")
     render = config.resolve()
-    items = list_items(source, config.held_out)
+    listing = list_items(source, config.held_out)
+    items = listing.items
     classes = sorted({item.class_name for item in items}, key=str)
     for class_name in classes:
         render.check_class(class_name)
@@ -128,14 +130,27 @@ def generate(
         if not kept:
             name, reason = skipped[0]
             raise ValueError(f"{out}: none of {len(items)} objects could be drawn; {name}: {reason}")
-        skipped += _unread(source)
-        manifest = build_manifest(state.configuration, items, done.values(), skipped, _facts(render, classes))
+        skipped += listing.unreadable
+        left_out = skipped + listing.duplicates
+        manifest = build_manifest(state.configuration, items, done.values(), left_out, _facts(render, classes))
         state.finish(manifest, LAYOUTS[render.layout].splits(kept))
     seconds = time.monotonic() - begun
     splits = {split: len(names) for split, names in manifest["splits"].items()}
-    named = (manifest[key]["names"] for key in ("not_in_split_file", "with_lost_files", "with_warnings"))
+    unlisted, incomplete, warned = (
+        manifest[key]["names"] for key in ("not_in_split_file", "with_lost_files", "with_warnings")
+    )
     return GenerationReport(
-        len(kept), sorted(skipped), seconds, images / seconds, reused, splits, *named, changed=list(changed)
+        written=len(kept),
+        skipped=sorted(skipped),
+        seconds=seconds,
+        images_per_second=images / seconds,
+        reused=reused,
+        splits=splits,
+        unlisted=unlisted,
+        incomplete=incomplete,
+        warned=warned,
+        changed=list(changed),
+        duplicates=[name for name, _ in listing.duplicates],
     )
 
 
@@ -178,19 +193,6 @@ def _has_changed(item: Item, entry: Entry, meshes: str | None) -> bool:
     if not was:  # of a version that compared the sizes
         entry["record"]["made_of"] = now
     return bool(was) and was != now
-
-
-def _unread(source: Source) -> list[tuple[str, str]]:
-    """Names and reasons of meshes that lie beside the others in a format that is not read."""
-    if isinstance(source, Procedural):
-        return []
-    from data_gen.meshes.find import find_unreadable
-
-    readable = ", ".join(MESH_SUFFIXES)
-    return [
-        (path.as_posix(), f"expected one of {readable}, found {path.suffix}; convert it")
-        for path in find_unreadable(source.path)
-    ]
 
 
 def _without_path(reason: str, source: Source) -> str:

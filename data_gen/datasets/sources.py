@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase as fnmatch
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +14,7 @@ import numpy as np
 
 from data_gen.meshes.files import STATES_ITS_AXIS
 
-__all__ = ["Item", "MeshFolder", "Procedural", "Source", "list_items", "seed_of"]
+__all__ = ["Item", "Listing", "MeshFolder", "Procedural", "Source", "list_items", "seed_of"]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,22 @@ class Item:
     up: Literal["y", "z"] | None = None
 
 
-def list_items(source: Source, held_out: float | int | None) -> list[Item]:
+@dataclass(frozen=True)
+class Listing:
+    """The objects of a source.
+
+    Attributes:
+        items: those that are to be rendered, training ones first.
+        unreadable: names and reasons of files that are none of them for their format.
+        duplicates: names and reasons of files that hold one of them in another format.
+    """
+
+    items: list[Item]
+    unreadable: list[tuple[str, str]] = field(default_factory=list)
+    duplicates: list[tuple[str, str]] = field(default_factory=list)
+
+
+def list_items(source: Source, held_out: float | int | None) -> Listing:
     """All objects of a source, with their splits.
 
     Args:
@@ -90,11 +105,12 @@ def list_items(source: Source, held_out: float | int | None) -> list[Item]:
             each class by name (as the paper's 200x200 data were split).
 
     Returns:
-        The objects, training ones first. A class that is unknown or a count that makes no sense is a ValueError.
+        The objects. A class that is unknown or a count that makes no sense is a ValueError.
     """
-    items = _procedural(source, held_out) if isinstance(source, Procedural) else _meshes(source, held_out)
+    procedural = isinstance(source, Procedural)
+    listing = Listing(_procedural(source, held_out)) if procedural else _meshes(source, held_out)
     order = {"train": 0, "val": 1, "test": 2}
-    return sorted(items, key=lambda item: (order[item.split], item.name))
+    return replace(listing, items=sorted(listing.items, key=lambda item: (order[item.split], item.name)))
 
 
 def seed_of(seed: int, *parts: object) -> int:
@@ -130,7 +146,7 @@ def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
     return items
 
 
-def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
+def _meshes(source: MeshFolder, held_out: float | int | None) -> Listing:
     from data_gen.meshes.find import find_meshes, safe_name
 
     if source.up not in ("y", "z"):
@@ -140,12 +156,12 @@ def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
     if source.split_file is not None and held_out is not None:
         raise ValueError(f"held_out: expected none, for {source.split_file} decides, got {held_out}")
     found = find_meshes(source.path, split_file=source.split_file)
-    if source.split_file is not None and not any(mesh.split for mesh in found):
+    if source.split_file is not None and not any(mesh.split for mesh in found.meshes):
         raise ValueError(f"{source.split_file}: expected models of {source.path}, found none of them; check both")
-    axes = _axes(source, [mesh.path for mesh in found])
-    stated = held_out is None and any(mesh.split for mesh in found)
+    axes = _axes(source, [mesh.path for mesh in found.meshes])
+    stated = held_out is None and any(mesh.split for mesh in found.meshes)
     classes: dict[str | None, list[Any]] = defaultdict(list)
-    for mesh in sorted(found, key=lambda mesh: mesh.name):
+    for mesh in found.meshes:
         classes[mesh.class_name or source.class_name].append(mesh)
     items = []
     for class_name, meshes in classes.items():
@@ -157,7 +173,7 @@ def _meshes(source: MeshFolder, held_out: float | int | None) -> list[Item]:
             unlisted = stated and mesh.split is None
             up = axes[mesh.path]
             items.append(Item(mesh.name, class_name, split, path=str(mesh.path), unlisted=unlisted, up=up))
-    return items
+    return Listing(items, found.unreadable, found.duplicates)
 
 
 def _axes(source: MeshFolder, paths: list[Path]) -> dict[Path, Any]:

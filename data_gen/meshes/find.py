@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from data_gen.meshes.files import MESH_SUFFIXES, OTHER_SUFFIXES, MeshError
 from data_gen.meshes.shapenet import class_of_synset, find_models, is_shapenet, paper_split, read_split_file
 
-__all__ = ["MeshFile", "find_meshes", "find_unreadable", "safe_name"]
+__all__ = ["FoundMeshes", "MeshFile", "find_meshes", "safe_name"]
+
+_BEST_FIRST = (".glb", ".gltf", ".obj", ".dae", ".ply", ".off", ".stl")
+"""Formats by how much they hold of what an object looks like; of an object in several the first is taken."""
+
+_FORMATS = "|".join(suffix.removeprefix(".") for suffix in (*MESH_SUFFIXES, *OTHER_SUFFIXES))
+_NAMES_A_FORMAT = re.compile(
+    rf"({_FORMATS}|collada|blender)s?([\W_]*(binary|draco|embedded|files?|formats?|mesh(es)?|models?|quantized))*", re.I
+)
+"""Folders of packs of objects: `OBJ format`, `glTF-Binary`, `FBX`, `Blends`."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +41,21 @@ class MeshFile:
     split: str | None = None
 
 
+@dataclass(frozen=True)
+class FoundMeshes:
+    """What a folder holds.
+
+    Attributes:
+        meshes: that can be read, sorted by name; one file an object.
+        unreadable: files of formats that are not read, from the folder on, with the reason.
+        duplicates: files that hold the same object as one of `meshes` in another format, likewise.
+    """
+
+    meshes: list[MeshFile]
+    unreadable: list[tuple[str, str]] = field(default_factory=list)
+    duplicates: list[tuple[str, str]] = field(default_factory=list)
+
+
 def safe_name(text: str) -> str:
     """Turn any text into the name of a file: letters, digits, dot, hyphen and underscore, at most 100 of them.
 
@@ -48,19 +73,21 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^\w.-]+", "_", plain, flags=re.ASCII).strip("._-")[:100] or "mesh"
 
 
-def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> list[MeshFile]:
-    """List the meshes under a folder, sorted by name.
+def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> FoundMeshes:
+    """List the meshes under a folder.
 
     A ShapeNetCore tree (or one class of it) gives `CLASS_ID` with class and split: the official split if its file is
     given or lies in the folder as `all.csv` (a model that it does not list has none), else that of the paper. Any
     other folder gives every mesh file at any depth, named by its path, without class and split, but for hidden files.
+    Files of one name beside each other, or in folders that are named after formats, are one object, of which the best
+    is taken.
 
     Args:
         folder: the folder.
         split_file: ShapeNet's official `all.csv`.
 
     Returns:
-        The meshes, their names unique even where case does not count.
+        The meshes, their names unique even where case does not count, and what is left out.
 
     Raises:
         MeshError: if the folder is absent or holds no mesh, or the split file cannot be read.
@@ -71,37 +98,41 @@ def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> 
             f"{root}: expected a folder of meshes, found {'a file' if root.exists() else 'nothing'}; give the folder"
         )
     if is_shapenet(root):
-        return _shapenet(root, Path(split_file) if split_file is not None else root / "all.csv", split_file is not None)
+        split_path = Path(split_file) if split_file is not None else root / "all.csv"
+        return FoundMeshes(_shapenet(root, split_path, split_file is not None))
     if split_file is not None:
         raise MeshError(
             f"{root}: expected a ShapeNetCore tree for {split_file}, found none; give the folder of synsets"
         )
-    paths = sorted(path for path in root.rglob("*") if _is_mesh(path, root))
-    if not paths:
+    objects: dict[tuple[str, ...], list[Path]] = defaultdict(list)
+    for path in _mesh_files(root):
+        folders = (name for name in path.parts[:-1] if not _NAMES_A_FORMAT.fullmatch(name))
+        objects[(*folders, path.stem)].append(path)
+    taken, unreadable, duplicates = [], [], []
+    for paths in objects.values():
+        best = min(paths, key=lambda path: (_rank(path), path))
+        if _rank(best) < len(_BEST_FIRST):
+            taken.append(best)
+            duplicates += [(str(path), f"the same object as {best}, which is taken") for path in paths if path != best]
+        else:
+            wanted = f"expected one of {', '.join(MESH_SUFFIXES)}"
+            unreadable += [(str(path), f"{wanted}, found {path.suffix}; convert it") for path in paths]
+    if not taken:
         raise MeshError(f"{root}: expected mesh files ({', '.join(MESH_SUFFIXES)}), found none; convert yours to one")
-    return _unique(MeshFile(safe_name(path.relative_to(root).with_suffix("").as_posix()), path) for path in paths)
+    named = [MeshFile(safe_name(str(path.with_suffix(""))), root / path) for path in sorted(taken)]
+    return FoundMeshes(_unique(named), sorted(unreadable), sorted(duplicates))
 
 
-def find_unreadable(folder: str | Path) -> list[Path]:
-    """List the files under a folder that are meshes of a format which is not read.
-
-    Args:
-        folder: the folder.
-
-    Returns:
-        Their paths from the folder on, sorted; none of a ShapeNetCore tree.
-    """
-    root = Path(folder)
-    if is_shapenet(root):
-        return []
-    return sorted(path.relative_to(root) for path in root.rglob("*") if _is_mesh(path, root, OTHER_SUFFIXES))
+def _mesh_files(root: Path) -> list[Path]:
+    """The paths of all mesh files from a folder on, sorted, but those that are hidden."""
+    found = (path for path in root.rglob("*") if path.suffix.lower() in (*MESH_SUFFIXES, *OTHER_SUFFIXES))
+    paths = (path.relative_to(root) for path in found if path.is_file())
+    return sorted(path for path in paths if not any(part.startswith(".") or part == "__MACOSX" for part in path.parts))
 
 
-def _is_mesh(path: Path, root: Path, suffixes: tuple[str, ...] = MESH_SUFFIXES) -> bool:
-    if path.suffix.lower() not in suffixes:
-        return False
-    hidden = any(part.startswith(".") or part == "__MACOSX" for part in path.relative_to(root).parts)
-    return not hidden and path.is_file()
+def _rank(path: Path) -> int:
+    suffix = path.suffix.lower()
+    return _BEST_FIRST.index(suffix) if suffix in _BEST_FIRST else len(_BEST_FIRST)
 
 
 def _shapenet(root: Path, split_path: Path, is_required: bool) -> list[MeshFile]:

@@ -178,21 +178,24 @@ def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path)
     cut = "mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 1\nusemtl paint\nf 1 2 3\n"
     (meshes / "grey.obj").write_text(cut)
     for kind in ("3mf", "fbx", "usdz"):
-        (meshes / f"ball.{kind}").write_text("a format that is not read")
+        (meshes / f"amphora.{kind}").write_text("a format that is not read")
+    (meshes / "ball.fbx").write_text("the same object as ball.obj")
     report = generate(MeshFolder(meshes), tmp_path / "out", GenerationConfig(held_out=0, **SMALL))
     assert report.written == 3
-    assert [name for name, _ in report.skipped] == ["ball.3mf", "ball.fbx", "ball.usdz", "broken", "empty"]
+    assert [name for name, _ in report.skipped] == ["amphora.3mf", "amphora.fbx", "amphora.usdz", "broken", "empty"]
     assert [reason.partition("found ")[2] for _, reason in report.skipped[:3]] == [
         f"{kind}; convert it" for kind in (".3mf", ".fbx", ".usdz")
     ]
     assert all(reason.startswith(f"{name}.") for name, reason in report.skipped[3:]), "no path of this machine"
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
-    assert [(entry["name"], entry["reason"]) for entry in manifest["skipped"]] == report.skipped
+    skipped = [(entry["name"], entry["reason"]) for entry in manifest["skipped"]]
+    assert skipped == sorted([*report.skipped, ("ball.fbx", "the same object as ball.obj, which is taken")])
     assert Dataset(tmp_path / "out").names() == ["ball", "box", "grey"]
     assert manifest["with_lost_files"] == {"count": 1, "names": ["grey"]}
     assert manifest["objects"]["grey"]["lost_files"] == ["gone.mtl"]
-    (line,) = remarks(report, tmp_path / "out")
+    line, other = remarks(report, tmp_path / "out")
     assert line.startswith("drawn without a texture or another file that they name: 1 of 3 objects (grey), listed in")
+    assert "taken in another format: 1 of the files (ball.fbx), listed in" in other
 
 
 def test_the_axis_is_that_of_the_format_unless_a_file_or_folder_is_named(tmp_path):
@@ -201,7 +204,8 @@ def test_the_axis_is_that_of_the_format_unless_a_file_or_folder_is_named(tmp_pat
         (tmp_path / name).touch()
 
     def axes(**keywords):
-        return "".join(item.up or "-" for item in sorted(list_items(MeshFolder(tmp_path, **keywords), 0), key=by_path))
+        items = list_items(MeshFolder(tmp_path, **keywords), 0).items
+        return "".join(item.up or "-" for item in sorted(items, key=by_path))
 
     def by_path(item):
         return item.path
@@ -300,8 +304,8 @@ def test_the_authors_layout_takes_the_classes_that_their_loader_knows(tmp_path):
 
 
 def test_data_sets_of_one_seed_share_objects_and_never_mix_training_and_held_out():
-    small = {item.name: item.seed for item in list_items(Procedural("car", 20, 1), 5)}
-    large = {item.name: item.seed for item in list_items(Procedural("car", 100, 1), 10)}
+    small = {item.name: item.seed for item in list_items(Procedural("car", 20, 1), 5).items}
+    large = {item.name: item.seed for item in list_items(Procedural("car", 100, 1), 10).items}
     assert small.items() <= large.items()
     assert len(set(large.values())) == len(large)
 
@@ -309,7 +313,7 @@ def test_data_sets_of_one_seed_share_objects_and_never_mix_training_and_held_out
 def test_mesh_files_are_split_by_name_four_to_one(tmp_path):
     for index in range(10):
         trimesh.creation.box().export(tmp_path / f"mesh{index}.ply")
-    splits = [item.split for item in list_items(MeshFolder(tmp_path), None)]
+    splits = [item.split for item in list_items(MeshFolder(tmp_path), None).items]
     assert splits == ["train"] * 8 + ["test"] * 2
 
 
@@ -373,13 +377,13 @@ def test_a_class_that_the_split_file_leaves_out_whole_is_trained_on_and_named(tm
         trimesh.creation.box().export(path)
     official = tmp_path / "tree" / "all.csv"
     official.write_text("id,synsetId,subSynsetId,modelId,split\n0,02958343,02958343,a,test")
-    items = list_items(MeshFolder(tmp_path / "tree"), None)
+    items = list_items(MeshFolder(tmp_path / "tree"), None).items
     assert [(item.name, item.split, item.unlisted) for item in items] == [
         ("chair_x", "train", True),
         ("chair_y", "train", True),
         ("car_a", "test", False),
     ]
-    assert not any(item.unlisted for item in list_items(MeshFolder(tmp_path / "tree"), 1))
+    assert not any(item.unlisted for item in list_items(MeshFolder(tmp_path / "tree"), 1).items)
 
 
 @pytest.mark.usefixtures("here")
@@ -392,7 +396,7 @@ def test_an_official_split_file_decides(tmp_path):
     official = tmp_path / "all.csv"
     rows = [f"{i},02958343,02958343,{name},{split}" for i, (name, split) in enumerate(zip("abc", SPLITS, strict=True))]
     official.write_text("\n".join(["id,synsetId,subSynsetId,modelId,split", *rows]))
-    items = list_items(MeshFolder(tree_of_cars, split_file=official), None)
+    items = list_items(MeshFolder(tree_of_cars, split_file=official), None).items
     assert [(item.name, item.split) for item in items] == [
         ("car_b", "train"),
         ("car_d", "train"),  # not listed

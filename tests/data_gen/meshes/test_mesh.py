@@ -363,10 +363,10 @@ def test_loading_twice_gives_the_same_bytes(tmp_path):
 
 
 def test_find_meshes_names_are_unique_sorted_and_safe(tmp_path):
-    for name in ("b/Stuhl Nr. 1.glb", "B/stuhl nr. 1.obj", "a.ply", "a.stl", ".hidden.glb", "notes.txt", "日本.off"):
+    for name in ("b/Stuhl Nr. 1.glb", "B/stuhl nr. 1.obj", "a.ply", "a+.stl", ".hidden.glb", "notes.txt", "日本.off"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("x")
-    found = find_meshes(tmp_path)
+    found = find_meshes(tmp_path).meshes
     names = [mesh.name for mesh in found]
     assert names == sorted(names)
     assert sorted(names) == ["B_stuhl_nr._1", "a", "a_2", "b_Stuhl_Nr._1_2", "mesh"]
@@ -391,7 +391,7 @@ def test_importing_the_package_loads_no_mesh_library():
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real meshes of ../shared/meshes are not here")
 def test_all_real_meshes_load_with_their_losses_named():
     outcomes = {}
-    for file in find_meshes(SHARED):
+    for file in find_meshes(SHARED).meshes:
         try:
             mesh = load_mesh(file.path, name=file.name)
         except MeshError as error:

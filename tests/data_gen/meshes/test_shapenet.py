@@ -71,7 +71,7 @@ def test_a_tree_gives_classes_and_the_split_of_the_paper(tmp_path, version):
     write_model(tmp_path, CHAIR, "x", version)
     (tmp_path / CAR / "empty").mkdir()
     (tmp_path / "taxonomy.json").write_text("[]")
-    found = find_meshes(tmp_path)
+    found = find_meshes(tmp_path).meshes
     assert [(mesh.name, mesh.class_name, mesh.split) for mesh in found] == [
         ("car_m0", "car", "train"),
         ("car_m1", "car", "train"),
@@ -81,7 +81,7 @@ def test_a_tree_gives_classes_and_the_split_of_the_paper(tmp_path, version):
         ("chair_x", "chair", "test"),
     ]
     assert all(load_mesh(mesh.path).face_count == 4 for mesh in found[:2])
-    assert [mesh.name for mesh in find_meshes(tmp_path / CAR)] == [f"car_m{index}" for index in range(5)]
+    assert [mesh.name for mesh in find_meshes(tmp_path / CAR).meshes] == [f"car_m{index}" for index in range(5)]
 
 
 def test_the_official_split_counts_where_it_is_given(tmp_path):
@@ -89,10 +89,10 @@ def test_the_official_split_counts_where_it_is_given(tmp_path):
         write_model(tmp_path, PLANE, model, 2)
     rows = f"id,synsetId,subSynsetId,modelId,split\n1,{PLANE},02690373,a,test\n2,2691156,02690373,b,val\n"
     (tmp_path / "given.csv").write_text(rows)
-    found = find_meshes(tmp_path, split_file=tmp_path / "given.csv")
+    found = find_meshes(tmp_path, split_file=tmp_path / "given.csv").meshes
     assert [mesh.split for mesh in found] == ["test", "val", None]
     (tmp_path / "all.csv").write_text(rows.replace("val", "train"))
-    assert [mesh.split for mesh in find_meshes(tmp_path)] == ["test", "train", None]
+    assert [mesh.split for mesh in find_meshes(tmp_path).meshes] == ["test", "train", None]
 
 
 def test_a_wrong_split_file_is_refused(tmp_path):

@@ -1,0 +1,61 @@
+"""Source of truth: folders of empty files, of which a person sees at once how many objects they hold."""
+
+import pytest
+
+from data_gen.datasets.sources import MeshFolder, list_items
+from data_gen.meshes.find import find_meshes
+
+
+def touch(root, *names):
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    return root
+
+
+def taken(root, **keywords):
+    return [mesh.path.relative_to(root).as_posix() for mesh in find_meshes(root, **keywords).meshes]
+
+
+def test_files_of_one_name_are_one_object_and_the_best_format_is_taken(tmp_path):
+    touch(tmp_path, "a.glb", "a.obj", "a.fbx", "b.stl", "b.PLY", "c/b.off", "d.fbx", "d.blend")
+    found = find_meshes(tmp_path)
+    assert [mesh.path.name for mesh in found.meshes] == ["a.glb", "b.PLY", "b.off"]
+    assert found.duplicates == [
+        ("a.fbx", "the same object as a.glb, which is taken"),
+        ("a.obj", "the same object as a.glb, which is taken"),
+        ("b.stl", "the same object as b.PLY, which is taken"),
+    ]
+    assert [name for name, _ in found.unreadable] == ["d.blend", "d.fbx"]
+
+
+@pytest.mark.parametrize(
+    ("folders", "best"),
+    [
+        (("DAE format/x.dae", "GLTF format/x.glb", "OBJ format/x.obj", "FBX format/x.fbx"), "GLTF format/x.glb"),
+        (("glTF/x.gltf", "glTF-Binary/x.glb", "glTF-Embedded/x.gltf", "glTF-Draco/x.gltf"), "glTF-Binary/x.glb"),
+        (("OBJ/old/x.obj", "Blends/old/x.blend", "FBX/old/x.fbx"), "OBJ/old/x.obj"),
+        (("x.blend", "exports/x.fbx", "stl/x.stl", "ply files/x.ply"), "ply files/x.ply"),
+    ],
+)
+def test_folders_that_are_named_after_formats_hold_the_same_objects(tmp_path, folders, best):
+    touch(tmp_path, *folders, *(name.replace("x.", "y.") for name in folders))
+    assert taken(tmp_path) == [best, best.replace("x.", "y.")]
+
+
+def test_other_folders_hold_other_objects(tmp_path):
+    names = ["obj_chairs/x.obj", "obj_tables/x.obj", "plywood/x.ply", "office/x.glb", "stlouis/x.stl", "x.off"]
+    assert sorted(taken(touch(tmp_path, *names))) == sorted(names)
+
+
+def test_no_object_is_trained_on_in_one_format_and_tested_in_another(tmp_path):
+    objects = ("chair", "desk", "lamp", "sofa", "table")
+    kinds = {"DAE format": "dae", "GLTF format": "glb", "OBJ format": "obj"}
+    touch(tmp_path, *(f"Models/{folder}/{name}.{kind}" for folder, kind in kinds.items() for name in objects))
+    listing = list_items(MeshFolder(tmp_path), None)
+    assert [(item.split, item.path.rpartition("/")[2]) for item in listing.items] == [
+        *(("train", f"{name}.glb") for name in objects[:4]),
+        ("test", "table.glb"),
+    ]
+    assert len(listing.duplicates) == 10
