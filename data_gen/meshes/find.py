@@ -47,7 +47,8 @@ class FoundMeshes:
 
     Attributes:
         meshes: that can be read, sorted by name; one file an object.
-        unreadable: files of formats that are not read, from the folder on, with the reason.
+        unreadable: files of formats that are not read, and those beside the models of a ShapeNetCore tree, from the
+            folder on, with the reason.
         duplicates: files that hold the same object as one of `meshes` in another format, likewise.
     """
 
@@ -98,8 +99,7 @@ def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> 
             f"{root}: expected a folder of meshes, found {'a file' if root.exists() else 'nothing'}; give the folder"
         )
     if is_shapenet(root):
-        split_path = Path(split_file) if split_file is not None else root / "all.csv"
-        return FoundMeshes(_shapenet(root, split_path, split_file is not None))
+        return _shapenet(root, Path(split_file) if split_file is not None else root / "all.csv", split_file is not None)
     if split_file is not None:
         raise MeshError(
             f"{root}: expected a ShapeNetCore tree for {split_file}, found none; give the folder of synsets"
@@ -135,10 +135,13 @@ def _rank(path: Path) -> int:
     return _BEST_FIRST.index(suffix) if suffix in _BEST_FIRST else len(_BEST_FIRST)
 
 
-def _shapenet(root: Path, split_path: Path, is_required: bool) -> list[MeshFile]:
+def _shapenet(root: Path, split_path: Path, is_required: bool) -> FoundMeshes:
     models = find_models(root)
     split = read_split_file(split_path) if is_required or split_path.is_file() else paper_split(models)
-    return _unique(
+    folders = {model.folder.relative_to(root) for model in models}
+    others = [path for path in _mesh_files(root) if folders.isdisjoint(path.parents)]
+    reason = "expected a model of the ShapeNetCore tree, found another mesh; give the folder that holds it alone"
+    meshes = _unique(
         MeshFile(
             name=safe_name(f"{class_of_synset(model.synset)}_{model.model_id}"),
             path=model.path,
@@ -147,6 +150,7 @@ def _shapenet(root: Path, split_path: Path, is_required: bool) -> list[MeshFile]
         )
         for model in models
     )
+    return FoundMeshes(meshes, [(str(path), reason) for path in others])
 
 
 def _unique(found: Iterable[MeshFile]) -> list[MeshFile]:

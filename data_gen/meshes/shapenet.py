@@ -51,11 +51,13 @@ class ShapeNetModel:
         synset: number of its class, 8 digits.
         model_id: its name in the tree, unique in its class.
         path: its OBJ file.
+        folder: that holds it and its textures.
     """
 
     synset: str
     model_id: str
     path: Path
+    folder: Path
 
 
 def class_of_synset(synset: str) -> str:
@@ -69,7 +71,7 @@ def class_of_synset(synset: str) -> str:
 
 def is_shapenet(folder: Path) -> bool:
     """Whether a folder is a ShapeNetCore tree, or one class of it."""
-    return any(_has_models(synset) for synset in _synset_folders(folder))
+    return bool(_synset_folders(folder))
 
 
 def find_models(folder: Path) -> list[ShapeNetModel]:
@@ -86,7 +88,7 @@ def find_models(folder: Path) -> list[ShapeNetModel]:
         for entry in sorted(synset.iterdir()):
             path = next((entry / name for name in (_V2, _V1) if (entry / name).is_file()), None)
             if path is not None:
-                models.append(ShapeNetModel(synset.resolve().name, entry.name, path))
+                models.append(ShapeNetModel(synset.resolve().name, entry.name, path, entry))
     return models
 
 
@@ -145,14 +147,15 @@ def read_split_file(path: Path) -> dict[tuple[str, str], str]:
 
 
 def _synset_folders(folder: Path) -> list[Path]:
-    if _is_synset(folder.resolve().name):
+    if _is_synset(folder):
         return [folder]
-    return sorted(entry for entry in folder.iterdir() if entry.is_dir() and _is_synset(entry.name))
+    return sorted(entry for entry in folder.iterdir() if entry.is_dir() and _is_synset(entry))
 
 
-def _is_synset(name: str) -> bool:
-    return re.fullmatch(r"\d{8}", name) is not None
-
-
-def _has_models(synset: Path) -> bool:
-    return any((entry / name).is_file() for entry in synset.iterdir() for name in (_V2, _V1))
+def _is_synset(folder: Path) -> bool:
+    """Whether a folder holds models and is named as a class of ShapeNetCore, or as another one of version 2."""
+    number = folder.resolve().name
+    if re.fullmatch(r"\d{8}", number) is None:  # of dates, too
+        return False
+    kinds = (_V2, _V1) if number in SYNSETS else (_V2,)
+    return any((entry / name).is_file() for entry in folder.iterdir() for name in kinds)

@@ -84,6 +84,39 @@ def test_a_tree_gives_classes_and_the_split_of_the_paper(tmp_path, version):
     assert [mesh.name for mesh in find_meshes(tmp_path / CAR).meshes] == [f"car_m{index}" for index in range(5)]
 
 
+def test_folders_that_are_named_after_dates_are_no_classes(tmp_path):
+    for name in ("20240131/chair/model.obj", "20240131/sofa/model.obj", "20240207/lamp/model.obj", "other.glb"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "20240131/desk.ply").touch()
+    found = find_meshes(tmp_path).meshes
+    assert {mesh.class_name for mesh in found} == {None}
+    assert [mesh.name for mesh in found] == [
+        "20240131_chair_model",
+        "20240131_desk",
+        "20240131_sofa_model",
+        "20240207_lamp_model",
+        "other",
+    ]
+
+
+def test_a_class_of_another_number_is_one_in_version_2(tmp_path):
+    write_model(tmp_path, "00000001", "a", 2)
+    assert [(mesh.name, mesh.class_name) for mesh in find_meshes(tmp_path).meshes] == [("00000001_a", "00000001")]
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_meshes_beside_the_models_of_a_tree_are_listed(tmp_path, version):
+    write_model(tmp_path, CAR, "a", version)
+    for name in (f"{CAR}/b.obj", "20240131/chair/model.obj", "more/c.glb", "d.fbx"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    found = find_meshes(tmp_path)
+    assert [mesh.name for mesh in found.meshes] == ["car_a"]
+    assert [name for name, _ in found.unreadable] == [f"{CAR}/b.obj", "20240131/chair/model.obj", "d.fbx", "more/c.glb"]
+    assert found.unreadable[0][1].startswith("expected a model of the ShapeNetCore tree, found another mesh")
+
+
 def test_the_official_split_counts_where_it_is_given(tmp_path):
     for model in ("a", "b", "c"):
         write_model(tmp_path, PLANE, model, 2)
@@ -117,7 +150,7 @@ def test_a_wrong_split_file_is_refused(tmp_path):
 def test_the_split_does_not_depend_on_the_order_and_takes_80_percent(tmp_path):
     from data_gen.meshes.shapenet import ShapeNetModel
 
-    models = [ShapeNetModel(CAR, f"{index:03d}", tmp_path) for index in range(101)]
+    models = [ShapeNetModel(CAR, f"{index:03d}", tmp_path, tmp_path) for index in range(101)]
     shuffled = [models[index] for index in np.random.default_rng(0).permutation(len(models))]
     split = paper_split(shuffled)
     assert split == paper_split(models)
