@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -47,8 +48,8 @@ class FoundMeshes:
 
     Attributes:
         meshes: that can be read, sorted by name; one file an object.
-        unreadable: files of formats that are not read, and those beside the models of a ShapeNetCore tree, from the
-            folder on, with the reason.
+        unreadable: files of formats that are not read, those beside the models of a ShapeNetCore tree, and folders that
+            cannot be looked into, from the folder on, with the reason.
         duplicates: files that hold the same object as one of `meshes` in another format, likewise.
     """
 
@@ -81,7 +82,7 @@ def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> 
     given or lies in the folder as `all.csv` (a model that it does not list has none), else that of the paper. Any
     other folder gives every mesh file at any depth, named by its path, without class and split, but for hidden files.
     Files of one name beside each other, or in folders that are named after formats, are one object, of which the best
-    is taken.
+    is taken. Links are followed, to each folder once.
 
     Args:
         folder: the folder.
@@ -105,10 +106,11 @@ def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> 
             f"{root}: expected a ShapeNetCore tree for {split_file}, found none; give the folder of synsets"
         )
     objects: dict[tuple[str, ...], list[Path]] = defaultdict(list)
-    for path in _mesh_files(root):
+    files, unreadable = _mesh_files(root)
+    for path in files:
         folders = (name for name in path.parts[:-1] if not _NAMES_A_FORMAT.fullmatch(name))
         objects[(*folders, path.stem)].append(path)
-    taken, unreadable, duplicates = [], [], []
+    taken, duplicates = [], []
     for paths in objects.values():
         best = min(paths, key=lambda path: (_rank(path), path))
         if _rank(best) < len(_BEST_FIRST):
@@ -123,11 +125,40 @@ def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> 
     return FoundMeshes(_unique(named), sorted(unreadable), sorted(duplicates))
 
 
-def _mesh_files(root: Path) -> list[Path]:
-    """The paths of all mesh files from a folder on, sorted, but those that are hidden."""
-    found = (path for path in root.rglob("*") if path.suffix.lower() in (*MESH_SUFFIXES, *OTHER_SUFFIXES))
-    paths = (path.relative_to(root) for path in found if path.is_file())
-    return sorted(path for path in paths if not any(part.startswith(".") or part == "__MACOSX" for part in path.parts))
+def _mesh_files(root: Path, whole: Collection[Path] = ()) -> tuple[list[Path], list[tuple[str, str]]]:
+    """The mesh files under a folder but those that are hidden, sorted, and what cannot be looked into, with the reason.
+
+    Each folder is looked into once: where it lies if that is under the root, else by the first link that leads to it.
+
+    Args:
+        root: the folder, from which all paths are.
+        whole: folders that are not looked into.
+    """
+    found, failed = [], []
+    folders, links, seen = [Path()], [], set()
+    while folders or links:
+        folder = folders.pop() if folders else links.pop(0)
+        try:
+            status = os.stat(root / folder)
+            if folder in whole or (status.st_dev, status.st_ino) in seen:
+                continue
+            seen.add((status.st_dev, status.st_ino))
+            with os.scandir(root / folder) as entries:
+                inner = sorted(entries, key=lambda entry: entry.name)
+        except OSError as error:
+            failed.append((str(folder), f"expected a folder that can be read, found {error.strerror}"))
+            continue
+        for entry in inner:
+            path = folder / entry.name
+            if entry.name.startswith(".") or entry.name == "__MACOSX":
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                folders.append(path)
+            elif os.path.isdir(entry):
+                links.append(path)
+            elif path.suffix.lower() in (*MESH_SUFFIXES, *OTHER_SUFFIXES) and os.path.isfile(entry):
+                found.append(path)
+    return sorted(found), failed
 
 
 def _rank(path: Path) -> int:
@@ -139,7 +170,7 @@ def _shapenet(root: Path, split_path: Path, is_required: bool) -> FoundMeshes:
     models = find_models(root)
     split = read_split_file(split_path) if is_required or split_path.is_file() else paper_split(models)
     folders = {model.folder.relative_to(root) for model in models}
-    others = [path for path in _mesh_files(root) if folders.isdisjoint(path.parents)]
+    others, failed = _mesh_files(root, folders)
     reason = "expected a model of the ShapeNetCore tree, found another mesh; give the folder that holds it alone"
     meshes = _unique(
         MeshFile(
@@ -150,7 +181,7 @@ def _shapenet(root: Path, split_path: Path, is_required: bool) -> FoundMeshes:
         )
         for model in models
     )
-    return FoundMeshes(meshes, [(str(path), reason) for path in others])
+    return FoundMeshes(meshes, sorted([*failed, *((str(path), reason) for path in others)]))
 
 
 def _unique(found: Iterable[MeshFile]) -> list[MeshFile]:

@@ -4,6 +4,7 @@ import pytest
 
 from data_gen.datasets.sources import MeshFolder, list_items
 from data_gen.meshes.find import find_meshes
+from data_gen.meshes.mesh import load_mesh
 
 
 def touch(root, *names):
@@ -59,3 +60,26 @@ def test_no_object_is_trained_on_in_one_format_and_tested_in_another(tmp_path):
         ("test", "table.glb"),
     ]
     assert len(listing.duplicates) == 10
+
+
+def test_linked_folders_are_looked_into_and_each_folder_once(tmp_path):
+    touch(tmp_path / "elsewhere", "a/x.obj", "b/y.obj")
+    root = touch(tmp_path / "meshes", "kept/z.obj")
+    (root / "linked").symlink_to(tmp_path / "elsewhere/a")
+    (root / "again").symlink_to(tmp_path / "elsewhere")
+    (root / "first").symlink_to(root / "kept")
+    (root / "kept/back").symlink_to(root)
+    (root / "kept/itself").symlink_to(root / "kept/itself")
+    assert taken(root) == ["again/a/x.obj", "again/b/y.obj", "kept/z.obj"]
+
+
+def test_the_mesh_in_a_linked_folder_may_lie_outside_and_reads_what_is_beside_it(tmp_path):
+    folder = touch(tmp_path / "elsewhere/tree")
+    folder.mkdir(parents=True)
+    (folder / "x.obj").write_text("mtllib x.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 1\nusemtl paint\nf 1 2 3\n")
+    (folder / "x.mtl").write_text("newmtl paint\nKd 1 0 0\n")
+    root = touch(tmp_path / "meshes")
+    root.mkdir()
+    (root / "tree").symlink_to(folder)
+    (found,) = find_meshes(root).meshes
+    assert load_mesh(found.path, within=root).lost_files == ()
