@@ -94,7 +94,7 @@ def generate(
     if isinstance(source, Procedural) and source.count > MOST_OBJECTS:
         raise ValueError(f"count: expected at most {MOST_OBJECTS} objects, got {source.count}; make several data sets")
     render = config.resolve()
-    listing = list_items(source, config.held_out)
+    listing = list_items(source, config.held_out, out)
     items = listing.items
     classes = sorted({item.class_name for item in items}, key=str)
     for class_name in classes:

@@ -12,14 +12,16 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from data_gen.datasets.sources import Item
 from hyperplanes.utilities.encoding import encode_json, sha256
 from hyperplanes.utilities.files import DataError, inside, malformed, read_bytes, read_json
 from hyperplanes.utilities.writing import one_writer, write_whole
 
-__all__ = ["FORMAT", "MANIFEST", "GenerationState", "Verification", "build_manifest", "verify"]
+if TYPE_CHECKING:
+    from data_gen.datasets.sources import Item
+
+__all__ = ["FORMAT", "MANIFEST", "GenerationState", "Verification", "build_manifest", "holds_data_set", "verify"]
 
 MANIFEST = "manifest.json"
 FORMAT = "hyperplanes-dataset"
@@ -98,6 +100,15 @@ def build_manifest(
         "objects": {item.name: {**by_name[item.name]["record"], "files": by_name[item.name]["files"]} for item in done},
         "skipped": [{"name": name, "reason": reason} for name, reason in sorted(skipped)],
     }
+
+
+def holds_data_set(folder: Path) -> bool:
+    """Whether `generate` has written a data set into a folder, or begun to."""
+    if (folder / PROGRESS_FOLDER / "configuration.json").is_file():
+        return True
+    with suppress(DataError):
+        return (folder / MANIFEST).is_file() and read_json(folder / MANIFEST).get("format") == FORMAT
+    return False
 
 
 def verify(folder: str | Path) -> Verification:

@@ -6,7 +6,7 @@ import os
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -49,7 +49,7 @@ class FoundMeshes:
     Attributes:
         meshes: that can be read, sorted by name; one file an object.
         unreadable: files of formats that are not read, those beside the models of a ShapeNetCore tree, and folders that
-            cannot be looked into, from the folder on, with the reason.
+            are not looked into, from the folder on, with the reason.
         duplicates: files that hold the same object as one of `meshes` in another format, likewise.
     """
 
@@ -75,7 +75,12 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^\w.-]+", "_", plain, flags=re.ASCII).strip("._-")[:100] or "mesh"
 
 
-def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> FoundMeshes:
+def find_meshes(
+    folder: str | Path,
+    *,
+    split_file: str | Path | None = None,
+    reason_against: Callable[[Path], str | None] = lambda _: None,
+) -> FoundMeshes:
     """List the meshes under a folder.
 
     A ShapeNetCore tree (or one class of it) gives `CLASS_ID` with class and split: the official split if its file is
@@ -87,6 +92,7 @@ def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> 
     Args:
         folder: the folder.
         split_file: ShapeNet's official `all.csv`.
+        reason_against: says why not to look into a folder below; None to do so, nothing where none need know of it.
 
     Returns:
         The meshes, their names unique even where case does not count, and what is left out.
@@ -100,13 +106,14 @@ def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> 
             f"{root}: expected a folder of meshes, found {'a file' if root.exists() else 'nothing'}; give the folder"
         )
     if is_shapenet(root):
-        return _shapenet(root, Path(split_file) if split_file is not None else root / "all.csv", split_file is not None)
+        split_path = Path(split_file) if split_file is not None else root / "all.csv"
+        return _shapenet(root, split_path, split_file is not None, reason_against)
     if split_file is not None:
         raise MeshError(
             f"{root}: expected a ShapeNetCore tree for {split_file}, found none; give the folder of synsets"
         )
     objects: dict[tuple[str, ...], list[Path]] = defaultdict(list)
-    files, unreadable = _mesh_files(root)
+    files, unreadable = _mesh_files(root, reason_against)
     for path in files:
         folders = (name for name in path.parts[:-1] if not _NAMES_A_FORMAT.fullmatch(name))
         objects[(*folders, path.stem)].append(path)
@@ -125,28 +132,28 @@ def find_meshes(folder: str | Path, *, split_file: str | Path | None = None) -> 
     return FoundMeshes(_unique(named), sorted(unreadable), sorted(duplicates))
 
 
-def _mesh_files(root: Path, whole: Collection[Path] = ()) -> tuple[list[Path], list[tuple[str, str]]]:
-    """The mesh files under a folder but those that are hidden, sorted, and what cannot be looked into, with the reason.
+def _mesh_files(root: Path, reason_against: Callable[[Path], str | None]) -> tuple[list[Path], list[tuple[str, str]]]:
+    """The mesh files under a folder but those that are hidden, from it on, sorted, and folders that are left out.
 
     Each folder is looked into once: where it lies if that is under the root, else by the first link that leads to it.
-
-    Args:
-        root: the folder, from which all paths are.
-        whole: folders that are not looked into.
     """
-    found, failed = [], []
+    found, left_out = [], []
     folders, links, seen = [Path()], [], set()
     while folders or links:
         folder = folders.pop() if folders else links.pop(0)
         try:
             status = os.stat(root / folder)
-            if folder in whole or (status.st_dev, status.st_ino) in seen:
+            if (status.st_dev, status.st_ino) in seen:
                 continue
             seen.add((status.st_dev, status.st_ino))
+            reason = reason_against(root / folder) if folder.parts else None
+            if reason is not None:
+                left_out += [(str(folder), reason)] if reason else []
+                continue
             with os.scandir(root / folder) as entries:
                 inner = sorted(entries, key=lambda entry: entry.name)
         except OSError as error:
-            failed.append((str(folder), f"expected a folder that can be read, found {error.strerror}"))
+            left_out.append((str(folder), f"expected a folder that can be read, found {error.strerror}"))
             continue
         for entry in inner:
             path = folder / entry.name
@@ -158,7 +165,7 @@ def _mesh_files(root: Path, whole: Collection[Path] = ()) -> tuple[list[Path], l
                 links.append(path)
             elif path.suffix.lower() in (*MESH_SUFFIXES, *OTHER_SUFFIXES) and os.path.isfile(entry):
                 found.append(path)
-    return sorted(found), failed
+    return sorted(found), left_out
 
 
 def _rank(path: Path) -> int:
@@ -166,11 +173,13 @@ def _rank(path: Path) -> int:
     return _BEST_FIRST.index(suffix) if suffix in _BEST_FIRST else len(_BEST_FIRST)
 
 
-def _shapenet(root: Path, split_path: Path, is_required: bool) -> FoundMeshes:
+def _shapenet(
+    root: Path, split_path: Path, is_required: bool, reason_against: Callable[[Path], str | None]
+) -> FoundMeshes:
     models = find_models(root)
     split = read_split_file(split_path) if is_required or split_path.is_file() else paper_split(models)
-    folders = {model.folder.relative_to(root) for model in models}
-    others, failed = _mesh_files(root, folders)
+    folders = {model.folder for model in models}
+    others, left_out = _mesh_files(root, lambda folder: "" if folder in folders else reason_against(folder))
     reason = "expected a model of the ShapeNetCore tree, found another mesh; give the folder that holds it alone"
     meshes = _unique(
         MeshFile(
@@ -181,7 +190,7 @@ def _shapenet(root: Path, split_path: Path, is_required: bool) -> FoundMeshes:
         )
         for model in models
     )
-    return FoundMeshes(meshes, sorted([*failed, *((str(path), reason) for path in others)]))
+    return FoundMeshes(meshes, sorted([*left_out, *((str(path), reason) for path in others)]))
 
 
 def _unique(found: Iterable[MeshFile]) -> list[MeshFile]:

@@ -1,6 +1,7 @@
 """Source of truth: a data set made of the files as they are now, byte for byte."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -111,6 +112,21 @@ def test_a_data_set_of_a_version_that_compared_sizes_goes_on_while_they_are_the_
     path.write_text(json.dumps(manifest))
     with pytest.raises(DataError, match=r"source\.names"):
         run(meshes)
+
+
+def test_meshes_of_data_sets_inside_the_folder_are_none_of_the_source(meshes):
+    config = replace(CONFIG, channels=("rgba", "mesh"))
+    for out in (meshes / "out", meshes / "sets/other"):
+        reports = [generate(MeshFolder(meshes), out, config) for _ in range(2)]
+        assert [report.reused for report in reports] == [0, 2]
+    assert [name for name, _ in reports[1].skipped] == ["c", "out"]
+    assert [name for name, _ in reports[0].skipped] == ["c", "out"]
+    (meshes / "sets/other/manifest.json").unlink()
+    (meshes / "sets/other/.progress").mkdir()
+    (meshes / "sets/other/.progress/configuration.json").write_text("{}")
+    assert [name for name, _ in generate(MeshFolder(meshes), meshes / "out", config).skipped] == ["c", "sets/other"]
+    alone = generate(MeshFolder(meshes / "out"), meshes.parent / "again", replace(CONFIG, held_out=0))
+    assert (alone.written, alone.skipped) == (2, []), "given itself, it is a folder of meshes"
 
 
 def test_what_a_model_is_made_of_is_in_the_manifest(meshes):
