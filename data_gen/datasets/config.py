@@ -20,6 +20,7 @@ ENGINES = ("local", "ray")
 """Where objects are rendered: worker processes of this machine, or a Ray cluster."""
 
 VIEWS, RESOLUTION = 50, 64
+FEWEST_VIEWS = 2
 MOST_VIEWS, MOST_SAMPLES, MOST_BYTES = 10_000, 16_384, 4 * 2**30  # an object; along a side; of all its pictures
 EXTRA_CHANNELS = {"depth": 4, "normals": 12, "coordinates": 12, "mesh": 0}  # bytes a pixel
 
@@ -222,8 +223,9 @@ class GenerationConfig:
 def _check_sizes(config: RenderConfig) -> None:
     """Sizes are checked before anything is allocated; the pictures of one object are in memory at once."""
     views, resolution, supersample = config.views, config.resolution, config.supersample
-    if views > MOST_VIEWS:
-        raise ValueError(f"views: expected at most {MOST_VIEWS:,} an object, got {views:,}")
+    if not FEWEST_VIEWS <= views <= MOST_VIEWS:
+        wanted = f"{FEWEST_VIEWS} (support and query) to {MOST_VIEWS:,} an object"
+        raise ValueError(f"views: expected {wanted}, got {views:,}")
     if resolution * supersample > MOST_SAMPLES:
         raise ValueError(
             f"resolution: expected at most {MOST_SAMPLES:,} samples along a side, got {resolution:,} pixels of "

@@ -103,6 +103,14 @@ def test_photographs_in_the_axes_of_another_program_are_recognised():
     assert check_gaze(views) == (True, "cameras: 8 of 8 look at one place")
 
 
+def test_cameras_whose_axes_are_parallel_may_look_at_one_place_or_not():
+    views = photographs(8)
+    assert check_gaze(views[:1]) is None
+    moved = views.cameras.extrinsics[:1].repeat(8, 1, 1)
+    moved[:, 0, 3] += torch.arange(8)
+    assert check_gaze(replace(views, cameras=camera.with_poses(views.cameras, moved))) is None
+
+
 def test_masks_that_agree_under_no_reading_are_wrong(scene):
     """Poses dealt out at random explain no mask; the relative comparison alone called them right."""
     views = balls(type(scene))

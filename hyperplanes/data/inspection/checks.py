@@ -13,6 +13,8 @@ from hyperplanes.views import Views
 
 __all__ = ["check_duplicates", "check_gaze", "check_splits"]
 
+PARALLEL = 1e-6  # from 1, the cosine of the angle between two axes: 0.08 degrees
+
 
 def check_duplicates(views: Views) -> str | None:
     """A sentence where one picture stands for several poses, None where each pose has a picture of its own.
@@ -36,16 +38,19 @@ def check_duplicates(views: Views) -> str | None:
     )
 
 
-def check_gaze(views: Views) -> tuple[bool, str]:
+def check_gaze(views: Views) -> tuple[bool, str] | None:
     """Whether the cameras look at one place: the point nearest to all their axes is seen by most of them.
 
     Args:
         views: of one scene.
 
     Returns:
-        Whether at least half of them see it, and a line that says how many.
+        Whether at least half of them see it, and a line that says how many; None where all axes are parallel, so that
+        no point is the nearest.
     """
     eyes, axes = camera.centres(views.cameras), camera.viewing_directions(views.cameras)
+    if float((axes @ axes[0]).abs().min()) > 1 - PARALLEL:
+        return None
     point = nearest_point(eyes, axes)
     ahead = ((point - eyes) * axes).sum(-1) > 0
     pixels = views.cameras.project(point.expand(len(views), 1, 3))[:, 0]

@@ -31,6 +31,7 @@ AS_DECLARED = "as declared"
 CLEARLY = 0.15
 LEAST_COVERAGE = 0.83  # of the masks by their hull: 0.86 to 0.95 with right poses, 0.24 to 0.80 with wrong ones
 FEWEST_MATCHES = 30
+FEWEST_VIEWS = 3  # two masks are silhouettes of a hull under nearly any poses
 NEAR = 2.0  # pixels of 256 from the epipolar line
 MATCHING, RANDOM = 0.6, 0.3  # of the matches are near with right poses, and at most that many with wrong ones
 
@@ -47,6 +48,7 @@ class Conventions:
         by: "masks" or "pictures".
         matches: how many corners were matched.
         coverage: how much of the masks their hull covers with the poses as declared.
+        without: why it is not by masks.
     """
 
     scores: dict[str, float]
@@ -54,6 +56,7 @@ class Conventions:
     by: str = "masks"
     matches: int = 0
     coverage: float = 1.0
+    without: str = "there are no masks"
 
     @property
     def consistent(self) -> bool:
@@ -66,7 +69,7 @@ class Conventions:
     def line(self) -> str:
         """One line for people."""
         if not self.scores:
-            return f"conventions: not checked, there are no masks, and only {self.matches} corners could be matched"
+            return f"conventions: not checked, {self.without}, and only {self.matches} corners could be matched"
         declared = self.scores[AS_DECLARED]
         others = max(score for name, score in self.scores.items() if name != AS_DECLARED)
         what, measure = (
@@ -108,8 +111,12 @@ def check_conventions(views: Views) -> Conventions:
     Returns:
         The agreement under each reading of the poses: of the masks, or without masks of the pictures.
     """
-    if not masks_tell(views) or len(views) < 3:
-        return _by_pictures(views)
+    if views.masks is None:
+        return _by_pictures(views, "there are no masks")
+    if not masks_tell(views):
+        return _by_pictures(views, "the masks do not tell object and background apart")
+    if len(views) < FEWEST_VIEWS:
+        return _by_pictures(views, f"fewer than {FEWEST_VIEWS} views are too few to compare masks")
     masks, cameras = small_masks(views)
     readings = {name: camera.with_poses(cameras, pose) for name, pose in _readings(cameras).items()}
     scores = {name: coarse_hull(masks, turned).overlap(masks, turned) for name, turned in readings.items()}
@@ -118,10 +125,10 @@ def check_conventions(views: Views) -> Conventions:
     return Conventions(scores, _clearly_best(scores), coverage=coverage)
 
 
-def _by_pictures(views: Views) -> Conventions:
+def _by_pictures(views: Views, without: str) -> Conventions:
     matches = match_pictures(views)
     if len(matches) < FEWEST_MATCHES:
-        return Conventions({}, AS_DECLARED, "pictures", len(matches))
+        return Conventions({}, AS_DECLARED, "pictures", len(matches), without=without)
     scores = {name: near_lines(matches, pose) for name, pose in _readings(views.cameras).items()}
     return Conventions(scores, _clearly_best(scores), "pictures", len(matches))
 

@@ -123,10 +123,15 @@ def describe(path: str | Path | Dataset, objects: int = 8) -> Description:
 
     Returns:
         What was found; objects that cannot be read are listed in it and do not stop it.
+
+    Raises:
+        ValueError: fewer than one object to look at.
     """
+    if objects < 1:
+        raise ValueError(f"objects: expected at least 1 to look at, got {objects}")
     data = path if isinstance(path, Dataset) else Dataset(path)
     names = data.names()
-    chosen = np.linspace(0, len(names) - 1, min(max(1, objects), len(names))).round().astype(int)
+    chosen = np.linspace(0, len(names) - 1, min(objects, len(names))).round().astype(int)
     found, broken = [], []
     for name in (names[index] for index in chosen):
         try:
@@ -183,7 +188,7 @@ def _checked(task: Task) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is wrong, and what was looked at besides."""
     halves = task.support, task.query
     parts = [join_views(*halves)] if task.support.size == task.query.size else halves
-    outcomes = [check_gaze(task.support), check_splits(*halves)]
+    outcomes = [each for each in (check_gaze(task.support), check_splits(*halves)) if each is not None]
     problems = [same for part in parts if (same := check_duplicates(part))]
     problems += [line for fine, line in outcomes if not fine]
     return tuple(problems), tuple(line for fine, line in outcomes if fine)

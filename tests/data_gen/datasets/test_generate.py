@@ -246,9 +246,10 @@ def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypat
         ),
         ({"resolution": 100_000}, "resolution: expected at most 16,384 samples along a side, got 100,000 pixels of 3"),
         ({"resolution": 5000}, "resolution: expected at most 4 GiB of pictures an object, got 4.7 GiB"),
-        ({"views": 10**9}, "views: expected at most 10,000 an object, got 1,000,000,000"),
+        ({"views": 10**9}, r"views: expected 2 \(support and query\) to 10,000 an object, got 1,000,000,000"),
+        ({"views": 1}, "views: expected 2 .* an object, got 1"),
         ({"timeout": 0.0}, "timeout: expected seconds above 0, got 0"),
-        ({"views": 0}, "views: expected at least 1, received 0"),
+        ({"views": 0}, "views: expected 2 .* an object, got 0"),
         ({"held_out": math.inf}, "held_out: expected a fraction below 1 or a count up to 5 of each class, got inf"),
         ({"held_out": math.nan}, "held_out: expected a fraction below 1 or a count up to 5 of each class, got nan"),
         ({"supersample": 0}, "supersample: expected 1 to 8, got 0"),
@@ -270,7 +271,7 @@ def test_arguments_that_make_no_sense_are_named(tmp_path, arguments, message):
 def test_names_that_the_authors_layout_makes_the_same_are_refused(tmp_path):
     for name in ("a_1", "a-1"):
         trimesh.creation.box().export(tmp_path / f"{name}.ply")
-    config = GenerationConfig(layout="hyperplanes-200", views=1)
+    config = GenerationConfig(layout="hyperplanes-200", views=2)
     with pytest.raises(ValueError, match="a_1: expected a name that hyperplanes-200 tells from a-1"):
         generate(MeshFolder(tmp_path, class_name="car"), tmp_path / "out", config)
     assert not (tmp_path / "out").exists()
@@ -291,7 +292,7 @@ def test_options_of_the_other_source_are_refused(given, message):
 @pytest.mark.usefixtures("here")
 def test_the_authors_layout_takes_the_classes_that_their_loader_knows(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.ply")
-    config = GenerationConfig(layout="hyperplanes-200", views=1, held_out=0, workers=1)
+    config = GenerationConfig(layout="hyperplanes-200", views=2, held_out=0, workers=1)
     for source, found in (
         (Procedural("lamp", 1), "lamp"),
         (MeshFolder(tmp_path), "meshes without a class; give --class-name"),
@@ -300,7 +301,7 @@ def test_the_authors_layout_takes_the_classes_that_their_loader_knows(tmp_path):
             generate(source, tmp_path / "out", config)
     GenerationConfig(layout="srn", distance=4.0).resolve().check_class("chair")
     generate(MeshFolder(tmp_path, class_name="chair"), tmp_path / "out", config)
-    assert (tmp_path / "out/chairs/sampled/1_box.npz").is_file()
+    assert (tmp_path / "out/chairs/sampled/2_box.npz").is_file()
 
 
 def test_data_sets_of_one_seed_share_objects_and_never_mix_training_and_held_out():

@@ -7,7 +7,9 @@ import sys
 import numpy as np
 import pytest
 from PIL import Image
+from rendered_here import rendered_here
 
+from data_gen.datasets.generate import GenerationConfig, Procedural, generate
 from data_gen.datasets.inspect import inspect
 from hyperplanes.data import DataError
 from hyperplanes.geometry import cameras as camera
@@ -127,3 +129,21 @@ def test_an_empty_hull_is_not_said_to_be_a_lack_of_masks(tmp_path):
     text = "\n".join(inspect(folder, tmp_path / "out").lines())
     assert "visual hull: empty" in text
     assert "masks: none" not in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_two_views_cannot_tell_is_no_problem(tmp_path):
+    """One support view: no point is the nearest to one axis, and one mask is the silhouette of a hull anywhere."""
+    with rendered_here():
+        generate(Procedural("car", 2), tmp_path / "cars", GenerationConfig(views=2, resolution=32, workers=1))
+    found = inspect(tmp_path / "cars", tmp_path / "out")
+    text = "\n".join(found.lines())
+    assert not found.has_problems, text
+    assert "look at one place" not in text
+    assert "conventions: not checked, fewer than 3 views are too few to compare masks" in text
+    assert "there are no masks" not in text
+
+
+def test_a_data_set_of_which_nothing_is_looked_at_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="objects: expected at least 1 to look at, got 0"):
+        inspect(write(tmp_path / "ball"), tmp_path / "out", 0)
