@@ -148,6 +148,12 @@ def remarks(report: GenerationReport, out: Path) -> list[str]:
         ("drawn with other warnings", "with_warnings"): others,
     }
     lines = [
+        f"{'fewer' if report.splits[split] else 'no'} objects in the split {split}: {report.splits[split]} of {count}; "
+        "repair what was skipped, or choose another --held-out"
+        for split, count in report.requested.items()
+        if report.splits[split] < count
+    ]
+    lines += [
         f"{what}: {len(names)} of {report.written} objects ({_some(names)}), "
         f"listed in {out / 'manifest.json'} under {key}"
         for (what, key), names in found.items()

@@ -42,6 +42,7 @@ class GenerationReport:
         images_per_second: that this call wrote.
         reused: objects that an earlier call had written.
         splits: how many objects are in each split.
+        requested: how many were to be in it; at least one to test on where any were to be held out.
         unlisted: objects that the split file does not name, and that are trained on.
         incomplete: objects that are drawn without a texture or another file that they name.
         warned: objects with warnings, of which those with lost files are some.
@@ -55,6 +56,7 @@ class GenerationReport:
     images_per_second: float
     reused: int = 0
     splits: dict[str, int] = field(default_factory=dict)
+    requested: dict[str, int] = field(default_factory=dict)
     unlisted: list[str] = field(default_factory=list)
     incomplete: list[str] = field(default_factory=list)
     warned: list[str] = field(default_factory=list)
@@ -136,6 +138,8 @@ def generate(
         state.finish(manifest, LAYOUTS[render.layout].splits(kept))
     seconds = time.monotonic() - begun
     splits = {split: len(names) for split, names in manifest["splits"].items()}
+    requested = {split: sum(item.split == split for item in items) for split in splits}
+    requested["test"] = max(requested["test"], int(bool(config.held_out)))
     unlisted, incomplete, warned = (
         manifest[key]["names"] for key in ("not_in_split_file", "with_lost_files", "with_warnings")
     )
@@ -146,6 +150,7 @@ def generate(
         images_per_second=images / seconds,
         reused=reused,
         splits=splits,
+        requested=requested,
         unlisted=unlisted,
         incomplete=incomplete,
         warned=warned,

@@ -193,9 +193,28 @@ def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path)
     assert Dataset(tmp_path / "out").names() == ["ball", "box", "grey"]
     assert manifest["with_lost_files"] == {"count": 1, "names": ["grey"]}
     assert manifest["objects"]["grey"]["lost_files"] == ["gone.mtl"]
-    line, other = remarks(report, tmp_path / "out")
+    fewer, line, other = remarks(report, tmp_path / "out")
+    assert fewer == "fewer objects in the split train: 3 of 5; repair what was skipped, or choose another --held-out"
     assert line.startswith("drawn without a texture or another file that they name: 1 of 3 objects (grey), listed in")
     assert "taken in another format: 1 of the files (ball.fbx), listed in" in other
+
+
+@pytest.mark.usefixtures("here")
+def test_a_split_that_has_lost_objects_is_named(tmp_path):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for name in "abcdef":
+        trimesh.creation.box().export(meshes / f"{name}.ply")
+    for broken, lines in (
+        ("f", ["fewer objects in the split test: 1 of 2"]),
+        ("e", ["no objects in the split test: 0 of 2"]),
+        ("a", ["fewer objects in the split train: 3 of 4", "no objects in the split test: 0 of 2"]),
+    ):
+        (meshes / f"{broken}.ply").write_text("ply")
+        report = generate(MeshFolder(meshes), tmp_path / "out", GenerationConfig(**SMALL))
+        assert [line.partition(";")[0] for line in remarks(report, tmp_path / "out")] == lines
+    alone = generate(Procedural("car", 1), tmp_path / "one", GenerationConfig(held_out=0.5, **SMALL))
+    assert [line.partition(";")[0] for line in remarks(alone, tmp_path)] == ["no objects in the split test: 0 of 1"]
 
 
 def test_the_axis_is_that_of_the_format_unless_a_file_or_folder_is_named(tmp_path):
