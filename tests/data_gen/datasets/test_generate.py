@@ -330,6 +330,23 @@ def test_data_sets_of_one_seed_share_objects_and_never_mix_training_and_held_out
     assert len(set(large.values())) == len(large)
 
 
+@pytest.mark.parametrize("largest", [2**9 - 1, 2**32 - 1])
+def test_an_object_that_would_be_another_is_drawn_again_and_no_other(monkeypatch, largest):
+    """Of 200 draws from 512 numbers some 34 are another's; in order, the training objects before the held-out ones."""
+    monkeypatch.setattr("data_gen.datasets.sources.SEEDS", largest)
+    whole = {item.name: item.seed for item in list_items(Procedural("car", 200, 1), 100).items}
+    before = set()
+    for index in range(100):
+        for test, name in enumerate((f"car_{index:05d}", f"car_test_{index:05d}")):
+            drawn = int(np.random.SeedSequence([1, test, index]).generate_state(1)[0]) & largest
+            assert (whole[name] == drawn) == (drawn not in before)
+            before.add(whole[name])
+    assert len(before) == 200
+    for count, held_out in ((100, 0), (120, 20), (60, 59)):
+        part = {item.name: item.seed for item in list_items(Procedural("car", count, 1), held_out).items}
+        assert part.items() <= whole.items(), "data sets of one seed share objects"
+
+
 def test_mesh_files_are_split_by_name_four_to_one(tmp_path):
     for index in range(10):
         trimesh.creation.box().export(tmp_path / f"mesh{index}.ply")
