@@ -188,16 +188,18 @@ def _former(configuration: dict[str, Any], items: list[Item]) -> dict[str, Any] 
 
 
 def _has_changed(item: Item, entry: Entry, meshes: str | None) -> bool:
-    """Whether the files of a mesh are others than those that it was drawn from, or stand elsewhere."""
+    """Whether the files of a mesh are others than those that it was drawn from, or their place is."""
     if item.path is None or meshes is None:
         return False
     from data_gen.meshes.model_folder import model_checksums
 
-    was = entry["record"].get("made_of", {})
-    now = model_checksums(Path(item.path), was, Path(meshes))
-    if not was:  # of a version that compared the sizes
-        entry["record"]["made_of"] = now
-    return bool(was) and was != now
+    record = entry["record"]
+    was = {key: record.get(key, {}) for key in ("made_of", "source")}
+    now = {"made_of": model_checksums(Path(item.path), was["made_of"], Path(meshes)), "source": item.source}
+    if not any(was.values()):  # of a version that compared the sizes
+        record |= now
+        return False
+    return was != now
 
 
 def _without_path(reason: str, source: Source) -> str:

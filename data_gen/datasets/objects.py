@@ -88,6 +88,8 @@ def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict
     }
     if item.seed is not None:
         record["seed"] = item.seed
+    if item.source is not None:
+        record["source"] = item.source
     if mesh.warnings:
         record["warnings"] = list(mesh.warnings)
     if mesh.made_of:

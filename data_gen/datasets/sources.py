@@ -73,6 +73,7 @@ class Item:
         split: "train", "val" or "test".
         seed: of the procedural shape, or None for a file.
         path: of the mesh file, or None for a procedural shape.
+        source: the same from the folder of meshes on.
         unlisted: whether a split file decides and does not name it, so that it is trained on.
         up: the axis that points up in the file, y or z; None for what its format says.
     """
@@ -82,6 +83,7 @@ class Item:
     split: str
     seed: int | None = None
     path: str | None = None
+    source: str | None = None
     unlisted: bool = False
     up: Literal["y", "z"] | None = None
 
@@ -193,8 +195,8 @@ def _meshes(source: MeshFolder, held_out: float | int | None, out: Path | None) 
             if stated:
                 split = mesh.split or "train"
             unlisted = stated and mesh.split is None
-            up = axes[mesh.path]
-            items.append(Item(mesh.name, class_name, split, path=str(mesh.path), unlisted=unlisted, up=up))
+            paths = {"path": str(mesh.path), "source": mesh.path.relative_to(source.path).as_posix()}
+            items.append(Item(mesh.name, class_name, split, unlisted=unlisted, up=axes[mesh.path], **paths))
     return Listing(items, found.unreadable, found.duplicates)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from data_gen.meshes.files import MESH_SUFFIXES, OTHER_SUFFIXES, MeshError
 from data_gen.meshes.shapenet import class_of_synset, find_models, is_shapenet, paper_split, read_split_file
+from hyperplanes.utilities.encoding import sha256
 
 __all__ = ["FoundMeshes", "MeshFile", "find_meshes", "safe_name"]
 
@@ -61,18 +62,25 @@ class FoundMeshes:
 def safe_name(text: str) -> str:
     """Turn any text into the name of a file: letters, digits, dot, hyphen and underscore, at most 100 of them.
 
+    Other letters can be shown by few fonts, those of our contact sheets and of matplotlib not among them.
+
     Args:
         text: any text.
 
     Returns:
-        The name; `mesh` if nothing of the text is left.
+        The name, `mesh` if nothing of the text is left; with a checksum of the text where letters are lost.
 
     >>> safe_name("Tisch & Stühle/2.glb")
     'Tisch_Stuhle_2.glb'
+    >>> safe_name("стол 2.glb"), safe_name("стул 2.glb")
+    ('2.glb_db4391bf', '2.glb_a87eab70')
     """
     plain = unicodedata.normalize("NFKD", text)
     plain = "".join(letter for letter in plain if not unicodedata.combining(letter))
-    return re.sub(r"[^\w.-]+", "_", plain, flags=re.ASCII).strip("._-")[:100] or "mesh"
+    name = re.sub(r"[^\w.-]+", "_", plain, flags=re.ASCII).strip("._-")[:100]
+    if name and not any(letter.isalnum() and not letter.isascii() for letter in plain):
+        return name
+    return f"{name[:91] or 'mesh'}_{sha256(os.fsencode(unicodedata.normalize('NFC', text)))[:8]}"
 
 
 def find_meshes(

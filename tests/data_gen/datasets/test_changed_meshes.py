@@ -104,7 +104,7 @@ def test_a_data_set_of_a_version_that_compared_sizes_goes_on_while_they_are_the_
     del source["splits"]
     source["names"] = sha256(repr(names).encode())
     for record in manifest["objects"].values():
-        del record["made_of"]
+        del record["made_of"], record["source"]
     path.write_text(json.dumps(manifest))
     assert (run(meshes).reused, verify(meshes.parent / "out").intact) == (2, True)
     trimesh.creation.box().export(meshes / "a.ply", encoding="ascii")
@@ -129,9 +129,13 @@ def test_meshes_of_data_sets_inside_the_folder_are_none_of_the_source(meshes):
     assert (alone.written, alone.skipped) == (2, []), "given itself, it is a folder of meshes"
 
 
-def test_what_a_model_is_made_of_is_in_the_manifest(meshes):
+def test_which_file_a_model_is_and_what_it_is_made_of_is_in_the_manifest(meshes):
     (meshes / "b.mtl").write_text(PAINT)
+    (meshes / "стол").mkdir()
+    (meshes / "a.ply").rename(meshes / "стол/a.ply")
     run(meshes)
-    made_of = json.loads((meshes.parent / "out/manifest.json").read_text())["objects"]["b"]["made_of"]
+    records = json.loads((meshes.parent / "out/manifest.json").read_text())["objects"]
+    assert {record["source"] for record in records.values()} == {"b.obj", "стол/a.ply"}
+    made_of = records["b"]["made_of"]
     checksums = {name: sha256((meshes / name).read_bytes()) for name in ("b.obj", "b.mtl")}
     assert made_of == {**checksums, "wood.png": None}

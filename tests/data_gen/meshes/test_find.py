@@ -62,6 +62,18 @@ def test_no_object_is_trained_on_in_one_format_and_tested_in_another(tmp_path):
     assert len(listing.duplicates) == 10
 
 
+def test_names_in_other_letters_differ_and_do_not_depend_on_their_neighbours(tmp_path):
+    texts = ("椅子", "机", "стул", "стол", "Stuhl", "Stühle", "が", "か")
+    touch(tmp_path, *(f"{text}.glb" for text in texts))
+    names = {mesh.path.stem: mesh.name for mesh in find_meshes(tmp_path).meshes}
+    assert len({name.rpartition("_")[2] for name in names.values()}) == len(texts)
+    assert (names["Stuhl"], names["Stühle"]) == ("Stuhl", "Stuhle")
+    assert all(name.isascii() for name in names.values())
+    (tmp_path / "机.glb").unlink()
+    names.pop("机")
+    assert {mesh.path.stem: mesh.name for mesh in find_meshes(tmp_path).meshes} == names
+
+
 def test_linked_folders_are_looked_into_and_each_folder_once(tmp_path):
     touch(tmp_path / "elsewhere", "a/x.obj", "b/y.obj")
     root = touch(tmp_path / "meshes", "kept/z.obj")
