@@ -161,7 +161,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
     [
         (["generate", "--out", "OUT"], ["--class", "--meshes"]),
         (["generate", "--meshes", "OUT/none", "--out", "OUT"], ["OUT/none", "found nothing"]),
-        (["generate", "--class", "caar", "--out", "OUT"], ["expected one of car, chair", "did you mean car?"]),
+        (["generate", "--class", "caar", "--out", "OUT"], ["class: expected one of car, chair", "did you mean car?"]),
         (
             ["generate", "--class", "car", "--layout", "srm", "--out", "OUT"],
             ["expected one of native, ", "mean srn?"],

@@ -44,16 +44,18 @@ class Arguments:
         meshes_class: What the meshes are, where their tree does not say it: layouts of other projects name folders so.
         count: How many procedural objects, the held-out ones included; 70 when not given.
         seed: Of the procedural shapes and of random rigs and lights.
-        resolution: Pixels along a side of the square images; what the rig or the layout is made for, else 64, when not
-            given.
-        views: Cameras an object, alternately support and query; 50 when not given.
+        resolution: Pixels along a side of the square images; when not given 200 in the layout hyperplanes-200, else
+            those of the data set that the rig is of, else 64.
+        views: Cameras an object, alternately support and query; those of the data set that the rig is of, else 50, when
+            not given.
         held_out: Objects of each class for the test split: a count, or a fraction below 1. A seventh when not given; of
             mesh files the split that their tree states, else a fifth.
         rig: Where the cameras stand: the same places for all objects, random ones, a circle, a spiral, or as in one
             of the two data sets of the paper or in SRN's, with its distance, lens and resolution.
         distance: Of the cameras from the object's centre, in radii of the object; what the rig or the layout is made
             for, else 3, when not given.
-        field_of_view: Of the cameras in degrees; that of the rig or the layout, else the object just fits.
+        field_of_view: Of the cameras in degrees; when not given that of the layout or of the data set that the rig is
+            of, at any distance, else the object just fits.
         lighting: Where the light comes from.
         layout: How the files lie: native, or as another project's loader reads them.
         up: The axis that points up in OBJ, PLY, STL and OFF files, which do not say it; glTF is y up by its

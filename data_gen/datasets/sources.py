@@ -133,13 +133,9 @@ def seed_of(seed: int, *parts: object) -> int:
 
 
 def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
-    from data_gen.shapes import find_classes
-    from hyperplanes.utilities.errors import did_you_mean
+    from data_gen.shapes import check_class
 
-    known = find_classes()
-    if source.class_name not in known:
-        near = did_you_mean(source.class_name, known)
-        raise ValueError(f"class: expected one of {', '.join(known)}, got {source.class_name!r}{near}")
+    check_class(source.class_name)
     if source.count < 1 or source.seed < 0:
         raise ValueError(
             f"count, seed: expected at least 1 object and a seed >= 0, got {source.count} and {source.seed}"

@@ -123,13 +123,14 @@ def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:
         The full angle in degrees, `2 asin(1.04 / distance)`.
 
     Raises:
-        ValueError: if the camera is too near for any angle to do.
+        ValueError: if the camera is too near for any angle to do, or infinitely far.
 
     >>> round(fitting_field_of_view(3.0), 3)
     40.567
     """
-    if not distance > _MARGIN * OBJECT_RADIUS:
-        raise ValueError(f"distance: expected more than {_MARGIN} (the object's radius is 1), received {distance}")
+    if not _MARGIN * OBJECT_RADIUS < distance < math.inf:
+        wanted = f"a finite number of more than {_MARGIN} (the object's radius is 1)"
+        raise ValueError(f"distance: expected {wanted}, received {distance}")
     return math.degrees(2.0 * math.asin(_MARGIN * OBJECT_RADIUS / distance))
 
 

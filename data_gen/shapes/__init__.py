@@ -56,7 +56,7 @@ def check_class(class_name: str) -> None:
     known = find_classes()
     if class_name not in known:
         near = did_you_mean(class_name, known)
-        raise ValueError(f"class_name: expected one of {', '.join(known)}, got {class_name!r}{near}")
+        raise ValueError(f"class: expected one of {', '.join(known)}, got {class_name!r}{near}")
 
 
 def assemble(class_name: str, seed: int) -> list[Part]:

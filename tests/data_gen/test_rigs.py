@@ -1,5 +1,7 @@
 """Source of truth: Kornia's projection, the stated spread of cameras, hand-made numbers, and what is refused."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -154,6 +156,7 @@ def test_one_intrinsic_matrix_serves_all_views():
         (lambda: rigs.fixed(0, 16), "at least 1, received 0"),
         (lambda: rigs.fixed(4, 0), "at least 1 pixel, received 0"),
         (lambda: rigs.fixed(4, 16, distance=1.0), "more than 1.04 .* received 1.0"),
+        (lambda: rigs.fixed(4, 16, distance=math.inf), "distance: expected a finite number .* received inf"),
         (lambda: rigs.fixed(4, 16, lowest=50.0, highest=20.0), "received 50.0 and 20.0"),
         (lambda: rigs.random(4, 16, seed=0, lowest=-91.0), "received -91.0 and 90.0"),
         (lambda: rigs.fixed(4, 16, field_of_view=180.0), "received 180.0"),

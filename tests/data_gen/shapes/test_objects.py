@@ -133,7 +133,7 @@ def test_frame_is_y_up_and_front_along_z():
 
 
 def test_wrong_arguments_are_named():
-    with pytest.raises(ValueError, match="class_name: expected one of car, chair, plane, lamp, random, got 'boat'"):
+    with pytest.raises(ValueError, match="class: expected one of car, chair, plane, lamp, random, got 'boat'"):
         make("boat", 0)
     with pytest.raises(ValueError, match="seed: expected a non-negative integer, got -1"):
         make("car", -1)
