@@ -16,7 +16,6 @@ from data_gen.datasets.manifest import Entry, GenerationState, build_manifest
 from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
 from data_gen.rigs import OBJECT_RADIUS
-from hyperplanes.utilities.encoding import sha256
 from hyperplanes.utilities.environment import usable_cores
 from hyperplanes.utilities.files import DataError
 
@@ -102,9 +101,8 @@ def generate(
     for class_name in classes:
         render.check_class(class_name)
     check_names(render.layout, [item.name for item in items])
-    configuration = _configuration(source, items, render, config.held_out)
     meshes = str(source.path) if isinstance(source, MeshFolder) else None
-    with GenerationState(out, configuration, _former(configuration, items)) as state:
+    with GenerationState(out, _configuration(source, items, render, config.held_out)) as state:
         done = state.done()
         listed = [item for item in items if item.name in done]
         changed = {item.name: done.pop(item.name) for item in listed if _has_changed(item, done[item.name], meshes)}
@@ -178,28 +176,14 @@ def _configuration(
     return render.as_json() | {"generator": generator, "source": described, "held_out": held_out}
 
 
-def _former(configuration: dict[str, Any], items: list[Item]) -> dict[str, Any] | None:
-    """What a version wrote that knew a mesh by the size of its file."""
-    if not any(item.path for item in items):
-        return None
-    names = [[item.name, item.split, item.up, Path(item.path or "").stat().st_size] for item in items]
-    source = {key: value for key, value in configuration["source"].items() if key != "splits"}
-    return configuration | {"source": source | {"names": sha256(repr(names).encode())}}
-
-
 def _has_changed(item: Item, entry: Entry, meshes: str | None) -> bool:
     """Whether the files of a mesh are others than those that it was drawn from, or their place is."""
     if item.path is None or meshes is None:
         return False
     from data_gen.meshes.model_folder import model_checksums
 
-    record = entry["record"]
-    was = {key: record.get(key, {}) for key in ("made_of", "source")}
-    now = {"made_of": model_checksums(Path(item.path), was["made_of"], Path(meshes)), "source": item.source}
-    if not any(was.values()):  # of a version that compared the sizes
-        record |= now
-        return False
-    return was != now
+    made_of, place = entry["record"]["made_of"], entry["record"]["source"]
+    return made_of != model_checksums(Path(item.path), made_of, Path(meshes)) or place != item.source
 
 
 def _without_path(reason: str, source: Source) -> str:

@@ -147,18 +147,16 @@ class GenerationState:
     Args:
         out: the folder of the data set.
         configuration: what decides the bytes of the data set.
-        former: how an earlier version wrote the same configuration, if it did otherwise.
 
     Raises:
         DataError: a folder with other content, made with another configuration, or in use by another process.
     """
 
-    def __init__(self, out: Path, configuration: dict[str, Any], former: dict[str, Any] | None = None) -> None:
+    def __init__(self, out: Path, configuration: dict[str, Any]) -> None:
         self.out = out
         self.folder = out / PROGRESS_FOLDER
         self.scratch = self.folder / "unfinished"
         self.configuration = configuration
-        self.former = former
 
     def __enter__(self) -> GenerationState:
         """Lock the folder and check it."""
@@ -182,7 +180,7 @@ class GenerationState:
         if existing is None and others:
             found = ", ".join(sorted(others)[:3])
             raise DataError(self.out, "an empty folder or an unfinished data set", found, "name another one")
-        if existing is not None and existing not in (self.configuration, self.former):
+        if existing is not None and existing != self.configuration:
             was, now = _flat(existing), _flat(self.configuration)
             changed = sorted(key for key in was | now if was.get(key) != now.get(key))
             held, wanted = (

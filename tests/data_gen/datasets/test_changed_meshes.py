@@ -11,7 +11,6 @@ from rendered_here import rendered_here
 
 from data_gen.commands.generate import summary
 from data_gen.datasets.generate import GenerationConfig, MeshFolder, generate
-from data_gen.datasets.manifest import verify
 from hyperplanes.data import DataError
 from hyperplanes.utilities.encoding import sha256
 
@@ -91,26 +90,6 @@ def test_a_mesh_more_is_another_data_set_and_named(meshes):
     run(meshes)
     trimesh.creation.box().export(meshes / "d.ply")
     with pytest.raises(DataError, match=r"source\.splits\.c test, .*splits\.d None.*found.* train, .*splits\.d test;"):
-        run(meshes)
-
-
-def test_a_data_set_of_a_version_that_compared_sizes_goes_on_while_they_are_the_same(meshes):
-    run(meshes)
-    path = meshes.parent / "out/manifest.json"
-    manifest, names = json.loads(path.read_text()), []
-    for name, split, up in (("a.ply", "train", "y"), ("b.obj", "train", "y"), ("c.glb", "test", None)):
-        names.append([Path(name).stem, split, up, (meshes / name).stat().st_size])
-    source = manifest["configuration"]["source"]
-    del source["splits"]
-    source["names"] = sha256(repr(names).encode())
-    for record in manifest["objects"].values():
-        del record["made_of"], record["source"]
-    path.write_text(json.dumps(manifest))
-    assert (run(meshes).reused, verify(meshes.parent / "out").intact) == (2, True)
-    trimesh.creation.box().export(meshes / "a.ply", encoding="ascii")
-    assert run(meshes).changed == ["a"]
-    path.write_text(json.dumps(manifest))
-    with pytest.raises(DataError, match=r"source\.names"):
         run(meshes)
 
 
