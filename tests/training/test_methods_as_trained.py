@@ -76,7 +76,8 @@ def test_maml_and_maml_of_first_order_learn_other_weights():
     (second, losses), (first, other) = (
         trained(method, steps=3, inner_rate=0.5) for method in ("maml", "maml_first_order")
     )
-    assert losses[0] == other[0]  # the loss is the same, its gradient is not
+    # the loss is the same, but for colours that one of them does not draw; its gradient is not
+    assert losses[0] == pytest.approx(other[0], rel=1e-3)
     moved = torch.cat([(a - b).flatten() for a, b in zip(second.parameters(), first.parameters(), strict=True)])
     assert moved.abs().max() > 1e-3
 
