@@ -18,10 +18,6 @@ from data_gen.meshes.files import STATES_ITS_AXIS
 __all__ = ["Item", "Listing", "MeshFolder", "Procedural", "Source", "list_items", "seed_of"]
 
 
-SEEDS = 2**32 - 1
-"""The largest seed of a procedural object; of 77,000 objects, two were alike in half of the cases."""
-
-
 @dataclass(frozen=True)
 class Procedural:
     """Objects of a class of `data_gen.shapes`.
@@ -151,9 +147,12 @@ def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
 
 
 def _draw(sequence: np.random.SeedSequence, taken: set[int]) -> int:
-    """The first number of a sequence that none of the objects before has, in data sets of any size."""
+    """The first number of a sequence that none of the objects before has, in data sets of any size.
+
+    Numbers have 32 bits: of 77,000 objects two would be alike in half of the cases.
+    """
     words = 1
-    while (seed := int(sequence.generate_state(words)[-1]) & SEEDS) in taken:
+    while (seed := int(sequence.generate_state(words)[-1])) in taken:
         words += 1
     taken.add(seed)
     return seed

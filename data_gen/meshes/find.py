@@ -25,6 +25,8 @@ _NAMES_A_FORMAT = re.compile(
 )
 """Folders of packs of objects: `OBJ format`, `glTF-Binary`, `FBX`, `Blends`."""
 
+_SAME_FORMAT = {"glb": "gltf", "collada": "dae", "blender": "blend"}
+
 
 @dataclass(frozen=True)
 class MeshFile:
@@ -122,9 +124,12 @@ def find_meshes(
         )
     objects: dict[tuple[str, ...], list[Path]] = defaultdict(list)
     files, unreadable = _mesh_files(root, reason_against)
+    plain = {path for path in files if not _object_of(path)[1]}
     for path in files:
-        folders = (name for name in path.parts[:-1] if not _NAMES_A_FORMAT.fullmatch(name))
-        objects[(*folders, path.stem)].append(path)
+        place, _ = _object_of(path)
+        # in the folder of its format and beside that, too: two objects
+        twice = path not in plain and Path(*place).with_suffix(path.suffix) in plain
+        objects[path.parts if twice else place].append(path)
     taken, duplicates = [], []
     for paths in objects.values():
         best = min(paths, key=lambda path: (_rank(path), path))
@@ -174,6 +179,19 @@ def _mesh_files(root: Path, reason_against: Callable[[Path], str | None]) -> tup
             elif path.suffix.lower() in (*MESH_SUFFIXES, *OTHER_SUFFIXES) and os.path.isfile(entry):
                 found.append(path)
     return sorted(found), left_out
+
+
+def _object_of(path: Path) -> tuple[tuple[str, ...], bool]:
+    """What files of one object have in common, and whether this one lies in a folder that is named after its format."""
+
+    def format_of(name: str) -> str:
+        return _SAME_FORMAT.get(name.lower(), name.lower())
+
+    folders, own = path.parts[:-1], format_of(path.suffix.removeprefix("."))
+    left = [
+        name for name in folders if (found := _NAMES_A_FORMAT.fullmatch(name)) is None or format_of(found[1]) != own
+    ]
+    return (*left, path.stem), len(left) < len(folders)
 
 
 def _rank(path: Path) -> int:

@@ -121,6 +121,7 @@ class ImagePlanes:
             raise ValueError(f"images: expected shape {expected}, got {tuple(images.shape)}")
         result = copy.copy(self)
         result.images, result.exact, result.masked = images.contiguous(), True, None
+        vars(result).pop("_kept_packed", None)
         return result
 
     @without_autocast

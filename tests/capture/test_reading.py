@@ -117,6 +117,14 @@ def test_masks_do_not_change_the_pictures_that_poses_are_found_in(kind, tmp_path
     assert shown[0] == shown[attempts]
 
 
+def test_an_empty_folder_of_masks_is_none(upright, tmp_path):
+    for index in range(3):
+        save(upright, tmp_path / f"{index}.jpg")
+    (tmp_path / "masks").mkdir()
+    photographs, notes = list_photographs(find_photographs(tmp_path), tmp_path / "masks")
+    assert ([photograph.mask for photograph in photographs], notes) == ([None] * 3, [])
+
+
 def test_masks_of_close_ups_may_be_white_all_over(upright, tmp_path):
     (tmp_path / "masks").mkdir()
     for index in range(3):

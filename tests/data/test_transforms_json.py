@@ -148,14 +148,15 @@ def test_train_and_test_files_are_support_and_query(scene, tmp_path):
     assert read_task(tmp_path / "transforms_train.json").name == tmp_path.name
 
 
-def test_an_object_of_learnit_is_read_alone_and_in_its_data_set(scene, tmp_path):
+@pytest.mark.parametrize("folder", ["./abc", "/data/rgb", "../../rgb"])
+def test_an_object_of_learnit_is_read_alone_and_in_its_data_set(scene, tmp_path, folder):
     """As published: cars/abc/transforms.json lists ./abc/000, and its loader takes the last part, beside the file."""
     home = tmp_path / "cars/abc"
     scene.write(home)
     document = scene.document()
     for name, frame in zip(scene.names, document["frames"], strict=True):
         (home / name).rename(home / Path(name).name)
-        frame["file_path"] = f"./abc/{Path(name).stem}"
+        frame["file_path"] = f"{folder}/{Path(name).stem}"
     (home / "transforms.json").write_text(json.dumps(document))
     (tmp_path / "cars_splits.json").write_text(json.dumps({"train": [], "test": ["abc"]}))
     whole, alone = open_dataset(tmp_path).task("abc"), read_views(home)

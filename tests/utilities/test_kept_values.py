@@ -6,6 +6,8 @@ from types import SimpleNamespace
 
 import torch
 
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.kept import kept
 
 
@@ -31,3 +33,21 @@ def test_the_memory_of_what_it_was_made_of_is_not_given_to_another_tensor():
     del value
     gc.collect()
     assert alive() is not None
+
+
+def test_nothing_is_kept_of_what_a_function_transform_makes():
+    owner = SimpleNamespace()
+
+    def squared(value):
+        return kept(owner, "square", [value], lambda: value.square().sum())
+
+    for point in (torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])):
+        assert torch.equal(torch.func.grad(squared)(point), 2 * point)
+    assert float(squared(torch.ones(2))) == 2.0
+
+
+def test_a_compiled_graph_takes_what_was_made_before_it():
+    grid = full(Sphere(), 4)
+    expected = grid.box[0]
+    times = torch.compile(lambda value: value * grid.box[0], backend="eager", fullgraph=True)
+    assert torch.equal(times(torch.ones(2)), torch.full((2,), expected))

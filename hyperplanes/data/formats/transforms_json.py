@@ -162,14 +162,20 @@ def _frame(path: Path, fields: dict[str, Any], legacy: bool, root: Path) -> Fram
     written = fields.get("file_path")
     if not isinstance(written, str) or not written:
         raise DataError(path, "a file_path in every frame", repr(written), "export the file again")
-    located, name = _located(path, written, root), written
+    beside, as_written = path.parent / PurePosixPath(written.replace("\\", "/")).name, True
+    try:
+        located = _located(path, written, root)
+    except DataError:  # a folder elsewhere, whose pictures may have come with the file
+        if not any(beside.with_name(beside.name + suffix).is_file() for suffix in ("", *_SUFFIXES)):
+            raise
+        located, as_written = beside, False
     if not located.is_file():
         homes = located.parent, located.parent / "images", path.parent  # as written, OmniObject3D's, learnit's
         candidates = [home / (located.name + suffix) for home in homes for suffix in ("", *_SUFFIXES)]
         located = next((candidate for candidate in candidates if candidate.is_file()), located)
         check_link(located, root)
-        if located.parent != homes[0]:
-            name = located.relative_to(path.parent).as_posix()
+        as_written &= located.parent == homes[0]
+    name = written if as_written else located.relative_to(path.parent).as_posix()
     pose = check_pose(fields.get("transform_matrix"), path, written)
     mask = fields.get("mask_path")
     return Frame(

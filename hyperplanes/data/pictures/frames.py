@@ -182,7 +182,7 @@ def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tup
     for index in there:
         first.setdefault(frames[index].path.resolve(), index)
     kept = list(first.values())
-    if again := [frames[index].name for index in there if index not in kept]:
+    if again := [frames[index].name for index in sorted({*there} - {*kept})]:
         notes.append(f"{len(again)} frames left out, whose pictures are listed before: {listed(again)}")
     return kept, notes
 

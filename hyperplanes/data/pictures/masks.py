@@ -66,6 +66,8 @@ def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None
         with_ending[path.stem.removesuffix("_mask")].append(path)
         for name in {path.name, path.stem}:
             exact[name].append(path)
+    if not files:
+        return [None] * len(pictures)
     masks = []
     for picture in pictures:
         tables = [(table, name) for name in (picture.name, picture.stem) for table in (exact, with_ending)]

@@ -47,6 +47,9 @@ def test_folders_that_are_named_after_formats_hold_the_same_objects(tmp_path, fo
 
 def test_other_folders_hold_other_objects(tmp_path):
     names = ["obj_chairs/x.obj", "obj_tables/x.obj", "plywood/x.ply", "office/x.glb", "stlouis/x.stl", "x.off"]
+    names += ["max/part.stl", "ma/part.stl", "part.stl", "step/part.stl"]  # of programs, and of other files than these
+    names += ["y.obj", "obj/y.obj"]  # two files of one format
+    names += ["a/z.obj", "a/a/z.obj"]
     assert sorted(taken(touch(tmp_path, *names))) == sorted(names)
 
 
