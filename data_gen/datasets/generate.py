@@ -12,7 +12,7 @@ from typing import Any
 
 from data_gen.datasets.config import GenerationConfig, RenderConfig
 from data_gen.datasets.layouts import LAYOUTS, check_names
-from data_gen.datasets.manifest import Entry, GenerationState, build_manifest
+from data_gen.datasets.manifest import Entry, GenerationState, build_manifest, holds_data_set
 from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
 from data_gen.rigs import OBJECT_RADIUS
@@ -95,7 +95,14 @@ def generate(
     if isinstance(source, Procedural) and source.count > MOST_OBJECTS:
         raise ValueError(f"count: expected at most {MOST_OBJECTS} objects, got {source.count}; make several data sets")
     render = config.resolve()
-    listing = list_items(source, config.held_out, out)
+
+    def reason_against(folder: Path) -> str | None:
+        if out.exists() and folder.samefile(out):
+            return ""
+        written = holds_data_set(folder)
+        return "expected meshes, found a data set of hyperplanes generate; give its folder alone" if written else None
+
+    listing = list_items(source, config.held_out, reason_against)
     items = listing.items
     classes = sorted({item.class_name for item in items}, key=str)
     for class_name in classes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase as fnmatch
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from data_gen.datasets.manifest import holds_data_set
 from data_gen.meshes.files import STATES_ITS_AXIS
 
 __all__ = ["Item", "Listing", "MeshFolder", "Procedural", "Source", "list_items", "seed_of"]
@@ -99,7 +99,11 @@ class Listing:
     duplicates: list[tuple[str, str]] = field(default_factory=list)
 
 
-def list_items(source: Source, held_out: float | int | None, out: Path | None = None) -> Listing:
+def list_items(
+    source: Source,
+    held_out: float | int | None,
+    reason_against: Callable[[Path], str | None] = lambda _: None,
+) -> Listing:
     """All objects of a source, with their splits.
 
     Args:
@@ -107,13 +111,13 @@ def list_items(source: Source, held_out: float | int | None, out: Path | None = 
         held_out: how many objects of each class go into the test split: a count, a fraction below 1, or None for one
             in seven of procedural objects, and for mesh files the split that the tree states, else the last 20 % of
             each class by name (as the paper's 200x200 data were split).
-        out: where the data set is written; meshes in it are none of the source, nor those of any other data set.
+        reason_against: as in `find_meshes`.
 
     Returns:
         The objects. A class that is unknown or a count that makes no sense is a ValueError.
     """
     procedural = isinstance(source, Procedural)
-    listing = Listing(_procedural(source, held_out)) if procedural else _meshes(source, held_out, out)
+    listing = Listing(_procedural(source, held_out)) if procedural else _meshes(source, held_out, reason_against)
     order = {"train": 0, "val": 1, "test": 2}
     return replace(listing, items=sorted(listing.items, key=lambda item: (order[item.split], item.name)))
 
@@ -158,7 +162,7 @@ def _draw(sequence: np.random.SeedSequence, taken: set[int]) -> int:
     return seed
 
 
-def _meshes(source: MeshFolder, held_out: float | int | None, out: Path | None) -> Listing:
+def _meshes(source: MeshFolder, held_out: float | int | None, reason_against: Callable[[Path], str | None]) -> Listing:
     from data_gen.meshes.find import find_meshes, safe_name
 
     if source.up not in ("y", "z"):
@@ -167,13 +171,6 @@ def _meshes(source: MeshFolder, held_out: float | int | None, out: Path | None) 
         raise ValueError(f"class_name: expected letters, digits, . - and _, got {source.class_name!r}")
     if source.split_file is not None and held_out is not None:
         raise ValueError(f"held_out: expected none, for {source.split_file} decides, got {held_out}")
-
-    def reason_against(folder: Path) -> str | None:
-        if out is not None and out.exists() and folder.samefile(out):
-            return ""
-        written = holds_data_set(folder)
-        return "expected meshes, found a data set of hyperplanes generate; give its folder alone" if written else None
-
     found = find_meshes(source.path, split_file=source.split_file, reason_against=reason_against)
     if source.split_file is not None and not any(mesh.split for mesh in found.meshes):
         raise ValueError(f"{source.split_file}: expected models of {source.path}, found none of them; check both")
