@@ -84,9 +84,9 @@ def render(
             absent.
         proposal: the field of the coarse pass of `Hierarchical`; `field` where absent. `RayMarching` evaluates it only
             for gradients, so that it learns.
-        generator: jitters the samples; on the CPU. Without one they are the same each time. With gradients
-            `RayMarching` draws by it which samples have one, unless its `stop` is 0: gradients are then estimates that
-            are right in the mean, and second derivatives are not.
+        generator: jitters the samples; on the CPU. Without one they are the same each time. Where gradients are kept,
+            `RayMarching` with a `stop` above 0 also draws by it which samples have one. Such gradients are estimates,
+            right in the mean; second derivatives of them are not.
         background: grey value behind everything.
         differentiable: keep gradients to whatever the field and the rays depend on; by default for rays, not for
             cameras. Without gradients rays are rendered in chunks, so that memory does not grow with their number, and

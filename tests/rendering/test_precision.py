@@ -8,11 +8,14 @@ from torch.nn.functional import linear
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.rotation import Rotation
+from hyperplanes.adaptation.stacking import learned_part
 from hyperplanes.fields import base
 from hyperplanes.geometry import occupancy
 from hyperplanes.geometry.cameras import (
+    camera_from_world,
     centres,
     look_at,
+    moved,
     pinhole,
     projection_matrices,
     resized,
@@ -21,8 +24,9 @@ from hyperplanes.geometry.cameras import (
 )
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import carve, full
-from hyperplanes.geometry.poses import farthest_first
+from hyperplanes.geometry.poses import farthest_first, outermost_first
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.reflections import rotation_about
 from hyperplanes.rendering import footprint as footprints
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.renderer import allow_tf32
@@ -87,8 +91,9 @@ def test_places_are_those_of_full_precision_under_autocast(monkeypatch, compiled
         planes = ImagePlanes(views.images, views.cameras, backend=None if compiled else "torch")
         seen = planes.lookup(points, return_directions=True)
         hull = carve(views.masks, views.cameras, views.bounds, 24).occupied
-        chosen = torch.tensor(farthest_first(eyes, 0, 100))
-        where = [centres(cameras), projection_matrices(cameras), footprint(grid, cameras), chosen]
+        chosen = torch.tensor([farthest_first(eyes, 0, 100), outermost_first(eyes, 100)])
+        turned = camera_from_world(moved(cameras, rotation_about((0.1, 0.2, 0.3), 0.5)))
+        where = [centres(cameras), projection_matrices(cameras), footprint(grid, cameras), chosen, turned]
         return [*where, seen.colours, seen.directions, seen.coordinates, hull]
 
     expected = found()
@@ -99,7 +104,7 @@ def test_places_are_those_of_full_precision_under_autocast(monkeypatch, compiled
 def test_rays_are_traced_as_without_autocast():
     views = ball_views(ring(6, (16, 16)))
     field = HyperPlanes.from_pretrained("small").adapt(views)
-    for each in (field, Rotation(0.3).field(field)):
+    for each in (learned_part(field).field, field, Rotation(0.3).field(field)):
         expected = each.trace(views.rays(0), differentiable=False).colour
         with torch.autocast("cpu", torch.bfloat16):
             assert torch.equal(each.trace(views.rays(0), differentiable=False).colour, expected)
