@@ -11,19 +11,20 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera, undistorted_pixels
 from hyperplanes.geometry.inputs import ArrayLike
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.rays import Rays, cast
+from hyperplanes.geometry.rays import Rays, cast, pixel_grid
 from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["first_hits"]
 
 STEPS = 128  # along a diameter of the scene, where rays look for their first occupied voxel
 ROUND = 8  # of them at once, without a compiler
-RAYS = 2048  # that one call of the kernel works on
-RAYS_AT_ONCE = 1 << 17  # that are cast together: those of many photographs would take gigabytes
+ROWS = 16  # of pixels that one call of the kernel works on
+RAYS_AT_ONCE = 1 << 17  # that are cast together, without a compiler: those of many photographs would take gigabytes
 
 
 @torch.no_grad()
@@ -42,32 +43,47 @@ def first_hits(
         end of the ray in the scene's sphere, or of the sphere's centre plus its radius.
     """
     height, width = camera.image_size(cameras)
-    device = cameras.extrinsics.device
-    centre = torch.tensor(occupancy.bounds.centre, device=device)
-    far = (camera.centres(cameras) - centre).norm(dim=1) + occupancy.bounds.radius
+    centres, bounds = camera.centres(cameras), occupancy.bounds
+    far = (centres - centres.new_tensor(bounds.centre)).norm(dim=1) + bounds.radius
     result = far[:, None, None].repeat(1, height, width)
-    masks = torch.ones_like(result) if masks is None else torch.as_tensor(masks, device=device)[:, 0]
+    masks = torch.ones_like(result) if masks is None else torch.as_tensor(masks, device=result.device)[:, 0]
     kind = result.device.type == "cpu" and result.dtype == torch.float32
-    compiled = kind and find_spec("numba") and are_plain(result)
+    if kind and find_spec("numba") and are_plain(result, masks):
+        _find_compiled(occupancy, cameras, masks.detach().to(result), result)
+        return result
     together = max(1, RAYS_AT_ONCE // (height * width))
     for first in range(0, len(masks), together):
         found = (masks[first : first + together] > 0).nonzero()  # view, row, column
         for pixels in (found + found.new_tensor([first, 0, 0])).split(RAYS_AT_ONCE):
-            rays = cast(cameras, pixels[:, 0], pixels[:, 1:].flip(1).to(result), occupancy.bounds)
-            result[pixels.unbind(1)] = (_hits_compiled if compiled else _hits_torch)(occupancy, rays)
+            rays = cast(cameras, pixels[:, 0], pixels[:, 1:].flip(1).to(result), bounds)
+            result[pixels.unbind(1)] = _hits_torch(occupancy, rays)
     return result
 
 
-def _hits_compiled(occupancy: Occupancy, rays: Rays) -> Float[Tensor, " ray"]:
-    """The distances, by the compiled kernel."""
-    bounds, side = occupancy.bounds, occupancy.occupied.shape[0]
-    corner = np.asarray(bounds.centre, np.float32) - np.float32(bounds.radius)
-    step, per_unit = np.float32(2 * bounds.radius / STEPS), np.float32(side / (2 * bounds.radius))
-    parts = [part.contiguous().numpy() for part in (rays.origins, rays.directions, rays.near, rays.far)]
-    occupied, nearest = occupancy.occupied.contiguous().numpy().view(np.uint8), np.empty(len(rays), np.float32)
+def _find_compiled(occupancy: Occupancy, cameras: PinholeCamera, masks: Tensor, result: Tensor) -> None:
+    """Writes the distances of the pixels whose masks are above 0 into `result`, by the compiled kernel."""
+    bounds, matrix = occupancy.bounds, camera.intrinsics(cameras).flatten(1)
+    rotation = camera.camera_from_world(cameras)[:, :3, :3].flatten(1)
+    numbers = torch.cat([camera.centres(cameras), rotation, matrix[:, [0, 4, 2, 5, 1]]], 1)
+    pixels = result.new_empty(0, 0, 0, 2)
+    if isinstance(cameras, DistortedCamera):
+        pixels, shown = _without_lenses(cameras, *result.shape[1:])
+        masks = masks * shown
+    fixed = (
+        *(each.to(result).contiguous().numpy() for each in (numbers, pixels)), masks.numpy(),
+        np.array([*bounds.centre, bounds.radius], np.float32), np.float32(2 * bounds.radius / STEPS),
+        np.array(occupancy.box, np.float32), occupancy.occupied.contiguous().numpy().view(np.uint8), result.numpy(),
+    )  # fmt: skip
     kernel = compile_kernel("first_hits.first_hits", torch.float32)
-    parallel_for(lambda a, b: kernel(*parts, step, corner, per_unit, occupied, nearest, a, b), len(rays), RAYS)
-    return torch.from_numpy(nearest)
+    parallel_for(lambda a, b: kernel(*fixed, a, b), result.shape[0] * result.shape[1], ROWS)
+
+
+def _without_lenses(cameras: DistortedCamera, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Where each pixel of each view would be without lens distortion, and whether it is anywhere (`cast`)."""
+    grid = pixel_grid(height, width)
+    found = [undistorted_pixels(cameras, view.expand(len(grid)), grid) for view in torch.arange(cameras.batch_size)]
+    pixels, shown = (torch.stack(part).unflatten(1, (height, width)) for part in zip(*found, strict=True))
+    return pixels, shown
 
 
 def _hits_torch(occupancy: Occupancy, rays: Rays) -> Float[Tensor, " ray"]:

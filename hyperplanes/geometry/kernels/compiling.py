@@ -58,7 +58,7 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
         "UniTuple(int64, 4), T[::1], T[::1], int64, int64"
     ),
     "first_hits.first_hits": (
-        "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T, uint8[:, :, ::1], T[::1], int64, int64"
+        "T[:, ::1], T[:, :, :, ::1], T[:, :, :], T[::1], T, T[::1], uint8[:, :, ::1], T[:, :, ::1], int64, int64"
     ),
     "footprints.footprints": "T[:, ::1], T[:, :, ::1], T[:, :, ::1], T, T, boolean[:, :, ::1], int64, int64",
     "layers.layers": "T[:, :], T[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
