@@ -137,17 +137,20 @@ def _from_outside(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Te
     car lie behind, and no ray gets there.
     """
     result = torch.where(asked, torch.inf, 0.0)
-    box, corner = _box_of(asked)
-    left, depth = asked[box].clone(), result[box]  # an object fills a small part of its grid
-    padded = torch.nn.functional.pad(left, (1,) * 6)  # what lies beyond the box is outside
-    layer = left & dilate(~padded)[1:-1, 1:-1, 1:-1]
-    while layer.any():
-        found = _densities(grid.centres_of(layer.nonzero() + corner), density) * grid.voxel
-        depth[layer] = found.to(depth)
-        left &= ~layer
-        passed = torch.zeros_like(left)
-        passed[layer] = found < OPAQUE
-        layer = dilate(passed) & left
+    box, corner = _box_of(asked)  # an object fills a small part of its grid
+    left = torch.nn.functional.pad(asked[box], (1,) * 6)  # what lies beyond the box is outside
+    steps = torch.tensor([left.shape[1] * left.shape[2], left.shape[2], 1], device=left.device)
+    around = torch.cartesian_prod(*[torch.arange(-1, 2, device=left.device)] * 3) @ steps
+    layer = (left & dilate(~left)).flatten().nonzero()[:, 0]
+    shape, left = left.shape, left.flatten()
+    depth = torch.where(left, torch.inf, 0.0)
+    while len(layer):
+        places = torch.stack(torch.unravel_index(layer, shape), 1) - 1 + corner
+        found = _densities(grid.centres_of(places), density) * grid.voxel
+        depth[layer], left[layer] = found.to(depth), False
+        beside = (layer[found < OPAQUE][:, None] + around).flatten()
+        layer = beside[left[beside]].unique()
+    result[box] = depth.unflatten(0, shape)[1:-1, 1:-1, 1:-1]
     return result
 
 

@@ -44,13 +44,6 @@ def queries(count, seed=0):
     return points, torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
 
 
-def both_ways(monkeypatch, compute):
-    """What the kernels and plain PyTorch compute."""
-    compiled = compute()
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
-    return compiled, compute()
-
-
 def test_the_depth_of_a_ball_is_that_of_its_sphere():
     cameras = ring(3, SIZE)
     found = first_hits(ball(), cameras)
