@@ -19,7 +19,6 @@ __all__ = ["HULL_SIDE", "SHOWN", "UNKNOWN", "handicaps", "images_by", "reflected
 
 HULL_SIDE = 96  # voxels an axis of the hull in which parts that are not symmetric are looked for
 SHOWN = 0.9  # opacity of a mask from which on a pixel shows the object
-REACH = 4  # voxels, by which these parts go on where other ones hide their beginning
 UNKNOWN = 0.97  # opacity where a reflection is known to be wrong: nothing is carved, and its colour does not count
 HANDICAP = 0.05  # penalty of reflections as planes: light falls from one side, and writing is reversed
 ROTATED = 0.2  # likewise of those about other planes, which few objects are the same about in each detail
@@ -96,6 +95,4 @@ def _asymmetric_parts(support: Views, reflections: Views, found: Occupancy) -> O
     points, occupied = found.centres().to(support.images), found.occupied.clone()
     where = ImagePlanes(missed.to(support.images), support.cameras, background=0.0).lookup(points).colours
     occupied[found.occupied] = where.amax(1)[:, 0] > 0.5
-    # up to where they meet the others: there they stand before or behind something that is held
-    grown = replace(found, occupied=occupied).dilated(REACH)
-    return replace(grown, occupied=grown.occupied & found.occupied)
+    return replace(found, occupied=occupied)
