@@ -106,6 +106,8 @@ class Trainer:
             self.loader.close()
 
     def _run(self) -> Iterator[Progress]:
+        if self.processes.first and self.step < self.config.steps:
+            self.validator.prepare()  # a bad held-out object ends the training before steps are lost with it
         config, speed = self.config, Speed(self.step, self.config.steps, self.objective.rays_per_step)
         while self.step < config.steps:
             # the next objects are made ready by a thread while this step is taken

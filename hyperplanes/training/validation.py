@@ -60,6 +60,13 @@ class Validator:
         self.model, self.data, self.config, self.adapt = model, data, config, adapt
         self._episodes: dict[str, Episode] = {}
 
+    def prepare(self) -> None:
+        """Read the held-out objects and make them ready; ValueError for one that cannot be validated on.
+
+        The first validation does so where nobody has.
+        """
+        self._held_out()
+
     @torch.no_grad()
     def run(self) -> Validation | None:
         """PSNR of the views and the diagnostics of the hypernetwork; None where there are no held-out objects."""

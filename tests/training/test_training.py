@@ -695,6 +695,19 @@ def test_an_object_that_cannot_be_trained_on_is_named():
         Trainer(small_model(), Blank(), FAST).take_step()
 
 
+def test_a_held_out_object_that_cannot_be_validated_on_is_named_before_the_first_step():
+    class Blank(Balls):
+        def task(self, name):
+            task = super().task(name)
+            masks = task.support.masks * name.startswith("train")
+            return replace(task, support=replace(task.support, masks=masks))
+
+    trainer = Trainer(small_model(), Blank(), FAST)
+    with pytest.raises(ValueError, match="test0: masks of the support views: expected an object"):
+        list(trainer.run())
+    assert trainer.step == 0
+
+
 def test_a_validation_tells_what_the_updates_have_in_common(tmp_path):
     """Diagnostics of the held-out objects, recorded in the curve and beside the weights."""
     model = awaken(small_model())
