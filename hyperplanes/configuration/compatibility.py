@@ -102,13 +102,19 @@ def check_training(config: TrainingConfig, model: ModelConfig) -> None:
     """Refuse a training that a model cannot have.
 
     Raises:
-        ValueError: numbers of views for a field that knows them by their places, what a learned initialisation does
-            not do, rotations without numbers of views, or the volume loss for a model without a volume or a grid.
+        ValueError: numbers of views for a field that knows them by their places, a single view an object for one that
+            does not, what a learned initialisation does not do, rotations without numbers of views, or the volume loss
+            for a model without a volume or a grid.
     """
     if config.views and (not find_targets()[model.target].permutation_invariant or min(config.views) < 1):
         raise ValueError(
             "training.views: expected numbers of at least 1, for the field image_based, which takes any of them, "
             f"got {list(config.views)} for {model.target}"
+        )
+    if model.method == "sv_meta" and find_targets()[model.target].permutation_invariant:
+        raise ValueError(
+            f"sv_meta: expected a field that knows views by their places, got {model.target}, which would learn to "
+            "copy the colours of a single view"
         )
     for name in ("random_background", "empty_points", "antialias"):
         if getattr(config, name) and model.initialisation is not None:

@@ -18,6 +18,7 @@ from hyperplanes.training.episodes.drawing import object_generator
 from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.views import Task
 from tests.reference_rendering import Balls, small_model
+from tests.training.test_volume_loss import MODEL
 
 FAST = TrainingConfig(steps=4, tasks=2, rays=24, evaluate_every=100, checkpoint_every=100, learning_rate=1e-3)
 
@@ -181,6 +182,12 @@ def test_planes_are_hidden_by_no_learned_initialisation():
 def test_what_inner_steps_do_not_do_is_refused(name, value):
     with pytest.raises(ValueError, match=f"training.{name}: expected .* for mv_meta"):
         initialisation_trainer(model_of("mv_meta"), Balls(), replace(FAST, **{name: value}), None)
+
+
+def test_a_field_of_any_number_of_views_is_not_trained_on_a_single_one_an_object():
+    model = HyperPlanes(replace(MODEL, hypernetwork=None, initialisation=InitialisationConfig("sv_meta")))
+    with pytest.raises(ValueError, match="sv_meta: expected a field that knows views by .*, got image_based"):
+        initialisation_trainer(model, Balls(), FAST, None)
 
 
 def test_gradient_steps_from_an_initialisation_are_plain_descent_unless_an_optimiser_is_stated():
