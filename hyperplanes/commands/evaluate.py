@@ -140,6 +140,11 @@ def run(arguments: Arguments) -> int:
         raise ValueError("--method: expected at least one, got none")
     if arguments.curve is not None and len(arguments.steps) < 2:
         raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
+    if (fewest := min(arguments.steps, default=0)) < 0:
+        raise ValueError(f"--steps: expected 0 or more, got {fewest}")
+    for name in arguments.method:
+        if not at_steps(name, arguments.steps):
+            raise ValueError(f"--steps: expected a number of at least 1 for {name}, got 0")
     for figure in (arguments.curve, arguments.boxes, arguments.grid):
         if figure is not None:
             figure_kind(figure)  # a wrong name is found before anything is evaluated
