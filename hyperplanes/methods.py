@@ -157,7 +157,14 @@ def _field_scratch(name: str, request: Request) -> Adapter:
 
 
 def _optimised(model: HyperPlanes, request: Request, trained: ModelConfig | None = None) -> FineTuned:
-    """Gradient descent from these weights, as those of a trained model are optimised, or of the model itself."""
+    """Gradient descent from these weights, as those of a trained model are optimised, or of the model itself.
+
+    Raises:
+        ValueError: settings that optimise something else than the weights.
+    """
+    if request.settings.trainable != "weights":
+        found = request.settings.trainable
+        raise ValueError(f"fine_tune: expected weights for {request.name}, which has no hypernetwork, got {found}")
     initialisation = (trained or model.config).initialisation
     assert initialisation is not None
     steps = initialisation.steps if request.steps is None else request.steps

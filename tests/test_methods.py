@@ -94,6 +94,12 @@ def test_missing_checkpoints_are_named(name, family):
         make_method(name, {})
 
 
+@pytest.mark.parametrize("name", ["mv_meta_2", "maml", "standard", "mv_shuffled"])
+def test_of_a_learned_initialisation_only_the_weights_are_optimised(folders, name):
+    with pytest.raises(ValueError, match=f"fine_tune: expected weights for {name}, .*, got hypernetwork"):
+        make_method(name, folders, settings=FineTuning(trainable="hypernetwork"))
+
+
 def test_every_method_in_words():
     names = [f"{name}_100" if name.endswith("scratch") else name for name in METHODS]
     names += ["hyperplanes_100", "hyperplanes_auto", "point_multiplane_10", "mv_meta_10"]
