@@ -52,6 +52,13 @@ def test_the_true_hull_and_colours_have_the_least_loss():
         assert float(volume_loss(weights(wrong), shown)) > least + 0.01
 
 
+def test_an_object_whose_volume_cannot_be_made_is_named():
+    task = Balls(views=8, size=(24, 24)).task("train0")
+    blank = replace(task, support=replace(task.support, masks=torch.zeros_like(task.support.masks)))
+    with pytest.raises(ValueError, match="train0: masks of the support views: expected an object"):
+        volume_of_all_views(HyperPlanes(MODEL), replace(blank, query=blank.support))
+
+
 def test_only_cells_of_the_hull_that_is_shown_count_and_only_the_first_features():
     model = HyperPlanes(MODEL)
     shown = episode(model)

@@ -116,6 +116,7 @@ def volume_of_all_views(model: HyperPlanes, task: Task) -> Float[Tensor, "4 x y 
     Returns:
         The first channels of `volume_of`, in half precision: they are kept for every object of a training.
     """
-    volume = model.prepare(join_views(task.support, task.query)).volume
+    with prefix_errors(task.name):
+        volume = model.prepare(join_views(task.support, task.query)).volume
     assert volume is not None
     return volume[:VOLUME_CHANNELS].half()
