@@ -80,8 +80,11 @@ class Samples:
 
 
 def write_curve(path: Path, curve: Sequence[Mapping[str, float]]) -> None:
-    """Write the reports of a training as CSV: a row a report, a column a quantity, empty where it was not measured."""
-    columns = list(dict.fromkeys(name for row in curve for name in row))
+    """Write the reports of a training as CSV: a row a report, a column a quantity, empty where it was not measured.
+
+    Steps and losses come first, then the others by name, whatever the order of the rows of a training that went on.
+    """
+    columns = ["step", "loss", *sorted({name for row in curve for name in row} - {"step", "loss"})]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()

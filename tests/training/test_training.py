@@ -535,6 +535,16 @@ def test_a_curve_and_pictures_lie_beside_the_weights(tmp_path):
         assert abs(pixels[16 * index : 16 * index + 16, :16] / 255 - seen.clamp(0, 1).numpy()).max() <= 1 / 255
 
 
+def test_a_resumed_training_writes_its_curve_in_the_same_columns(tmp_path):
+    config = with_(evaluate_every=1)
+    for folder, counts in (("whole", [2]), ("parts", [1, 2])):
+        for steps in counts:
+            train(small_model(), Balls(), replace(config, steps=steps), tmp_path / folder)
+    whole, parts = ((tmp_path / folder / "curve.csv").read_text() for folder in ("whole", "parts"))
+    assert whole == parts
+    assert whole.startswith("step,loss,")
+
+
 def test_tensorboard_shows_the_curve_and_the_pictures(tmp_path):
     """Source of truth: TensorBoard's own reader of event files."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
