@@ -31,7 +31,7 @@ def test_missing_and_empty_folders(tmp_path):
 
 def test_of_a_single_view_none_can_be_left_out(scene, tmp_path):
     one = type(scene)(views=1).write(tmp_path)
-    refused(read_task, one, match="expected two views or more, found 1; --all-views shows")
+    refused(read_task, one, match="expected two views or more, found 1; add views; `render --all-views` shows")
     assert len(read_views(one)) == 1
 
 

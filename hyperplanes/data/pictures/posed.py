@@ -144,7 +144,8 @@ class PosedTask:
     def alternating(cls, scene: Posed, name: str) -> PosedTask:
         """Every other view from the first on as support, the rest as query; a single one is a DataError."""
         if len(scene) < 2:
-            raise DataError(name, "two views or more", f"{len(scene)}", "--all-views shows what there is to the model")
+            remedy = "add views; `render --all-views` shows a model what there is"
+            raise DataError(name, "two views or more", f"{len(scene)}", remedy)
         index = list(range(len(scene)))
         return cls.split(scene, index[::2], index[1::2], name)
 
