@@ -210,6 +210,13 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
             ["train", "--data", "DATA", "--steps", "3", "--epochs", "1", "--out", "OUT/run"],
             ["--steps, --epochs: expected one of the two, got 3 and 1"],
         ),
+        (
+            [
+                *["train", "--data", "DATA", "--method", "autoencoder", "--devices", "2"],
+                *["--training.reference-objects", "3", "--out", "OUT/run"],
+            ],
+            ["reference_objects: expected a multiple of the 2 processes, got 3; give --training.reference-objects 4"],
+        ),
         (["evaluate", "--data", "DATA", "--method"], ["--method: expected at least one, got none"]),
         (
             ["evaluate", "--data", "DATA", "--method", "nearest_view", "scratch", "--steps", "0"],

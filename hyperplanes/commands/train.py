@@ -273,6 +273,7 @@ def _run(arguments: Arguments) -> int:
     from hyperplanes.data.support import WithSupport
     from hyperplanes.training import start_training
     from hyperplanes.training.distributed import check_shares
+    from hyperplanes.training.episodes.loader import reference_objects
     from hyperplanes.training.launching import count_processes, launched
     from hyperplanes.training.monitoring import TensorBoard
 
@@ -301,7 +302,7 @@ def _run(arguments: Arguments) -> int:
         if method == "mv_matched":
             reference = find_checkpoints([reference]).get("mv_meta", reference)
     processes = count_processes(arguments.devices, arguments.nodes)
-    objects = chosen.training.reference_objects if chosen.model.hypernetwork else 0
+    objects = reference_objects(chosen.model, chosen.training)
     check_shares(chosen.training.tasks, objects, processes[0] * processes[1])
     held_out = len(data.names("test"))
     with launched(*processes, choose_device(arguments.device)) as device:

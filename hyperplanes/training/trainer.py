@@ -73,7 +73,7 @@ class Trainer:
         check_training(config, model.config)
         precision = choose_precision(config, model, folder)
         self.config = config = replace(config, steps=config.steps_for(len(names)), precision=precision)
-        check_shares(config.tasks, reference_objects(model, config), self.processes.count)
+        check_shares(config.tasks, reference_objects(model.config, config), self.processes.count)
         self.folder = folder if self.processes.first else None
         self.optimisation = Optimisation(model, config)
         self.checkpointing = Checkpointing(folder, model, self.optimisation, config, self.processes.first)

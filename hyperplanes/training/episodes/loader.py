@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.training.distributed import Processes
@@ -134,7 +135,7 @@ class EpisodeLoader:
             step: steps done before.
         """
         config, generator = self.config, step_generator(self.config.seed, step)
-        count = config.tasks + reference_objects(self.model, config)
+        count = config.tasks + reference_objects(self.model.config, config)
         if config.views:
             return [self._numbered(number) for number in draw_episodes(count, config.episodes, step, generator)]
         if self.classes:
@@ -190,9 +191,9 @@ def training_names(data: Tasks) -> list[str]:
     return names
 
 
-def reference_objects(model: HyperPlanes, config: TrainingConfig) -> int:
-    """How many objects of a step only have their HyperPlanes read; none without a hypernetwork."""
-    return config.reference_objects if model.hypernetwork is not None else 0
+def reference_objects(model: ModelConfig, config: TrainingConfig) -> int:
+    """How many objects of a step only have their HyperPlanes read; none where no network reads HyperPlanes."""
+    return config.reference_objects if (model.hypernetwork or model.autoencoder) is not None else 0
 
 
 def reads_hull(model: HyperPlanes, config: TrainingConfig) -> bool:
