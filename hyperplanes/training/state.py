@@ -166,6 +166,10 @@ def _load(
             raise CheckpointError(f"{path}: expected an entry {name!r} ({kind.__name__}), found {found}; {REMEDY}")
     if saved["step"] < 0:
         raise CheckpointError(f"{path}: expected a number of steps, found {saved['step']}; {REMEDY}")
+    if odd := [row for row in saved["curve"] if not _is_report(row)]:
+        raise CheckpointError(
+            f"{path}: expected a curve of numbers by name, the step among them, found {odd[0]!r:.40}; {REMEDY}"
+        )
     wanted, before = (
         json.loads(encode_json(dict(each))) for each in (config, {**defaults, **_upgraded(path, saved["config"])})
     )
@@ -195,6 +199,13 @@ def _load(
                 state.setdefault(int(place), {})[name] = found[key]
         optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
     return saved["step"], saved["curve"]
+
+
+def _is_report(row: object) -> bool:
+    """Whether it can be a row of a curve; None stands for what was not measured."""
+    if not isinstance(row, dict) or not isinstance(row.get("step"), int):
+        return False
+    return all(value is None or isinstance(value, int | float) for value in row.values())
 
 
 def _upgraded(path: Path, config: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -634,6 +634,14 @@ def test_a_training_file_with_a_hole_is_a_checkpoint_error(trained, name, value)
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("row", [1, {"loss": 0.5}, {"step": 1, "psnr": "high"}], ids=str)
+def test_a_curve_that_is_none_is_a_checkpoint_error(trained, row):
+    saved = json.loads((trained / "training.json").read_text())
+    (trained / "training.json").write_text(json.dumps({**saved, "curve": [*saved["curve"], row]}))
+    with pytest.raises(CheckpointError, match=r"training.json: expected a curve of numbers by name, .* found "):
+        Trainer(small_model(), Balls(), with_(steps=1), trained)
+
+
 def test_a_state_of_another_shape_is_a_checkpoint_error(trained):
     (path,) = trained.glob("training-*.safetensors")
     tensors = checkpoints.load_tensors(path)
