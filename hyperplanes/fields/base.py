@@ -34,7 +34,7 @@ class TargetConfig:
 
     Attributes:
         depth: fully connected layers before the heads.
-        width: of each of them.
+        width: of each of them; the layer before colours has half of it.
         planes: number of ImagePlanes the network is made for; of a field that takes any number of views, those
             that are read at a point.
         point_frequencies: number of frequencies of the positional encoding of points.
@@ -44,7 +44,7 @@ class TargetConfig:
     """
 
     depth: Annotated[int, range(1, 257)] = 8
-    width: Annotated[int, range(1, 8193)] = 256
+    width: Annotated[int, range(2, 8193)] = 256
     planes: Annotated[int, range(1, 1025)] = 25
     point_frequencies: Annotated[int, range(33)] = 10
     direction_frequencies: Annotated[int, range(33)] = 4

@@ -26,9 +26,14 @@ class SimplifiedNeRF(NeRF):
     Sines and cosines of the point at `point_frequencies` frequencies from 1 to 256, `depth` layers without a skip
     connection, and one layer for colour and density, of which ReLU is taken. `direction_frequencies` and
     `density_scale` are not read.
+
+    Raises:
+        ValueError: no frequency, so that nothing of the point would be read.
     """
 
     def __init__(self, config: TargetConfig) -> None:
+        if config.point_frequencies < 1:  # the point itself is no input
+            raise ValueError("network.point_frequencies: expected at least 1 for simplified_nerf, got 0")
         super().__init__(config)
         width = config.width
         self.skip = 0

@@ -3,6 +3,7 @@ nothing, permuted planes with permuted first weights are the same field).
 """
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -258,6 +259,13 @@ def test_an_abstract_target_says_so():
 
 
 @torch.no_grad()
+def test_a_shape_that_no_network_can_have_is_refused():
+    with pytest.raises(ValueError, match="width: expected a whole number from 2 to 8192, got 1"):
+        replace(SMALL, width=1)
+    with pytest.raises(ValueError, match="network.point_frequencies: expected at least 1 for simplified_nerf, got 0"):
+        make("simplified_nerf", replace(SMALL, point_frequencies=0))
+
+
 def test_the_simplified_nerf_is_its_formula_point_by_point():
     # tancik/learnit: sines and cosines at 2 ** linspace(0, 8, L), layers without a skip connection, ReLU of the density
     config = TargetConfig(depth=3, width=8, point_frequencies=4)
