@@ -65,8 +65,15 @@ class BatchNorm2d(nn.BatchNorm2d):
     """
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - torch's name
-        """As torch.nn.BatchNorm2d."""
+        """As torch.nn.BatchNorm2d; ValueError where the statistics would be those of a single value."""
         if not self.training or not is_shared():
+            if (self.training or not self.track_running_stats) and input.numel() == input.shape[1]:
+                kind = "batch" if self.track_running_stats else "batch_statistics"
+                raise ValueError(
+                    "hypernetwork.normalisation or autoencoder.normalisation: expected 'group' for one small image "
+                    f"at a time, got {kind!r}, which compares the values of a channel, of which there is one; or "
+                    "take more images by views or training.tasks"
+                )
             return super().forward(input)
         axes = (0, 2, 3)
         # mean and variance over the batches of all processes

@@ -18,6 +18,17 @@ def test_convnet_gives_one_code_an_image_of_any_size(size):
     assert ConvNet(10)(pictures(size=size)).shape == (3, 10)
 
 
+@pytest.mark.parametrize("normalisation", ["batch", "batch_statistics"])
+def test_a_single_value_a_channel_has_no_statistics_of_a_batch(normalisation):
+    """16 pixels are halved four times: one is left."""
+    network, one = ConvNet(10, normalisation), pictures(1, (16, 16))
+    with pytest.raises(ValueError, match=f"hypernetwork.normalisation .* got '{normalisation}'.* training.tasks"):
+        network(one)
+    assert network(pictures(2, (16, 16))).shape == (2, 10)
+    if normalisation == "batch":  # by running statistics
+        assert network.eval()(one).shape == (1, 10)
+
+
 def test_convnet_is_3x3_convolutions_each_with_batch_normalisation():
     network = ConvNet(10)
     assert all(layer.kernel_size == (3, 3) for layer in network.modules() if isinstance(layer, nn.Conv2d))
