@@ -76,8 +76,12 @@ class HyperPlanesNetwork(nn.Module):
 
     @property
     def known_rig(self) -> Rig:
-        """Where the views of the training stood, and how others are matched to them."""
-        return Rig(self.rig, self.config.order)
+        """Where the views of the training stood, and how others are matched to them; empty where nothing asks for it.
+
+        The buffer has its rows all the same, as in the files of earlier versions.
+        """
+        asked = self.target.reads_planes or self.hypernetwork is not None
+        return Rig(self.rig if asked else self.rig[:0], self.config.order)
 
     def set_rig(self, support: Views) -> None:
         """Take the camera directions of these support views as the order of the planes; some fields have none.
@@ -85,9 +89,10 @@ class HyperPlanesNetwork(nn.Module):
         Raises:
             ValueError: fewer views than planes.
         """
-        if len(support) < len(self.rig):
-            raise ValueError(f"support: expected at least {len(self.rig)} views, one a plane, got {len(support)}")
-        self.rig.copy_(support.camera_directions[: len(self.rig)])
+        planes = len(self.known_rig)
+        if len(support) < planes:
+            raise ValueError(f"support: expected at least {planes} views, one a plane, got {len(support)}")
+        self.rig[:planes].copy_(support.camera_directions[:planes])
 
     def arrange(self, support: Views) -> Views:
         """The support views as the field takes them: one a plane of the rig, or all as they are.

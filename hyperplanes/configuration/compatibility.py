@@ -31,7 +31,7 @@ def check_model(config: ModelConfig) -> type[Target]:
         expected, found = target.config_type.__name__, type(config.network).__name__
         raise ValueError(f"network: expected a {expected} for {config.target}, got a {found}")
     _check_hypernetwork(config, target)
-    if config.plane_dropout and (target.permutation_invariant or config.target == "nerf"):
+    if config.plane_dropout and (target.permutation_invariant or not target.reads_planes):
         raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
     for name in ("stacked", "hull_share", "gated", "symmetric", "symmetry", "azimuth"):
         if getattr(config, name) and not target.permutation_invariant:

@@ -40,7 +40,7 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
             "object; cut the object out (RGBA images, or a folder masks/), or give --learn-background"
         )
     planes = model.config.network.planes
-    if len(shown) < planes and len(model.rig):
+    if len(shown) < planes and len(model.known_rig):
         found.append(f"{len(shown)} views are shown and the model was trained with {planes}: some stand for several")
     unlike, angle = _unlikeness(model, shown)
     if unlike is not None and unlike > UNLIKE:
@@ -103,13 +103,13 @@ def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | Non
 
 def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
     """Root mean square of the standardised codes, None without such, and the mean angle from the training's rig."""
-    network, angle = model.hypernetwork, 0.0
-    if not len(model.rig) and (network is None or network.reads_volume):
+    network, rig, angle = model.hypernetwork, model.known_rig.positions, 0.0
+    if not len(rig) and (network is None or network.reads_volume):
         return None, angle
     with torch.no_grad():
         context = model.prepare(shown, carved=False)
-        if len(model.rig):
-            cosine = (context.views.camera_directions.to(model.rig) * model.rig).sum(-1)
+        if len(rig):
+            cosine = (context.views.camera_directions.to(rig) * rig).sum(-1)
             angle = float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).mean())
         with in_use(model):
             codes = None if network is None else network.standardised_codes(observe([context], network.resolution))

@@ -62,11 +62,14 @@ class Target(nn.Module):
         config_type: the dataclass of its shape.
         permutation_invariant: takes any number of views in any order, and so could copy the view that a ray comes from;
             otherwise `config.planes` views, each known by its place.
+        reads_planes: looks something up in support views; otherwise, where nothing else reads them by their places, all
+            of them are taken as they are.
         volume_size: channels and cells an axis of what `volume_of` makes; None where there is no such volume.
     """
 
     config_type: ClassVar[type[TargetConfig]] = TargetConfig
     permutation_invariant: ClassVar[bool] = False
+    reads_planes: ClassVar[bool] = True
     volume_size: ClassVar[tuple[int, int] | None] = None
 
     def __init__(self, config: TargetConfig) -> None:
@@ -113,8 +116,8 @@ class Target(nn.Module):
         return {}
 
     def arrange(self, support: Views, rig: Rig) -> Views:
-        """The support views as planes: here one a plane, each the nearest to where the rig has one."""
-        return support[rig.places(support)]
+        """The support views as planes: here one a plane, each the nearest to where the rig has one, if it has any."""
+        return support[rig.places(support)] if len(rig) else support
 
     def choose_hyperplanes(self, views: Views, rig: Rig, count: int, choice: str) -> Int[Tensor, " k"]:
         """Which of the arranged views a hypernetwork reads.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -17,6 +19,8 @@ __all__ = ["NeRF"]
 
 class NeRF(Target):
     """F(x, d; theta) = (c, sigma)."""
+
+    reads_planes: ClassVar[bool] = False
 
     @property
     def input_size(self) -> int:

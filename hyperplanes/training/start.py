@@ -127,7 +127,7 @@ def _check_views(model: HyperPlanes, tasks: Tasks) -> None:
     Raises:
         ValueError: fewer; the message says what `train --support` can do about it.
     """
-    planes, names = len(model.rig), sorted(tasks.names("train"))
+    planes, names = len(model.known_rig), sorted(tasks.names("train"))
     if not planes or not names:
         return
     task = tasks.task(names[0])

@@ -11,6 +11,7 @@ from hyperplanes.adaptation.fine_tuned import shuffled
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data.support import SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
+from hyperplanes.hypernetwork import AutoencoderConfig
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.training import Trainer, TrainingConfig, start_training
@@ -251,6 +252,22 @@ def test_too_few_support_views_are_told_the_number_that_can_be_trained_with(tmp_
     with pytest.raises(ValueError, match="^train0: expected 25 views .*, got 8; --support 8 takes all of them$"):
         start(25, data=WithSupport(Balls(), 25))
     assert start(8, 8, WithSupport(Balls(), 8)).model.rig.shape == (8, 3)
+
+
+def test_a_field_without_planes_takes_all_support_views_however_many(tmp_path):
+    """Unless an autoencoder reads views by their places. Of 25 planes, as earlier versions wrote it, it loads."""
+    network = replace(small_model().config.network, planes=25)
+    earlier = HyperPlanes(replace(model_of("mv_meta").config, network=network))
+    earlier.rig.fill_(1.0)
+    earlier.save(tmp_path / "earlier")
+    new = start_training(earlier.config, FAST, Balls(), tmp_path / "new").model
+    for model in (new, HyperPlanes.from_pretrained(tmp_path / "earlier")):
+        for count in (4, 30):
+            support = Balls(views=count).task("train0").support
+            assert torch.equal(model.prepare(support).views.images, support.images)
+    read = replace(earlier.config, initialisation=None, autoencoder=AutoencoderConfig(views=2, code=8, latent=8))
+    with pytest.raises(ValueError, match="^train0: expected a support view for each of 25 planes, got 4"):
+        start_training(read, FAST, Balls(), tmp_path / "read")
 
 
 def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not_fit(tmp_path):
