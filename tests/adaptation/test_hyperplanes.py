@@ -274,7 +274,7 @@ def config_of(model):
 @pytest.mark.parametrize(
     ("part", "change", "words"),
     [
-        ("network", {"width": "16"}, "network.width: '16' instead of a whole number from 1 to 8192"),
+        ("network", {"width": "16"}, "network.width: '16' instead of a whole number from 2 to 8192"),
         ("network", {"depth": True}, "network.depth: True instead of a whole number"),
         ("network", {"width": 10**12}, "width: 1000000000000 instead of a whole number from 1 to 8192"),
         ("network", {"planes": 0}, "planes: 0 instead of a whole number from 1 to 1024"),
