@@ -276,7 +276,7 @@ def config_of(model):
     [
         ("network", {"width": "16"}, "network.width: '16' instead of a whole number from 2 to 8192"),
         ("network", {"depth": True}, "network.depth: True instead of a whole number"),
-        ("network", {"width": 10**12}, "width: 1000000000000 instead of a whole number from 1 to 8192"),
+        ("network", {"width": 10**12}, "width: 1000000000000 instead of a whole number from 2 to 8192"),
         ("network", {"planes": 0}, "planes: 0 instead of a whole number from 1 to 1024"),
         ("network", {"density_scale": float("inf")}, "network.density_scale: inf instead of a number"),
         ("hypernetwork", {"layers": "colour"}, "hypernetwork.layers: 'colour' instead of a list of names"),
