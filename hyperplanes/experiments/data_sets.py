@@ -15,6 +15,7 @@ from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.data.support import WithBounds
 from hyperplanes.experiments.scales import Scale
 from hyperplanes.experiments.workspace import Workspace, unique_name
+from hyperplanes.utilities.files import folder_checksum
 from hyperplanes.views import Tasks
 
 __all__ = ["DataSets"]
@@ -45,6 +46,7 @@ class DataSets:
         self.workspace, self.scale, self.generate, self.device = workspace, scale, generate, device
         self.given, self.legacy = given or {}, legacy
         self._tasks: dict[str, TasksOnDevice] = {}
+        self._names: dict[str, str] = {}  # of given data sets: what they hold is looked at once
 
     def tasks(self, class_name: str) -> Tasks:
         """The data set of a class; ValueError where none was given and the scale generates none."""
@@ -66,9 +68,12 @@ class DataSets:
         return self.workspace.folder("data", class_name, self.name(class_name), settings, work)
 
     def name(self, class_name: str) -> str:
-        """What tells the data set of a class from others: the folder of a given one, or a name with a checksum."""
+        """What tells the data set of a class from others: a name, of a given one its folder, with a checksum."""
         if class_name in self.given:
-            return str(self.given[class_name].resolve())
+            if class_name not in self._names:
+                folder = self.given[class_name].resolve()
+                self._names[class_name] = f"{folder}-{folder_checksum(folder, self.workspace.out)}"
+            return self._names[class_name]
         return unique_name(class_name, self._settings(class_name))
 
     def evaluated(self, class_name: str, split: str, most: int | None = None) -> list[str]:

@@ -73,6 +73,24 @@ def test_a_training_in_a_folder_of_its_own_is_made_anew_when_its_data_changes(tm
     assert len(trained) == 4
 
 
+def test_results_of_a_given_data_set_are_those_of_what_it_holds(tmp_path, monkeypatch):
+    """Property: with other content under the same path, trainings and evaluations have other names."""
+    monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
+    cars, table, cpu = tmp_path / "cars", DemoSettings.quick_check().table, torch.device("cpu")
+    cars.mkdir()
+
+    def names():
+        workspace = Workspace(tmp_path / "out")
+        data = DataSets(workspace, DemoSettings.quick_check().scale, generate=None, device=cpu, given={"car": cars})
+        runner = Runner(workspace, data, train=print, device=cpu)
+        return data.name("car"), runner.trainings.name(table, table.trainings[0], 0)
+
+    before = names()
+    assert names() == before
+    (cars / "manifest.json").write_text("{}")
+    assert all(now != then for now, then in zip(names(), before, strict=True))
+
+
 class ManualWorkers:
     """Workers for two pieces of work at a time, which end when the test says so."""
 

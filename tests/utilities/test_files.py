@@ -16,7 +16,7 @@ from hyperplanes.data import open_dataset
 from hyperplanes.data.formats.npz import read_npz
 from hyperplanes.data.pictures.images import read_image
 from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors
-from hyperplanes.utilities.files import DataError, inside, malformed, read_bytes, read_json
+from hyperplanes.utilities.files import DataError, folder_checksum, inside, malformed, read_bytes, read_json
 from hyperplanes.utilities.writing import one_writer
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -168,3 +168,42 @@ def test_an_array_that_claims_more_than_there_is_is_refused(tmp_path):
         archive.writestr("images.npy", np.lib.format.magic(1, 0) + len(header).to_bytes(2, "little") + header)
     with pytest.raises(DataError, match="expected at most 2147483648 bytes of arrays, found 8000000000000"):
         read_npz(path)
+
+
+def test_the_checksum_of_a_folder_is_that_of_what_it_holds(tmp_path):
+    """Property: it changes with a file's name, size and time, in a folder or behind a link, and with nothing else."""
+    held, elsewhere = tmp_path / "held", tmp_path / "elsewhere"
+    for folder in (held / "a", held / "runs", elsewhere):
+        folder.mkdir(parents=True)
+    (held / "link").symlink_to(elsewhere)
+    (elsewhere / "back").symlink_to(held)
+    picture, linked = held / "a" / "picture.png", elsewhere / "mesh.obj"
+    picture.write_bytes(b"12")
+    found = [folder_checksum(held, held / "runs")]
+    (held / "runs" / "page.html").write_bytes(b"1")
+    (held / ".lock").write_bytes(b"")
+    assert folder_checksum(held, held / "runs") == found[0]
+    for change in (
+        lambda: picture.write_bytes(b"123"),
+        lambda: os.utime(picture, ns=(0, 1)),
+        lambda: picture.rename(held / "b.png"),
+        lambda: linked.write_bytes(b"1"),
+    ):
+        change()
+        found.append(folder_checksum(held, held / "runs"))
+    assert len(set(found)) == len(found)
+
+
+def test_the_manifest_of_a_data_set_counts_in_place_of_the_times_of_its_files(tmp_path):
+    """Property: a data set made again is the same; another manifest, and a file of another size, are not."""
+    manifest, picture = tmp_path / "manifest.json", tmp_path / "picture.png"
+    manifest.write_bytes(b"1")
+    picture.write_bytes(b"12")
+    found = folder_checksum(tmp_path)
+    for path in (manifest, picture):
+        os.utime(path, ns=(0, 1))
+    assert folder_checksum(tmp_path) == found
+    manifest.write_bytes(b"2")
+    other = folder_checksum(tmp_path)
+    picture.write_bytes(b"123")
+    assert len({found, other, folder_checksum(tmp_path)}) == 3
