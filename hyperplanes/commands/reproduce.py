@@ -112,8 +112,8 @@ def run(arguments: Arguments) -> int:
     def found(cell: Cell, seed: int, score: ObjectScore, *_: int) -> None:
         console.say(f"{cell.row}, {cell.column}, seed {seed}: {score.name} {score.psnr:.2f} dB")
 
-    device, legacy = arguments.device, arguments.legacy
-    workers = make_workers(arguments.workers, arguments.out, scale, device, legacy=legacy)
+    device, given, legacy = arguments.device, data_sets(arguments.data), arguments.legacy
+    workers = make_workers(arguments.workers, arguments.out, scale, device, given=given, legacy=legacy)
     runner = make_runner(
         Workspace(arguments.out),
         scale,
@@ -121,7 +121,7 @@ def run(arguments: Arguments) -> int:
         device=device,
         announce=console.say,
         workers=workers,
-        given=data_sets(arguments.data),
+        given=given,
         legacy=legacy,
     )
     if arguments.estimate or scale.resolution is None:

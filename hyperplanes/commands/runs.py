@@ -35,7 +35,7 @@ def count_workers(asked: int | None, device: str) -> int:
     return min(MOST, usable_cores()) if choose_device(device).type == "cpu" else 1
 
 
-def make_workers(count: int, out: Path, scale: Scale, device: str, *, legacy: bool = False) -> Workers | None:
+def make_workers(count: int, out: Path, scale: Scale, device: str, **given: Any) -> Workers | None:
     """Processes for the runner of a folder, a context; None for a single one, whose work this process does.
 
     Args:
@@ -43,20 +43,20 @@ def make_workers(count: int, out: Path, scale: Scale, device: str, *, legacy: bo
         out: the folder of the workspace.
         scale: how large.
         device: auto, or the name of one.
-        legacy: as in `open_dataset`.
+        given: as in `make_runner`.
     """
     from hyperplanes.experiments.workers import Workers
 
-    return Workers(count, partial(_worker_runner, out, scale, device, legacy)) if count > 1 else None
+    return Workers(count, partial(_worker_runner, out, scale, device, **given)) if count > 1 else None
 
 
-def _worker_runner(out: Path, scale: Scale, device: str, legacy: bool) -> Runner:
-    """The runner of a worker process, which is given its data sets with its work."""
+def _worker_runner(out: Path, scale: Scale, device: str, **given: Any) -> Runner:
+    """The runner of a worker process, which is told of generated data sets with its work."""
     from hyperplanes.commands.console import Console
     from hyperplanes.experiments.workspace import Workspace
 
     console = Console(plain=True)
-    return make_runner(Workspace(out), scale, console=console, device=device, announce=lambda line: None, legacy=legacy)
+    return make_runner(Workspace(out), scale, console=console, device=device, announce=lambda line: None, **given)
 
 
 def make_runner(

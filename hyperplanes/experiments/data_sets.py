@@ -30,7 +30,7 @@ class DataSets:
         generate: called with what decides a data set and the folder it is to lie in; goes on where it stopped.
         device: where views are kept.
         given: folders by class, instead of generated data sets.
-        legacy: as in `open_dataset`, of those that are not generated.
+        legacy: as in `open_dataset`, of given ones.
     """
 
     def __init__(
@@ -45,6 +45,7 @@ class DataSets:
     ) -> None:
         self.workspace, self.scale, self.generate, self.device = workspace, scale, generate, device
         self.given, self.legacy = given or {}, legacy
+        self.generated: dict[str, Path] = {}  # by another process, whose worker this one is
         self._tasks: dict[str, TasksOnDevice] = {}
         self._names: dict[str, str] = {}  # of given data sets: what they hold is looked at once
 
@@ -52,8 +53,7 @@ class DataSets:
         """The data set of a class; ValueError where none was given and the scale generates none."""
         if class_name not in self._tasks:
             folder = self.folder(class_name)
-            generated = folder.resolve().is_relative_to(self.workspace.out.resolve())  # which workers are given, too
-            data: Tasks = open_dataset(folder, legacy=self.legacy and not generated)
+            data: Tasks = open_dataset(folder, legacy=self.legacy and class_name in self.given)
             if self.scale.bounds is not None:
                 data = WithBounds(data, self.scale.bounds)
             self._tasks[class_name] = TasksOnDevice(data, self.device)
@@ -63,6 +63,8 @@ class DataSets:
         """The folder of the data set of a class; as `tasks`."""
         if class_name in self.given:
             return self.given[class_name].resolve()
+        if class_name in self.generated:
+            return self.generated[class_name]
         settings = self._settings(class_name)
         work = partial(self.generate, settings)
         return self.workspace.folder("data", class_name, self.name(class_name), settings, work)

@@ -179,7 +179,7 @@ class Runner:
                 continue
             for job, _, path, known in self._evaluations(experiment, cell, seed):
                 if known is None and path not in self._evaluated:
-                    self._evaluated[path] = self.workers.submit(self._given(cell.on), partial(_evaluate, job))
+                    self._evaluated[path] = self.workers.submit(self._folders(cell.on), partial(_evaluate, job))
 
     def do_all(self, class_name: str, works: Sequence[Callable[[Runner], Result]]) -> list[Result]:
         """What pieces of work return, side by side where there are workers.
@@ -190,7 +190,7 @@ class Runner:
         """
         if self.workers is None:
             return [work(self) for work in works]
-        started = [self.workers.submit(self._given(class_name), work) for work in works]
+        started = [self.workers.submit(self._folders(class_name), work) for work in works]
         return [each.result() for each in started]
 
     def _evaluations(
@@ -232,7 +232,7 @@ class Runner:
         keep = partial(_save_pictures, self.pictures(cell, job.name), cell) if experiment.keep_pictures else None
         return evaluate(method, *self._method_in_use[1], [job.name], keep).objects[0]
 
-    def _given(self, class_name: str) -> dict[str, Path]:
+    def _folders(self, class_name: str) -> dict[str, Path]:
         """The data set of a class, for a worker, which generates none."""
         return {class_name: self.data.folder(class_name)}
 

@@ -74,14 +74,14 @@ class Workers:
                 child.kill()
         self._pool.shutdown()
 
-    def submit(self, given: Mapping[str, Path], work: Callable[[Any], Result]) -> Future[Result]:
+    def submit(self, folders: Mapping[str, Path], work: Callable[[Any], Result]) -> Future[Result]:
         """Do a piece of work in a process, as soon as one is free.
 
         Args:
-            given: folders of the data sets by class; a worker generates none.
+            folders: of the data sets by class; a worker generates none.
             work: called with what `make` made in the process; pickled, as its result is.
         """
-        return self._started().submit(_do, given, work)
+        return self._started().submit(_do, folders, work)
 
     def _started(self) -> ProcessPoolExecutor:
         if self._pool is None:
@@ -100,7 +100,7 @@ def _start(make: Callable[[], HasData]) -> None:
     _runner = make()
 
 
-def _do(given: Mapping[str, Path], work: Callable[[Any], Result]) -> Result:
-    _runner.data.given = {**_runner.data.given, **given}
+def _do(folders: Mapping[str, Path], work: Callable[[Any], Result]) -> Result:
+    _runner.data.generated |= folders  # given ones, which the process knows, go first
     with interruptible():
         return work(_runner)

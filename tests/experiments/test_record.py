@@ -9,6 +9,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from hyperplanes.commands.runs import make_workers
+from hyperplanes.experiments import data_sets, workers
 from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.experiments.demonstration.settings import DemoSettings
 from hyperplanes.experiments.engine import Runner
@@ -89,6 +91,27 @@ def test_results_of_a_given_data_set_are_those_of_what_it_holds(tmp_path, monkey
     assert names() == before
     (cars / "manifest.json").write_text("{}")
     assert all(now != then for now, then in zip(names(), before, strict=True))
+
+
+def test_legacy_is_of_the_data_sets_that_are_given_wherever_they_lie(tmp_path, monkeypatch):
+    """By hand: a given one inside the workspace, a generated one, and one whose folder a worker is told."""
+    read, cpu = {}, torch.device("cpu")
+    monkeypatch.setattr(data_sets, "open_dataset", lambda path, legacy: read.setdefault(path.name, legacy) or Balls())
+    scale, given = DemoSettings.quick_check().scale, {"car": tmp_path / "data" / "cars"}
+
+    def generate(settings, folder):
+        folder.mkdir(parents=True)
+
+    main = DataSets(Workspace(tmp_path), scale, generate=generate, device=cpu, given=given, legacy=True)
+    main.tasks("car")
+    main.tasks("chair")
+    assert list(read.values()) == [True, False]
+    read.clear()
+    worker = make_workers(2, tmp_path, scale, "cpu", given=given, legacy=True)._make()
+    monkeypatch.setattr(workers, "_runner", worker, raising=False)
+    for name in given | {"chair": ""}:
+        workers._do({name: main.folder(name)}, lambda runner, name=name: runner.data.tasks(name))
+    assert list(read.values()) == [True, False]
 
 
 class ManualWorkers:
