@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.export.images import orbit_cameras, picture_paths, save_images
 from hyperplanes.methods import Unchecked, WithSampler, make_method
 from hyperplanes.utilities.checkpoints import read_json
+from hyperplanes.utilities.environment import find_processor
 from hyperplanes.utilities.writing import write_json
 from hyperplanes.views import Task, Tasks
 
@@ -159,6 +160,8 @@ class Runner:
         for count, (job, settings, path, known) in enumerate(self._evaluations(experiment, cell, seed), 1):
             if known is None:
                 self.workspace.begin()
+                if _is_time(cell):
+                    wait(self._evaluated.values())  # workers slow down what is measured beside them
                 started = self._evaluated.pop(path, None)
                 found = self.evaluate(job) if started is None else started.result()
                 known = Score(method, (found,))
@@ -175,7 +178,7 @@ class Runner:
         if self.workers is None:
             return
         for cell in experiment.cells:
-            if cell.quantity.endswith("seconds") or not self.trainings.is_made(experiment, cell.trained, seed):
+            if _is_time(cell) or not self.trainings.is_made(experiment, cell.trained, seed):
                 continue
             for job, _, path, known in self._evaluations(experiment, cell, seed):
                 if known is None and path not in self._evaluated:
@@ -209,6 +212,7 @@ class Runner:
             "fine_tuning": stated(self.fine_tuning(cell)),
             **({} if cell.query is None else {"query": cell.query}),
             **({"orbit": cell.orbit} if cell.orbit else {}),
+            **({"measured_alone": self._measured_by()} if _is_time(cell) else {}),
             **self.data.reading,
         }
         for name in self.data.evaluated(cell.on, cell.split, experiment.objects):
@@ -231,6 +235,12 @@ class Runner:
             self._method_in_use = made_for, self._method(experiment, cell, method, job.checkpoint, job.seed)
         keep = partial(_save_pictures, self.pictures(cell, job.name), cell) if experiment.keep_pictures else None
         return evaluate(method, *self._method_in_use[1], [job.name], keep).objects[0]
+
+    def _measured_by(self) -> dict[str, Any]:
+        """What decides how long an evaluation takes in this process."""
+        on_gpu = self.device.type == "cuda"
+        name = torch.cuda.get_device_name(self.device) if on_gpu else find_processor()
+        return {"device": name, "threads": torch.get_num_threads()}
 
     def _folders(self, class_name: str) -> dict[str, Path]:
         """The data set of a class, for a worker, which generates none."""
@@ -307,6 +317,11 @@ def curve_of(checkpoint: Path) -> Curve:
 def file_name(row: str) -> str:
     """The heading of a row in file names."""
     return row.replace(":", "-on-")
+
+
+def _is_time(cell: Cell) -> bool:
+    """Whether a cell asks for seconds, which this process measures while no other one works for it."""
+    return cell.quantity.endswith("seconds")
 
 
 def _evaluate(job: Evaluation, runner: Runner) -> ObjectScore:

@@ -114,6 +114,23 @@ def test_legacy_is_of_the_data_sets_that_are_given_wherever_they_lie(tmp_path, m
     assert list(read.values()) == [True, False]
 
 
+def test_seconds_are_not_those_that_another_cell_has_found(tmp_path, monkeypatch):
+    """Property: PSNR and seconds of one evaluation have two files, and seconds one for each number of threads."""
+    monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
+    cpu, psnr = torch.device("cpu"), replace(DemoSettings.quick_check().packaged.cells[0], split="test")
+    data = DataSets(Workspace(tmp_path), DemoSettings.quick_check().packaged_scale, generate=None, device=cpu)
+    runner, seconds = Runner(data.workspace, data, train=print, device=cpu), replace(psnr, quantity="image_seconds")
+
+    def files(cell):
+        experiment = replace(DemoSettings.quick_check().packaged, cells=(cell,), keep_pictures=False)
+        return {path for _, _, path, _ in runner._evaluations(experiment, cell, 0)}
+
+    found = files(psnr), files(seconds)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 7)
+    assert files(psnr) == found[0]
+    assert len(found[0] | found[1] | files(seconds)) == 3 * len(found[0])
+
+
 class ManualWorkers:
     """Workers for two pieces of work at a time, which end when the test says so."""
 
