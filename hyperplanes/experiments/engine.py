@@ -54,7 +54,8 @@ class Outcome:
         scores: by (row, column), over all seeds.
         curves: of the trainings, by row and then by seed.
         seeds: how many.
-        objects: trained on, by class.
+        objects: trained on, by class; none where every model is packaged.
+        given: classes whose data sets were given, and not generated.
     """
 
     experiment: Experiment
@@ -63,6 +64,7 @@ class Outcome:
     curves: Mapping[str, list[Curve]]
     seeds: int
     objects: Mapping[str, int]
+    given: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,8 @@ class Runner:
             {place: merge_seeds(found) for place, found in scores.items()},
             {name: list(found.values()) for name, found in curves.items()},
             seeds,
-            {each.on: len(self.data.tasks(each.on).names("train")) for each in experiment.trainings},
+            {e.on: len(self.data.tasks(e.on).names("train")) for e in experiment.trainings if not e.packaged},
+            [each for each in experiment.classes if each in self.data.given],
         )
 
     def train_all(self, experiment: Experiment, seed: int, evaluated: Sequence[Experiment] = ()) -> None:

@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from statistics import fmean, pstdev
 from typing import Any
 
+from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.evaluation import Score
 from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS, differences
 from hyperplanes.experiments.engine import Outcome
@@ -91,39 +92,64 @@ def _theirs(outcome: Outcome, row: str, column: str) -> str:
 def what_differs(outcome: Outcome) -> list[str]:
     """What is not as in the paper, and what the paper leaves open, a line each."""
     experiment, scale = outcome.experiment, outcome.scale
-    lines = []
-    objects = ", ".join(f"{count} {name}s" for name, count in outcome.objects.items())
-    if scale.resolution is not None:
-        lines.append(
-            f"Data: procedural objects of {scale.resolution}x{scale.resolution} pixels, {scale.views // 2} support and "
-            f"{scale.views // 2} query views; trained on {objects}. Paper: ShapeNet at {experiment.size}x"
-            f"{experiment.size}, 25 and 25 views."
-        )
-    else:
-        lines.append(f"Data: trained on {objects}.")
-    if scale.steps is not None:
+    lines = [f"Data: {_data(outcome)}. Paper: ShapeNet at {experiment.size}x{experiment.size}, 25 and 25 views."]
+    if scale.steps is not None and (steps := _steps(outcome, scale.steps)):
         epochs = experiment.epochs
         paper = epochs if isinstance(epochs, int) else ", ".join(f"{n}s {count}" for n, count in epochs.items())
-        learned = scale.learned.get("training.steps") if experiment.name == "shapenet" else None
-        others = f", {learned:,} of learned initialisations" if learned else ""
-        lines.append(f"Training: {scale.steps:,} steps of each model{others}. Paper: epochs, {paper}.")
+        lines.append(f"Training: {steps}. Paper: epochs, {paper}.")
     if scale.max_steps is not None and any(scale.method(cell.method) != cell.method for cell in experiment.cells):
         lines.append(f"At most {scale.max_steps} gradient steps on the support views of an object.")
     if experiment.figure == "steps" and scale.max_curve_steps is not None:
         lines.append(f"At most {scale.max_curve_steps:,} gradient steps on the support views of an object.")
     if scale.evaluated is not None:
-        count = min(scale.evaluated, experiment.objects or scale.evaluated)
-        lines.append(f"Judged by {count} object{'s' if count > 1 else ''} a class. Paper: all test objects.")
-    lines.append(
-        f"Seeds: {outcome.seeds}, each that of a training and of the fine-tuning of its evaluations"
-        f"{'; ± is the standard deviation over them' if outcome.seeds > 1 else ''}. Paper: {experiment.runs}."
-    )
+        counts = sorted({len(score.objects) for score in outcome.scores.values()})
+        count = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+        lines.append(f"Judged by {count} object{'' if count == '1' else 's'} a class. Paper: all test objects.")
+    lines.append(f"{_seeds(outcome)}. Paper: {experiment.runs}.")
     silent = [
         name for name in SILENT if any(cell.column == name or cell.row.endswith(name) for cell in experiment.cells)
     ]
     if silent:
         lines.append(f"Of {', '.join(silent)} no source states settings: those of the target of HyperPlanes are taken.")
     return [*lines, *experiment.notes]
+
+
+def _data(outcome: Outcome) -> str:
+    """The data sets, and how many of their objects were trained on."""
+    scale, parts = outcome.scale, []
+    if len(outcome.given) < len(outcome.experiment.classes):
+        size, views = f"{scale.resolution}x{scale.resolution}", scale.views // 2
+        parts.append(f"procedural objects of {size} pixels, {views} support and {views} query views")
+    if outcome.given:
+        parts.append(f"given data sets of {', '.join(f'{name}s' for name in outcome.given)}")
+    if outcome.objects:
+        parts.append("trained on " + ", ".join(f"{count} {name}s" for name, count in outcome.objects.items()))
+    return "; ".join(parts)
+
+
+def _steps(outcome: Outcome, steps: int) -> str:
+    """How long each model was trained; nothing where all are packaged."""
+    trained = [each.method in LEARNED for each in outcome.experiment.trainings if not each.packaged]
+    learned = outcome.scale.learned.get("training.steps", steps)
+    parts = [] if all(trained) else [f"{steps:,} steps of each model"]
+    if any(trained) and (learned != steps or not parts):
+        parts.append(f"{learned:,} {'' if parts else 'steps '}of learned initialisations")
+    return ", ".join(parts)
+
+
+def _seeds(outcome: Outcome) -> str:
+    """What seeds there are, and what has none."""
+    packaged = [cell for cell in outcome.experiment.cells if cell.trained.packaged]
+    if len(packaged) == len(outcome.experiment.cells):
+        return "Seeds: packaged models are evaluated once"
+    spread = "; ± is the standard deviation over them" if outcome.seeds > 1 else ""
+    once = "; packaged models are evaluated once" if packaged and outcome.seeds > 1 else ""
+    return f"Seeds: {outcome.seeds}, each that of a training and of the fine-tuning of its evaluations{spread}{once}"
+
+
+def _evaluated(score: Score) -> int:
+    """With how many seeds."""
+    return max(1, len(score.seeds))
 
 
 def settings(outcome: Outcome) -> list[list[str]]:
@@ -148,13 +174,17 @@ def as_markdown(outcome: Outcome, command: str, figures: Sequence[str] = ("figur
     machine = f"{where['gpu'] or where['processor']}, {where['cores']} cores, torch {where['torch']}"
     notes = "\n".join(f"- {line}" for line in what_differs(outcome))
     shown = "\n\n".join(f"![{name.partition('.')[0]}]({name})" for name in figures)
-    columns = "\n".join(f"- {line}" for line in sources())
+    columns, differing = "\n".join(f"- {line}" for line in sources()), ""
+    if stated := settings(outcome):
+        differing = (
+            f"Settings that a source states otherwise (preset {outcome.scale.presets[experiment.size]}); - where it "
+            f"states nothing:\n\n{markdown_table(DIFFERENCE_HEADINGS, stated)}\n{columns}\n\n"
+        )
     return (
         f"# {experiment.title}\n\nHyperPlanes (arXiv 2402.01524), {experiment.where}.\n\n"
         f"{markdown_table(headings(outcome), rows(outcome))}\n"
         f"{shown}\n\n## What differs\n\n{notes}\n\n"
-        f"Settings that a source states otherwise (preset {outcome.scale.presets[experiment.size]}); - where it states "
-        f"nothing:\n\n{markdown_table(DIFFERENCE_HEADINGS, settings(outcome))}\n{columns}\n\n## How it was made\n\n"
+        f"{differing}## How it was made\n\n"
         f"    {command}\n\nCommit {where['commit']}; {machine}.\n"
     )
 
@@ -163,10 +193,11 @@ def as_csv(outcome: Outcome) -> str:
     """A line a number, ours and the paper's, every digit."""
     lines: list[Sequence[object]] = []
     for cell in outcome.experiment.cells:
-        number, deviation = value(outcome.scores[cell.row, cell.column], cell.quantity)
-        pooled = outcome.scores[cell.row, cell.column].mean("psnr_pooled") if cell.quantity == "psnr" else None
+        score = outcome.scores[cell.row, cell.column]
+        number, deviation = value(score, cell.quantity)
+        pooled = score.mean("psnr_pooled") if cell.quantity == "psnr" else None
         theirs = outcome.experiment.published_value(cell.row, cell.column)
-        lines.append((cell.row, cell.column, cell.quantity, number, deviation, pooled, outcome.seeds, theirs))
+        lines.append((cell.row, cell.column, cell.quantity, number, deviation, pooled, _evaluated(score), theirs))
     return csv_table(("row", "column", "quantity", "value", "deviation", "pooled", "seeds", "paper"), lines)
 
 
@@ -187,7 +218,7 @@ def as_json(outcome: Outcome, command: str) -> dict[str, Any]:
         "experiment": outcome.experiment.name,
         "where": outcome.experiment.where,
         "scale": outcome.scale.name,
-        "seeds": outcome.seeds,
+        "seeds": max(map(_evaluated, outcome.scores.values())),
         "command": command,
         "differs": what_differs(outcome),
         "settings": [asdict(each) for each in differences(outcome.experiment, outcome.scale)],

@@ -1,13 +1,17 @@
 """Source of truth: the LaTeX source of the paper, typed into the tests a second time as sums, and properties."""
 
+import csv
+import io
 from dataclasses import replace
 
 import pytest
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.presets import TRAINABLE, preset
-from hyperplanes.experiments import EXPERIMENTS, SCALES
+from hyperplanes.evaluation import ObjectScore, Score, merge_seeds
+from hyperplanes.experiments import EXPERIMENTS, SCALES, report
 from hyperplanes.experiments.configurations import change, configuration, differences
+from hyperplanes.experiments.engine import Outcome
 from hyperplanes.experiments.published import CROSS, SHAPENET, SINGLE, TARGET, TIME
 from hyperplanes.methods import METHODS
 
@@ -238,3 +242,40 @@ def test_scales_make_things_smaller_and_say_so():
     assert paper.applied(iterations) == iterations
     assert [small.seeds(EXPERIMENTS[name]) for name in ("shapenet", "cross-class", "target")] == [3, 3, 3]
     assert paper.seeds(EXPERIMENTS["cross-class"]) == 5
+
+
+def outcome_of(experiment, seeds, **about):
+    """An outcome with two objects in each cell, so many seeds, and one where the model is packaged."""
+    row = Score("", (ObjectScore("a", 20.0, 0.9, 1.0, 1.0, 19.0), ObjectScore("b", 22.0, 0.9, 1.0, 1.0, 21.0)))
+    scores = {(c.row, c.column): row if c.trained.packaged else merge_seeds([row] * seeds) for c in experiment.cells}
+    return Outcome(experiment, SCALES["small"], scores, {}, seeds, **about)
+
+
+def test_a_table_of_packaged_models_on_given_data_says_so():
+    """By hand: nothing was generated or trained, and two objects were evaluated once, of the scale's ten."""
+    packaged = EXPERIMENTS["shapenet"].of(["small, 1 view", "Cars"])
+    outcome = outcome_of(packaged, 1, objects={}, given=["car"])
+    assert report.what_differs(outcome)[:3] == [
+        "Data: given data sets of cars. Paper: ShapeNet at 128x128, 25 and 25 views.",
+        "Judged by 2 objects a class. Paper: all test objects.",
+        f"Seeds: packaged models are evaluated once. Paper: {packaged.runs}.",
+    ]
+    assert "states otherwise" not in report.as_markdown(outcome, "")
+
+
+def test_a_table_says_what_was_trained_on_what_and_how_often():
+    both = EXPERIMENTS["shapenet"].of(["small, 1 view", "HyperPlanes, 1 view", "Cars", "Chairs"])
+    outcome = outcome_of(both, 3, objects={"car": 40, "chair": 7}, given=["chair"])
+    data, training, _, seeds, *_ = report.what_differs(outcome)
+    assert data.startswith(
+        "Data: procedural objects of 32x32 pixels, 25 support and 25 query views; given data sets of chairs; "
+        "trained on 40 cars, 7 chairs. Paper: "
+    )
+    assert training.startswith("Training: 200 steps of each model. Paper: ")
+    assert seeds.startswith("Seeds: 3, each that of a training")
+    assert "packaged models are evaluated once" in seeds
+    lines = csv.DictReader(io.StringIO(report.as_csv(outcome)))
+    assert {line["row"]: line["seeds"] for line in lines} == {"small, 1 view": "1", "HyperPlanes, 1 view": "3"}
+    learned = EXPERIMENTS["shapenet"].of(["MV Meta, 1 view", "Cars"])
+    outcome = replace(outcome, experiment=learned, scale=SCALES["gpu"])
+    assert report.what_differs(outcome)[1].startswith("Training: 2,000 steps of learned initialisations. Paper")
