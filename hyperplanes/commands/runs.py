@@ -92,6 +92,7 @@ def make_runner(
     def generate(settings: Mapping[str, Any], folder: Path) -> None:
         verb, named = find_verb("generate").load(), dict(settings)
         class_name, count = named.pop("class"), named.pop("objects")
+        named.pop("contents", None)  # tells the data set from one of other meshes in the same folder
         objects = {} if "meshes" in named else {"class_name": class_name, "count": count}
         verb.run(verb.Arguments(folder, **objects, **named))
 

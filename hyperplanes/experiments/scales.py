@@ -41,7 +41,8 @@ class Scale:
         bounds: the sphere of every scene; what the files say or the masks show where None.
         shown: numbers of support views, where a table has rows of several; None for all of them.
         packaged: with the rows of models that come with the package.
-        data: what is generated otherwise, by class: entries that `generate` takes.
+        data: what is generated otherwise, by class: entries that `generate` takes, and the `contents` of a folder that
+            it reads, as by `files.folder_checksum`.
     """
 
     name: str

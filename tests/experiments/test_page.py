@@ -208,3 +208,26 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     found = to_pixels(model.adapt(support).render(orbit_cameras(support, 2)).images)
     read = np.stack([np.asarray(Image.open(frame).convert("RGB")) for frame in frames])
     assert np.abs(read.astype(int) - found).max() <= 1
+
+
+def test_the_first_page_is_made_anew_when_the_mesh_files_change(tmp_path, monkeypatch):
+    """Property: a mesh that is added is noticed, what the demonstration itself writes beside them is not."""
+    made, cpu = [], torch.device("cpu")
+    monkeypatch.setattr(Demonstration, "_show_packaged", lambda self, page: made.append(page.write_bytes(b"")))
+    out = tmp_path / "out"
+    out.mkdir()
+
+    def make_runner(workspace, scale):
+        return Runner(workspace, DataSets(workspace, scale, generate=None, device=cpu), train=None, device=cpu)
+
+    def show():
+        settings = replace(DemoSettings.quick_check(), meshes=tmp_path)
+        demonstration = Demonstration(settings, out, make_runner, lambda: None, print, None)
+        demonstration.show_packaged()
+        return demonstration.packaged.data.name("meshes")
+
+    first = show()
+    assert (show(), len(made)) == (first, 1)
+    (tmp_path / "chair.obj").write_bytes(b"")
+    assert show() != first
+    assert len(made) == 2

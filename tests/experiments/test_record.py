@@ -118,7 +118,7 @@ def test_seconds_are_not_those_that_another_cell_has_found(tmp_path, monkeypatch
     """Property: PSNR and seconds of one evaluation have two files, and seconds one for each number of threads."""
     monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
     cpu, psnr = torch.device("cpu"), replace(DemoSettings.quick_check().packaged.cells[0], split="test")
-    data = DataSets(Workspace(tmp_path), DemoSettings.quick_check().packaged_scale, generate=None, device=cpu)
+    data = DataSets(Workspace(tmp_path), DemoSettings.quick_check().packaged_scale(tmp_path), generate=None, device=cpu)
     runner, seconds = Runner(data.workspace, data, train=print, device=cpu), replace(psnr, quantity="image_seconds")
 
     def files(cell):

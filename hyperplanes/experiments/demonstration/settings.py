@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from hyperplanes.experiments.experiment import Cell, Experiment, Trained
 from hyperplanes.experiments.scales import Scale
 from hyperplanes.methods import at_steps, describe_method
 from hyperplanes.rendering.renderer import RayMarching
+from hyperplanes.utilities.files import folder_checksum
 from hyperplanes.utilities.shell import command_line
 
 __all__ = ["MODELS", "PACKAGED", "TUNED", "DemoSettings", "describe_row"]
@@ -162,17 +163,23 @@ class DemoSettings:
             data={self.class_name: {"seed": self.seed}, self.unseen_class: {"seed": self.seed, **unseen}},
         )
 
-    @property
-    def packaged_scale(self) -> Scale:
-        """One object a class from cameras anywhere, and the mesh files."""
-        drawn = {"rig": "random", "seed": self.seed, "views": self.views}
+    def packaged_scale(self, out: Path) -> Scale:
+        """One object a class from cameras anywhere, and the mesh files.
+
+        Args:
+            out: the folder of the demonstration; what it holds is none of the mesh files.
+        """
+        drawn: dict[str, object] = {"rig": "random", "seed": self.seed, "views": self.views}
+        data: dict[str, Mapping[str, object]] = dict.fromkeys(self.first, drawn)
+        if self.meshes is not None:
+            data["meshes"] = {**drawn, "meshes": str(self.meshes), "contents": folder_checksum(self.meshes, out)}
         return Scale(
             name="demonstration",
             presets={self.resolution: self.preset},
             resolution=self.first_resolution,
             objects=1,
             held_out=1,
-            data={**dict.fromkeys(self.first, drawn), "meshes": {**drawn, "meshes": str(self.meshes)}},
+            data=data,
         )
 
     def command(self, out: Path) -> str:

@@ -45,7 +45,7 @@ class Demonstration:
         self.settings, self.out, self.say, self.evaluating = settings, out, say, evaluating
         classes = [*settings.first, "meshes"]
         first = Workspace(out / "first", {name: name for name in classes}, begin)
-        self.packaged = make_runner(first, settings.packaged_scale)
+        self.packaged = make_runner(first, settings.packaged_scale(out))
         places = {settings.class_name: "data", settings.unseen_class: "unseen"} | {name: name for name in MODELS}
         self.runner = make_runner(Workspace(out, places, begin), settings.scale)
 
@@ -65,7 +65,8 @@ class Demonstration:
         """What needs no training, in first.html."""
         settings, page = self.settings, self.out / "first.html"
         names = ("first", "first_resolution", "first_counts", "seed", "frames")
-        deciding = {name: getattr(settings, name) for name in names} | {"meshes": str(settings.meshes)}
+        meshes = "" if settings.meshes is None else self.packaged.data.name("meshes")
+        deciding = {name: getattr(settings, name) for name in names} | {"meshes": meshes}
         self.packaged.workspace.make(page.name, deciding, [page], lambda: self._show_packaged(page))
 
     def _show_packaged(self, page: Path) -> None:
