@@ -118,6 +118,14 @@ def test_the_parts_of_a_step_are_those_that_its_table_names(threads):
     assert all(found[part]["seconds"] > 0 for part in tables.PARTS)
 
 
+@pytest.mark.parametrize("option", ["--json=rows.json", "--js=rows.json", "--j"])
+def test_rows_are_kept_however_the_option_is_written(option, monkeypatch, capsys):
+    """Property: argparse takes these as --json, so does the check of the load."""
+    monkeypatch.setattr(benchmarks_main, "load_at_start", lambda: 1.4)
+    assert benchmarks_main.main(["small", "--quick", option]) == 2
+    assert "1.4 cores busy" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", sorted(OF_SPEED))
 def test_rows_of_speed_are_not_kept_beside_other_work(name, tmp_path, monkeypatch, capsys):
     """Property: with more than 0.3 cores busy nothing is measured or written; the message says how to do it anyway."""
