@@ -116,7 +116,7 @@ class Experiment:
             The cells whose row or column, or of headings of both kinds whose row and column, are among them.
 
         Raises:
-            ValueError: a heading that the table has not.
+            ValueError: a heading that the table has not, or headings of which no cell has two.
         """
         known = [*self.rows, *self.columns]
         if unknown := [each for each in headings if each not in known]:
@@ -125,6 +125,8 @@ class Experiment:
         rows = [each for each in headings if each in self.rows] or self.rows
         columns = [each for each in headings if each in self.columns] or self.columns
         kept = tuple(cell for cell in self.cells if cell.row in rows and cell.column in columns)
+        if not kept:
+            raise ValueError(f"--only: expected headings with a common cell, got {', '.join(map(repr, headings))}")
         return replace(self, cells=kept, pictures=tuple(each for each in self.pictures if each in rows))
 
     def published_value(self, row: str, column: str) -> float | None:

@@ -226,6 +226,8 @@ def test_some_rows_and_columns_of_a_table():
     assert [each.on for each in shapenet.of(["Lamps"]).trainings] == ["lamp"] * len(shapenet.of(["Lamps"]).trainings)
     with pytest.raises(ValueError, match="--only: expected headings of shapenet, .*'Cars', 'Lamps', got 'Boats'"):
         shapenet.of(["Boats"])
+    with pytest.raises(ValueError, match="--only: expected headings with a common cell, got 'Cars: HyperPlanes', '3'"):
+        SCALES["smoke"].applied(EXPERIMENTS["iterations"]).of(["Cars: HyperPlanes", "3"])
 
 
 def test_scales_make_things_smaller_and_say_so():
