@@ -51,7 +51,8 @@ class Arguments:
         meshes: A folder with a few mesh files that the packaged model shows first, beside procedural objects.
         first_only: End after the packaged model's page.
         seed: Of the data, the trainings and the evaluation.
-        workers: Processes that train and evaluate side by side; one a core, at most four, when not given.
+        workers: Processes that train and evaluate side by side, with one thread each, by which fine-tuned scores may
+            differ in their last digits from those of one process; one a core, at most four, when not given.
         quick_check: Only see that everything runs: a few tiny objects and networks that learn nothing.
         device: auto, cpu or cuda.
     """

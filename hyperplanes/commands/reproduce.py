@@ -54,7 +54,8 @@ class Arguments:
         seeds: Other than the scale's: seeds of trainings and of the fine-tuning of their evaluations.
         legacy: Read the principal points of published data at W / 2 at integer pixel centres, as the code published
             with them has it.
-        workers: Processes that train and evaluate side by side; times are measured by one alone.
+        workers: Processes that train and evaluate side by side, with one thread each, by which fine-tuned scores may
+            differ in their last digits from those of one process; times are measured by one alone.
         estimate: Only measure a few steps of every training and say how long all will take here.
         device: auto, cpu or cuda.
     """
