@@ -4,12 +4,11 @@
 other processes keep more than `load.LIMIT` cores busy, unless `--under-load` is given; the load stands beside the rows.
 """
 
+import os
 import sys
 from importlib import import_module
 
 from benchmarks.load import LIMIT, OF_SPEED, load_at_start
-from hyperplanes.utilities.checkpoints import CheckpointError
-from hyperplanes.utilities.files import DataError
 
 NAMES = (
     "adapting",
@@ -40,6 +39,10 @@ def main(arguments: list[str]) -> int:
 
     Args:
         arguments: the name, and what its `main` reads.
+
+    Raises:
+        ValueError: wrong input, where HYPERPLANES_TRACEBACK is set; else one line and the exit code 2.
+        OSError: likewise.
     """
     whatever = arguments[:1] == [UNDER_LOAD]
     arguments = arguments[whatever:]
@@ -58,8 +61,10 @@ def main(arguments: list[str]) -> int:
         return 2
     try:
         return int(import_module(f"benchmarks.{arguments[0]}").main(arguments[1:]) or 0)
-    except (DataError, CheckpointError) as error:
-        print(f"benchmarks {arguments[0]}: {error}", file=sys.stderr)
+    except (ValueError, OSError) as error:  # wrong input, as the command line of hyperplanes takes them
+        if os.environ.get("HYPERPLANES_TRACEBACK", "") not in ("", "0"):
+            raise
+        print(f"benchmarks {arguments[0]}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.objects import held_out
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import Renderable
@@ -44,9 +45,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--views", type=Path, help="posed images; a procedural car when not given")
     parser.add_argument("--checkpoint", default="small", help="the model (default: %(default)s)")
     parser.add_argument("--fit", type=int, nargs="+", default=[STEPS, 2 * STEPS], help="steps of fitting voxels")
-    parser.add_argument("--side", type=int, help="voxels an axis; those of pages when not given")
+    parser.add_argument("--side", type=positive, help="voxels an axis; those of pages when not given")
     parser.add_argument("--steps", type=int, default=100, help="of fine-tuning, the reference; 0 leaves it out")
-    parser.add_argument("--query", type=int, default=10, help="views that are compared (default: %(default)s)")
+    parser.add_argument("--query", type=positive, default=10, help="views that are compared (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="a small car, few steps: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)

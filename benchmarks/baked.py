@@ -15,6 +15,7 @@ import statistics
 from pathlib import Path
 
 from benchmarks._timing import timed
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from benchmarks.views import add_data_options, suite_folders
 from hyperplanes.adaptation import HyperPlanes
@@ -38,10 +39,10 @@ def main(arguments: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks baked", description=__doc__)
     add_data_options(parser)
-    parser.add_argument("--counts", type=int, nargs="+", default=[25], help="numbers of support views")
-    parser.add_argument("--objects", type=int, default=3, help="of each data set")
-    parser.add_argument("--query", type=int, default=3, help="views of each object to be judged by")
-    parser.add_argument("--side", type=int, help="voxels an axis; those of pages when not given")
+    parser.add_argument("--counts", type=positive, nargs="+", default=[25], help="numbers of support views")
+    parser.add_argument("--objects", type=positive, default=3, help="of each data set")
+    parser.add_argument("--query", type=positive, default=3, help="views of each object to be judged by")
+    parser.add_argument("--side", type=positive, help="voxels an axis; those of pages when not given")
     parser.add_argument("--fit", type=int, default=STEPS, help="steps of fitting (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="one object, few steps: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")

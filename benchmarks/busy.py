@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks._timing import ratio
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.utilities.environment import usable_cores
 
@@ -47,8 +48,10 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks busy", description=__doc__)
     parser.add_argument("--works", nargs="+", choices=WORKS, default=list(WORKS))
     parser.add_argument("--policies", nargs="+", choices=("passive", "active"), default=["passive"])
-    parser.add_argument("--repeats", type=int, default=3, help="in each process (default: %(default)s)")
-    parser.add_argument("--rounds", type=int, default=3, help="processes of each way, in turn (default: %(default)s)")
+    parser.add_argument("--repeats", type=positive, default=3, help="in each process (default: %(default)s)")
+    parser.add_argument(
+        "--rounds", type=positive, default=3, help="processes of each way, in turn (default: %(default)s)"
+    )
     parser.add_argument("--quick", action="store_true", help="small and once: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     parser.add_argument("--measure", choices=WORKS, help=argparse.SUPPRESS)  # what a process of its own does

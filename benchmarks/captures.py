@@ -31,6 +31,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch.nn.functional import interpolate
 
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish, write_rows
 from benchmarks.staged_photographs import Staged, stage, walk_around
 from data_gen.meshes.find import find_meshes
@@ -115,9 +116,9 @@ def main(arguments: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks captures", description=__doc__)
     parser.add_argument("--meshes", type=Path, nargs="+", help="meshes, and folders of them; ellipsoids if not given")
-    parser.add_argument("--count", type=int, default=3, help="objects of each folder, or ellipsoids")
-    parser.add_argument("--views", type=int, default=36)
-    parser.add_argument("--size", type=int, default=560, help="pixels along the longer side")
+    parser.add_argument("--count", type=positive, default=3, help="objects of each folder, or ellipsoids")
+    parser.add_argument("--views", type=positive, default=36)
+    parser.add_argument("--size", type=positive, default=560, help="pixels along the longer side")
     parser.add_argument("--mask", default="auto", help="as of `hyperplanes capture`")
     parser.add_argument("--checkpoint", help="a model to compare new views with")
     parser.add_argument(

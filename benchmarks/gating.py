@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.options import positive
 from benchmarks.views import add_data_options, suite_folders
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.checkpoints import find_checkpoint
@@ -37,7 +38,7 @@ def main(arguments: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks gating", description=__doc__)
     add_data_options(parser)
-    parser.add_argument("--objects", type=int, default=24, help="held-out ones of each data set")
+    parser.add_argument("--objects", type=positive, default=24, help="held-out ones of each data set")
     parser.add_argument("--out", type=Path, metavar="FOLDER", required=True, help="where the model goes")
     parser.add_argument("--quick", action="store_true", help="one object: to see that it runs")
     chosen = parser.parse_args(arguments)

@@ -29,6 +29,7 @@ from torch.nn.functional import pad
 
 from benchmarks._timing import add_device_option, interleaved, peak_bytes, timed
 from benchmarks.objects import held_out
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from benchmarks.training import Objects
 from hyperplanes.adaptation import HyperPlanes
@@ -66,7 +67,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--data", type=Path, help="a data set; a procedural car where absent")
     add_device_option(parser, "cuda")
     parser.add_argument("--steps", type=int, default=100, help="of fine-tuning (default: %(default)s)")
-    parser.add_argument("--repeats", type=int, default=7, help="of each view (default: %(default)s)")
+    parser.add_argument("--repeats", type=positive, default=7, help="of each view (default: %(default)s)")
     parser.add_argument("--compile", action="store_true", help="compile the paper's network, too: a minute or two")
     parser.add_argument("--quick", action="store_true", help="few and small views: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")

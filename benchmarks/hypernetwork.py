@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.diagnostics import diagnose
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
@@ -66,9 +67,9 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks hypernetwork", description=__doc__)
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets, a class each")
     parser.add_argument("--variant", nargs="+", choices=VARIANTS, default=["none", "low_rank"])
-    parser.add_argument("--planes", type=int, default=25, help="ImagePlanes of the field")
+    parser.add_argument("--planes", type=positive, default=25, help="ImagePlanes of the field")
     parser.add_argument("--optimiser", choices=("adam", "muon"), default="muon", help="of theta")
-    parser.add_argument("--tasks", type=int, default=4, help="objects a step; 768 rays are shared among them")
+    parser.add_argument("--tasks", type=positive, default=4, help="objects a step; 768 rays are shared among them")
     parser.add_argument("--references", type=int, default=0, help="further objects a step that are not rendered")
     parser.add_argument("--steps", type=int, default=1200)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, relu
 
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.configuration.presets import ALL_LAYERS, Preset, preset
@@ -221,8 +222,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets")
     parser.add_argument("--variant", nargs="+", choices=(*VARIANTS, *HYPERNETWORKS, "white"), default=list(VARIANTS))
     parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--counts", type=int, nargs="+", default=[3, 5, 10, 25], help="numbers of support views")
-    parser.add_argument("--objects", type=int, default=4, help="held-out ones of each data set to judge by")
+    parser.add_argument("--counts", type=positive, nargs="+", default=[3, 5, 10, 25], help="numbers of support views")
+    parser.add_argument("--objects", type=positive, default=4, help="held-out ones of each data set to judge by")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--quick", action="store_true", help="2 steps: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")

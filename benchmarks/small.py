@@ -24,6 +24,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from benchmarks._timing import interleaved, ratio, timed, without
 from benchmarks.objects import held_out
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import AdaptedField, Pictures
@@ -47,10 +48,10 @@ def main(arguments: list[str]) -> int:
         arguments: see --help.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks small", description=__doc__)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[128, 400], help="pixels a side of the car")
+    parser.add_argument("--sizes", type=positive, nargs="+", default=[128, 400], help="pixels a side of the car")
     parser.add_argument("--scene", type=Path, help="a posed scene in place of the car")
-    parser.add_argument("--views", type=int, default=25, help="that are shown (default: %(default)s)")
-    parser.add_argument("--repeats", type=int, default=5, help="views of each (default: %(default)s)")
+    parser.add_argument("--views", type=positive, default=25, help="that are shown (default: %(default)s)")
+    parser.add_argument("--repeats", type=positive, default=5, help="views of each (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="a car of 64 pixels, two views")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)

@@ -17,6 +17,7 @@ import torch
 
 from benchmarks._timing import timed
 from benchmarks.objects import held_out
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data import read_task
@@ -39,7 +40,7 @@ def main(arguments: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks splats", description=__doc__)
     parser.add_argument("--objects", nargs="+", default=["car", "chair"], help="classes (default: car chair)")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[100], help="pixels a side (default: 100)")
+    parser.add_argument("--sizes", type=positive, nargs="+", default=[100], help="pixels a side (default: 100)")
     parser.add_argument("--scene", type=Path, help="a posed scene in their place")
     parser.add_argument("--quick", action="store_true", help="a car of 48 pixels, few steps")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")

@@ -23,6 +23,7 @@ from torch.nn.functional import conv3d
 
 from benchmarks._timing import interleaved, ratio, timed
 from benchmarks.objects import held_out
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from benchmarks.training import Objects, step_parts
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
@@ -47,7 +48,7 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks steps", description=__doc__)
     parser.add_argument("--data", type=Path, help="a data set; procedural cars where absent")
     parser.add_argument("--untrained", action="store_true", help="begin with first weights, not the packaged ones")
-    parser.add_argument("--repeats", type=int, default=12, help="steps of each (default: %(default)s)")
+    parser.add_argument("--repeats", type=positive, default=12, help="steps of each (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="that take a step (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="two objects, one step of each")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")

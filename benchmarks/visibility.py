@@ -15,6 +15,7 @@ import torch
 
 from benchmarks._timing import interleaved, ratio
 from benchmarks.objects import held_out
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry.chosen_views import Visibility
@@ -34,10 +35,10 @@ def main(arguments: list[str]) -> int:
         arguments: see --help.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks visibility", description=__doc__)
-    parser.add_argument("--points", type=int, default=20_000)
-    parser.add_argument("--size", type=int, default=128, help="pixels a side")
-    parser.add_argument("--views", type=int, nargs="+", default=[25, 50])
-    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--points", type=positive, default=20_000)
+    parser.add_argument("--size", type=positive, default=128, help="pixels a side")
+    parser.add_argument("--views", type=positive, nargs="+", default=[25, 50])
+    parser.add_argument("--repeats", type=positive, default=15)
     parser.add_argument("--quick", action="store_true", help="few points and pixels: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)

@@ -104,6 +104,26 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     assert rows == [(count, name) for count, names in expected.items() for name in names]
 
 
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["captures", "--quick", "--meshes", "OUT/none"], "none: expected a folder of meshes, found nothing"),
+        (["captures", "--quick", "--count", "0"], "--count: expected a whole number of at least 1, got '0'"),
+        (["small", "--sizes", "0"], "--sizes: expected a whole number of at least 1, got '0'"),
+        (["splats", "--objects", "zebra"], "class: expected one of car, chair, plane, lamp, random, got 'zebra'"),
+    ],
+)
+def test_mistakes_are_one_line(words, expected, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(benchmarks_main, "load_at_start", lambda: 0.0)
+    places = {"DATA": str(demo_folder() / "data"), "OUT": str(tmp_path)}
+    try:
+        code = benchmarks_main.main([places.get(w, w.replace("OUT", places["OUT"])) for w in words])
+    except SystemExit as ended:  # by argparse, after the usage
+        code = ended.code
+    assert code == 2
+    assert expected in capsys.readouterr().err.splitlines()[-1]
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_parts_of_a_step_are_those_that_its_table_names(threads):
     trainer = Trainer(HyperPlanes(MODEL), Balls(), TrainingConfig(tasks=2, rays=16, views=(1, 3)))
