@@ -34,6 +34,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import pad
 
+from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Renderable
@@ -55,12 +56,14 @@ from hyperplanes.export.images import to_pixels
 from hyperplanes.geometry.volume import CHANNELS
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Task, Tasks, Views
 
 __all__ = ["METHODS", "PARTS", "adapters", "add_data_options", "main", "suite_folders"]
 
+QUERY = 3  # views of each object that it is judged by, where the options do not say
 QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_seconds")
 
 
@@ -72,15 +75,15 @@ def main(arguments: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks views", description=__doc__)
     add_data_options(parser)
-    parser.add_argument("--counts", type=int, nargs="+", default=[1, 3, 5, 10, 25], help="numbers of support views")
+    parser.add_argument("--counts", type=positive, nargs="+", help="numbers of support views: 1 3 5 10 25")
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="of fine-tuning, and of the same field "
                         "from random weights")  # fmt: skip
-    parser.add_argument("--seeds", type=int, default=1, help="of the steps; the mean over them counts")
+    parser.add_argument("--seeds", type=positive, default=1, help="of the steps; the mean over them counts")
     parser.add_argument("--coarse", action="store_true", help="these by the grid of features as it is, too")
-    parser.add_argument("--objects", type=int, default=3, help="of each data set")
+    parser.add_argument("--objects", type=positive, default=3, help="of each data set")
     parser.add_argument("--inputs", type=int, nargs="+", metavar="VIEW", help="instead of --counts: these views by "
                         "their place, from 0")  # fmt: skip
-    parser.add_argument("--query", type=int, help="views of each object to be judged by: 3; all with --inputs")
+    parser.add_argument("--query", type=positive, help="views of each object to be judged by: 3; all with --inputs")
     parser.add_argument(
         "--methods",
         nargs="*",
@@ -94,24 +97,24 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--pictures", type=Path, metavar="FILE", help="PNG: of each data set the best, the median and "
                         "the worst view by the most views shown; columns are the truth and the numbers of views, "
                         "ascending")  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="one count and object: to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="one count and two objects: to see that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     chosen = parser.parse_args(arguments)
-    if chosen.seeds < 1:
-        parser.error(f"--seeds: expected at least 1, got {chosen.seeds}")
+    if chosen.counts and chosen.inputs:
+        parser.error("--counts, --inputs: expected one of the two")
+    chosen.counts = chosen.counts or [1, 3, 5, 10, 25]
     folders = suite_folders(parser, chosen)
     if chosen.quick:
         chosen.counts, chosen.objects, chosen.query = [3], 2, 1
     if chosen.inputs:
         chosen.counts = [len(chosen.inputs)]
+    opened = [(suite, path, *_opened(path, chosen)) for suite, path in folders]
     model, rows, sheet = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint))), [], []
-    for suite, path in folders:
-        data = open_dataset(path)
-        names = sorted(data.names("test"))[: chosen.objects]
+    for suite, path, data, names, counts in opened:
         seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count: truth and prediction of every view
-        for count in chosen.counts:
+        for count in counts:
             inputs = Inputs(data, tuple(chosen.inputs), chosen.query) if chosen.inputs else None
-            shown = _Rotated(inputs or Shown(data, count, chosen.query or 3), chosen.rotated)
+            shown = _Rotated(inputs or Shown(data, count, chosen.query or QUERY), chosen.rotated)
             steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
             made = seen.setdefault(count, [])
             about: Row = {"data": path.resolve().name, "views": count, "objects": len(names)}
@@ -131,6 +134,29 @@ def main(arguments: list[str]) -> int:
         sheet = [pad(row, (0, widest - row.shape[2]), value=1.0) for row in sheet]
         write_whole(chosen.pictures, encode_png(to_pixels(torch.cat(sheet, 1)[None])[0], small=True))
     return 0
+
+
+def _opened(path: Path, chosen: argparse.Namespace) -> tuple[Tasks, list[str], list[int]]:
+    """A data set, the objects that are judged, and the numbers of views that can be shown of each of them.
+
+    Raises:
+        DataError: no such object, or fewer views than any number that was asked for.
+    """
+    data = open_dataset(path)
+    names = sorted(data.names("test"))[: chosen.objects]
+    if not names:
+        raise DataError(path, "objects in the test split", "none", "generate it with --held-out")
+    if chosen.inputs:
+        return data, names, chosen.counts
+    shown = Shown(data, max(chosen.counts), chosen.query or QUERY)
+    most = min(len(shown.task(name).support) for name in names)
+    counts = [count for count in chosen.counts if count <= most]
+    if not counts:
+        raise DataError(path, f"{min(chosen.counts)} views to show", f"{most}", "choose smaller --counts or --query")
+    for count in chosen.counts:
+        if count > most:
+            print(f"{path}: no rows of {count} views, there are {most} to show", flush=True)
+    return data, names, counts
 
 
 def _measured(

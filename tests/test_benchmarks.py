@@ -111,6 +111,12 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
         (["captures", "--quick", "--count", "0"], "--count: expected a whole number of at least 1, got '0'"),
         (["small", "--sizes", "0"], "--sizes: expected a whole number of at least 1, got '0'"),
         (["splats", "--objects", "zebra"], "class: expected one of car, chair, plane, lamp, random, got 'zebra'"),
+        (["views", "--data", "DATA", "--objects", "0"], "--objects: expected a whole number of at least 1, got '0'"),
+        (["views", "--data", "DATA", "--query", "0"], "--query: expected a whole number of at least 1, got '0'"),
+        (["views", "--data", "DATA", "--counts", "3", "0"], "--counts: expected a whole number of at least 1, got '0'"),
+        (["views", "--data", "DATA", "--counts", "1", "--inputs", "1"], "--counts, --inputs: expected one of the two"),
+        (["views", "--data", "DATA", "--counts", "100"], "data: expected 100 views to show, found 9; choose smaller"),
+        (["views", "--data", "DATA", "--inputs", "99"], "expected inputs from 0 to 11, got (99,)"),
     ],
 )
 def test_mistakes_are_one_line(words, expected, tmp_path, monkeypatch, capsys):
@@ -122,6 +128,17 @@ def test_mistakes_are_one_line(words, expected, tmp_path, monkeypatch, capsys):
         code = ended.code
     assert code == 2
     assert expected in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_rows_are_of_numbers_of_views_that_were_shown(monkeypatch, capsys):
+    """By hand: of 12 views of an object three are kept back, so nine can be shown."""
+    monkeypatch.setattr(views, "adapters", lambda *_, **__: {})
+    monkeypatch.setattr(views, "_measured", lambda *_: [{"name": "a method"}])
+    monkeypatch.setattr(views, "_best_median_worst", lambda seen: [])
+    assert views.main(["--data", str(demo_folder() / "data"), "--counts", "1", "9", "10"]) == 0
+    shown = capsys.readouterr().out
+    assert [f"'views': {count}," in shown for count in (1, 9, 10)] == [True, True, False]
+    assert "data: no rows of 10 views, there are 9 to show" in shown
 
 
 @pytest.mark.parametrize("threads", [1, 2])
