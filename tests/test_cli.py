@@ -743,6 +743,7 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     for verb, *option in (
         *(["render", "--protocol", "paper"], ["render", "--fine-tune", "hypernetwork"], ["render", "--no-reflections"]),
         *(["render", "--representation", "field"], ["export", "--page-voxels", "32", "--what", "page"]),
+        *(["export", "--fit", "3", "--what", what] for what in ("page", "turntable")),
     ):
         assert main([verb, "--checkpoint", str(out), *scene, *option]) == 2
         assert f"{option[0]}: expected none with a baked file" in complaint(capsys)

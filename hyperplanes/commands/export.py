@@ -119,7 +119,12 @@ def run(arguments: Arguments) -> int:
             coarsening(arguments.page_voxels)
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
-    given = {"--page-voxels": arguments.page_voxels is not None, "--no-reflections": arguments.no_reflections}
+    given = {
+        "--page-voxels": arguments.page_voxels is not None,
+        "--no-reflections": arguments.no_reflections,
+        # splats are fitted, whatever their voxels come from
+        "--fit": arguments.fit != Arguments.fit and "splats" not in arguments.what,
+    }
     refuse_of_baked(source, given)
     task, _ = read_object(arguments, source, console)
     refuse_sources(out / "images", arguments.views, task)
