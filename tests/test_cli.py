@@ -38,6 +38,7 @@ from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.data import DataError, read_task
 from hyperplanes.data.dataset import locate_scene
+from hyperplanes.evaluation import suitability
 from hyperplanes.export.baking import BakedScene
 from hyperplanes.export.images import to_pixels
 from hyperplanes.fields.baked import BakedField
@@ -716,7 +717,7 @@ def test_a_camera_path_of_nerfstudio_is_pictures_of_all_that_is_asked_for(tmp_pa
     assert max(pixels(tmp_path / "out/0000.png").shape[:2]) == 8
 
 
-def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
+def test_baking_writes_one_file_that_renders_by_itself(tmp_path, monkeypatch, capsys):
     out = tmp_path / "voxels.safetensors"
     views = ["--views", str(first_object(demo_folder())), "--out", str(out)]
     command = ["bake", "--checkpoint", str(demo_folder()), *views, "--voxels", "32", "--fit", "2"]
@@ -728,13 +729,19 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, capsys):
     pictures = BakedScene(BakedField.load(out)).render(read_task(first_object(demo_folder())).query.cameras)
     assert 0 < float(pictures.opacity.mean()) < 1
     scene = ["--views", str(first_object(demo_folder())), "--out", str(tmp_path / "again")]
+    advised = []
+    monkeypatch.setattr(suitability, "worse_than_copying", lambda *given: advised.append(given[-1]) or [])
     assert main(["render", "--checkpoint", str(out), *scene]) == 0
+    assert advised == [None]  # no steps, which a baked file refuses
     names = sorted(Path(name).name for name in read_task(first_object(demo_folder())).query.names)
     for name, image in zip(names, to_pixels(pictures.images).astype(int), strict=True):
         assert abs(pixels(tmp_path / "again" / name) - image).max() <= 1
     mesh = ["--what", "mesh", "--voxels", "32", "--level", "10", "--texture", "32"]
     assert main(["export", "--checkpoint", str(out), *scene, *mesh]) == 0
-    assert re.search(r"overlap the rendered ones of 6 query views by [\d.]+%", capsys.readouterr().out)
+    told = capsys.readouterr()
+    assert re.search(r"overlap the rendered ones of 6 query views by [\d.]+%", told.out)
+    assert "--level" in told.err
+    assert "--steps" not in told.err  # nor here
     assert main(["inspect", str(out)]) == 0
     assert "of 32^3 voxels" in capsys.readouterr().out
     capsys.readouterr()

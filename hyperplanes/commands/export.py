@@ -96,7 +96,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.animation import choose_representation
-    from hyperplanes.export.baking import coarsening, default_side
+    from hyperplanes.export.baking import BakedScene, coarsening, default_side
     from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, save_images, to_pixels
     from hyperplanes.export.mesh import check_voxels
     from hyperplanes.export.page import page_of, save_page, turning_picture
@@ -150,7 +150,7 @@ def run(arguments: Arguments) -> int:
         console.say(f"{path}: {arguments.frames} frames")
     if "mesh" in arguments.what:
         solid = field if isinstance(field, AdaptedField) else field.adapted
-        _write_mesh(solid, shown, query, arguments, console)
+        _write_mesh(solid, shown, query, arguments, console, adaptable=not isinstance(source, BakedScene))
     if "points" in arguments.what:
         from hyperplanes.export.points import point_cloud, save_points
 
@@ -213,8 +213,13 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
     console.say(f"{path}: {len(splats.means):,} splats, {path.stat().st_size / 1e6:.1f} MB{quality}")
 
 
-def _write_mesh(solid: AdaptedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:
-    """The mesh, with a line on how it agrees with the field's pictures, and a warning where it does not."""
+def _write_mesh(
+    solid: AdaptedField, shown: Views, query: Views, arguments: Arguments, console: Console, *, adaptable: bool
+) -> None:
+    """The mesh, with a line on how it agrees with the field's pictures, and a warning where it does not.
+
+    What is not adaptable, a baked file, refuses `--steps`, so that the warning does not advise them.
+    """
     from hyperplanes.export.mesh import density_grid, extract_mesh, save_mesh
     from hyperplanes.export.mesh_filling import fill_hidden
     from hyperplanes.export.mesh_level import agreement, choose_level
@@ -241,7 +246,9 @@ def _write_mesh(solid: AdaptedField, shown: Views, query: Views, arguments: Argu
         f"{found.overlap:.1%} (intersection over union), and {found.depth:.1%} of what both cover is as far away; cut "
         f"at density {level:.3g}"
     )
+    more = ", or --steps 100" if adaptable else ""
     if found.overlap < GOOD_OVERLAP:
-        console.warn(f"{path}: parts are missing or too large; more --voxels, another --level, or --steps 100")
+        several = "more --voxels, another --level" if adaptable else "more --voxels, or another --level"
+        console.warn(f"{path}: parts are missing or too large; {several}{more}")
     elif found.depth < GOOD_DEPTH:
-        console.warn(f"{path}: walls are missing or lie too far out; another --level, or --steps 100")
+        console.warn(f"{path}: walls are missing or lie too far out; another --level{more}")

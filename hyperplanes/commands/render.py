@@ -165,7 +165,8 @@ def run(arguments: Arguments) -> int:
                 f"copying the nearest view {scores[1]:.2f} dB"
             )
             scores = scores if arguments.steps == 0 else None
-    for line in worse_than_copying(shown, *scores, arguments.steps) if scores else []:
+    steps = None if isinstance(source, BakedScene) else arguments.steps
+    for line in worse_than_copying(shown, *scores, steps) if scores else []:
         console.warn(f"{task.name}: {line}")
     console.say(f"{arguments.out}: {len(paths)} pictures, {format_duration(seconds)} a view")
     return 0

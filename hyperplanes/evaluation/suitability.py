@@ -65,7 +65,7 @@ def worse_than_copying(shown: Views, rendered: float, copied: float, steps: obje
         shown: the views that it was shown.
         rendered: PSNR of the field in decibels.
         copied: PSNR of the nearest view.
-        steps: fine-tuning steps that were asked for.
+        steps: fine-tuning steps that were asked for; None of a baked file, which takes none.
     """
     if rendered >= copied:
         return []

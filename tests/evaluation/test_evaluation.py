@@ -10,7 +10,7 @@ import torch
 from hyperplanes.adaptation import NearestView, Pictures
 from hyperplanes.evaluation import ObjectScore, Score, evaluate
 from hyperplanes.evaluation.figures import PictureGrid
-from hyperplanes.evaluation.suitability import suitability_warnings
+from hyperplanes.evaluation.suitability import suitability_warnings, worse_than_copying
 from hyperplanes.evaluation.tables import rows
 from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 from tests.reference_rendering import Balls, awaken, ball_views, ring, small_model
@@ -186,3 +186,14 @@ def test_asking_whether_views_suit_changes_no_model_in_training():
     assert model.training
     assert any("code_normalisation" in name for name in before)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+@pytest.mark.parametrize(("steps", "advice"), [(0, "--steps 100 adapts"), (5, "check masks"), (None, "check masks")])
+def test_steps_are_advised_where_they_can_be_taken(steps, advice):
+    """A baked file, whose steps are None, refuses `--steps`."""
+    views = ball_views(ring(4, (12, 12)))
+    views = replace(views, masks=torch.zeros(4, 1, 12, 12))
+    (line,) = worse_than_copying(views, 10.0, 12.0, steps)
+    assert "worse than copying the nearest view: 10.00 dB against 12.00 dB" in line
+    assert advice in line
+    assert worse_than_copying(views, 12.0, 12.0, steps) == []
