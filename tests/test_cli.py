@@ -681,6 +681,17 @@ def test_a_cloud_of_points_is_exported(tmp_path, capsys):
     assert f"points.ply: {number} points with normals and colours" in capsys.readouterr().out
 
 
+def test_what_only_the_field_can_refuse_is_named_as_it_was_typed(tmp_path, monkeypatch, capsys):
+    """A level above all densities, and means of points of which none is on the surface."""
+    monkeypatch.setattr("hyperplanes.export.points._is_confirmed", lambda points, *_: torch.zeros(len(points)) > 0)
+    demo = demo_folder()
+    line = ["export", "--checkpoint", str(demo), "--views", str(first_object(demo)), "--out", str(tmp_path)]
+    for option, *more in (["--level", "1e9", "--what", "mesh", "--voxels", "8"], ["--points", "1", "--what", "points"]):
+        capsys.readouterr()
+        assert main([*line, option, *more]) == 2
+        assert f"hyperplanes export: {option}: expected more" in capsys.readouterr().err
+
+
 def test_a_camera_path_of_nerfstudio_is_pictures_of_all_that_is_asked_for(tmp_path, capsys):
     """The poses of the query views as a path: the same pictures, of another size where asked; none from elsewhere."""
     demo = demo_folder()

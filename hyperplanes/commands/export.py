@@ -100,7 +100,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, save_images, to_pixels
     from hyperplanes.export.mesh import check_voxels
     from hyperplanes.export.page import page_of, save_page, turning_picture
-    from hyperplanes.utilities.errors import prefix_errors
+    from hyperplanes.utilities.errors import prefix_errors, rename_errors
     from hyperplanes.utilities.writing import write_whole
 
     if not arguments.what:
@@ -156,7 +156,8 @@ def run(arguments: Arguments) -> int:
 
         bounds = (field if isinstance(field, AdaptedField) else field.adapted).occupancy.bounds
         pictures = render_views(field, shown.cameras, console)
-        cloud = point_cloud(pictures, shown.cameras, bounds, arguments.points)
+        with rename_errors("count", "--points"):
+            cloud = point_cloud(pictures, shown.cameras, bounds, arguments.points)
         path = save_points(cloud, out / "points.ply")
         console.say(f"{path}: {len(cloud):,} points with normals and colours, of {len(shown)} views")
     if {"page", "splats"} & set(arguments.what):
@@ -224,12 +225,14 @@ def _write_mesh(
     from hyperplanes.export.mesh_filling import fill_hidden
     from hyperplanes.export.mesh_level import agreement, choose_level
     from hyperplanes.export.texture import save_textured, texture_surface
+    from hyperplanes.utilities.errors import rename_errors
 
     density, level = density_grid(solid, arguments.voxels), arguments.level
     if level is None:
         level = choose_level(solid, density, shown.cameras)
         density = fill_hidden(density, level, solid.occupancy.bounds, shown.cameras)
-    surface = extract_mesh(solid, level=level, density=density)
+    with rename_errors("level", "--level"):
+        surface = extract_mesh(solid, level=level, density=density)
     path = arguments.out / f"mesh.{arguments.mesh_format}"
     if arguments.mesh_format == "glb":
         textured = texture_surface(surface, solid, shown, faces=arguments.faces, size=arguments.texture)

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 
-__all__ = ["MissingPackageError", "did_you_mean", "nearest", "prefix_errors"]
+__all__ = ["MissingPackageError", "did_you_mean", "nearest", "prefix_errors", "rename_errors"]
 
 
 class MissingPackageError(RuntimeError):
@@ -51,3 +51,27 @@ def prefix_errors(name: str) -> Generator[None]:
         yield
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
+
+
+@contextmanager
+def rename_errors(argument: str, option: str) -> Generator[None]:
+    """Puts the name that was typed in place of an argument's, with which a ValueError raised within begins.
+
+    >>> with rename_errors("level", "--level"):
+    ...     raise ValueError("level: expected more than 0")
+    Traceback (most recent call last):
+    ValueError: --level: expected more than 0
+
+    Args:
+        argument: of the function that is called.
+        option: of the command line.
+
+    Raises:
+        ValueError: as the one that was raised.
+    """
+    try:
+        yield
+    except ValueError as error:
+        if not str(error).startswith(f"{argument}: "):
+            raise
+        raise ValueError(f"{option}{str(error).removeprefix(argument)}") from error
