@@ -196,6 +196,7 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.splats import STEPS, fit_splats, save_splats, splats_of
     from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
+    from hyperplanes.export.voxel_fitting import render_guide
     from hyperplanes.geometry.distortion import DistortedCamera
     from hyperplanes.utilities.metrics import psnr
 
@@ -204,7 +205,10 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
     if straight and arguments.fit:
         with console.bar("fitting splats") as bar:
             steps = arguments.fit * STEPS // VOXEL_STEPS
-            splats = fit_splats(splats, shown, steps=steps, on_step=lambda done: bar.show(done, steps, "steps"))
+            guide = render_guide(BakedScene(baked), shown, size=shown.size)
+            splats = fit_splats(
+                splats, shown, guide=guide, steps=steps, on_step=lambda done: bar.show(done, steps, "steps")
+            )
     if straight:
         asked = query[:8].to("cpu")
         pictures = splats.render(asked.cameras), BakedScene(baked).render(asked.cameras).images

@@ -94,16 +94,26 @@ def splats_of(baked: BakedField) -> Splats:
 
 @checked
 def fit_splats(
-    splats: Splats, views: Views, *, steps: int = STEPS, seed: int = 0, on_step: Callable[[int], None] | None = None
+    splats: Splats,
+    views: Views,
+    *,
+    guide: Views | None = None,
+    steps: int = STEPS,
+    seed: int = 0,
+    on_step: Callable[[int], None] | None = None,
 ) -> Splats:
     """The splats that can be seen, after gradient steps (Adam) on all that describes them, one view a step.
 
     Of cars of 100 x 100 pixels with 25 views shown, round splats whose opacities and colours alone were fitted had 8 dB
     less on other views than their voxels. Three quarters of them were hidden.
 
+    Fitted to a few views alone, they show these and little else, as voxels do. With the guide example-car at 64 x 64
+    pixels has 25.8 dB on other views instead of 22.5 with three views shown, and 27.0 instead of 24.7 with six.
+
     Args:
         splats: where it starts.
         views: posed images of the object, without lens distortion.
+        guide: renderings of the voxels from other places, from `render_guide`, which are views like the others.
         steps: gradient steps.
         seed: of the order of the views.
         on_step: told the number of steps done.
@@ -112,14 +122,17 @@ def fit_splats(
         At most as many splats; as they are where there is no step.
 
     Raises:
-        ValueError: no views, or cameras with lens distortion.
+        ValueError: no views, cameras with lens distortion, or a guide of another size.
     """
     if not len(views) or isinstance(views.cameras, DistortedCamera):
         found = "some with it" if len(views) else "none"
         raise ValueError(f"views: expected at least one without lens distortion, got {found}")
+    if guide is not None and guide.size != views.size:
+        raise ValueError(f"guide: expected renderings of the views' size {views.size}, got {guide.size}")
     if not steps:
         return splats
     views = views.to("cpu", torch.float32)
+    views = views if guide is None else _joined(views, guide)
     splats = splats[_weights(splats, views) > SEEN]
     size = float(splats.scales.mean()) if len(splats.scales) else 1.0
     # offsets of all numbers from what they begin with, each kind with its rate
@@ -151,6 +164,13 @@ def fit_splats(
             on_step(step + 1)
     with torch.no_grad():
         return moved()
+
+
+def _joined(views: Views, guide: Views) -> Views:
+    """All of them, with the bounds of the first."""
+    guide = guide.to("cpu", torch.float32)
+    cameras = camera.concatenate([views.cameras, guide.cameras])
+    return Views(torch.cat([views.images, guide.images]), cameras, bounds=views.bounds)
 
 
 def _weights(splats: Splats, views: Views) -> Float[Tensor, " splat"]:

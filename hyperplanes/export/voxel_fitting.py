@@ -33,30 +33,37 @@ LARGEST_DEPTH = 0.7  # of a voxel at first: what is opaque hides the voxels behi
 ENOUGH = 16  # views by which voxels are fitted without a guide
 
 
-def render_guide(adapted: AdaptedField, views: Views) -> Views | None:
-    """Views of a field from all around the object, as the second source of `fit_voxels` where few views are shown.
+def render_guide(
+    source: AdaptedField | BakedScene, views: Views, *, size: tuple[int, int] | None = None
+) -> Views | None:
+    """Views from all around the object, as the second source of `fit_voxels` and `fit_splats` of few shown views.
 
     Fitted to a few views alone, voxels show them and little else. Two chairs have 20.6 dB as baked from three views,
     18.7 fitted, 20.5 with the guide (`python -m benchmarks baked --data data/chairs --counts 3 --objects 2 --query 4`).
 
     Args:
-        adapted: the field that the voxels were baked from.
+        source: the field that voxels were baked from, or the voxels that splats are made of.
         views: posed images that it was adapted to.
+        size: height and width of the renderings; half those of the views where absent.
 
     Returns:
-        Sixteen views of half the size, as far from the object as the given ones; None where these are sixteen or more.
+        Sixteen views, as far from the object as the given ones; None where these are sixteen or more.
     """
     if len(views) >= ENOUGH:
         return None
-    bounds = adapted.occupancy.bounds
+    bounds = source.occupancy.bounds if isinstance(source, AdaptedField) else source.field.bounds
     centre = torch.tensor(bounds.centre)
     distance = (camera.centres(views.cameras).cpu().float() - centre).norm(dim=1).mean()
     eyes = centre + distance * camera.fibonacci_sphere(ENOUGH, 1.0)[:, 2, :3]
     matrix = camera.intrinsics(views.cameras)[:1].cpu().float().expand(ENOUGH, 3, 3)
     around = camera.pinhole(matrix, camera.look_at(eyes, bounds.centre), *views.size)
-    height, width = (max(8, side // 2) for side in views.size)
+    height, width = size or (max(8, side // 2) for side in views.size)
     around = camera.resized(around, height, width)
-    return Views(adapted.render(around, mixed_precision=False).images.clamp(0, 1).cpu(), around, bounds=bounds)
+    if isinstance(source, AdaptedField):
+        pictures = source.render(around, mixed_precision=False)
+    else:
+        pictures = source.render(around)
+    return Views(pictures.images.clamp(0, 1).cpu(), around, bounds=bounds)
 
 
 def fit_voxels(

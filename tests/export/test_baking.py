@@ -301,6 +301,16 @@ def test_a_guide_keeps_what_few_views_do_not_show(adapted, seen):
     assert render_guide(adapted, many) is None
 
 
+def test_the_guide_of_splats_is_of_their_voxels_in_the_size_of_the_views(adapted, seen, baked):
+    """Source of truth: the field that the voxels were baked from, from the same places."""
+    few = Views(seen.images, CAMERAS)[:2]
+    guide, wanted = (render_guide(source, few, size=few.size) for source in (BakedScene(baked), adapted))
+    assert guide is not None
+    assert guide.size == few.size
+    assert len(guide) == 16
+    assert float(psnr(guide.images, wanted.images).mean()) > 35
+
+
 def test_a_ray_beside_the_voxels_and_nearly_parallel_to_an_axis_ends(baked):
     """A component of 1e-20, as products of cosines have it, asks for more steps than there are numbers."""
     rays = Rays(

@@ -152,6 +152,18 @@ def test_fitting_brings_back_what_was_taken_away(splats):
     assert fit_splats(spoilt, Views(truth.clamp(0, 1), CAMERAS), steps=0) is spoilt
 
 
+def test_a_guide_keeps_what_few_views_do_not_show(splats):
+    """One view of another brightness: without the guide all that it does not show is lost, with it less."""
+    truth = splats.render(CAMERAS)
+    shown = Views(0.8 * truth.clamp(0, 1), CAMERAS)[:1]
+    guide = Views(truth.clamp(0, 1), CAMERAS)[1:4]
+    alone, guided = (fit_splats(splats, shown, guide=each, steps=16) for each in (None, guide))
+    lost = [float(psnr(each.render(CAMERAS)[4:], truth[4:]).mean()) for each in (alone, guided)]
+    assert lost[1] > lost[0] + 1
+    with pytest.raises(ValueError, match=r"guide: expected renderings of the views' size \(40, 40\), got \(20, 20\)"):
+        fit_splats(splats, shown, guide=guide.resized(20), steps=1)
+
+
 def test_views_that_cannot_be_fitted_are_refused(splats):
     views = Views(torch.zeros(6, 3, SIZE, SIZE), CAMERAS)
     distorted = Views(views.images, DistortedCamera(CAMERAS, torch.zeros(6, 5)))
