@@ -21,10 +21,13 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
-__all__ = ["LARGEST", "address_of", "page_of", "save_page", "turning_picture"]
+__all__ = ["AROUND", "LARGEST", "address_of", "page_of", "save_page", "turning_picture"]
 
 LARGEST = 8_000_000
-"""Bytes of the voxels in a page. Beyond it coefficients get fewer bits, the second-order ones first."""
+"""Bytes of a page. Beyond it coefficients get fewer bits, the second-order ones first."""
+
+AROUND = 4096
+"""Of these, bytes for what `save_page` puts around: some 500, and twice the title of at most 255, escaped at worst."""
 
 BITS = ((8, 8, 8), (8, 7, 6), (8, 6, 5), (8, 6, 4), (7, 5, 3), (7, 5, 0))
 """Of the mean colour, the first and the second order; 0 leaves an order out. Tried in turn until the page is small."""
@@ -58,14 +61,14 @@ body > p {{ position: fixed; left: 1em; bottom: 0; pointer-events: none; }}
 """
 
 
-def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: int = LARGEST) -> str:
+def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: int = LARGEST - AROUND) -> str:
     """A part of an HTML page that draws baked voxels by WebGL2; any number of them may stand in one page.
 
     Args:
         baked: what is shown.
         views: whose up, distance and lens the viewer begins with.
         picture: a WebP file, animated or not, that stands there until the voxels are shown, and where they cannot be.
-        largest: bytes of the voxels in the page.
+        largest: bytes of all that is returned, in UTF-8.
 
     Returns:
         A `<div class="voxels">` with all that it needs, as wide as what it stands in and square unless styled
@@ -74,16 +77,6 @@ def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: i
     Raises:
         ValueError: voxels that do not get small enough.
     """
-    # as many bits a number as the size allows
-    for bits in BITS:
-        low, span, text = _encoded(baked, bits)
-        if len(text) <= largest:
-            break
-    else:
-        raise ValueError(
-            f"page: expected at most {largest / 1e6:g} MB, got {len(text) / 1e6:.1f} MB of {len(baked.values):,} "
-            f"voxels; bake fewer than {baked.side} along an axis"
-        )
     # what the viewer begins with
     start = orbit_cameras(views, 1)
     scene = {
@@ -92,18 +85,28 @@ def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: i
         "centre": baked.bounds.centre,
         "radius": baked.bounds.radius,
         "steps": STEPS,
-        "low": low,
-        "range": span,
         "up": upward(views.cameras),
         "eye": camera.centres(start)[0].tolist(),
         "focal": float(camera.intrinsics(start)[0, 0, 0]) / min(camera.image_size(start)),
     }
     still = f'<img alt="" src="data:image/webp;base64,{base64.b64encode(picture).decode()}">' if picture else ""
     viewer = resources.files("hyperplanes.export").joinpath("viewer.js").read_text("utf-8")
-    return (
-        f'{STYLE}\n<div class="voxels">{still}<script type="application/json">{json.dumps(scene)}</script>'
-        f'<script type="text/plain">{text}</script></div>\n'
-        f"<script>\n{viewer}showVoxels(document.currentScript.previousElementSibling);\n</script>"
+    size = 0
+    # as many bits a number as the size allows
+    for bits in BITS:
+        low, span, text = _encoded(baked, bits)
+        described = json.dumps({**scene, "low": low, "range": span})
+        part = (
+            f'{STYLE}\n<div class="voxels">{still}<script type="application/json">{described}</script>'
+            f'<script type="text/plain">{text}</script></div>\n'
+            f"<script>\n{viewer}showVoxels(document.currentScript.previousElementSibling);\n</script>"
+        )
+        size = len(part.encode())
+        if size <= largest:
+            return part
+    raise ValueError(
+        f"page: expected at most {largest / 1e6:.3g} MB, got {size / 1e6:.3g} MB of {len(baked.values):,} voxels and a "
+        f"picture of {len(picture) / 1e6:.3g} MB; bake fewer voxels than {baked.side} along an axis"
     )
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.baking import BakedScene, bake
-from hyperplanes.export.page import address_of, page_of, save_page, turning_picture
+from hyperplanes.export.page import AROUND, address_of, page_of, save_page, turning_picture
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
@@ -159,9 +159,14 @@ def test_a_page_is_one_file_that_asks_for_nothing(baked, views, tmp_path):
     assert not [word for word in ("http:", "https:", 'src="/', "import(", "fetch(") if word in text]
 
 
-def test_a_page_that_is_too_large_loses_precision_before_it_is_refused(baked, views):
-    whole = len(page_of(baked, views))
-    smaller = len(page_of(baked, views, largest=int(0.7 * whole)))
-    assert smaller < 0.75 * whole
-    with pytest.raises(ValueError, match="page: expected at most 0.001 MB, got"):
-        page_of(baked, views, largest=1000)
+def test_a_page_that_is_too_large_loses_precision_before_it_is_refused(baked, views, tmp_path):
+    """All of the file counts: the picture, the viewer, and what stands around them with the longest title."""
+    picture = bytes(40_000)
+    whole = len(page_of(baked, views, picture=picture).encode())
+    limit = whole - 1
+    smaller = page_of(baked, views, picture=picture, largest=limit)
+    assert len(smaller.encode()) <= limit
+    assert len(page_of(baked, views, picture=picture, largest=int(0.8 * whole))) < 0.8 * whole
+    assert save_page(smaller, tmp_path / "page.html", 255 * '"').stat().st_size <= limit + AROUND
+    with pytest.raises(ValueError, match=r"page: expected at most 0.001 MB, got .* and a picture of 0.04 MB"):
+        page_of(baked, views, picture=picture, largest=1000)
