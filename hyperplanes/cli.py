@@ -99,6 +99,7 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
     import tyro
 
     module = import_module(name)
+    _refuse_repeated(rest)
     settings: list[str] = []
     if "settings" in module.Arguments.__annotations__:  # options with a dot, such as --model.hypernetwork.views 3
         rest, settings = split_settings(rest)
@@ -112,6 +113,24 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
     )
     _check_ranges(parsed)
     return module.run(replace(parsed, settings=tuple(settings)) if settings else parsed)
+
+
+def _refuse_repeated(arguments: Sequence[str]) -> None:
+    """Refuse options that stand there twice: of all their values the parsers would keep the last, and say nothing.
+
+    >>> _refuse_repeated(["--what", "images", "mesh", "--page-voxels=64", "--page_voxels", "96"])
+    Traceback (most recent call last):
+    ValueError: --page-voxels: expected once, got it twice; an option that takes several values takes them side by side
+
+    Raises:
+        ValueError: such an option, where no help is asked for.
+    """
+    options = [each.partition("=")[0].replace("_", "-") for each in arguments if each.startswith("--")]
+    repeated = next((each for place, each in enumerate(options) if each in options[:place]), None)
+    if repeated is not None and not {"-h", "--help"} & set(arguments):
+        times = {2: "twice"}.get(options.count(repeated), f"{options.count(repeated)} times")
+        several = "an option that takes several values takes them side by side"
+        raise ValueError(f"{repeated}: expected once, got it {times}; {several}")
 
 
 def _with_axes(arguments: list[str]) -> list[str]:

@@ -148,6 +148,23 @@ def test_an_unknown_flag_is_wrong_input(capsys):
     assert end.value.code == 2
 
 
+@pytest.mark.parametrize(
+    ("line", "option"),
+    [
+        ("export --what images --what mesh", "--what"),
+        ("export --fit=3 --fit 4", "--fit"),
+        ("export --page-voxels 32 --page_voxels 64", "--page-voxels"),
+        ("export --all-views --all-views", "--all-views"),
+        ("train --model.network.depth 3 --model.network.depth=4", "--model.network.depth"),
+        ("train --training.learning_rate 1 --training.learning-rate 2", "--training.learning-rate"),
+    ],
+)
+def test_an_option_that_stands_twice_is_refused(line, option, capsys):
+    """The parser would take the last and drop the others."""
+    assert main([*line.split(), "--out", "unused"]) == 2
+    assert f"{option}: expected once, got it twice" in complaint(capsys)
+
+
 def test_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("hyperplanes 0")
@@ -767,7 +784,7 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, monkeypatch, ca
         assert f"{option[0]}: expected none with a baked file" in complaint(capsys)
     assert main(["adapt", "--checkpoint", str(out), *scene]) == 2
     assert "expected a checkpoint's folder to adapt with, got a file" in complaint(capsys)
-    assert main([*command, "--voxels", "7"]) == 2
+    assert main([*command[:-4], "--voxels", "7"]) == 2
     assert "7" in complaint(capsys)
 
 
