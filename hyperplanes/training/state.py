@@ -203,7 +203,7 @@ def _load(
 
 def _is_report(row: object) -> bool:
     """Whether it can be a row of a curve; None stands for what was not measured."""
-    if not isinstance(row, dict) or not isinstance(row.get("step"), int):
+    if not isinstance(row, dict) or not isinstance(row.get("step"), int | float):
         return False
     return all(value is None or isinstance(value, int | float) for value in row.values())
 
