@@ -4,11 +4,11 @@
 other processes keep more than `load.LIMIT` cores busy, unless `--under-load` is given; the load stands beside the rows.
 """
 
-import os
 import sys
 from importlib import import_module
 
 from benchmarks.load import LIMIT, OF_SPEED, load_at_start
+from hyperplanes.utilities.errors import one_line, wants_traceback
 
 NAMES = (
     "adapting",
@@ -62,9 +62,9 @@ def main(arguments: list[str]) -> int:
     try:
         return int(import_module(f"benchmarks.{arguments[0]}").main(arguments[1:]) or 0)
     except (ValueError, OSError) as error:  # wrong input, as the command line of hyperplanes takes them
-        if os.environ.get("HYPERPLANES_TRACEBACK", "") not in ("", "0"):
+        if wants_traceback():
             raise
-        print(f"benchmarks {arguments[0]}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"benchmarks {arguments[0]}: {one_line(error)}", file=sys.stderr)
         return 2
 
 

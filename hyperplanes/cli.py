@@ -5,9 +5,7 @@ A verb's module is imported only when that verb is asked for, so `hyperplanes --
 
 from __future__ import annotations
 
-import errno
 import inspect
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -18,12 +16,10 @@ from typing import Any, get_type_hints
 
 from hyperplanes.commands import EXAMPLES, find_verb, find_verbs, split_settings
 from hyperplanes.utilities.entry_points import find_entries
-from hyperplanes.utilities.errors import MissingPackageError
+from hyperplanes.utilities.errors import TRACEBACK_VARIABLE, MissingPackageError, is_memory, one_line, wants_traceback
 from hyperplanes.utilities.interrupts import Terminated, interruptible
 
 __all__ = ["main"]
-
-TRACEBACK_VARIABLE = "HYPERPLANES_TRACEBACK"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code, ended = 0, end
     written = _flush()
     if written is not None and code == 0:
-        return _complain(f"hyperplanes: standard output: {_one_line(written)}")
+        return _complain(f"hyperplanes: standard output: {one_line(written)}")
     if ended is not None:
         raise ended
     return code
@@ -64,7 +60,7 @@ def _flush() -> OSError | None:
 
 def _main(arguments: Sequence[str] | None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
-    traceback = "--traceback" in given or os.environ.get(TRACEBACK_VARIABLE, "") not in ("", "0")
+    traceback = "--traceback" in given or wants_traceback()
     given = [argument for argument in given if argument != "--traceback"]
     if not given or given[0] in ("-h", "--help", "help"):
         return _say(_overview()) or (0 if given else 2)
@@ -90,9 +86,9 @@ def _main(arguments: Sequence[str] | None) -> int:
         sys.stdout = None  # as in `_flush`
         return 0
     except (ValueError, OSError, MemoryError, RuntimeError) as error:
-        if traceback or not (isinstance(error, ValueError | OSError | MissingPackageError) or _is_memory(error)):
+        if traceback or not (isinstance(error, ValueError | OSError | MissingPackageError) or is_memory(error)):
             raise
-        return _complain(f"hyperplanes {verb}: {_one_line(error)}")
+        return _complain(f"hyperplanes {verb}: {one_line(error)}")
 
 
 def _run(verb: str, name: str, rest: list[str]) -> int:
@@ -164,22 +160,6 @@ def _brought(module: ModuleType) -> list[str]:
     return [f"{what} of other packages: {', '.join(names)}." for what, names in found.items() if names]
 
 
-def _is_memory(error: Exception) -> bool:
-    return isinstance(error, MemoryError) or "can't allocate memory" in str(error) or "out of memory" in str(error)
-
-
-def _one_line(error: Exception) -> str:
-    if _is_memory(error):
-        found = " ".join(str(error).split("\n")[0].split()) or "none left"
-        return f"expected enough memory, found {found}; ask for smaller or fewer pictures, voxels or processes"
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        where = f"{error.filename}: " if error.filename else ""
-        return f"{where}expected room to write, found a full disk; free some and run the same command again"
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror or error}; check the path and its permissions"
-    return " ".join(str(error).split()) or type(error).__name__
-
-
 def _say(text: str) -> int:
     """Print; the exit code."""
     try:
@@ -188,7 +168,7 @@ def _say(text: str) -> int:
         sys.stdout = None  # as in `_flush`
     except OSError as error:
         sys.stdout = None
-        return _complain(f"hyperplanes: standard output: {_one_line(error)}")
+        return _complain(f"hyperplanes: standard output: {one_line(error)}")
     return 0
 
 

@@ -3,10 +3,24 @@
 from __future__ import annotations
 
 import difflib
+import errno
+import os
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 
-__all__ = ["MissingPackageError", "did_you_mean", "nearest", "prefix_errors", "rename_errors"]
+__all__ = [
+    "TRACEBACK_VARIABLE",
+    "MissingPackageError",
+    "did_you_mean",
+    "is_memory",
+    "nearest",
+    "one_line",
+    "prefix_errors",
+    "rename_errors",
+    "wants_traceback",
+]
+
+TRACEBACK_VARIABLE = "HYPERPLANES_TRACEBACK"
 
 
 class MissingPackageError(RuntimeError):
@@ -75,3 +89,34 @@ def rename_errors(argument: str, option: str) -> Generator[None]:
         if not str(error).startswith(f"{argument}: "):
             raise
         raise ValueError(f"{option}{str(error).removeprefix(argument)}") from error
+
+
+def wants_traceback() -> bool:
+    """Whether TRACEBACK_VARIABLE asks to be shown where errors came from."""
+    return os.environ.get(TRACEBACK_VARIABLE, "") not in ("", "0")
+
+
+def one_line(error: Exception) -> str:
+    """What to say of an error with which a command ended.
+
+    Args:
+        error: of wrong input, a full disk or too little memory.
+    """
+    if is_memory(error):
+        found = " ".join(str(error).split("\n")[0].split()) or "none left"
+        return f"expected enough memory, found {found}; ask for smaller or fewer pictures, voxels or processes"
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}expected room to write, found a full disk; free some and run the same command again"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror or error}; check the path and its permissions"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def is_memory(error: Exception) -> bool:
+    """Whether there was too little memory.
+
+    Args:
+        error: of Python, or of PyTorch, which says so in words.
+    """
+    return isinstance(error, MemoryError) or "can't allocate memory" in str(error) or "out of memory" in str(error)
