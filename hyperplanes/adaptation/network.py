@@ -76,10 +76,7 @@ class HyperPlanesNetwork(nn.Module):
 
     @property
     def known_rig(self) -> Rig:
-        """Where the views of the training stood, and how others are matched to them; empty where nothing asks for it.
-
-        The buffer has its rows all the same, as in the files of earlier versions.
-        """
+        """Where the views of the training stood, and how others are matched to them; empty where nothing asks."""
         asked = self.target.reads_planes or self.hypernetwork is not None
         return Rig(self.rig if asked else self.rig[:0], self.config.order)
 

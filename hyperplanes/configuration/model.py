@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hyperplanes.configuration.initialisation import InitialisationConfig
-from hyperplanes.configuration.upgrade import upgrade_model
 from hyperplanes.fields import TargetConfig, find_targets
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.hypernetwork import KINDS, AutoencoderConfig, HyperNetworkConfig, ImageHyperNetworkConfig
@@ -125,7 +124,7 @@ class ModelConfig:
 
     @classmethod
     def of_json(cls, value: Mapping[str, Any], where: Path | str = "configuration") -> ModelConfig:
-        """The configuration that `as_json` wrote. Entries that newer versions added may be missing.
+        """The configuration that `as_json` wrote. Entries that have defaults may be missing.
 
         Args:
             value: what a file holds.
@@ -148,7 +147,6 @@ class ModelConfig:
     @classmethod
     def structured(cls, value: Mapping[str, Any]) -> ModelConfig:
         """As `of_json`; SettingsError names the entry that does not fit."""
-        value = upgrade_model(value)
         for name in ("network", "sampling", "hypernetwork", "protocol"):
             if name not in value:
                 raise SettingsError(name, "a missing entry")

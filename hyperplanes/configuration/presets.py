@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from hyperplanes.configuration.initialisation import LEARNED, InitialisationConfig
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.training import TrainingConfig
-from hyperplanes.configuration.upgrade import TARGETS as FORMER_TARGETS
 from hyperplanes.fields import TARGETS, ImageBasedConfig, TargetConfig, find_targets
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
@@ -83,7 +82,6 @@ class Preset:
             ValueError: an unknown method or target, HyperPlanes of a configuration without a hypernetwork, or a target
                 beside a method that is another one.
         """
-        method, target = FORMER_TARGETS.get(method, method), FORMER_TARGETS.get(target or "", target)
         targets = find_targets()
         known = [*TRAINABLE, *(name for name in targets if name not in TRAINABLE)]
         if method not in known:

@@ -19,7 +19,6 @@ import yaml
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.presets import Preset
 from hyperplanes.configuration.training import TrainingConfig
-from hyperplanes.configuration.upgrade import upgrade_model, upgrade_training
 from hyperplanes.fields import find_targets
 from hyperplanes.hypernetwork import KINDS
 from hyperplanes.utilities.errors import nearest
@@ -109,13 +108,13 @@ def changed(chosen: Preset, changes: Mapping[str, Any]) -> Preset:
     model, training = chosen.model.as_json(), asdict(chosen.training)
     try:
         path = "model"
-        wanted = upgrade_model(changes.get("model", {}))
+        wanted = changes.get("model", {})
         if isinstance(wanted, Mapping) and wanted.get("protocol", model["protocol"]) != model["protocol"]:
             model["sampling"] = {}
         _change_kind(model, wanted)
         made = ModelConfig.structured(_merged(model, wanted))
         path = "training"
-        trained = structure(TrainingConfig, _merged(training, upgrade_training(changes.get("training", {}))))
+        trained = structure(TrainingConfig, _merged(training, changes.get("training", {})))
     except SettingsError as error:
         raise SettingsError(f"{path}.{error.path}" if error.path else path, error.problem) from None
     return replace(chosen, model=made, training=trained)

@@ -209,7 +209,7 @@ class Runner:
             "checkpoint": self.trainings.name(experiment, cell.trained, seed),
             "method": method,
             "on": self.data.name(cell.on),
-            "free": cell.trainable if method != cell.trained.method else "",  # as earlier versions named it
+            "trainable": cell.trainable if method != cell.trained.method else "",
             "seed": seed,
             "views": self._views(cell, checkpoint),
             "fine_tuning": stated(self.fine_tuning(cell)),

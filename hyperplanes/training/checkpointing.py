@@ -20,9 +20,6 @@ __all__ = ["Checkpointing", "choose_precision"]
 MAY_DIFFER = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every", "keep_last", "memory", "prefetch")
 """Settings that may be others in a training that is resumed."""
 
-OLD_PRECISION = "single"
-"""Of trainings of earlier versions, which do not state it."""
-
 
 def choose_precision(config: TrainingConfig, model: HyperPlanes, folder: Path | None) -> str:
     """What `config.precision` "automatic" is: what the training in the folder began with, or what is fast and exact.
@@ -40,7 +37,8 @@ def choose_precision(config: TrainingConfig, model: HyperPlanes, folder: Path | 
     if folder is not None and (folder / "training.json").exists():
         before = read_json(folder / "training.json").get("config")
         found = before.get("precision") if isinstance(before, dict) else None
-        return found if found in ("single", "bfloat16") else OLD_PRECISION  # others are refused where the state is read
+        if found in ("single", "bfloat16"):  # others are refused where the state is read
+            return found
     suits = model.reads_volume and model.rig.device.type == "cpu" and has_fast_bfloat16()
     return "bfloat16" if suits else "single"
 
@@ -84,9 +82,8 @@ class Checkpointing:
         """
         if self.folder is None or not self.resumable:
             return 0, []
-        config, defaults = asdict(self.config), asdict(TrainingConfig(precision=OLD_PRECISION))
         optimisers, data = self.optimisation.optimisers, loader.fingerprint
-        step, curve = load_state(self.folder, self.model, optimisers, config, MAY_DIFFER, defaults, data)
+        step, curve = load_state(self.folder, self.model, optimisers, asdict(self.config), MAY_DIFFER, data)
         if self._writes and not (self.folder / "model.safetensors").exists():
             self.model.save(self.folder)  # of a first checkpoint that was killed before it
         return step, curve

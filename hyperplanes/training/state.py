@@ -21,18 +21,16 @@ from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.optimisers import Muon
-from hyperplanes.configuration.upgrade import upgrade_training
 from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
 from hyperplanes.utilities.encoding import encode_json
 from hyperplanes.utilities.files import DataError, malformed
-from hyperplanes.utilities.settings import SettingsError
 from hyperplanes.utilities.writing import write_json
 
 __all__ = ["Curve", "check_model", "check_whole", "load_state", "save_state"]
 
 Curve: TypeAlias = list[dict[str, float]]
 
-ENTRIES = {"step": int, "curve": list, "config": dict, "state": str}
+ENTRIES = {"step": int, "curve": list, "config": dict, "data": dict, "state": str}
 STATE = re.compile(r"training-(\d{8,})\.safetensors")
 REMEDY = "give another --out folder or the same options"
 
@@ -44,7 +42,7 @@ def save_state(
     step: int,
     curve: Curve,
     config: Mapping[str, Any],
-    data: Mapping[str, Any] | None = None,
+    data: Mapping[str, Any],
 ) -> None:
     """Put a new state in the place of the last one, or beside the last ones where the configuration keeps several.
 
@@ -63,9 +61,7 @@ def save_state(
         for place, entries in optimiser.state_dict()["state"].items():
             tensors |= {f"{index}.{place}.{key}": torch.as_tensor(value) for key, value in entries.items()}
     save_tensors(folder / name, tensors)
-    document = {"step": step, "curve": curve, "config": dict(config), "state": name}
-    if data is not None:
-        document["data"] = dict(data)
+    document = {"step": step, "curve": curve, "config": dict(config), "data": dict(data), "state": name}
     kept = config.get("keep_last", 1)
     beside = (folder / name).with_suffix(".json")
     if kept > 1:
@@ -104,8 +100,7 @@ def load_state(
     optimisers: Sequence[torch.optim.Optimizer],
     config: Mapping[str, Any],
     may_differ: Sequence[str],
-    defaults: Mapping[str, Any],
-    data: Mapping[str, Any] | None = None,
+    data: Mapping[str, Any],
 ) -> tuple[int, Curve]:
     """Continue where `save_state` stopped: weights and moments are set.
 
@@ -115,8 +110,7 @@ def load_state(
         optimisers: over the same parameters.
         config: of the training that is to go on.
         may_differ: entries of it that a resumed training may change.
-        defaults: what entries are that a training of an earlier version has not.
-        data: as in `save_state`; trainings of earlier versions have noted none.
+        data: as in `save_state`.
 
     Returns:
         The steps done, and the curve.
@@ -126,26 +120,21 @@ def load_state(
     """
     path = folder / "training.json"
     saved = read_json(path)
-    _compare_data(path, saved.get("data"), data)
     try:
         with malformed(path, "the state of a training", CheckpointError):
-            return _load(path, saved, model, optimisers, config, may_differ, defaults)
+            return _load(path, saved, model, optimisers, config, may_differ, data)
     except DataError as error:
         raise CheckpointError(str(error)) from error
 
 
-def _compare_data(path: Path, before: object, now: Mapping[str, Any] | None) -> None:
-    if before is None or now is None or before == now:
+def _compare_data(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    differing = [name for name in now if before.get(name) != now[name]]
+    if not differing:
         return
-    before = before if isinstance(before, dict) else {}
-    counts = before.get("objects"), now.get("objects")
-    differing = [name for name in now if name in before and before[name] != now[name]]
-    if not differing:  # of an earlier version, which noted less
-        return
-    found = f"{counts[1]} with other {' and '.join(differing)}"
+    found = f"{now['objects']} with other {' and '.join(differing)}"
     remedy = "give --legacy as before" if differing == ["calibration"] else "give the same --data"
     raise CheckpointError(
-        f"{path}: expected the {counts[0]} objects that the training began with, found {found}; {remedy}, "
+        f"{path}: expected the {before.get('objects')} objects that the training began with, found {found}; {remedy}, "
         f"or another --out with --checkpoint {path.parent} to begin with these weights"
     )
 
@@ -157,23 +146,22 @@ def _load(
     optimisers: Sequence[torch.optim.Optimizer],
     config: Mapping[str, Any],
     may_differ: Sequence[str],
-    defaults: Mapping[str, Any],
+    data: Mapping[str, Any],
 ) -> tuple[int, Curve]:
     folder = path.parent
     for name, kind in ENTRIES.items():
         if not isinstance(saved.get(name), kind):
             found = "none" if name not in saved else type(saved[name]).__name__
             raise CheckpointError(f"{path}: expected an entry {name!r} ({kind.__name__}), found {found}; {REMEDY}")
+    _compare_data(path, saved["data"], data)
     if saved["step"] < 0:
         raise CheckpointError(f"{path}: expected a number of steps, found {saved['step']}; {REMEDY}")
     if odd := [row for row in saved["curve"] if not _is_report(row)]:
         raise CheckpointError(
             f"{path}: expected a curve of numbers by name, the step among them, found {odd[0]!r:.40}; {REMEDY}"
         )
-    wanted, before = (
-        json.loads(encode_json(dict(each))) for each in (config, {**defaults, **_upgraded(path, saved["config"])})
-    )
-    differing = [name for name in wanted if name not in may_differ and before[name] != wanted[name]]
+    wanted, before = json.loads(encode_json(dict(config))), saved["config"]
+    differing = [name for name in wanted if name not in may_differ and before.get(name) != wanted[name]]
     if differing:
         raise CheckpointError(
             f"{path}: expected the same training to resume, found other {', '.join(differing)}; {REMEDY}"
@@ -206,14 +194,6 @@ def _is_report(row: object) -> bool:
     if not isinstance(row, dict) or not isinstance(row.get("step"), int | float):
         return False
     return all(value is None or isinstance(value, int | float) for value in row.values())
-
-
-def _upgraded(path: Path, config: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The settings of the training, by the names of this version; CheckpointError where one of them is gone."""
-    try:
-        return upgrade_training(config)
-    except SettingsError as error:
-        raise CheckpointError(f"{path}: {error}; {REMEDY}") from None
 
 
 def check_whole(folder: Path) -> None:

@@ -28,6 +28,7 @@ from tests.fuzz.published import Published
 
 VIEWS, HEIGHT, WIDTH = 4, 10, 12
 CONFIG = {"steps": 3, "seed": 0}
+DATA = {"objects": 1}
 
 
 def pictures():
@@ -208,12 +209,12 @@ def training(folder):
     optimiser = torch.optim.Adam(model.parameters())
     sum(parameter.sum() for parameter in model.parameters()).backward()
     optimiser.step()
-    save_state(folder, model, [optimiser], 1, [{"step": 1.0, "loss": 0.5}], CONFIG)
+    save_state(folder, model, [optimiser], 1, [{"step": 1.0, "loss": 0.5}], CONFIG, DATA)
 
 
 def go_on(folder):
     model = HyperPlanes.from_pretrained(find_checkpoint(folder))
-    load_state(folder, model, [torch.optim.Adam(model.parameters())], CONFIG, ("steps",), {})
+    load_state(folder, model, [torch.optim.Adam(model.parameters())], CONFIG, ("steps",), DATA)
 
 
 def baked(folder):

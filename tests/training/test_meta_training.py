@@ -255,7 +255,7 @@ def test_too_few_support_views_are_told_the_number_that_can_be_trained_with(tmp_
 
 
 def test_a_field_without_planes_takes_all_support_views_however_many(tmp_path):
-    """Unless an autoencoder reads views by their places. Of 25 planes, as earlier versions wrote it, it loads."""
+    """Unless an autoencoder reads views by their places. Of 25 planes it loads as well."""
     network = replace(small_model().config.network, planes=25)
     earlier = HyperPlanes(replace(model_of("mv_meta").config, network=network))
     earlier.rig.fill_(1.0)

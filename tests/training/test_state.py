@@ -1,14 +1,11 @@
 """Source of truth: the weights that a training had when it wrote a file, to the bit."""
 
-import json
 import shutil
 from dataclasses import replace
 
-import pytest
-
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.training import Trainer, TrainingConfig, train
-from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors
+from hyperplanes.training import Trainer, TrainingConfig
+from hyperplanes.utilities.checkpoints import load_tensors
 from tests.reference_rendering import Balls, awaken, small_model
 
 CONFIG = TrainingConfig(steps=5, tasks=1, rays=8, evaluate_every=100, checkpoint_every=1, held_out=0)
@@ -72,19 +69,3 @@ def test_the_best_model_is_that_of_the_validation_with_the_highest_quality(tmp_p
     for steps in (3, 5):  # resumed after the best look
         judged(steps, tmp_path / "parts")
     assert same(HyperPlanes.from_pretrained(tmp_path / "parts" / "best").state_dict(), best)
-
-
-def test_a_training_of_an_earlier_version_goes_on(tmp_path):
-    train(small_model(), Balls(), replace(CONFIG, steps=1), tmp_path)
-    saved = json.loads((tmp_path / "training.json").read_text())
-    earlier = saved["config"]
-    for name in ("clip", "balanced", "keep_last"):  # which it did not have
-        del earlier[name]
-    earlier["final"], earlier["completion"] = earlier.pop("final_rate_factor"), earlier.pop("volume_loss")
-    earlier |= {"alternating": False, "average": 0.0}  # which are gone
-    (tmp_path / "training.json").write_text(json.dumps(saved))
-    assert Trainer(small_model(), Balls(), CONFIG, tmp_path).step == 1
-    earlier["average"] = 0.999
-    (tmp_path / "training.json").write_text(json.dumps(saved))
-    with pytest.raises(CheckpointError, match=r"training.json: average: expected 0.0, since .* removed, got 0.999"):
-        Trainer(small_model(), Balls(), CONFIG, tmp_path)

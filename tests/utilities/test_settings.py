@@ -17,10 +17,12 @@ from hyperplanes.cli import main
 from hyperplanes.commands.train import Arguments, resolve
 from hyperplanes.configuration.presets import PRESETS, configure, preset
 from hyperplanes.configuration.settings_file import changed, document, parse_options, read_experiment, write_experiment
-from hyperplanes.fields import NeRF, TargetConfig, find_targets
+from hyperplanes.fields import ImageBasedConfig, NeRF, TargetConfig, find_targets
+from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.methods import Method, describe_method, make_method
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.utilities import entry_points
+from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.settings import SettingsError, structure
 
@@ -116,11 +118,17 @@ def test_a_configuration_written_is_the_one_read(name, tmp_path):
     assert yaml.safe_load(document("x", chosen))["model"] == json.loads(json.dumps(chosen.model.as_json()))
 
 
-def test_settings_of_earlier_versions_are_read():
-    before = {"training": {"final": 0.1, "completion": 0.0, "alternating": False, "average": 0.0}}
-    assert changed(preset("quick"), before).training.final_rate_factor == 0.1
-    with pytest.raises(SettingsError, match=r"training\.average: expected 0.0, since .* removed, got 0.9"):
-        changed(preset("quick"), {"training": {"average": 0.9}})
+def test_another_kind_has_its_own_settings():
+    made = changed(preset("small"), parse_options(["--model.hypernetwork.kind", "images"])).model.hypernetwork
+    assert made == ImageHyperNetworkConfig()
+    wanted = {"target": "point_multiplane", "hypernetwork": {"kind": "images"}}
+    assert not isinstance(changed(preset("small"), {"model": wanted}).model.network, ImageBasedConfig)
+
+
+def test_an_entry_that_lacks_a_part_is_named():
+    entries = {**preset("small").model.as_json(), "symmetry": {"order": 2}}
+    with pytest.raises(CheckpointError, match=r"symmetry\.plane: a missing entry"):
+        ModelConfig.of_json(entries)
 
 
 def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
@@ -171,6 +179,7 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
         (["--model.symmetry.plane.normal", "[1, 0]"], "--model.symmetry.plane.normal: "),
         (["--model.symmetry", "{plane: {normal: [1, 0, 0]}, order: 1000}"], "--model.symmetry.order: 1000 instead of"),
         (["--training.optimiser", "sgd"], "--training.optimiser: expected one of 'adam', 'muon', got 'sgd'"),
+        (["--model.network.grid", "8"], "--model.network.grid: an unknown entry"),
         (["--model.network", "3"], "--model.network: 3 instead of its entries"),
         (["--training.rays", "["], "--training.rays: expected a plain value"),
         (["--method", "magic"], "method: expected one of hyperplanes, "),
