@@ -35,7 +35,6 @@ REQUIRED = {
     "lightning_fabric": "lightning-fabric",
     "rich": "rich",
     "tyro": "tyro",
-    "cattrs": "cattrs",
     "yaml": "pyyaml",
     "charset_normalizer": "charset-normalizer",
 }

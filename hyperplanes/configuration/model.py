@@ -158,10 +158,7 @@ class ModelConfig:
         # the field says which dataclass its shape is
         known = find_targets()
         kind = known[made.target].config_type if made.target in known else TargetConfig
-        try:
-            return replace(made, network=structure(kind, value["network"]))
-        except SettingsError as error:
-            raise SettingsError(f"network.{error.path}" if error.path else "network", error.problem) from None
+        return replace(made, network=structure(kind, value["network"], "network"))
 
     @classmethod
     def load(cls, folder: Path) -> ModelConfig:

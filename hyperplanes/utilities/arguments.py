@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args,
 import torch
 from torch import Tensor
 
-__all__ = ["checked", "checked_fields", "kind_of"]
+__all__ = ["checked", "checked_fields", "kind_of", "mismatch"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -22,9 +22,9 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     """A decorator: arguments of another class than annotated are a ValueError that names the argument.
 
     Looked at are annotations that are classes, generic ones such as `Sequence[str]`, of which the class counts, tuples
-    of a fixed length, `Callable`, `Literal`, `Annotated[int, range(...)]`, unions of all these, and jaxtyping's arrays,
-    of which the kind of numbers, the number of dimensions and those of a fixed size count; all others are taken as
-    they come. A class is no `Callable` that returns something else than its instances.
+    with their elements, `Callable`, `Literal`, `Annotated[int, range(...)]`, unions of all these, and jaxtyping's
+    arrays, of which the kind of numbers, the number of dimensions and those of a fixed size count; all others are taken
+    as they come. A class is no `Callable` that returns something else than its instances.
 
     Args:
         function: with annotations that its module can resolve.
@@ -71,19 +71,30 @@ def _checking(function: Callable[P, R], annotated: Any) -> Callable[P, R]:
         looked_at = hints()
         for name, value in given.items():
             hint = looked_at.get(name, Any)
-            if hint is not Any and not _fits(value, hint):
-                raise ValueError(f"{name}: expected {_shown(hint)}, got {kind_of(value)}")
+            if hint is not Any and (problem := mismatch(value, hint)):
+                raise ValueError(f"{name}: {problem}")
         return function(*positional, **named)
 
     return called
 
 
+def mismatch(value: object, hint: Any) -> str | None:
+    """What is expected and what there is where a value is of another type than an annotation says; None where it fits.
+
+    >>> mismatch((3, "4"), tuple[int, ...])
+    "expected a tuple of int, got a tuple of 3, '4'"
+    """
+    return None if _fits(value, hint) else f"expected {_shown(hint)}, got {kind_of(value)}"
+
+
 def kind_of(value: object) -> str:
     """What a value is, for a message.
 
-    >>> kind_of(None), kind_of([1])
-    ('None', 'a list')
+    >>> kind_of(None), kind_of([1]), kind_of((1.5, [2]))
+    ('None', 'a list', 'a tuple of 1.5, a list')
     """
+    if isinstance(value, tuple) and value:
+        return f"a tuple of {', '.join([*map(kind_of, value[:4]), *(['...'] if len(value) > 4 else [])])}"
     if isinstance(value, Tensor):
         return f"a tensor of {str(value.dtype).removeprefix('torch.')}, shape {tuple(value.shape)}"
     if value is None or isinstance(value, bool | int | float | str):
@@ -164,10 +175,11 @@ def _fits_one(value: object, hint: Any) -> bool:
     if origin is Callable and isinstance(value, type):
         returned = get_origin(arguments[-1]) or arguments[-1]
         return isinstance(returned, type) and issubclass(value, returned)
-    if origin is tuple and Ellipsis not in arguments:
-        if not isinstance(value, tuple) or len(value) != len(arguments):
+    if origin is tuple:
+        if not isinstance(value, tuple):
             return False
-        return all(_fits(each, part) for each, part in zip(value, arguments, strict=True))
+        parts = arguments[:1] * len(value) if Ellipsis in arguments else arguments
+        return len(value) == len(parts) and all(map(_fits, value, parts))
     try:
         return isinstance(value, origin or hint)
     except TypeError:  # a protocol that cannot be asked
@@ -202,5 +214,6 @@ def _shown_one(part: Any) -> str:
     if get_origin(part) is Literal:
         return f"one of {', '.join(map(repr, get_args(part)))}"
     if get_origin(part) is tuple:
-        return f"a tuple of {len(get_args(part))} numbers"
+        parts = get_args(part)
+        return f"a tuple of {_shown(parts[0])}" if Ellipsis in parts else f"a tuple of {len(parts)} numbers"
     return "None" if part is type(None) else getattr(get_origin(part) or part, "__name__", str(part))

@@ -274,18 +274,18 @@ def config_of(model):
 @pytest.mark.parametrize(
     ("part", "change", "words"),
     [
-        ("network", {"width": "16"}, "network.width: '16' instead of a whole number from 2 to 8192"),
-        ("network", {"depth": True}, "network.depth: True instead of a whole number"),
-        ("network", {"width": 10**12}, "width: 1000000000000 instead of a whole number from 2 to 8192"),
-        ("network", {"planes": 0}, "planes: 0 instead of a whole number from 1 to 1024"),
-        ("network", {"density_scale": float("inf")}, "network.density_scale: inf instead of a number"),
-        ("hypernetwork", {"layers": "colour"}, "hypernetwork.layers: 'colour' instead of a list of names"),
+        ("network", {"width": "16"}, "network.width: expected a whole number from 2 to 8192, got '16'"),
+        ("network", {"depth": True}, "network.depth: expected a whole number from 1 to 256, got True"),
+        ("network", {"width": 10**12}, "width: expected a whole number from 2 to 8192, got 1000000000000"),
+        ("network", {"planes": 0}, "planes: expected a whole number from 1 to 1024, got 0"),
+        ("network", {"density_scale": float("inf")}, "network.density_scale: expected finite numbers, got inf"),
+        ("hypernetwork", {"layers": "colour"}, "hypernetwork.layers: expected a tuple of str, got 'colour'"),
         ("hypernetwork", {"encoder": "vgg"}, "encoder: expected one of .*, got 'vgg'"),
         ("hypernetwork", {"views": 5}, "views: expected at most as many HyperPlanes as planes, 4, got 5"),
         (None, {"target": "voxels"}, "target: expected one of .*, got 'voxels'"),
-        (None, {"target": 3}, "target: 3 instead of a name"),
-        (None, {"hull_resolution": 10**6}, "hull_resolution: 1000000 instead of a whole number from 1 to 512"),
-        ("sampling", {"steps": 0}, "sampling.steps: 0 instead of a whole number from 1 to 16384"),
+        (None, {"target": 3}, "target: expected str, got 3"),
+        (None, {"hull_resolution": 10**6}, "hull_resolution: expected a whole number from 1 to 512, got 1000000"),
+        ("sampling", {"steps": 0}, "sampling.steps: expected a whole number from 1 to 16384, got 0"),
     ],
 )
 def test_a_checkpoint_of_wrong_types_or_absurd_sizes_names_its_file(model, tmp_path, part, change, words):

@@ -88,3 +88,18 @@ def test_right_arguments_pass():
     assert scaled(np.float32(2.0)) == 2
     with pytest.raises(ValueError, match="times: expected int, got True"):
         scaled(1.0, True)
+
+
+def test_elements_of_tuples_are_looked_at():
+    @checked
+    def drawn(sizes: tuple[int, ...], names: tuple[tuple[str, float], ...] = ()):
+        return len(sizes)
+
+    assert drawn(()) == 0
+    assert drawn((1, 2), (("a", 1), ("b", 0.5))) == 2
+    with pytest.raises(ValueError, match=r"^sizes: expected a tuple of int, got a tuple of 1, 2.5$"):
+        drawn((1, 2.5))
+    with pytest.raises(
+        ValueError, match=r"^names: expected a tuple of a tuple of 2 numbers, got a tuple of a tuple of"
+    ):
+        drawn((), (("a", "b"),))
