@@ -189,6 +189,6 @@ class HyperPlanes(HyperPlanesNetwork):
                 where huggingface_hub is installed; a folder of that name goes first.
 
         Returns:
-            The model, ready for use. What is missing, damaged or does not fit is a CheckpointError.
+            The model, ready for use. What is missing, damaged or does not fit is a DataError.
         """
         return read_checkpoint(name, cls)

@@ -20,8 +20,9 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
-from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
+from hyperplanes.utilities.checkpoints import load_tensors, save_tensors
 from hyperplanes.utilities.environment import cache_folder
+from hyperplanes.utilities.files import DataError
 from hyperplanes.views import Views
 
 __all__ = ["keep_field", "keep_tensors", "kept_file", "kept_folder", "recall_field", "recall_tensors"]
@@ -75,7 +76,7 @@ def recall_tensors(file: Path, names: Sequence[str]) -> dict[str, Tensor] | None
     """
     try:
         found = load_tensors(file) if file.exists() else {}
-    except CheckpointError:
+    except DataError:
         return None
     return found if set(found) == set(names) else None
 
@@ -144,7 +145,7 @@ def recall_field(folder: Path, views: Views, device: torch.device | str = "cpu")
         return None
     try:
         model = HyperPlanes.from_pretrained(folder).to(device)
-    except CheckpointError:
+    except DataError:
         return None
     with torch.no_grad():
         return model.adapt(views)

@@ -78,7 +78,7 @@ class Checkpointing:
             loader: of the objects, which are to be those that the training began with.
 
         Returns:
-            The steps done, and the curve. CheckpointError where the state is that of another training, or damaged.
+            The steps done, and the curve. DataError where the state is that of another training, or damaged.
         """
         if self.folder is None or not self.resumable:
             return 0, []

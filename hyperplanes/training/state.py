@@ -23,7 +23,7 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.optimisers import Muon
 from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
 from hyperplanes.utilities.encoding import encode_json
-from hyperplanes.utilities.files import DataError, malformed
+from hyperplanes.utilities.files import malformed
 from hyperplanes.utilities.writing import write_json
 
 __all__ = ["Curve", "check_model", "check_whole", "load_state", "save_state"]
@@ -113,18 +113,13 @@ def load_state(
         data: as in `save_state`.
 
     Returns:
-        The steps done, and the curve.
-
-    Raises:
-        CheckpointError: another training, other data, or files that are damaged, missing or do not belong together.
+        The steps done, and the curve. DataError where it is another training, on other data, or where files are
+        damaged, missing or do not belong together.
     """
     path = folder / "training.json"
     saved = read_json(path)
-    try:
-        with malformed(path, "the state of a training", CheckpointError):
-            return _load(path, saved, model, optimisers, config, may_differ, data)
-    except DataError as error:
-        raise CheckpointError(str(error)) from error
+    with malformed(path, "the state of a training"):
+        return _load(path, saved, model, optimisers, config, may_differ, data)
 
 
 def _compare_data(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -27,22 +27,19 @@ CHECKSUM = "sha256"  # entry of the file's own metadata
 LARGEST = 64 * 2**30  # bytes
 
 
-class CheckpointError(ValueError):
+class CheckpointError(files.DataError):
     """A checkpoint that cannot be used; one line that says which file, what was expected, what was found."""
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
+    """Read a JSON object; DataError where something else is in the file.
 
     Raises:
-        CheckpointError: no such file, or no JSON object in it.
+        CheckpointError: no such file.
     """
     if not path.exists():
         raise CheckpointError(f"{path}: expected a checkpoint's JSON file, found none; `hyperplanes train` writes one")
-    try:
-        return files.read_json(path)
-    except files.DataError as error:
-        raise CheckpointError(str(error)) from None
+    return files.read_json(path)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
@@ -74,7 +71,7 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
         expected: the names and shapes that must be there, no more and no less; anything where absent.
 
     Returns:
-        Tensors by name.
+        Tensors by name. DataError where there is no regular file.
 
     Raises:
         CheckpointError: no such file, a damaged one, other names or shapes than expected, tensors that their checksum
@@ -82,15 +79,13 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
     """
     from safetensors import SafetensorError, safe_open
 
+    if not path.exists():
+        raise CheckpointError(f"{path}: expected weights, found no file; `hyperplanes train` writes them")
+    files.check_regular(path, LARGEST)
     try:
-        files.check_regular(path, LARGEST)
         with safe_open(path, "pt") as file:
             checksum = (file.metadata() or {}).get(CHECKSUM)
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: expected weights, found no file; `hyperplanes train` writes them") from None
-    except files.DataError as error:
-        raise CheckpointError(str(error)) from None
     except (SafetensorError, OSError, ValueError, TypeError, RuntimeError) as error:
         raise CheckpointError(
             f"{path}: expected whole safetensors, found a damaged file ({error}); copy it again"

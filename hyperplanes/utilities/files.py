@@ -61,7 +61,7 @@ class DataError(ValueError):
 
 
 @contextmanager
-def malformed(path: str | Path, expected: str, passing: type[Exception] = DataError) -> Generator[None]:
+def malformed(path: str | Path, expected: str) -> Generator[None]:
     """Turns what parsers raise on content that they did not expect into a DataError that names the file.
 
     For the few places where bytes become values: a file that nobody foresaw is a wrong input and no fault of the
@@ -70,14 +70,13 @@ def malformed(path: str | Path, expected: str, passing: type[Exception] = DataEr
     Args:
         path: of what is read within.
         expected: what it should be.
-        passing: an error that says itself what is wrong with a file.
 
     Raises:
         DataError: any of MALFORMED.
     """
     try:
         yield
-    except (DataError, passing):
+    except DataError:
         raise
     except MALFORMED as error:
         found = f"{type(error).__name__} ({error})" if str(error) else type(error).__name__

@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hyperplanes.utilities.checkpoints import CheckpointError
 from hyperplanes.utilities.files import DataError
 from tests.fuzz.corpus import CORPUS
 from tests.fuzz.mutations import mutate
@@ -60,7 +59,7 @@ def judge(read, folder):
             read(folder)
     except Hang:
         return f"not done after {SECONDS} s"
-    except (DataError, CheckpointError, MeshError) as error:
+    except (DataError, MeshError) as error:
         text = str(error)
         return f"several lines: {text!r}" if "\n" in text else None if text else "an empty message"
     except Exception as error:

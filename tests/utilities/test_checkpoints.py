@@ -15,6 +15,7 @@ from hyperplanes.utilities.checkpoints import (
     read_json,
     save_tensors,
 )
+from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.writing import write_json, write_whole
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "count": torch.tensor(7), "b": torch.ones(3, 2).T}
@@ -28,8 +29,8 @@ def weights(tmp_path):
 
 
 def complaint(path, call):
-    """The message of the CheckpointError: one line, about this file."""
-    with pytest.raises(CheckpointError) as caught:
+    """The message of the error: one line, about this file."""
+    with pytest.raises(DataError) as caught:
         call()
     message = str(caught.value)
     assert "\n" not in message
