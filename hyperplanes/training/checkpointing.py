@@ -1,21 +1,44 @@
-"""The checkpoints of a training: when the first is read, and which are written."""
+"""The checkpoints of a training: one consistent state on disk at any moment, whenever the power goes.
+
+training.json                   step, curve, configuration, and the name of the file of that step; written last
+training-00000500.safetensors   weights and optimisers of step 500
+training-00000500.json          what training.json was at step 500, where earlier steps are kept: copied over
+                                training.json, the training goes on from there
+model.json, model.safetensors   the model alone, for everybody else
+best/                           the model with the highest PSNR of held-out objects
+"""
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+from torch import Tensor
 
 from hyperplanes.adaptation.diagnostics import Diagnostics
-from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
+from hyperplanes.adaptation.optimisers import Muon
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes import EpisodeLoader
 from hyperplanes.training.optimisation import Optimisation
-from hyperplanes.training.state import Curve, check_model, check_whole, load_state, save_state
-from hyperplanes.utilities.checkpoints import read_json
+from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
+from hyperplanes.utilities.encoding import encode_json
 from hyperplanes.utilities.environment import has_fast_bfloat16
+from hyperplanes.utilities.files import malformed
 from hyperplanes.utilities.writing import write_json
 
 __all__ = ["Checkpointing", "choose_precision"]
+
+Curve: TypeAlias = list[dict[str, float]]
+
+ENTRIES = {"step": int, "curve": list, "config": dict, "data": dict, "state": str}
+STATE = re.compile(r"training-(\d{8,})\.safetensors")
+REMEDY = "give another --out folder or the same options"
 
 MAY_DIFFER = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every", "keep_last", "memory", "prefetch")
 """Settings that may be others in a training that is resumed."""
@@ -82,11 +105,57 @@ class Checkpointing:
         """
         if self.folder is None or not self.resumable:
             return 0, []
-        optimisers, data = self.optimisation.optimisers, loader.fingerprint
-        step, curve = load_state(self.folder, self.model, optimisers, asdict(self.config), MAY_DIFFER, data)
+        path = self.folder / "training.json"
+        saved = read_json(path)
+        with malformed(path, "the state of a training"):
+            self._check(path, saved, loader.fingerprint)
+            self._load(self.folder / saved["state"])
         if self._writes and not (self.folder / "model.safetensors").exists():
             self.model.save(self.folder)  # of a first checkpoint that was killed before it
-        return step, curve
+        return saved["step"], saved["curve"]
+
+    def _check(self, path: Path, saved: Mapping[str, Any], data: Mapping[str, Any]) -> None:
+        """Refuse what is in training.json where it is of another training, on other data, or none."""
+        for name, kind in ENTRIES.items():
+            if not isinstance(saved.get(name), kind):
+                found = "none" if name not in saved else type(saved[name]).__name__
+                raise CheckpointError(f"{path}: expected an entry {name!r} ({kind.__name__}), found {found}; {REMEDY}")
+        _compare_data(path, saved["data"], data)
+        if saved["step"] < 0:
+            raise CheckpointError(f"{path}: expected a number of steps, found {saved['step']}; {REMEDY}")
+        if odd := [row for row in saved["curve"] if not _is_report(row)]:
+            raise CheckpointError(
+                f"{path}: expected a curve of numbers by name, the step among them, found {odd[0]!r:.40}; {REMEDY}"
+            )
+        wanted, before = json.loads(encode_json(asdict(self.config))), saved["config"]
+        differing = [name for name in wanted if name not in MAY_DIFFER and before.get(name) != wanted[name]]
+        if differing:
+            raise CheckpointError(
+                f"{path}: expected the same training to resume, found other {', '.join(differing)}; {REMEDY}"
+            )
+        if not STATE.fullmatch(saved["state"]):
+            raise CheckpointError(f"{path}: expected the name of a file of states, found {saved['state']!r}; {REMEDY}")
+
+    def _load(self, path: Path) -> None:
+        """Set weights and moments to those of a file."""
+        found = load_tensors(path)
+        weights = {f"model.{name}": value for name, value in self.model.state_dict().items()}
+        moments: dict[str, Tensor] = {}
+        for index, optimiser in enumerate(self.optimisation.optimisers):
+            names = ("momentum",) if isinstance(optimiser, Muon) else ("step", "exp_avg", "exp_avg_sq")
+            for place, parameter in enumerate(value for group in optimiser.param_groups for value in group["params"]):
+                if f"{index}.{place}.{names[0]}" in found:  # absent where no gradient has reached the parameter yet
+                    moments |= {f"{index}.{place}.{name}": parameter for name in names if name != "step"}
+                    moments |= {f"{index}.{place}.{name}": torch.zeros(()) for name in names if name == "step"}
+        check_tensors(path, found, {**weights, **moments})
+        self.model.load_state_dict({name: found[f"model.{name}"] for name in self.model.state_dict()})
+        for index, optimiser in enumerate(self.optimisation.optimisers):
+            state: dict[int, dict[str, Tensor]] = {}
+            for key in moments:
+                group, place, name = key.split(".")
+                if int(group) == index:
+                    state.setdefault(int(place), {})[name] = found[key]
+            optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
 
     def save(self, step: int, curve: Curve, diagnostics: Diagnostics | None, loader: EpisodeLoader) -> None:
         """Write model and state, whole or not at all.
@@ -97,13 +166,96 @@ class Checkpointing:
             diagnostics: of the last validation.
             loader: of the objects.
         """
-        if self._writes and self.folder is not None:
-            if diagnostics is not None:
-                write_json(self.folder / "diagnostics.json", diagnostics.as_json())
-            config, data = asdict(self.config), loader.fingerprint
-            save_state(self.folder, self.model, self.optimisation.optimisers, step, curve, config, data)
+        if not self._writes or self.folder is None:
+            return
+        if diagnostics is not None:
+            write_json(self.folder / "diagnostics.json", diagnostics.as_json())
+        name = f"training-{step:08d}.safetensors"
+        tensors = {f"model.{key}": value for key, value in self.model.state_dict().items()}
+        for index, optimiser in enumerate(self.optimisation.optimisers):
+            for place, entries in optimiser.state_dict()["state"].items():
+                tensors |= {f"{index}.{place}.{key}": torch.as_tensor(value) for key, value in entries.items()}
+        save_tensors(self.folder / name, tensors)
+        config, data = asdict(self.config), loader.fingerprint
+        document = {"step": step, "curve": curve, "config": config, "data": data, "state": name}
+        beside = (self.folder / name).with_suffix(".json")
+        if self.config.keep_last > 1:
+            write_json(beside, document)
+        else:
+            beside.unlink(missing_ok=True)
+        if (self.folder / "training.json").exists():
+            self.model.save(self.folder)
+            write_json(self.folder / "training.json", document)
+        else:  # a model without training.json beside it is one that lost it, see `check_whole`
+            write_json(self.folder / "training.json", document)
+            self.model.save(self.folder)
+        _delete_old(self.folder, name, self.config.keep_last)
 
     def save_best(self) -> None:
         """Write the model as the one with the highest PSNR so far."""
         if self._writes and self.folder is not None:
             self.model.save(self.folder / "best")
+
+
+def _delete_old(folder: Path, newest: str, kept: int) -> None:
+    """Delete all states but the newest and those of the last steps before it; later ones are of a run gone back on."""
+    states = sorted(path.name for path in folder.glob("training-*.safetensors") if STATE.fullmatch(path.name))
+    earlier = [name for name in states if _step(name) < _step(newest)]
+    staying = {newest, *earlier[len(earlier) - min(kept - 1, len(earlier)) :]}
+    for name in states:
+        if name not in staying:
+            (folder / name).with_suffix(".json").unlink(missing_ok=True)
+            (folder / name).unlink(missing_ok=True)
+
+
+def _step(name: str) -> int:
+    found = STATE.fullmatch(name)
+    assert found is not None
+    return int(found[1])
+
+
+def _compare_data(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    differing = [name for name in now if before.get(name) != now[name]]
+    if not differing:
+        return
+    found = f"{now['objects']} with other {' and '.join(differing)}"
+    remedy = "give --legacy as before" if differing == ["calibration"] else "give the same --data"
+    raise CheckpointError(
+        f"{path}: expected the {before.get('objects')} objects that the training began with, found {found}; {remedy}, "
+        f"or another --out with --checkpoint {path.parent} to begin with these weights"
+    )
+
+
+def _is_report(row: object) -> bool:
+    """Whether it can be a row of a curve; None stands for what was not measured."""
+    if not isinstance(row, dict) or not isinstance(row.get("step"), int | float):
+        return False
+    return all(value is None or isinstance(value, int | float) for value in row.values())
+
+
+def check_whole(folder: Path) -> None:
+    """Refuse a folder in which a new training would replace weights.
+
+    Raises:
+        CheckpointError: weights are there, but not training.json, which says how they were trained.
+    """
+    if not (folder / "training.json").exists() and (folder / "model.safetensors").exists():
+        kept = sorted(path.name for path in folder.glob("training-*.json"))
+        remedy = f"copy {kept[-1]} over it to go on from there" if kept else "give another --out folder"
+        raise CheckpointError(
+            f"{folder / 'training.json'}: expected the state of the training beside its weights, found none, and a new "
+            f"training would replace them; {remedy}, or --out elsewhere with --checkpoint {folder} to begin with them"
+        )
+
+
+def check_model(folder: Path, config: ModelConfig) -> None:
+    """Refuse a folder that holds another model.
+
+    Raises:
+        CheckpointError: it holds another one; the message says in what.
+    """
+    path = folder / "model.json"
+    if path.exists() and (differing := ModelConfig.load(folder).differences(config)):
+        raise CheckpointError(
+            f"{path}: expected the model that is to be trained, found other {', '.join(differing)}; {REMEDY}"
+        )

@@ -3,6 +3,7 @@
 import json
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -17,18 +18,20 @@ from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages
 from hyperplanes.configuration.presets import configure
 from hyperplanes.configuration.settings_file import read_experiment
+from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.data import open_dataset, read_channel, read_task, read_views
 from hyperplanes.experiments.record import Record
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import Sphere, cameras
-from hyperplanes.training.state import load_state, save_state
+from hyperplanes.training.checkpointing import Checkpointing
+from hyperplanes.training.optimisation import Optimisation
 from hyperplanes.utilities.encoding import encode_json, sha256
 from hyperplanes.utilities.writing import write_json
 from tests.fuzz.published import Published
 
 VIEWS, HEIGHT, WIDTH = 4, 10, 12
-CONFIG = {"steps": 3, "seed": 0}
-DATA = {"objects": 1}
+CONFIG = TrainingConfig(steps=3)
+OBJECTS = SimpleNamespace(fingerprint={"objects": 1})
 
 
 def pictures():
@@ -206,15 +209,15 @@ def small_model():
 
 def training(folder):
     model = small_model()
-    optimiser = torch.optim.Adam(model.parameters())
+    optimisation = Optimisation(model, CONFIG)
     sum(parameter.sum() for parameter in model.parameters()).backward()
-    optimiser.step()
-    save_state(folder, model, [optimiser], 1, [{"step": 1.0, "loss": 0.5}], CONFIG, DATA)
+    optimisation.step(0)
+    Checkpointing(folder, model, optimisation, CONFIG, True).save(1, [{"step": 1.0, "loss": 0.5}], None, OBJECTS)
 
 
 def go_on(folder):
     model = HyperPlanes.from_pretrained(find_checkpoint(folder))
-    load_state(folder, model, [torch.optim.Adam(model.parameters())], CONFIG, ("steps",), DATA)
+    Checkpointing(folder, model, Optimisation(model, CONFIG), CONFIG, True).resume(OBJECTS)
 
 
 def baked(folder):

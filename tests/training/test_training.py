@@ -617,7 +617,7 @@ def test_a_model_that_differs_in_no_weight_is_another_all_the_same(trained, chan
         Trainer(small_model(**change), Balls(), with_(steps=1), trained)
 
 
-@pytest.mark.parametrize("name", ["step", "curve", "config", "state"])
+@pytest.mark.parametrize("name", ["step", "curve", "config", "data", "state"])
 @pytest.mark.parametrize("value", [None, "missing", "../../elsewhere"])
 def test_a_training_file_with_a_hole_is_a_checkpoint_error(trained, name, value):
     saved = json.loads((trained / "training.json").read_text())
