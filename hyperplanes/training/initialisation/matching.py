@@ -12,7 +12,7 @@ from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes import Batch
 from hyperplanes.training.episodes.drawing import points_in
 from hyperplanes.training.initialisation.base import InitialisationObjective
-from hyperplanes.training.losses.emptiness import thin_opacity
+from hyperplanes.training.losses import thin_opacity
 
 __all__ = ["Matching"]
 
