@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from hyperplanes.utilities.encoding import encode_json, sha256
 from hyperplanes.utilities.files import DataError, inside, malformed, read_bytes, read_json
+from hyperplanes.utilities.settings import flattened
 from hyperplanes.utilities.writing import one_writer, write_whole
 
 if TYPE_CHECKING:
@@ -181,7 +182,7 @@ class GenerationState:
             found = ", ".join(sorted(others)[:3])
             raise DataError(self.out, "an empty folder or an unfinished data set", found, "name another one")
         if existing is not None and existing != self.configuration:
-            was, now = _flat(existing), _flat(self.configuration)
+            was, now = flattened(existing), flattened(self.configuration)
             changed = sorted(key for key in was | now if was.get(key) != now.get(key))
             held, wanted = (
                 ", ".join(f"{key} {source.get(key)}" for key in changed[:_DIFFERENCES]) for source in (was, now)
@@ -253,11 +254,3 @@ class GenerationState:
         if (self.out / MANIFEST).is_file():
             return read_json(self.out / MANIFEST).get("configuration", {})
         return None
-
-
-def _flat(configuration: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The values of a nested dictionary by their keys joined with dots."""
-    flat: dict[str, Any] = {}
-    for key, value in configuration.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import PIL.Image
 
+from hyperplanes.utilities.errors import one_line
+
 __all__ = [
     "IMAGE_FORMATS",
     "MAX_FILE_BYTES",
@@ -116,9 +118,5 @@ def check_image(data: bytes, name: str, *, limit: int = MAX_PIXELS) -> int:
     except PIL.UnidentifiedImageError as error:
         raise ValueError("not a whole image of a known format") from error
     except Exception as error:
-        raise ValueError(f"not a whole image ({_one_line(error) or type(error).__name__})") from error
+        raise ValueError(f"not a whole image ({one_line(error)[:160]})") from error
     return pixels
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:160]

@@ -15,7 +15,7 @@ from hyperplanes.hypernetwork import KINDS, AutoencoderConfig, HyperNetworkConfi
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
-from hyperplanes.utilities.settings import SettingsError, choose_by_tag, structure, tagged
+from hyperplanes.utilities.settings import SettingsError, choose_by_tag, flattened, structure, tagged
 
 __all__ = ["ORDERS", "ModelConfig"]
 
@@ -167,12 +167,5 @@ class ModelConfig:
 
     def differences(self, other: ModelConfig) -> list[str]:
         """The names of the entries in which two models differ, such as "sampling.steps"."""
-        mine, others = _flat(self.as_json()), _flat(other.as_json())
+        mine, others = flattened(self.as_json()), flattened(other.as_json())
         return sorted(name for name in mine | others if mine.get(name, ...) != others.get(name, ...))
-
-
-def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, part in value.items():
-        flat |= _flat(part, f"{prefix}{name}.") if isinstance(part, Mapping) else {f"{prefix}{name}": part}
-    return flat

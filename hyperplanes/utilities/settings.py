@@ -14,7 +14,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from hyperplanes.utilities.arguments import kind_of, mismatch
 from hyperplanes.utilities.errors import nearest
 
-__all__ = ["SettingsError", "choose_by_tag", "structure", "tagged"]
+__all__ = ["SettingsError", "choose_by_tag", "flattened", "structure", "tagged"]
 
 Made = TypeVar("Made")
 
@@ -76,6 +76,18 @@ def tagged(value: Any, tag: str, kinds: Mapping[str, type]) -> dict[str, Any] | 
     if value is None:
         return None
     return {tag: next(name for name, kind in kinds.items() if type(value) is kind), **asdict(value)}
+
+
+def flattened(entries: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested mappings by their names joined with dots.
+
+    >>> flattened({"a": {"b": 1, "c": 2}})
+    {'a.b': 1, 'a.c': 2}
+    """
+    flat: dict[str, Any] = {}
+    for name, value in entries.items():
+        flat |= flattened(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
 
 
 def _dataclass(kind: Any, value: object, path: str) -> Any:
