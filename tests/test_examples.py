@@ -58,7 +58,7 @@ def test_the_template_of_a_package_adds_its_field_and_its_method(monkeypatch, tm
     import torch
 
     from hyperplanes.adaptation import FineTuning, HyperPlanes
-    from hyperplanes.configuration.presets import PRESETS, configure
+    from hyperplanes.configuration.presets import PRESETS, preset
     from hyperplanes.methods import describe_method, make_method
     from hyperplanes.utilities import entry_points
     from tests.reference_rendering import ball_views, ring, small_model
@@ -78,5 +78,5 @@ def test_the_template_of_a_package_adds_its_field_and_its_method(monkeypatch, tm
     field = make_method("symmetric_scratch_3", {}, settings=FineTuning(rays=16)).adapt(ball_views(ring(4)))
     points = torch.rand(20, 3) - 0.5
     torch.testing.assert_close(field.density(points), field.density(points * torch.tensor([-1.0, 1.0, 1.0])))
-    HyperPlanes(configure("quick", "symmetric").model).save(tmp_path)
+    HyperPlanes(preset("quick").by_method("symmetric").model).save(tmp_path)
     assert HyperPlanes.from_pretrained(tmp_path).config.target == "symmetric"

@@ -58,15 +58,15 @@ def row(name: str, preset: Preset) -> tuple[str, ...]:
 
 def run(arguments: Arguments) -> int:
     """Print the table, or one of its rows in full."""
-    from hyperplanes.configuration.presets import PRESETS, configure
+    from hyperplanes.configuration.presets import PRESETS, preset
     from hyperplanes.configuration.settings_file import document
 
     console = Console()
     if arguments.name is not None:
-        console.say(document("hyperplanes", configure(arguments.name)).rstrip())
+        console.say(document("hyperplanes", preset(arguments.name).by_method("hyperplanes")).rstrip())
         return 0
-    console.table(HEADINGS, [row(name, preset) for name, preset in PRESETS.items()])
+    console.table(HEADINGS, [row(name, each) for name, each in PRESETS.items()])
     console.say("")
-    for name, preset in PRESETS.items():
-        console.say(f"{name}: {preset.about}")
+    for name, each in PRESETS.items():
+        console.say(f"{name}: {each.about}")
     return 0

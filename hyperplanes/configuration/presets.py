@@ -13,7 +13,7 @@ from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.errors import did_you_mean
 
-__all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "configure", "preset"]
+__all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "preset"]
 
 
 PAPER_SAMPLING = Hierarchical(64, 128)
@@ -284,16 +284,3 @@ def preset(name: str) -> Preset:
 TRAINABLE = ("hyperplanes", *reversed(TARGETS), "autoencoder", *LEARNED)
 """Methods that `train` knows, with the fields of other installed packages; those that are named as a field are one set
 of weights for all objects."""
-
-
-def configure(name: str, method: str = "hyperplanes") -> Preset:
-    """The configuration of a method at the scale of a preset.
-
-    Args:
-        name: of the preset.
-        method: one of TRAINABLE, or a field of another installed package.
-
-    Returns:
-        Model and training; an unknown preset or method is a ValueError.
-    """
-    return preset(name).by_method(method)

@@ -21,6 +21,7 @@ __all__ = ["GatingExample", "example_of", "fit_gate", "turned"]
 
 STEPS = 1500
 EXAMPLES, PIXELS = 16, 2048  # of a step, and of each of them
+SEED = 0  # of the weights and the draws
 RATE = 0.01  # of Adam, at first; it falls to nothing by a cosine
 
 
@@ -79,7 +80,7 @@ def turned(task: Task, generator: torch.Generator) -> Task:
     return replace(task, support=moved(task.support, motion), query=moved(task.query, motion))
 
 
-def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS, seed: int = 0) -> GatingNetwork:
+def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS) -> GatingNetwork:
     """A gating network by gradient steps (Adam) on the squared error of means of two pictures.
 
     Each example counts by its error relative to that of the learned field, so that PSNR rises on all alike.
@@ -87,7 +88,6 @@ def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS, seed: int
     Args:
         examples: of objects, shown by all numbers of views; those of which neither picture shows anything are left out.
         steps: of EXAMPLES drawn examples and PIXELS pixels of each.
-        seed: of the weights and the draws.
 
     Raises:
         ValueError: no example.
@@ -95,11 +95,11 @@ def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS, seed: int
     examples = [each for each in examples if len(each.read)]
     if not examples:
         raise ValueError("examples: expected one of which a picture shows anything, got none")
-    with seeded(seed):
+    with seeded(SEED):
         gate = GatingNetwork().requires_grad_()
     descent = torch.optim.Adam(gate.parameters(), RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(descent, steps)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(SEED)
     for _ in range(steps):
         drawn = [examples[place] for place in torch.randint(len(examples), (EXAMPLES,), generator=generator).tolist()]
         loss = torch.stack([_relative_error(gate, each, generator) for each in drawn]).mean()

@@ -16,7 +16,7 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.kept import keep_field, recall_field
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages
-from hyperplanes.configuration.presets import configure
+from hyperplanes.configuration.presets import preset
 from hyperplanes.configuration.settings_file import read_experiment
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.data import open_dataset, read_channel, read_task, read_views
@@ -199,7 +199,7 @@ def read_capture(folder):
 
 
 def small_model():
-    config = configure("quick", "hyperplanes").model
+    config = preset("quick").model
     network = replace(config.network, depth=1, width=8, planes=2)
     hyper = replace(config.hypernetwork, views=1, code=4, depth=1, width=8)
     model = HyperPlanes(replace(config, network=network, hypernetwork=hyper, hull_resolution=8))

@@ -15,7 +15,7 @@ from hyperplanes.adaptation.checkpoints import find_checkpoints
 from hyperplanes.adaptation.fine_tuned import FineTuned
 from hyperplanes.cli import main
 from hyperplanes.commands.train import Arguments, resolve
-from hyperplanes.configuration.presets import PRESETS, configure, preset
+from hyperplanes.configuration.presets import PRESETS, preset
 from hyperplanes.configuration.settings_file import changed, document, parse_options, read_experiment, write_experiment
 from hyperplanes.fields import ImageBasedConfig, NeRF, TargetConfig, find_targets
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
@@ -108,7 +108,7 @@ def test_one_number_is_a_list_of_one_where_a_list_is_expected():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_configuration_written_is_the_one_read(name, tmp_path):
-    chosen = configure(name, "multiplane")
+    chosen = preset(name).by_method("multiplane")
     chosen = replace(chosen, training=replace(chosen.training, seed=4))
     write_experiment(tmp_path / "config.yaml", "multiplane", chosen)
     found = read_experiment(tmp_path / "config.yaml")
