@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +16,7 @@ from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.export.images import to_pixels
 from hyperplanes.utilities.metrics import ssim
+from hyperplanes.utilities.tables import csv_table
 from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["Progress", "Samples", "Speed", "TensorBoard", "gradient_norms", "write_curve"]
@@ -85,11 +84,7 @@ def write_curve(path: Path, curve: Sequence[Mapping[str, float]]) -> None:
     Steps and losses come first, then the others by name, whatever the order of the rows of a training that went on.
     """
     columns = ["step", "loss", *sorted({name for row in curve for name in row} - {"step", "loss"})]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(curve)
-    write_whole(path, text.getvalue().encode())
+    write_whole(path, csv_table(columns, [[row.get(name) for name in columns] for row in curve]).encode())
 
 
 @torch.no_grad()

@@ -25,11 +25,9 @@ def colour_scale(values: npt.NDArray[np.floating]) -> Pixels:
     >>> colour_scale(np.array([0.0, 1.0])).tolist()
     [[255, 255, 255], [44, 11, 40]]
     """
-    anchors = np.array([[int(hue[i : i + 2], 16) for i in (1, 3, 5)] for hue in _ANCHORS], dtype=np.float64)
-    place = np.clip(values, 0, 1) * (len(anchors) - 1)
-    lower = np.minimum(place.astype(int), len(anchors) - 2)
-    part = (place - lower)[..., None]
-    return np.round(anchors[lower] * (1 - part) + anchors[lower + 1] * part).astype(np.uint8)
+    channels = zip(*(bytes.fromhex(hue[1:]) for hue in _ANCHORS), strict=True)
+    places = np.linspace(0, 1, len(_ANCHORS))
+    return np.round(np.stack([np.interp(values, places, each) for each in channels], -1)).astype(np.uint8)
 
 
 def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
