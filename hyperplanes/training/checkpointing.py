@@ -47,11 +47,6 @@ MAY_DIFFER = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every
 def choose_precision(config: TrainingConfig, model: HyperPlanes, folder: Path | None) -> str:
     """What `config.precision` "automatic" is: what the training in the folder began with, or what is fast and exact.
 
-    Args:
-        config: of the training.
-        model: that is trained.
-        folder: of the training.
-
     Returns:
         "single" or "bfloat16".
     """
@@ -158,14 +153,7 @@ class Checkpointing:
             optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
 
     def save(self, step: int, curve: Curve, diagnostics: Diagnostics | None, loader: EpisodeLoader) -> None:
-        """Write model and state, whole or not at all.
-
-        Args:
-            step: steps done.
-            curve: so far.
-            diagnostics: of the last validation.
-            loader: of the objects.
-        """
+        """Write model and state, whole or not at all."""
         if not self._writes or self.folder is None:
             return
         if diagnostics is not None:

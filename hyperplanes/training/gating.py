@@ -65,12 +65,7 @@ def example_of(model: HyperPlanes, task: Task) -> GatingExample:
 
 
 def turned(task: Task, generator: torch.Generator) -> Task:
-    """An object in a random orientation, as none of its kind stands: its cameras are turned about the scene's centre.
-
-    Args:
-        task: the object.
-        generator: of the rotation.
-    """
+    """An object in a random orientation, as none of its kind stands: cameras are turned about the scene's centre."""
     quaternion = torch.nn.functional.normalize(torch.randn(4, generator=generator, dtype=torch.float64), dim=0)
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3] = quaternion_to_rotation_matrix(quaternion[None])[0]

@@ -41,12 +41,7 @@ def photometric_loss(output: ForwardOutput) -> Tensor:
 
 
 def thin_opacity(density: Float[Tensor, " point"], bounds: Sphere) -> Float[Tensor, " point"]:
-    """The opacity of a layer a tenth of a radius thick, which does not depend on the unit of the world.
-
-    Args:
-        density: per world unit.
-        bounds: of the scene.
-    """
+    """The opacity of a layer a tenth of a radius thick, which does not depend on the unit of the world."""
     return 1 - torch.exp(-density * bounds.radius / 10)
 
 

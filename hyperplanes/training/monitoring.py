@@ -99,13 +99,7 @@ def gradient_norms(model: HyperPlanes) -> dict[str, float]:
 
 
 class Speed:
-    """Rays a second since the last report, and the seconds that are left.
-
-    Args:
-        step: steps done before.
-        steps: steps in all.
-        rays: of a step.
-    """
+    """Rays a second since the last report, and the seconds that are left of so many steps."""
 
     def __init__(self, step: int, steps: int, rays: int) -> None:
         self._first, self._steps, self._rays = step, steps, rays
@@ -145,12 +139,7 @@ class TensorBoard:
         self._writer = SummaryWriter(folder, purge_step=step + 1 if step else None)
 
     def add(self, row: Mapping[str, float], samples: Samples | None = None) -> None:
-        """One report.
-
-        Args:
-            row: of the curve, with its step.
-            samples: views to show.
-        """
+        """One report."""
         step = int(row["step"])
         for name, value in row.items():
             if name != "step":

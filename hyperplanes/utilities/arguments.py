@@ -43,9 +43,6 @@ def checked_fields(settings: type[R]) -> type[R]:
     >>> Network(depth=0)
     Traceback (most recent call last):
     ValueError: depth: expected a whole number from 1 to 256, got 0
-
-    Args:
-        settings: the dataclass.
     """
     setattr(settings, "__init__", _checking(settings.__init__, settings))  # noqa: B010 - no assignment to a method
     return settings

@@ -45,10 +45,6 @@ def read_json(path: Path) -> dict[str, Any]:
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
     """Write named tensors as safetensors, whole or not at all, with their checksum.
 
-    Args:
-        path: the file.
-        tensors: by name.
-
     Raises:
         CheckpointError: a number that is not finite; the file that was there stays.
     """

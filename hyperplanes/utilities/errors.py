@@ -32,10 +32,6 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
     >>> did_you_mean("hyperplane", ["hyperplanes", "nerf"])
     '; did you mean hyperplanes?'
-
-    Args:
-        name: what was given.
-        known: what there is.
     """
     close = difflib.get_close_matches(str(name), list(known), 1)
     return f"; did you mean {close[0]}?" if close else ""
@@ -46,10 +42,6 @@ def nearest(name: str, known: Sequence[str]) -> str:
 
     >>> nearest("stpes", ["rays", "steps"])
     'did you mean steps?'
-
-    Args:
-        name: what was given.
-        known: what there is.
     """
     return did_you_mean(name, known).removeprefix("; ") or f"expected one of {', '.join(known)}"
 
@@ -76,10 +68,6 @@ def rename_errors(argument: str, option: str) -> Generator[None]:
     Traceback (most recent call last):
     ValueError: --level: expected more than 0
 
-    Args:
-        argument: of the function that is called.
-        option: of the command line.
-
     Raises:
         ValueError: as the one that was raised.
     """
@@ -97,11 +85,7 @@ def wants_traceback() -> bool:
 
 
 def one_line(error: Exception) -> str:
-    """What to say of an error with which a command ended.
-
-    Args:
-        error: of wrong input, a full disk or too little memory.
-    """
+    """What to say of an error with which a command ended: of wrong input, a full disk or too little memory."""
     if is_memory(error):
         found = " ".join(str(error).split("\n")[0].split()) or "none left"
         return f"expected enough memory, found {found}; ask for smaller or fewer pictures, voxels or processes"
@@ -114,9 +98,5 @@ def one_line(error: Exception) -> str:
 
 
 def is_memory(error: Exception) -> bool:
-    """Whether there was too little memory.
-
-    Args:
-        error: of Python, or of PyTorch, which says so in words.
-    """
+    """Whether there was too little memory, for Python or for PyTorch, which says so in words."""
     return isinstance(error, MemoryError) or "can't allocate memory" in str(error) or "out of memory" in str(error)

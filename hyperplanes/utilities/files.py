@@ -67,10 +67,6 @@ def malformed(path: str | Path, expected: str) -> Generator[None]:
     For the few places where bytes become values: a file that nobody foresaw is a wrong input and no fault of the
     program. DataErrors and errors of the operating system pass as they are.
 
-    Args:
-        path: of what is read within.
-        expected: what it should be.
-
     Raises:
         DataError: any of MALFORMED.
     """

@@ -21,9 +21,6 @@ def without_autocast(function: Callable[Given, Result]) -> Callable[Given, Resul
     """A function that turns `torch.autocast` off while it runs: rays in bfloat16 miss their pixels.
 
     A network that may compute in less says so itself (`Field.mixed_precision`, `TrainingConfig.precision`).
-
-    Args:
-        function: of tensors on any device.
     """
 
     @functools.wraps(function)

@@ -18,9 +18,6 @@ def seeded(seed: int) -> Generator[None]:
     """PyTorch's global generator on the CPU, from which modules draw first weights, with a seed; then as it was before.
 
     The contexts of several threads last one after the other.
-
-    Args:
-        seed: of the generator.
     """
     with _alone, torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)  # `torch.manual_seed` would seed GPUs, too

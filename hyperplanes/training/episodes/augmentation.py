@@ -28,13 +28,7 @@ def draw_rotation(share: float, generator: torch.Generator) -> Rotation:
 
 
 def drop_planes(prepared: SupportContext, chance: float, generator: torch.Generator) -> SupportContext:
-    """The object without some of its planes.
-
-    Args:
-        prepared: the object.
-        chance: that a plane is hidden; with 0, nothing is drawn.
-        generator: of the draw.
-    """
+    """The object without some of its planes, each with that chance; with 0, nothing is drawn."""
     if not chance:
         return prepared
     hidden = torch.rand(len(prepared.views), generator=generator) < chance

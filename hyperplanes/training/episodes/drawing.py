@@ -29,44 +29,22 @@ OBJECTS_A_STREAM = 4
 
 
 def step_generator(seed: int, step: int) -> torch.Generator:
-    """What the objects of a step are drawn from.
-
-    Args:
-        seed: of the training.
-        step: steps done before.
-    """
+    """What the objects of a step are drawn from, after so many steps."""
     return torch.Generator().manual_seed(seed * 1_000_003 + step)
 
 
 def object_generator(seed: int, step: int, place: int) -> torch.Generator:
-    """What the rays and samples of one object of a step are drawn from, whoever else is in the step.
-
-    Args:
-        seed: of the training.
-        step: steps done before.
-        place: of the object in the step.
-    """
+    """What rays and samples of the object at a place of a step are drawn from, whoever else is in it."""
     return _generator(seed, step, place)
 
 
 def episode_generator(seed: int, number: int) -> torch.Generator:
-    """What the views of an episode are drawn from.
-
-    Args:
-        seed: of the training.
-        number: of the episode, from 0.
-    """
+    """What the views of an episode are drawn from; numbers begin at 0."""
     return _generator(seed, number, 0, EPISODES)
 
 
 def draw(names: Sequence[str], count: int, generator: torch.Generator) -> list[str]:
-    """Objects of a step, different ones while there are enough.
-
-    Args:
-        names: to draw from.
-        count: how many.
-        generator: of the draws.
-    """
+    """Objects of a step, different ones while there are enough."""
     if count == 1:
         return [names[int(torch.randint(len(names), (), generator=generator))]]
     return [names[index] for index in _places(len(names), count, generator)]
@@ -129,13 +107,7 @@ def episode_object(classes: Mapping[str, Sequence[str]], number: int, seed: int)
 
 
 def points_in(bounds: Sphere, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
-    """Random points, evenly in the volume of a sphere, on the CPU.
-
-    Args:
-        bounds: the sphere.
-        count: how many.
-        generator: of the points.
-    """
+    """Random points, evenly in the volume of a sphere, on the CPU."""
     unit = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     unit = unit * torch.rand(count, 1, generator=generator) ** (1 / 3)
     return unit * bounds.radius + torch.tensor(bounds.centre)

@@ -109,10 +109,6 @@ def prepare_subset(
 def volume_of_all_views(model: HyperPlanes, task: Task) -> Float[Tensor, "4 x y z"]:
     """What all views of an object together show of each cell: the share that the hull occupies, and the mean colour.
 
-    Args:
-        model: whose hypernetwork reads a volume.
-        task: the object.
-
     Returns:
         The first channels of `volume_of`, in half precision: they are kept for every object of a training.
     """

@@ -92,11 +92,7 @@ class EpisodeLoader:
         torch.linalg.det(torch.eye(3, device=model.rig.device))
 
     def batch(self, step: int) -> Batch:
-        """The objects of a step, ready; the first time it is asked for, an object is made ready here and now.
-
-        Args:
-            step: steps done before.
-        """
+        """The objects after so many steps, ready; one that is asked for the first time is made ready here."""
         names = self.names_of(step)
         draws = [Draw(name, self.get(name), self._generator(step, place)) for place, name in self._own(names)]
         count = self.config.tasks // self.processes.count
@@ -129,11 +125,7 @@ class EpisodeLoader:
         }
 
     def names_of(self, step: int) -> list[str]:
-        """The objects of a step, different ones while there are enough: those to render, then the reference objects.
-
-        Args:
-            step: steps done before.
-        """
+        """Different objects after so many steps, while there are enough: to render, then the reference objects."""
         config, generator = self.config, step_generator(self.config.seed, step)
         count = config.tasks + reference_objects(self.model.config, config)
         if config.views:

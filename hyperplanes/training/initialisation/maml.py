@@ -24,10 +24,6 @@ __all__ = ["MAML"]
 class MAML(InitialisationObjective):
     """The loss of query rays after gradient steps on support rays, and its gradient through them (Finn et al. 2017).
 
-    Args:
-        model: as in `InitialisationObjective`.
-        config: as in `InitialisationObjective`.
-
     Raises:
         ValueError: a field of any order, which would learn to copy the views that support rays come from.
     """
