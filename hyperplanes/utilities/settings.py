@@ -120,10 +120,11 @@ def _entry(hint: Any, value: Any, path: str) -> Any:
         return None
     if hint in _TAGGED:
         tag, kinds = _TAGGED[hint]
-        chosen = _mapping(value, path).get(tag)
+        entries = _mapping(value, path)
+        chosen = entries.get(tag)
         if not isinstance(chosen, str) or chosen not in kinds:
             raise SettingsError(path, f"{tag}: expected one of {', '.join(kinds)}, got {kind_of(chosen)}")
-        return _dataclass(kinds[chosen], {name: entry for name, entry in value.items() if name != tag}, path)
+        return _dataclass(kinds[chosen], {name: entry for name, entry in entries.items() if name != tag}, path)
     for part in get_args(hint) if NoneType in get_args(hint) else (hint,):
         if is_dataclass(part):
             return _dataclass(part, value, path)
