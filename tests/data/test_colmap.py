@@ -168,12 +168,12 @@ def test_broken_models_are_named(scene, tmp_path):
     for length in (0, 5, 60, 100, len(whole) - 40):
         path.write_bytes(whole[:length])
         with pytest.raises(DataError, match="expected a whole COLMAP model, found a broken one"):
-            read_colmap(folder)
+            read_colmap(folder, folder)
     path.write_bytes(whole.replace(b"view3.png", b"../x3.png"))
     with pytest.raises(DataError, match="expected file names inside"):
-        read_colmap(folder)
+        read_colmap(folder, folder)
     fisheye = write(scene, tmp_path / "fisheye", "OPENCV_FISHEYE", (0.1, 0, 0, 0))
     with pytest.raises(DataError, match="camera models SIMPLE_PINHOLE, .*, found OPENCV_FISHEYE; run COLMAP's"):
-        read_colmap(fisheye)
+        read_colmap(fisheye, fisheye)
     with pytest.raises(DataError, match="expected cameras and images, .bin or .txt, found neither"):
-        read_colmap(tmp_path)
+        read_colmap(tmp_path, tmp_path)

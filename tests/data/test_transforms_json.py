@@ -14,6 +14,7 @@ from hyperplanes.data import DataError, open_dataset, read_task, read_views
 from hyperplanes.data.formats.recognise import read_posed_task
 from hyperplanes.data.formats.transforms_document import transforms_document
 from hyperplanes.data.formats.transforms_json import _lens, read_transforms
+from hyperplanes.data.pictures.frames import assemble
 from hyperplanes.data.pictures.undistort import distort
 from hyperplanes.geometry import cameras as camera
 
@@ -44,7 +45,7 @@ def test_the_balls_centre_projects_onto_the_middle_of_its_silhouettes(scene, tmp
 
 def test_legacy_reading_moves_the_principal_point_by_half_a_pixel(scene, tmp_path):
     scene.write(tmp_path)
-    legacy = read_transforms(tmp_path / "transforms.json", legacy=True)
+    legacy, _ = assemble(read_transforms(tmp_path / "transforms.json", legacy=True))
     assert camera.intrinsics(legacy.cameras)[0, :2, 2].tolist() == [16.0, 12.0]
     assert camera.intrinsics(read_views(tmp_path).cameras)[0, :2, 2].tolist() == [15.5, 11.5]
 

@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hyperplanes.data.formats.catalogue import SPLITS, Catalogue, is_plain
-from hyperplanes.data.pictures.frames import Frame, assemble
-from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
+from hyperplanes.data.pictures.frames import Frame, Listing, assemble
+from hyperplanes.data.pictures.posed import PosedTask, check_pose
 from hyperplanes.utilities.files import MALFORMED, DataError, check_link, check_regular, inside, read_json
 
 __all__ = ["ANNOTATIONS", "catalogue", "is_sequence", "read_sequence"]
@@ -40,25 +40,15 @@ def is_sequence(folder: Path) -> bool:
     return (folder / "images").is_dir() and (folder.resolve().parent / ANNOTATIONS).is_file()
 
 
-def read_sequence(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
-    """The posed pictures of one sequence.
+def read_sequence(folder: Path, root: Path) -> Listing:
+    """The posed pictures of one sequence, CATEGORY/SEQUENCE, in the order of their frames, with the published masks.
 
-    Args:
-        folder: CATEGORY/SEQUENCE.
-        downscale: as in `assemble`.
-        root: no picture may lie outside of it, symbolic links followed; the folder when None.
-
-    Returns:
-        The pictures in the order of their frames, with the published masks. Anything wrong with a file is a DataError.
+    Anything wrong with a file is a DataError.
     """
-    folder = Path(folder)
     whole = folder.resolve()
     category = whole.parent
-    check_link(
-        category / ANNOTATIONS, root if root is not None and category.is_relative_to(root.resolve()) else category
-    )
-    frames = _annotations(category / ANNOTATIONS).get(whole.name, [])
-    return _read(whole, frames, downscale, folder if root is None else root)
+    check_link(category / ANNOTATIONS, root if category.is_relative_to(root.resolve()) else category)
+    return _listing(whole, _annotations(category / ANNOTATIONS).get(whole.name, []), root)
 
 
 def catalogue(folder: Path) -> Catalogue | None:
@@ -99,7 +89,7 @@ def catalogue(folder: Path) -> Catalogue | None:
 
     def read(name: str) -> PosedTask:
         home, frames = known[name]
-        return PosedTask.alternating(_read(home.resolve() / name, frames, None, folder), name)
+        return PosedTask.alternating(assemble(_listing(home.resolve() / name, frames, folder))[0], name)
 
     classes = {name: {"class": home.resolve().name} for name, (home, _) in known.items()}
     return Catalogue(
@@ -141,7 +131,7 @@ def _annotations(path: Path) -> dict[str, list[dict[str, Any]]]:
     return dict(sequences)
 
 
-def _read(folder: Path, listed: list[dict[str, Any]], downscale: int | None, root: Path) -> Posed:
+def _listing(folder: Path, listed: list[dict[str, Any]], root: Path) -> Listing:
     """The pictures of a sequence; paths are relative to the folder of categories."""
     source, base = folder.parent / ANNOTATIONS, folder.parent.parent
     if not listed:
@@ -169,7 +159,7 @@ def _read(folder: Path, listed: list[dict[str, Any]], downscale: int | None, roo
                 mask=found if found is not None and found.exists() else None,
             )
         )
-    return assemble(frames, source, downscale=downscale)[0]
+    return Listing(frames, source)
 
 
 def _calibration(view: dict[str, Any], source: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.pictures.frames import Frame, assemble, scaled_matrix
+from hyperplanes.data.pictures.frames import Frame, Listing, scaled_matrix
 from hyperplanes.data.pictures.images import image_size
 from hyperplanes.data.pictures.masks import find_masks
-from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.data.pictures.posed import check_pose
 from hyperplanes.utilities.files import DataError, check_link, inside, read_bytes, read_text
 
 __all__ = ["find_model", "image_names", "read_colmap"]
@@ -70,7 +70,7 @@ def find_model(folder: str | Path) -> Path | None:
     return None
 
 
-def read_colmap(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+def read_colmap(folder: Path, root: Path) -> Listing:
     """The posed pictures of a COLMAP reconstruction.
 
     COLMAP's world and its OpenCV axes are kept; its principal point counts from the pictures' borders. Pictures lie in
@@ -80,9 +80,8 @@ def read_colmap(folder: str | Path, *, downscale: int | None = None, root: Path 
 
     Args:
         folder: the project, or the model itself.
-        downscale: as in `assemble`.
         root: the model may not lie outside of it, symbolic links followed, nor a picture outside of it and of the
-            folder of pictures; the folder when None.
+            folder of pictures.
 
     Returns:
         The pictures, sorted by name.
@@ -90,24 +89,23 @@ def read_colmap(folder: str | Path, *, downscale: int | None = None, root: Path 
     Raises:
         DataError: no model, a camera model that is not read (fisheye), a truncated file, or pictures that are missing.
     """
-    folder = Path(folder)
     model = find_model(folder)
     if model is None:
         raise DataError(folder, "cameras and images, .bin or .txt", "neither", "check the path")
-    paths, cameras, images = _read(model, root or folder)
+    paths, cameras, images = _read(model, root)
     if not images:
         raise DataError(paths[1], "registered images", "none", "reconstruct again")
     images = sorted(images, key=lambda image: image.name)
     absent = [image.name for image in images if image.camera not in cameras]
     if absent:
         raise DataError(paths[0], f"the camera of {absent[0]}", "none", _REMEDY)
-    home = _pictures_folder(folder, model, images, cameras, paths[1], root or folder)
+    home = _pictures_folder(folder, model, images, cameras, paths[1], root)
     frames = []
     for image in images:
         seen = cameras[image.camera]
         frames.append(
             Frame(
-                _picture(home, image.name, paths[1], root or folder),
+                _picture(home, image.name, paths[1], root),
                 image.name,
                 check_pose(image.camera_from_world, paths[1], image.name),
                 partial(scaled_matrix, seen.matrix, seen.size),
@@ -115,9 +113,9 @@ def read_colmap(folder: str | Path, *, downscale: int | None = None, root: Path 
                 seen.coefficients,
             )
         )
-    masks = find_masks([home.parent / "masks"], [frame.path for frame in frames], root or home.parent)
+    masks = find_masks([home.parent / "masks"], [frame.path for frame in frames], root)
     frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
-    return assemble(frames, paths[1], downscale=downscale)[0]
+    return Listing(frames, paths[1])
 
 
 def image_names(model: Path, root: Path) -> dict[int, str]:

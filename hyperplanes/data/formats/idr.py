@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hyperplanes.data.formats.npz import read_arrays
-from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES, image_size
 from hyperplanes.data.pictures.masks import find_masks
-from hyperplanes.data.pictures.posed import Posed
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError, list_files
 
@@ -27,17 +26,12 @@ def camera_file(folder: Path) -> Path | None:
     return next((folder / name for name in _FILES if (folder / name).is_file()), None)
 
 
-def read_idr(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
-    """The posed pictures of a scene in IDR's layout.
+def read_idr(folder: Path, root: Path) -> Listing:
+    """The posed pictures of a scene in IDR's layout, with cameras.npz or cameras_sphere.npz.
 
     `world_mat_i` projects homogeneous points of the world to pixels (integer pixel centres), `scale_mat_i` takes the
     unit sphere, in which the object lies, to that world. Cameras are brought into the world of the unit sphere. Picture
     i is the i-th of image/ by name; mask/ holds masks of the same names, or numbered in the same order, as published.
-
-    Args:
-        folder: with cameras.npz or cameras_sphere.npz.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures in the order of their names.
@@ -45,12 +39,10 @@ def read_idr(folder: str | Path, *, downscale: int | None = None, root: Path | N
     Raises:
         DataError: no such file, matrices that are missing or project nothing, or not one picture a matrix.
     """
-    folder = Path(folder)
     source = camera_file(folder)
     if source is None:
         raise DataError(folder, "cameras.npz", "nothing", "check the path")
     home = next((folder / name for name in _HOMES if (folder / name).is_dir()), folder)
-    root = root or folder
     pictures = list_files(home, PICTURE_SUFFIXES, root)
     wanted = {f"{kind}_{index}" for kind in ("world_mat", "scale_mat") for index in range(len(pictures) + 1)}
     arrays = read_arrays(source, wanted, root)
@@ -67,7 +59,7 @@ def read_idr(folder: str | Path, *, downscale: int | None = None, root: Path | N
         frames.append(
             Frame(path, path.relative_to(folder).as_posix(), pose, _fixed(matrix), image_size(path), mask=mask)
         )
-    return assemble(frames, source, bounds=Sphere(), downscale=downscale)[0]
+    return Listing(frames, source, bounds=Sphere())
 
 
 def _fixed(matrix: npt.NDArray[np.float64]) -> Callable[[tuple[int, int]], npt.NDArray[np.float64]]:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.masks import find_masks
-from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.data.pictures.posed import check_pose
 from hyperplanes.utilities.axes import invert_poses
 from hyperplanes.utilities.files import MALFORMED, DataError, list_files, read_bytes
 
@@ -27,7 +27,7 @@ def is_llff(folder: Path) -> bool:
     return (folder / FILE).is_file()
 
 
-def read_llff(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+def read_llff(folder: Path, root: Path) -> Listing:
     """The posed pictures of a scene in LLFF's layout.
 
     A row of poses_bounds.npy is a 3 x 5 matrix, row by row, and two depths: the axes of the camera in the world (down,
@@ -35,20 +35,13 @@ def read_llff(folder: str | Path, *, downscale: int | None = None, root: Path | 
     The principal point is the middle of the picture. Rows are in the order of the sorted names of the pictures, which
     lie in images/, or scaled down by N in images_N/, of which the largest are read; masks may lie in masks/ or mask/.
 
-    Args:
-        folder: with poses_bounds.npy.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
-
     Returns:
         The pictures in the order of their names.
 
     Raises:
         DataError: another array, or not one picture a row.
     """
-    folder = Path(folder)
     source = folder / FILE
-    root = root or folder
     rows = _rows(source, root)
     pictures = _pictures(folder, len(rows), root)
     masks = find_masks([folder / "masks", folder / "mask"], pictures, root)
@@ -74,7 +67,7 @@ def read_llff(folder: str | Path, *, downscale: int | None = None, root: Path | 
                 depths=(float(near), float(far)) if 0 < near < far < np.inf else None,
             )
         )
-    return assemble(frames, source, downscale=downscale)[0]
+    return Listing(frames, source)
 
 
 class _Calibration:

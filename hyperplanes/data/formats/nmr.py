@@ -15,10 +15,10 @@ import numpy.typing as npt
 from hyperplanes.data.formats.catalogue import SPLITS, Catalogue, is_plain
 from hyperplanes.data.formats.npz import read_arrays
 from hyperplanes.data.formats.text_numbers import LARGEST_TEXT
-from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.masks import find_masks
-from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
+from hyperplanes.data.pictures.posed import PosedTask, check_pose
 from hyperplanes.utilities.files import DataError, list_files, read_text
 
 __all__ = ["catalogue", "is_nmr", "read_nmr"]
@@ -42,13 +42,8 @@ def is_nmr(folder: Path) -> bool:
     return bool(np.abs(world[:3, :3] @ world[:3, :3].T - np.eye(3)).max() < RIGID)
 
 
-def read_nmr(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+def read_nmr(folder: Path, root: Path) -> Listing:
     """The posed pictures of one object; the world is ShapeNet's, y up.
-
-    Args:
-        folder: with cameras.npz and image/.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures in the order of their names; the principal point is the middle of each.
@@ -56,7 +51,6 @@ def read_nmr(folder: str | Path, *, downscale: int | None = None, root: Path | N
     Raises:
         DataError: no picture, or cameras that are missing or none.
     """
-    folder, root = Path(folder), root or Path(folder)
     source = folder / "cameras.npz"
     pictures = list_files(folder / "image", PICTURE_SUFFIXES, root)
     if not pictures:
@@ -69,7 +63,7 @@ def read_nmr(folder: str | Path, *, downscale: int | None = None, root: Path | N
         pose = check_pose(_matrix(arrays, f"world_mat_{index}", source), source, path.name)
         focal = np.abs(np.diagonal(_matrix(arrays, f"camera_mat_{index}", source))[:2]).astype(np.float64)
         frames.append(Frame(path, f"image/{path.name}", pose, _Calibration(focal), mask=mask))
-    return assemble(frames, source, downscale=downscale)[0]
+    return Listing(frames, source)
 
 
 def catalogue(folder: Path) -> Catalogue | None:
@@ -106,7 +100,7 @@ def catalogue(folder: Path) -> Catalogue | None:
         raise DataError(folder, "the objects that its lists name", "none of their folders", "download them again")
 
     def read(name: str) -> PosedTask:
-        return PosedTask.alternating(read_nmr(paths[name], root=folder), name)
+        return PosedTask.alternating(assemble(read_nmr(paths[name], folder))[0], name)
 
     return Catalogue("nmr", splits, read, {"objects": objects}, tuple(skipped))
 

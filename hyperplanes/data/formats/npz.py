@@ -14,6 +14,7 @@ from hyperplanes.data.formats.catalogue import SPLITS, Catalogue, is_plain
 from hyperplanes.data.formats.transforms_document import opencv_from_opengl
 from hyperplanes.data.formats.transforms_json import read_transforms, read_transforms_task
 from hyperplanes.data.pictures.bounds import stated_bounds
+from hyperplanes.data.pictures.frames import assemble
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import MALFORMED, DataError, check_regular, read_json
@@ -205,7 +206,8 @@ def _learnit(
         if manifest:
             return read_transforms_task(homes[name], name, legacy=legacy, bounds=bounds, complete=True)
         file = homes[name] / "transforms.json"
-        return PosedTask.halves(read_transforms(file, legacy=legacy, bounds=bounds, complete=True), name)
+        scene, _ = assemble(read_transforms(file, legacy=legacy, bounds=bounds), complete=True)
+        return PosedTask.halves(scene, name)
 
     return Catalogue(LEGACY[0], splits, read, manifest, tuple(skipped))
 

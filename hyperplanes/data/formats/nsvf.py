@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hyperplanes.data.formats.text_numbers import read_numbers, read_rows
-from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing, assemble
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
-from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
+from hyperplanes.data.pictures.posed import PosedTask, check_pose
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.axes import invert_poses
 from hyperplanes.utilities.files import DataError, list_files
@@ -29,17 +29,12 @@ def is_nsvf(folder: Path) -> bool:
     return bool(names) and all(re.match(r"[012]_", name) for name in names)
 
 
-def read_nsvf(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+def read_nsvf(folder: Path, root: Path) -> Listing:
     """The posed pictures of a scene in NSVF's layout.
 
     pose/*.txt are OpenCV camera-to-world; intrinsics.txt is a 3 x 3 or 4 x 4 calibration, or begins with
     "f cx cy"; its principal point counts from the pictures' borders. bbox.txt, where it is, holds the corners of a box
     around the scene.
-
-    Args:
-        folder: of the scene.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures, sorted by name: those to train on, to validate with, and to test on.
@@ -47,8 +42,6 @@ def read_nsvf(folder: str | Path, *, downscale: int | None = None, root: Path | 
     Raises:
         DataError: anything wrong with a file.
     """
-    folder = Path(folder)
-    root = root or folder
     pictures = list_files(folder / "rgb", PICTURE_SUFFIXES, root)
     if not pictures:
         raise DataError(folder / "rgb", "pictures", "none", _REMEDY)
@@ -60,24 +53,15 @@ def read_nsvf(folder: str | Path, *, downscale: int | None = None, root: Path | 
         frames.append(
             Frame(path, f"rgb/{path.name}", invert_poses(world_from_camera), _Calibration(matrix, size), size)
         )
-    return assemble(frames, folder, bounds=_box(folder / "bbox.txt", root), downscale=downscale)[0]
+    return Listing(frames, folder, bounds=_box(folder / "bbox.txt", root))
 
 
-def read_nsvf_task(
-    folder: str | Path, name: str, *, downscale: int | None = None, root: Path | None = None
-) -> PosedTask:
+def read_nsvf_task(folder: Path, name: str, downscale: int | None, root: Path) -> PosedTask:
     """Support and query of a scene: the pictures 0_* to train on and 2_* to test on, or 1_* where there are none.
 
-    Args:
-        folder: of the scene.
-        name: of the object.
-        downscale: as in `assemble`.
-        root: as in `read_nsvf`.
-
-    Returns:
-        The two halves; views alternate where the names leave one of them empty.
+    Views alternate where the names leave one of the two halves empty.
     """
-    scene = read_nsvf(folder, downscale=downscale, root=root)
+    scene = assemble(read_nsvf(folder, root), downscale)[0]
     splits = [[at for at, each in enumerate(scene.names) if Path(each).name[0] == digit] for digit in "012"]
     query = splits[2] or splits[1]
     if not splits[0] or not query:

@@ -20,7 +20,7 @@ import torch
 
 from hyperplanes.data.formats.catalogue import Catalogue, is_plain
 from hyperplanes.data.formats.transforms_json import read_transforms
-from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing, assemble
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.axes import flip_camera_axes
@@ -41,13 +41,8 @@ def is_rendered(folder: Path) -> bool:
     return (folder / "000.png").is_file() and (folder / "000.npy").is_file()
 
 
-def read_rendered(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+def read_rendered(folder: Path, root: Path) -> Listing:
     """The posed pictures of one object of Objaverse; the world is Blender's, z up.
-
-    Args:
-        folder: of the object.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures in the order of their numbers.
@@ -55,7 +50,6 @@ def read_rendered(folder: str | Path, *, downscale: int | None = None, root: Pat
     Raises:
         DataError: a picture without its camera, or one that is none.
     """
-    folder, root = Path(folder), root or Path(folder)
     frames = []
     for path in list_files(folder, {".png"}, root):
         camera = path.with_suffix(".npy")
@@ -69,7 +63,7 @@ def read_rendered(folder: str | Path, *, downscale: int | None = None, root: Pat
             raise DataError(camera, "an array (3, 4)", str(error), _REMEDY) from error
         pose = check_pose(matrix, camera, path.name)
         frames.append(Frame(path, path.name, flip_camera_axes(pose.T).T, _calibration))
-    return assemble(frames, folder, bounds=CUBE, downscale=downscale)[0]
+    return Listing(frames, folder, bounds=CUBE)
 
 
 def objaverse(folder: Path) -> Catalogue | None:
@@ -103,7 +97,7 @@ def objaverse(folder: Path) -> Catalogue | None:
             skipped = (f"{path}: skipped {missing} of {len(listed)} objects without a folder",)
 
     def read(name: str) -> PosedTask:
-        return PosedTask.alternating(read_rendered(folder / name, root=folder), name)
+        return PosedTask.alternating(assemble(read_rendered(folder / name, folder))[0], name)
 
     return Catalogue("objaverse", splits, read, skipped=skipped)
 
@@ -113,22 +107,13 @@ def is_omniobject(folder: Path) -> bool:
     return (folder / "render" / "transforms.json").is_file() and (folder / "render" / "images").is_dir()
 
 
-def read_omniobject(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
-    """The posed pictures of one object of OmniObject3D; the world is Blender's, z up.
+def read_omniobject(folder: Path, downscale: int | None, root: Path) -> Posed:
+    """The posed pictures of one object of OmniObject3D, CATEGORY/OBJECT; the world is Blender's, z up.
 
     Their background is black and there is no alpha: where every pixel of the border is black, what is not black is the
-    object.
-
-    Args:
-        folder: CATEGORY/OBJECT.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
-
-    Returns:
-        The pictures in the order of the file. Anything wrong with a file is a DataError.
+    object. Anything wrong with a file is a DataError.
     """
-    folder = Path(folder)
-    found = read_transforms(folder / "render" / "transforms.json", downscale=downscale, root=root or folder)
+    found = assemble(read_transforms(folder / "render" / "transforms.json", root=root), downscale)[0]
     found = replace(found, names=tuple(f"render/{name}" for name in found.names))
     border = torch.cat([found.rgba[:, :3, [0, -1]].flatten(1), found.rgba[:, :3, :, [0, -1]].flatten(1)], 1)
     if found.has_alpha or border.any():
@@ -165,7 +150,7 @@ def omniobject(folder: Path) -> Catalogue | None:
     classes = {name: {"class": category} for category, found in paths.items() for name in found}
 
     def read(name: str) -> PosedTask:
-        return PosedTask.alternating(read_omniobject(where[name], root=folder), name)
+        return PosedTask.alternating(read_omniobject(where[name], None, folder), name)
 
     return Catalogue("omniobject3d", splits, read, {"objects": classes})
 

@@ -11,6 +11,7 @@ from hyperplanes.data.formats.apps import metashape, polycam, realitycapture, re
 from hyperplanes.data.formats.catalogue import FORMAT, Catalogue, native
 from hyperplanes.data.formats.transforms_json import find_transforms, read_transforms, read_transforms_task
 from hyperplanes.data.formats.unposed import refuse_unposed
+from hyperplanes.data.pictures.frames import Listing, assemble
 from hyperplanes.data.pictures.posed import Posed, PosedTask
 from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.files import DataError, read_json
@@ -23,12 +24,13 @@ class Layout:
     """A layout of one posed scene.
 
     Attributes:
-        found: whether a folder is in it.
-        read: all of its pictures; a folder, a factor to scale down by, and the root that no file may lie outside of.
+        found: what is true of a folder in it.
+        read: all of its pictures; a folder, a factor to scale down by, and the root that no file may lie outside of,
+            symbolic links followed.
         read_task: support and query, where the layout has splits of its own; views alternate else.
     """
 
-    found: Callable[[Path], bool]
+    found: Callable[[Path], object]
     read: Callable[[Path, int | None, Path], Posed]
     read_task: Callable[[Path, str, int | None, Path], PosedTask] | None = None
 
@@ -40,19 +42,19 @@ class Layout:
 
 
 def _layout(
-    found: Callable[[Path], object], read: Callable[..., Posed], read_task: Callable[..., PosedTask] | None = None
+    found: Callable[[Path], object],
+    read: Callable[[Path, Path], Listing],
+    read_task: Callable[[Path, str, int | None, Path], PosedTask] | None = None,
 ) -> Layout:
-    """A layout whose readers take the factor to scale down by and the root as `downscale` and `root`."""
-    return Layout(
-        lambda folder: bool(found(folder)),
-        lambda folder, downscale, root: read(folder, downscale=downscale, root=root),
-        read_task and (lambda folder, name, downscale, root: read_task(folder, name, downscale=downscale, root=root)),
-    )
+    """A layout whose files list pictures: `read` gets a folder and the root that no file may lie outside of."""
+    return Layout(found, lambda folder, downscale, root: assemble(read(folder, root), downscale)[0], read_task)
 
 
 LAYOUTS = (
     _layout(
-        find_transforms, lambda folder, **more: read_transforms(find_transforms(folder), **more), read_transforms_task
+        find_transforms,
+        lambda folder, root: read_transforms(find_transforms(folder), root=root),
+        lambda folder, name, downscale, root: read_transforms_task(folder, name, downscale=downscale, root=root),
     ),
     _layout(nsvf.is_nsvf, nsvf.read_nsvf, nsvf.read_nsvf_task),
     Layout(srn.is_srn, lambda folder, downscale, root: srn.read_srn(folder, root=root).downscaled(downscale)),
@@ -60,7 +62,7 @@ LAYOUTS = (
     _layout(llff.is_llff, llff.read_llff),
     _layout(nmr.is_nmr, nmr.read_nmr),
     _layout(idr.camera_file, idr.read_idr),
-    _layout(objaverse.is_omniobject, objaverse.read_omniobject),
+    Layout(objaverse.is_omniobject, objaverse.read_omniobject),
     _layout(objaverse.is_rendered, objaverse.read_rendered),
     _layout(co3d.is_sequence, co3d.read_sequence),
     _layout(polycam.is_polycam, polycam.read_polycam),
@@ -142,7 +144,7 @@ def read_posed(path: str | Path, downscale: int | None = None) -> Posed:
     if path.is_file() and path.suffix == ".npz":
         return npz.read_npz(path).downscaled(downscale)
     if path.is_file() and path.suffix == ".json":
-        return read_transforms(path, downscale=downscale)
+        return assemble(read_transforms(path), downscale)[0]
     return _format(path).read(path, downscale, path)
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from hyperplanes.data.formats.apps.calibration import brown_lens
 from hyperplanes.data.formats.transforms_document import calibration, opencv_from_opengl, stated_size
 from hyperplanes.data.pictures.bounds import stated_bounds
-from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing, assemble
 from hyperplanes.data.pictures.images import image_size
 from hyperplanes.data.pictures.masks import find_masks
-from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
+from hyperplanes.data.pictures.posed import PosedTask, check_pose
 from hyperplanes.data.pictures.undistort import distortion
 from hyperplanes.data.upright import stated_up
 from hyperplanes.geometry.rays import Sphere
@@ -44,10 +44,8 @@ def read_transforms(
     *,
     legacy: bool = False,
     bounds: Sphere | None = None,
-    downscale: int | None = None,
-    complete: bool = False,
     root: Path | None = None,
-) -> Posed:
+) -> Listing:
     """The posed pictures of one scene.
 
     Distorted pictures (k1, k2, k3, p1, p2 not zero) are undistorted with the same calibration. An alpha channel, or the
@@ -56,20 +54,14 @@ def read_transforms(
     Args:
         path: a transforms file, or several of one folder that are read as one scene.
         legacy: as in `calibration`.
-        bounds: of the scene; "scene_sphere" of the file, else an estimate, when None.
-        downscale: as in `assemble`.
-        complete: as in `assemble`.
+        bounds: of the scene; "scene_sphere" of the file when None.
         root: no picture may lie outside of it, symbolic links followed; the file's folder when None.
 
     Returns:
         The pictures of all frames in the order of the files. Anything wrong with a file is a DataError that names it.
     """
     paths = [Path(path)] if isinstance(path, (str, Path)) else list(path)
-    document, frames, _ = _listed_frames(paths, legacy, root)
-    source = paths[0] if len(paths) == 1 else paths[0].parent
-    bounds = bounds or stated_bounds(document, paths[0])
-    scene, _ = assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)
-    return replace(scene, up=stated_up(document, paths[0]))
+    return _listed(paths, legacy, bounds, root)[0]
 
 
 def read_transforms_task(
@@ -106,25 +98,25 @@ def read_transforms_task(
     if not files:
         raise DataError(path, "transforms.json or transforms_train.json", "neither", "check the path")
     paths = files if len(files) == 1 else [files[0], files[-1]]
-    document, frames, counts = _listed_frames(paths, legacy, root)
-    query = range(counts[0], len(frames))
+    listing, document, count = _listed(paths, legacy, bounds, root)
+    query = range(count, len(listing.frames))
     if len(paths) == 1:
-        frames, query = _split_by_names(document, frames, files[0])
-    bounds = bounds or stated_bounds(document, files[0])
-    source = files[0] if len(paths) == 1 else path
-    scene, kept = assemble(frames, source, bounds=bounds, downscale=downscale, complete=complete)
-    scene = replace(scene, up=stated_up(document, files[0]))
+        frames, query = _split_by_names(document, listing.frames, files[0])
+        listing = replace(listing, frames=frames)
+    scene, kept = assemble(listing, downscale, complete=complete)
     if query is None:
         return PosedTask.alternating(scene, name)
     halves = [[at for at, index in enumerate(kept) if (index in query) == asked] for asked in (False, True)]
     if not all(halves):
         found = f"{len(halves[0])} to train and {len(halves[1])} to test on"
         remedy = "copy the pictures to where the files name them, each in one split alone"
-        raise DataError(source, "pictures of both splits", found, remedy)
+        raise DataError(listing.source, "pictures of both splits", found, remedy)
     return PosedTask.split(scene, halves[0], halves[1], name)
 
 
-def _split_by_names(document: dict[str, Any], frames: list[Frame], path: Path) -> tuple[list[Frame], range | None]:
+def _split_by_names(
+    document: dict[str, Any], frames: Sequence[Frame], path: Path
+) -> tuple[Sequence[Frame], range | None]:
     """The frames that train_filenames and test_filenames name, and which of them are the query; None: no such lists."""
     halves = [document.get(f"{half}_filenames") for half in ("train", "test")]
     if not document.get("test_filenames") and isinstance(document.get("val_filenames"), list):
@@ -138,11 +130,20 @@ def _split_by_names(document: dict[str, Any], frames: list[Frame], path: Path) -
     return _chosen(document, frames, names, path), range(len(support), len(names))
 
 
-def _listed_frames(paths: list[Path], legacy: bool, root: Path | None) -> tuple[dict[str, Any], list[Frame], list[int]]:
-    """The first document, the frames of all, and how many each has."""
+def _listed(
+    paths: list[Path], legacy: bool, bounds: Sphere | None, root: Path | None
+) -> tuple[Listing, dict[str, Any], int]:
+    """What all files list, the first of them, and how many frames that has."""
     documents = [read_json(one, root or one.parent) for one in paths]
     parts = [_frames(path, document, legacy, root) for path, document in zip(paths, documents, strict=True)]
-    return documents[0], [frame for part in parts for frame in part], [len(part) for part in parts]
+    first, document = paths[0], documents[0]
+    listing = Listing(
+        [frame for part in parts for frame in part],
+        first if len(paths) == 1 else first.parent,
+        bounds or stated_bounds(document, first),
+        stated_up(document, first),
+    )
+    return listing, document, len(parts[0])
 
 
 def _frames(path: Path, document: dict[str, Any], legacy: bool, root: Path | None) -> list[Frame]:
@@ -210,7 +211,7 @@ def _located(path: Path, name: object, root: Path) -> Path:
     return inside(root, str(path.parent.relative_to(root) / text) if text else "", path)
 
 
-def _chosen(document: dict[str, Any], frames: list[Frame], only: Sequence[str], path: Path) -> list[Frame]:
+def _chosen(document: dict[str, Any], frames: Sequence[Frame], only: Sequence[str], path: Path) -> list[Frame]:
     listed = zip(document["frames"], frames, strict=True)
     by_name = {str(PurePosixPath(each["file_path"])): frame for each, frame in listed}
     chosen = []

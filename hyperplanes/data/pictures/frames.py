@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ from hyperplanes.data.pictures.undistort import check_lens, undistort
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["MEGAPIXEL", "Frame", "assemble", "listed", "scaled_matrix"]
+__all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "listed", "scaled_matrix"]
 
 MEGAPIXEL = 2**20
 """Pixels above which photographs are scaled down unless the caller says by how much."""
@@ -63,6 +63,25 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Listing:
+    """What the files of one scene say of it; no picture has been read, and none lies outside of the reader's `root`.
+
+    Attributes:
+        frames: its pictures, in the order that they are read in.
+        source: the file that lists them, for messages.
+        bounds: of the scene; estimated when None.
+        up: as in `Views`.
+        notes: as in `Posed`.
+    """
+
+    frames: Sequence[Frame]
+    source: str | Path
+    bounds: Sphere | None = None
+    up: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class _Found:
     """A frame whose picture is there.
 
@@ -82,14 +101,7 @@ class _Found:
         return (width, height) if self.turn >= 5 else self.stored
 
 
-def assemble(
-    frames: Sequence[Frame],
-    source: str | Path,
-    *,
-    bounds: Sphere | None = None,
-    downscale: int | None = None,
-    complete: bool = False,
-) -> tuple[Posed, list[int]]:
+def assemble(listing: Listing, downscale: int | None = None, *, complete: bool = False) -> tuple[Posed, list[int]]:
     """Read the pictures of frames and bring them to one size.
 
     Where at least two thirds of the pictures are there, the others are left out and named. So are frames whose picture
@@ -100,9 +112,7 @@ def assemble(
     calibration.
 
     Args:
-        frames: what a file lists.
-        source: that file, for messages.
-        bounds: of the scene; estimated when None.
+        listing: what the files say.
         downscale: take the mean of so many by so many pixels; None stands for as many as leave a megapixel at most.
         complete: a missing picture is an error, and nothing is scaled down unless asked for: data of ours.
 
@@ -110,6 +120,7 @@ def assemble(
         The pictures, and which of the frames they are. Pictures that are missing or misfit, or a lens that folds the
         picture, are a DataError.
     """
+    frames, source = listing.frames, listing.source
     # the frames that have a picture, and one size for all of them
     kept, notes = _present(frames, source, complete)
     found = [_examine(frames[index], source) for index in kept]
@@ -142,13 +153,13 @@ def assemble(
         np.stack([one.frame.camera_from_world for one in found]),
         np.stack(matrices),
         has_alpha=any(alphas),
-        bounds=bounds,
+        bounds=listing.bounds,
         names=tuple(one.frame.name for one in found),
         source=source,
         depths=None if None in depths else torch.tensor(depths, dtype=torch.float32),
         notes=tuple(notes),
     )
-    return scene, kept
+    return replace(scene, up=listing.up, notes=(*scene.notes, *listing.notes)), kept
 
 
 def listed(names: Sequence[str], most: int = 20) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,8 +15,8 @@ import numpy.typing as npt
 from hyperplanes.data.formats.apps.calibration import brown_lens, calibrated
 from hyperplanes.data.formats.apps.heads import find_by_head, only_one
 from hyperplanes.data.formats.apps.photographs import find_photographs
-from hyperplanes.data.pictures.frames import Frame, assemble, listed
-from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.data.pictures.frames import Frame, Listing, listed
+from hyperplanes.data.pictures.posed import check_pose
 from hyperplanes.utilities.files import DataError, malformed, read_bytes
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def find_cameras_files(folder: Path) -> list[Path]:
     return find_by_head(folder, ".xml", lambda head: "<document" in head and "<chunk" in head)
 
 
-def read_metashape(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+def read_metashape(folder: Path, root: Path) -> Listing:
     """The posed pictures of a file of cameras of Metashape, which lie beside it or in images/.
 
     A camera's `transform` is camera to chunk, by rows, in OpenCV's axes; that of its component, or of the chunk,
@@ -63,18 +63,12 @@ def read_metashape(folder: str | Path, *, downscale: int | None = None, root: Pa
     process_data/metashape_utils.py of nerfstudio, which keeps neither the component's transform nor that order). Of
     components that share no world the largest is taken. Masks may lie in masks/.
 
-    Args:
-        folder: with the file.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
-
     Returns:
         The pictures in the order of the file; what was left out is in the notes.
 
     Raises:
         DataError: no cameras that are aligned and calibrated, a fisheye or spherical camera, skew, or broken XML.
     """
-    folder, root = Path(folder), root or Path(folder)
     path = only_one(find_cameras_files(folder), folder, "XML file of cameras of Metashape")
     with malformed(path, "cameras of Metashape"):
         chunk = _chunk(path, root)
@@ -100,14 +94,10 @@ def read_metashape(folder: str | Path, *, downscale: int | None = None, root: Pa
         calibrate = calibrated(sensor.focal, sensor.centre, sensor.size, path)
         written = picture.relative_to(folder).as_posix()
         frames.append(Frame(picture, written, pose, calibrate, sensor.size, sensor.lens, mask))
-    scene = assemble(frames, path, downscale=downscale)[0]
     left_out = [each.get("label", "") for each in cameras if each not in kept]
-    if not left_out:
-        return scene
     why = "not aligned, not enabled, without calibration or in another component"
-    return replace(
-        scene, notes=(*scene.notes, f"{len(left_out)} of {len(cameras)} cameras are {why}: {listed(left_out)}")
-    )
+    notes = (f"{len(left_out)} of {len(cameras)} cameras are {why}: {listed(left_out)}",) if left_out else ()
+    return Listing(frames, path, notes=notes)
 
 
 def _chunk(path: Path, root: Path) -> Element:

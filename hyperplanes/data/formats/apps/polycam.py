@@ -9,9 +9,9 @@ import numpy as np
 
 from hyperplanes.data.formats.apps.calibration import calibrated
 from hyperplanes.data.formats.transforms_document import opencv_from_opengl
-from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing
 from hyperplanes.data.pictures.masks import find_masks
-from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.data.pictures.posed import check_pose
 from hyperplanes.utilities.files import DataError, check_link, list_files, malformed, read_json
 
 __all__ = ["is_polycam", "read_polycam"]
@@ -34,18 +34,13 @@ def _places(folder: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def read_polycam(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
-    """The posed pictures of a capture of Polycam.
+def read_polycam(folder: Path, root: Path) -> Listing:
+    """The posed pictures of a capture of Polycam, unzipped.
 
     keyframes/corrected_cameras/N.json and corrected_images/N.jpg, which are there once the app has processed the
     capture, else cameras and images. t_ij is row i, column j of the pose, camera to world in OpenGL's axes; the world
     is ARKit's, y up. Principal points count from the corner of the picture, as in ARKit. Masks may lie in masks/ beside
     the photographs' folder, or beside keyframes/. (Layout: nerfstudio, process_data/polycam_utils.py.)
-
-    Args:
-        folder: of the capture, unzipped.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures in the order of their names.
@@ -53,7 +48,6 @@ def read_polycam(folder: str | Path, *, downscale: int | None = None, root: Path
     Raises:
         DataError: anything wrong with a file.
     """
-    folder, root = Path(folder), root or Path(folder)
     found = _places(folder)
     if found is None:
         raise DataError(folder, "keyframes/cameras and keyframes/images", "neither", "export the raw data again")
@@ -73,7 +67,7 @@ def read_polycam(folder: str | Path, *, downscale: int | None = None, root: Path
     homes = [cameras.parent / "masks", folder / "masks"]
     masks = find_masks(homes, [frame.path for frame in frames], root)
     frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
-    return replace(assemble(frames, cameras, downscale=downscale)[0], up="y")
+    return Listing(frames, cameras, up="y")
 
 
 def _named(pictures: Path, stem: str) -> list[Path]:

@@ -14,8 +14,8 @@ from hyperplanes.data.formats.apps.calibration import brown_lens, calibration_ma
 from hyperplanes.data.formats.apps.heads import find_by_head, only_one
 from hyperplanes.data.formats.apps.photographs import find_photographs
 from hyperplanes.data.formats.transforms_document import opencv_from_opengl
-from hyperplanes.data.pictures.frames import Frame, assemble
-from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.data.pictures.frames import Frame, Listing
+from hyperplanes.data.pictures.posed import check_pose
 from hyperplanes.utilities.files import DataError, malformed, read_text
 
 __all__ = ["find_tables", "read_realitycapture", "world_from_angles"]
@@ -43,7 +43,7 @@ def _columns(line: str) -> list[str]:
     return [name.strip().lower() for name in line.lstrip("#").split(",")]
 
 
-def read_realitycapture(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+def read_realitycapture(folder: Path, root: Path) -> Listing:
     """The posed pictures of a table of cameras of RealityCapture, which lie beside it or in images/.
 
     Position x, y, alt; angles as `world_from_angles`. f is the focal length in millimetres where the longer side of the
@@ -53,15 +53,9 @@ def read_realitycapture(folder: str | Path, *, downscale: int | None = None, roo
     lie in masks/. (Columns and angles: nerfstudio, process_data/realitycapture_utils.py, which guesses another unit of
     px and py; that unit and the lens: "RealityCapture XMP Camera Math", support.capturingreality.com.)
 
-    Args:
-        folder: with the table.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
-
     Returns:
         The pictures in the order of the table. Anything wrong with a file is a DataError.
     """
-    folder, root = Path(folder), root or Path(folder)
     path = only_one(find_tables(folder), folder, "table of cameras of RealityCapture")
     names, cameras = _rows(path, root)
     pictures, masks = find_photographs(folder, names, path, root)
@@ -82,7 +76,7 @@ def read_realitycapture(folder: str | Path, *, downscale: int | None = None, roo
         opencv = opencv_from_opengl(check_pose(pose, path, name)[None])[0]
         written = picture.relative_to(folder).as_posix()
         frames.append(Frame(picture, written, opencv, partial(_calibration, focal, centre), None, lens, mask))
-    return assemble(frames, path, downscale=downscale)[0]
+    return Listing(frames, path)
 
 
 def world_from_angles(heading: float, pitch: float, roll: float) -> npt.NDArray[np.float64]:

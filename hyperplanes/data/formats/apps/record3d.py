@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from hyperplanes.data.formats.apps.calibration import calibrated
 from hyperplanes.data.formats.transforms_document import opencv_from_opengl
-from hyperplanes.data.pictures.frames import Frame, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing
 from hyperplanes.data.pictures.masks import find_masks
-from hyperplanes.data.pictures.posed import Posed, check_pose
+from hyperplanes.data.pictures.posed import check_pose
 from hyperplanes.utilities.files import DataError, check_link, malformed, read_json
 
 __all__ = ["is_record3d", "read_record3d"]
@@ -32,7 +32,7 @@ def _places(folder: Path) -> tuple[Path, Path] | None:
     return next(((file, home) for file, home in pairs if file.is_file() and home.is_dir()), None)
 
 
-def read_record3d(folder: str | Path, *, downscale: int | None = None, root: Path | None = None) -> Posed:
+def read_record3d(folder: Path, root: Path) -> Listing:
     """The posed pictures of a video of Record3D.
 
     Pose i belongs to rgbd/i.jpg (of an unzipped .r3d, beside `metadata`) or rgb/i.jpg (of an export as EXR and JPG,
@@ -41,18 +41,12 @@ def read_record3d(folder: str | Path, *, downscale: int | None = None, root: Pat
     `perFrameIntrinsicCoeffs` (fx, fy, cx, cy). Masks may lie in masks/. (Layout: its author in the issues 27, 33 and 83
     of marek-simonik/record3d; instant-ngp, scripts/record3d2nerf.py.)
 
-    Args:
-        folder: of the video.
-        downscale: as in `assemble`.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
-
     Returns:
         The pictures in the order of their numbers.
 
     Raises:
         DataError: anything wrong with a file.
     """
-    folder, root = Path(folder), root or Path(folder)
     found = _places(folder)
     if found is None:
         raise DataError(folder, "metadata and rgbd/, or metadata.json and rgb/", "neither", "export the video again")
@@ -77,7 +71,7 @@ def read_record3d(folder: str | Path, *, downscale: int | None = None, root: Pat
             pictures, opencv_from_opengl(np.stack(opengl)), calibrations, masks, strict=True
         )
     ]
-    return assemble(frames, path, downscale=downscale)[0]
+    return Listing(frames, path)
 
 
 def _intrinsics(document: dict[str, Any], count: int) -> npt.NDArray[np.float64]:
